@@ -10,6 +10,8 @@ front of the target are random. Parts:
   with one that is simplified to 1 mm, with panels wrong by 0.5 degrees and a scale wrong by 0.3 % (standard deviations, drawn for each
   view; the truth stays the same);
 - ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are averaged by their covariances;
+- ``triangulated``: as ``knowledge``, after one image of each of four cameras around the target at 1 to 1.6 m, whose distances odometry
+  of grade `lab` measures, which tells the scale;
 - ``independent``: as ``exact``, with images by the ray tracer Embree, without texture;
 - ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
   target is darker than 5 grey levels are left out, here and with the lamp;
@@ -30,6 +32,7 @@ every view to FILE (JSON lines) and does not repeat views that are in it.
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 import zlib
@@ -81,6 +84,8 @@ RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0]
 
 ViewRow = dict[str, float]
 """Figures of one view."""
+LAB = NavigationSection(grade="lab").errors()
+"""Errors of odometry and cameras of grade `lab`."""
 _EXPOSURES, _BLUR_PX, _LAMP = 8, 4.0, 60.0
 _VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
 """Views of an inspection, and views of each mesh after it."""
@@ -189,38 +194,76 @@ def inspect(views: int) -> Figures:
     }
 
 
-def inspected(scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int) -> ShapeFilter:
-    """Return the geometry by the views of two cameras on opposite sides of the target, with odometry of grade `lab`."""
-    count, errors = len(mesh.modes_m), NavigationSection(grade="lab").errors()
-    fused, shifts = ShapeFilter.prior(count), rng.normal(0.0, errors.camera_shift_m, (2, 3))
-    sigma_m, common_m = np.sqrt(2.0) * errors.position_noise_m, np.sqrt(2.0) * errors.camera_shift_m
-    for number in range(0, _VIEWS_BEFORE, 2):
-        pose, light = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
-        aside, _ = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
-        opposite = PoseInCamera(aside.position, HALF_TURN @ pose.rotation)
-        places, lenses = [], []
-        for camera, (seen, turn) in enumerate(((pose, np.eye(3)), (opposite, HALF_TURN))):
-            sun = replace(light, to_sun_w=tuple(turn @ light.to_sun_w))
-            image = scene.image(seen, sun, first + number + camera)
-            lens = seen.rotation.T @ (shifts[camera] - seen.position)
-            lenses.append(lens + rng.normal(0.0, errors.position_noise_m, 3))
+@dataclass(frozen=True)
+class Cameras:
+    """Cameras around the target at one time, with odometry of grade `lab`: ``turns``, (3, 3), of their axes about the target, and
+    ``shifts_m`` (n, 3) of their lenses, which flight software does not know."""
+
+    turns: tuple[Array, ...]
+    shifts_m: Array
+
+    @classmethod
+    def drawn(cls, turns: tuple[Array, ...], rng: np.random.Generator) -> Cameras:
+        return cls(turns, rng.normal(0.0, LAB.camera_shift_m, (len(turns), 3)))
+
+    def fused(
+        self, before: ShapeFilter, mesh: TrackerMesh, scene: SatelliteImages, rng: np.random.Generator, first: int, inspect: bool
+    ) -> ShapeFilter:  # fmt: skip
+        """Return the geometry after one image of each camera at 1 to 1.6 m: by their distances, and if they ``inspect`` by each."""
+        fused, count, seen_from = before, len(mesh.modes_m), []
+        pose, light = random_view(rng, 1.0, CAMERA)
+        for number, turn in enumerate(self.turns):
+            aside, _ = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
+            seen = PoseInCamera(aside.position, turn @ pose.rotation)
+            image = scene.image(seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), first + number)
+            lens_m = seen.rotation.T @ (self.shifts_m[number] - seen.position)
+            lens_m += rng.normal(0.0, LAB.position_noise_m, 3)
             found = _track(image, mesh, perturbed(seen, rng, *PRIOR))
             if found is None or not tracking.is_valid(found):
                 continue
-            direction = -found.pose.rotation.T @ found.pose.position
-            direction /= np.linalg.norm(direction)
-            fused = fused.with_view(direction, found.geometry.matrix, found.geometry.vector)
+            if inspect:
+                direction = -found.pose.rotation.T @ found.pose.position
+                direction /= np.linalg.norm(direction)
+                fused = fused.with_view(direction, found.geometry.matrix, found.geometry.vector)
             solution = PoseSolution(
                 position_m=vector(found.pose.position),
                 q_wxyz=vector(rotations.from_matrix(found.pose.rotation)),
                 covariance=vector(found.covariance),
                 reprojection_rms_px=found.rms_px,
             )
-            places.append(seen_place(solution, geometry_message(found.geometry), count))
-        if len(places) == 2 and places[0] is not None and places[1] is not None:
-            length_m = float(np.linalg.norm(lenses[0] - lenses[1]))
-            fused = fused.with_baseline(places[0], places[1], length_m, float(sigma_m), float(common_m))
+            place = seen_place(solution, geometry_message(found.geometry), count)
+            seen_from += [] if place is None else [(place, lens_m)]
+        sigma_m, common_m = np.sqrt(2.0) * LAB.position_noise_m, np.sqrt(2.0) * LAB.camera_shift_m
+        for (a, lens_a), (b, lens_b) in itertools.combinations(seen_from, 2):
+            length_m = float(np.linalg.norm(lens_a - lens_b))
+            fused = fused.with_baseline(a, b, length_m, float(sigma_m), float(common_m))
+        return fused
+
+
+def inspected(scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int) -> ShapeFilter:
+    """Return the geometry by the views of two cameras on opposite sides of the target."""
+    cameras, fused = Cameras.drawn((np.eye(3), HALF_TURN), rng), ShapeFilter.prior(len(mesh.modes_m))
+    for number in range(0, _VIEWS_BEFORE, 2):
+        fused = cameras.fused(fused, mesh, scene, rng, first + number, inspect=True)
     return fused
+
+
+def triangulated(cells: Cells, range_m: float, views: int) -> Figures:
+    """Track single images after one image of each of four cameras around the target, whose distances tell the scale."""
+    scene, quarter = SatelliteImages(), RIGHT_ANGLE
+    turns = tuple(np.linalg.matrix_power(quarter, k) for k in range(4))
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        mesh = _drawn_mesh(rng)
+        before = ShapeFilter.prior(len(mesh.modes_m))
+        fused = Cameras.drawn(turns, rng).fused(before, mesh, scene, rng, 5 * number, inspect=False)
+        corrected = mesh.corrected(fused.mean(), fused.covariance())
+        pose, light = random_view(rng, range_m, CAMERA)
+        image = scene.image(pose, light, 5 * number + 4)
+        return tracked_view(image, corrected, pose, perturbed(pose, rng, *PRIOR))
+
+    key = f"triangulated_{range_m:g}m"
+    return tracking_figures(key, cells.rows(key, views, view))
 
 
 def tracked_view(
@@ -509,6 +552,7 @@ def main() -> None:
         "exact",
         "knowledge",
         "crossed",
+        "triangulated",
         "inspect",
         "independent",
         "behind",
@@ -546,6 +590,7 @@ def main() -> None:
             "exact": lambda: at_ranges(lambda m: track_cell(cells, "exact", m, views)),
             "knowledge": lambda: at_ranges(lambda m: track_cell(cells, "knowledge", m, views)),
             "crossed": lambda: at_ranges(lambda m: crossed(cells, m, views)),
+            "triangulated": lambda: at_ranges(lambda m: triangulated(cells, m, views)),
             "inspect": lambda: inspect(views),
             "independent": lambda: at_ranges(lambda m: independent(cells, m, views)),
             "behind": lambda: behind(cells, views),

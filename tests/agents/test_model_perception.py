@@ -106,20 +106,22 @@ def test_lost_target_is_seen_again_from_the_expected_pose_without_a_search(acqui
     pose, _ = random_view(np.random.default_rng(3), 2.0, CAMERA)
     light, rng = Light((-0.5, -0.4, -1.0)), np.random.default_rng(4)
 
-    def images_until_seen(first, expected, most):
+    def images_until_seen(first, expected, most, dark=0):
         for number in range(most):
-            image = scene.image(pose, light, first + number)
+            image = SPACE if number < dark else scene.image(pose, light, first + number)
             for best in perception.estimate(image, expected).solutions[:1]:
                 assert angle_deg(best, pose) < 0.6
                 return number
         return most
 
     near = perturbed(pose, rng, 0.005, np.deg2rad(0.5))
-    assert images_until_seen(0, (near.position, rotations.from_matrix(near.rotation)), 20) < 20
+    expected = near.position, rotations.from_matrix(near.rotation)
+    assert images_until_seen(0, expected, 20) < 20
+    assert 4 < images_until_seen(20, expected, 20, dark=4) < 16
     perception.reset()
     # The gate rejects what comes of a wrong expectation.
-    wrong = perturbed(pose, rng, 0.0, np.deg2rad(40.0))
-    assert images_until_seen(20, (wrong.position, rotations.from_matrix(wrong.rotation)), 10) == 10
+    beside = pose.position + np.array([0.5, 0.3, 0.0])
+    assert images_until_seen(40, (beside, rotations.from_matrix(pose.rotation)), 10) == 10
 
 
 def test_wrong_expectation_does_not_keep_the_target_from_being_acquired(acquisition):

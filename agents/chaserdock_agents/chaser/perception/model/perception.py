@@ -198,7 +198,9 @@ class ModelPerception:
         updated: list[PoseTrack] = []
         for track in self._tracks:
             updated.append((yield from advance(pyramid, self.mesh, track)))
-        self._tracks = _distinct([t for t in updated if t.missed < _LOST_AFTER])
+        # A predicted pose is a better start in the next image than a lost track's own.
+        lost_after = _LOST_AFTER if waiting.predicted is None else 1
+        self._tracks = _distinct([t for t in updated if t.missed < lost_after])
 
     def _start(self, pyramid: Pyramid, position: ArrayLike, q: ArrayLike) -> Steps[tuple[PoseTrack, ...]]:
         """Return the track that begins near a predicted pose, if the gate accepts one."""

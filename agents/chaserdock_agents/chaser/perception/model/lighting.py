@@ -101,11 +101,8 @@ def light_by_view(
     if coarse is None or fine is None:
         return even
     if previous is not None and previous.to_sun_irf is not None:
-        fine, nearest, found = (
-            coarse,
-            previous.to_sun_irf,
-            [(*coarse.rate(previous.to_sun_irf), previous.to_sun_irf)],
-        )
+        fine, nearest = coarse, previous.to_sun_irf
+        found = [(*fine.rate(nearest), nearest)]
     else:
         rated = [coarse.rate(to_sun)[0] for to_sun in _COMPARED_SUNS]
         best = _COMPARED_SUNS[np.argsort(rated)[:_COMPARED_FINELY]]
@@ -229,7 +226,7 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
 
 def fit_light(mesh: TrackerMesh, points: LitPoints, previous: Lighting | None = None) -> Lighting | None:
     """Return the light that explains the points best; None for a dark image."""
-    if previous is not None and previous.to_sun_irf is not None:
+    if previous is not None and previous.to_sun_irf is not None and not previous.weak:
         best = points.rotation.T @ previous.to_sun_irf
     else:
         few = LitPoints(np.ascontiguousarray(points.rows[::_EVERY_POINT]), points.rotation)

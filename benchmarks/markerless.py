@@ -10,6 +10,8 @@ front of the target are random. Parts:
   with one that is simplified to 1 mm, with panels wrong by 0.5 degrees and a scale wrong by 0.3 % (standard deviations, drawn for each
   view; the truth stays the same);
 - ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are averaged by their covariances;
+- ``triangulated``: as ``knowledge``, after one image of each of four cameras around the target at 1 to 1.6 m, whose distances odometry
+  of grade `lab` measures, which tells the scale;
 - ``independent``: as ``exact``, with images by the ray tracer Embree, without texture;
 - ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
   target is darker than 5 grey levels are left out, here and with the lamp;
@@ -19,8 +21,9 @@ front of the target are random. Parts:
   gate;
 - ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the Earth, and in front of space by one
   of two cameras that see the target at right angles;
-- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated from 36 views from all around at 1 to 1.6 m
-  by the controller's filter; twelve views of each of ``views / 12`` drawn meshes;
+- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated by the controller's filter from 36 views from all around
+  at 1 to 1.6 m, by two cameras on opposite sides whose distance odometry of grade `lab` measures; twelve views of each of
+  ``views / 12`` drawn meshes;
 - ``sequence`` and ``closing``: a tumbling target, followed at 15 Hz from its acquisition on, at 3 m and from 1.4 to 0.55 m.
 
 Gross: an error above 2 degrees or 2 % of range that passes the gate. Times are CPU times of this process. ``--results FILE`` appends
@@ -29,6 +32,7 @@ every view to FILE (JSON lines) and does not repeat views that are in it.
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 import zlib
@@ -48,14 +52,17 @@ from chaserdock_agents.chaser.perception.model.alignment import Alignment, Pyram
 from chaserdock_agents.chaser.perception.model.mesh import TrackerMesh
 from chaserdock_agents.chaser.perception.model.perception import ModelPerception
 from chaserdock_agents.chaser.perception.refine import PoseInCamera
-from chaserdock_controller.estimation.target_shape import ShapeFilter
+from chaserdock_agents.chaser.sighting import geometry_message
+from chaserdock_controller.estimation.target_shape import ShapeFilter, seen_place
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.geometry_errors import geometry_parameters
 from chaserdock_models.meshes import with_geometry_errors
 from chaserdock_models.satellites import satellite
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import PoseSolution
 from chaserdock_protocol.scenario.camera import Effects
+from chaserdock_protocol.scenario.navigation import NavigationSection
 from chaserdock_world.rendering.background import SPACE_LEVEL, Earth, Light
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
@@ -72,10 +79,13 @@ PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
 PRIOR = (0.01, np.deg2rad(1.5))
 LEAST_GREY = 5.0
 MOST_UNSEEN = 120
+HALF_TURN = np.diag([-1.0, 1.0, -1.0])
 RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0])))
 
 ViewRow = dict[str, float]
 """Figures of one view."""
+LAB = NavigationSection(grade="lab").errors()
+"""Errors of odometry and cameras of grade `lab`."""
 _EXPOSURES, _BLUR_PX, _LAMP = 8, 4.0, 60.0
 _VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
 """Views of an inspection, and views of each mesh after it."""
@@ -145,23 +155,13 @@ class Cells:
 def inspect(views: int) -> Figures:
     """Estimate the geometry from many views, correct the mesh, and track ``views`` single images at 1 m."""
     rng, scene = np.random.default_rng(21), SatelliteImages()
-    errors, nees, rejected, shape_nees, used = [], [], 0, [], []
-    parameters = geometry_parameters(KNOWN, PANEL_SIGMA_RAD, SCALE_SIGMA)
+    errors, nees, rejected, shape_nees, used, scale_off = [], [], 0, [], [], []
     for number in range(max(views // _VIEWS_AFTER, 1)):
         turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in KNOWN.joints}
         scale = rng.normal(0.0, SCALE_SIGMA)
         mesh = TrackerMesh.of_mesh(with_geometry_errors(KNOWN, scale, turns), PANEL_SIGMA_RAD, SCALE_SIGMA)
         _ = mesh.suns
-        fused = ShapeFilter.prior(len(parameters))
-        for k in range(_VIEWS_BEFORE):
-            pose, light = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
-            image = scene.image(pose, light, 1000 * number + k)
-            found = _track(image, mesh, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
-            if found is not None and tracking.is_valid(found):
-                direction = -found.pose.rotation.T @ found.pose.position
-                fused = fused.with_view(
-                    direction / np.linalg.norm(direction), found.geometry.matrix, found.geometry.vector
-                )
+        fused = inspected(scene, mesh, rng, 1000 * number)
         # The tracker's mesh is the true one with errors, which it should find with the opposite sign.
         true = -np.append(
             np.concatenate([turns[j] for j in KNOWN.joints]) / PANEL_SIGMA_RAD, scale / SCALE_SIGMA
@@ -171,6 +171,7 @@ def inspect(views: int) -> Figures:
             float(off @ np.linalg.solve(fused.covariance()[: len(true), : len(true)], off)) / len(true)
         )
         used.append(len(fused.cells))
+        scale_off.append(off[-1] * SCALE_SIGMA)
         corrected = mesh.corrected(fused.mean(), fused.covariance())
         for k in range(_VIEWS_AFTER):
             pose, light = random_view(rng, 1.0, CAMERA)
@@ -189,7 +190,80 @@ def inspect(views: int) -> Figures:
         "inspect_meshes": len(used),
         "inspect_views_fused_mean": float(np.mean(used)),
         "inspect_geometry_nees_per_parameter": float(np.mean(shape_nees)),
+        "inspect_scale_rms": float(np.sqrt(np.mean(np.square(scale_off)))),
     }
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Cameras around the target at one time, with odometry of grade `lab`: ``turns``, (3, 3), of their axes about the target, and
+    ``shifts_m`` (n, 3) of their lenses, which flight software does not know."""
+
+    turns: tuple[Array, ...]
+    shifts_m: Array
+
+    @classmethod
+    def drawn(cls, turns: tuple[Array, ...], rng: np.random.Generator) -> Cameras:
+        return cls(turns, rng.normal(0.0, LAB.camera_shift_m, (len(turns), 3)))
+
+    def fused(
+        self, before: ShapeFilter, mesh: TrackerMesh, scene: SatelliteImages, rng: np.random.Generator, first: int, inspect: bool
+    ) -> ShapeFilter:  # fmt: skip
+        """Return the geometry after one image of each camera at 1 to 1.6 m: by their distances, and if they ``inspect`` by each."""
+        fused, count, seen_from = before, len(mesh.modes_m), []
+        pose, light = random_view(rng, 1.0, CAMERA)
+        for number, turn in enumerate(self.turns):
+            aside, _ = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
+            seen = PoseInCamera(aside.position, turn @ pose.rotation)
+            image = scene.image(seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), first + number)
+            lens_m = seen.rotation.T @ (self.shifts_m[number] - seen.position)
+            lens_m += rng.normal(0.0, LAB.position_noise_m, 3)
+            found = _track(image, mesh, perturbed(seen, rng, *PRIOR))
+            if found is None or not tracking.is_valid(found):
+                continue
+            if inspect:
+                direction = -found.pose.rotation.T @ found.pose.position
+                direction /= np.linalg.norm(direction)
+                fused = fused.with_view(direction, found.geometry.matrix, found.geometry.vector)
+            solution = PoseSolution(
+                position_m=vector(found.pose.position),
+                q_wxyz=vector(rotations.from_matrix(found.pose.rotation)),
+                covariance=vector(found.covariance),
+                reprojection_rms_px=found.rms_px,
+            )
+            place = seen_place(solution, geometry_message(found.geometry), count)
+            seen_from += [] if place is None else [(place, lens_m)]
+        sigma_m, common_m = np.sqrt(2.0) * LAB.position_noise_m, np.sqrt(2.0) * LAB.camera_shift_m
+        for (a, lens_a), (b, lens_b) in itertools.combinations(seen_from, 2):
+            length_m = float(np.linalg.norm(lens_a - lens_b))
+            fused = fused.with_baseline(a, b, length_m, float(sigma_m), float(common_m))
+        return fused
+
+
+def inspected(scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int) -> ShapeFilter:
+    """Return the geometry by the views of two cameras on opposite sides of the target."""
+    cameras, fused = Cameras.drawn((np.eye(3), HALF_TURN), rng), ShapeFilter.prior(len(mesh.modes_m))
+    for number in range(0, _VIEWS_BEFORE, 2):
+        fused = cameras.fused(fused, mesh, scene, rng, first + number, inspect=True)
+    return fused
+
+
+def triangulated(cells: Cells, range_m: float, views: int) -> Figures:
+    """Track single images after one image of each of four cameras around the target, whose distances tell the scale."""
+    scene, quarter = SatelliteImages(), RIGHT_ANGLE
+    turns = tuple(np.linalg.matrix_power(quarter, k) for k in range(4))
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        mesh = _drawn_mesh(rng)
+        before = ShapeFilter.prior(len(mesh.modes_m))
+        fused = Cameras.drawn(turns, rng).fused(before, mesh, scene, rng, 5 * number, inspect=False)
+        corrected = mesh.corrected(fused.mean(), fused.covariance())
+        pose, light = random_view(rng, range_m, CAMERA)
+        image = scene.image(pose, light, 5 * number + 4)
+        return tracked_view(image, corrected, pose, perturbed(pose, rng, *PRIOR))
+
+    key = f"triangulated_{range_m:g}m"
+    return tracking_figures(key, cells.rows(key, views, view))
 
 
 def tracked_view(
@@ -478,6 +552,7 @@ def main() -> None:
         "exact",
         "knowledge",
         "crossed",
+        "triangulated",
         "inspect",
         "independent",
         "behind",
@@ -515,6 +590,7 @@ def main() -> None:
             "exact": lambda: at_ranges(lambda m: track_cell(cells, "exact", m, views)),
             "knowledge": lambda: at_ranges(lambda m: track_cell(cells, "knowledge", m, views)),
             "crossed": lambda: at_ranges(lambda m: crossed(cells, m, views)),
+            "triangulated": lambda: at_ranges(lambda m: triangulated(cells, m, views)),
             "inspect": lambda: inspect(views),
             "independent": lambda: at_ranges(lambda m: independent(cells, m, views)),
             "behind": lambda: behind(cells, views),

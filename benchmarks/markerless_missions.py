@@ -24,19 +24,17 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from chaserdock_agents.chaser.perception import make_perception
-from chaserdock_agents.chaser.sighting import apply_geometry, look
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
-from chaserdock_protocol.messages import GeometryEstimate, Sighting
+from chaserdock_protocol.messages import GeometryEstimate, Image, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
-from chaserdock_world.rendering.pose_cameras import make_cameras
 from common import Figures, append_line, commit, make_parser, read_lines, run_parts
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
+from chaserdock.evaluation.perception import RenderedImages
 from chaserdock.evaluation.transfers import load_shipped
 
 SCENARIOS = {
@@ -88,45 +86,40 @@ class MarkerlessOutcome(msgspec.Struct, frozen=True):
     retreats: list[str] = msgspec.field(default_factory=list)
 
 
-class TimedImages:
-    """Render each chaser's image and run its perception on it, and keep the CPU times of both."""
+class TimedImages(RenderedImages):
+    """Rendered images and the perceptions of the chasers, with the CPU times of both."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._ticks_per_image = scenario.timing.ticks_per_image
-        self._cameras = make_cameras(scenario)
-        self.perceptions = [make_perception(scenario) for _ in scenario.chasers]
+        super().__init__(scenario)
         self.render_s: list[float] = []
         self.perception_s: list[float] = []
         self.seen: list[list[bool]] = [[] for _ in scenario.chasers]
 
-    def __call__(self, chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+    def image(self, chaser: int, tick: int, time_ns: int, states: States) -> Image:
         begin_s = time.process_time()
-        image = self._cameras.image(chaser, tick // self._ticks_per_image, tick, time_ns, states)
-        drawn_s = time.process_time()
-        sighting = look(self.perceptions[chaser], image, None)
-        self.perception_s.append(time.process_time() - drawn_s)
-        self.render_s.append(drawn_s - begin_s)
+        image = super().image(chaser, tick, time_ns, states)
+        self.render_s.append(time.process_time() - begin_s)
+        return image
+
+    def see(self, chaser: int, image: Image) -> Sighting:
+        begin_s = time.process_time()
+        sighting = super().see(chaser, image)
+        self.perception_s.append(time.process_time() - begin_s)
         self.seen[chaser].append(sighting.status == "seen")
         return sighting
 
 
 class TimedMission(InProcessMission):
-    """A mission that keeps the CPU times of its controller, and passes its estimates of the geometry on to the perceptions."""
+    """A mission that keeps the CPU times of its controller and the newest estimate of the geometry."""
 
     controller_s = 0.0
     geometry: GeometryEstimate | None = None
-
-    def __init__(self, scenario: Scenario, images: TimedImages) -> None:
-        super().__init__(scenario, images)
-        self._images = images
 
     def _control(self, inputs: TickInputs) -> TickOutputs | None:
         begin_s = time.process_time()
         outputs = super()._control(inputs)
         self.controller_s += time.process_time() - begin_s
-        for i, wrench in outputs.wrenches.items() if outputs is not None else ():
-            if refused := apply_geometry(self._images.perceptions[i], wrench.geometry):
-                raise RuntimeError(refused)
+        for wrench in outputs.wrenches.values() if outputs is not None else ():
             self.geometry = wrench.geometry or self.geometry
         return outputs
 

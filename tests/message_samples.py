@@ -63,7 +63,13 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         marker_ids=(0, 4),
         corners_px=tuple(float(i) for i in range(16)),
         rejected_ids=(17,),
-        geometry=m.GeometryMeasurement(information=(4.0, 0.0, 0.0, 9.0), vector=(1.0, -2.0)),
+        geometry=m.GeometryMeasurement(
+            information=(4.0, 0.0, 0.0, 9.0),
+            vector=(1.0, -2.0),
+            position_m=V,
+            position_by_errors=(0.001, 0.0, 0.0, 0.0, 0.0, 0.003),
+            position_covariance_m2=(1e-8, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 1e-6),
+        ),
         wall_estimate_s=0.01,
     ),
     m.TargetEstimate(
@@ -114,6 +120,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
             views=12,
             coverage=0.15,
         ),
+        expected=m.ExpectedPose(sim_time_ns=9, position_m=V, q_wxyz=Q),
     ),
     m.Plan(**HEAD, chaser=0, step_s=0.1, positions_m=V * 2, quaternions_wxyz=Q * 2, inputs=V * 2),
     m.PassiveSafety(

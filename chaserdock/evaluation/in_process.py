@@ -41,7 +41,7 @@ from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import docking_status, odometry_of
 
-from .perception import PerceptionModel
+from .perception import PerceptionModel, RenderedImages
 from .perfect_knowledge import PerfectEstimator
 
 
@@ -234,6 +234,8 @@ class InProcessMission:
     def _actuator_commands(self, outputs: TickOutputs, time_ns: int) -> dict[int, ActuatorCommand]:
         commands = {}
         for i, wrench in outputs.wrenches.items():
+            if isinstance(self.perception, RenderedImages):
+                self.perception.inform(i, wrench)
             command = passed_on(wrench)
             if i in self.thrusters:
                 self.thrusters[i].avoid_plumes(self._known_target)

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 from chaserdock_agents.chaser.perception import make_perception
-from chaserdock_agents.chaser.sighting import look, prediction_from
+from chaserdock_agents.chaser.sighting import apply_geometry, look, prediction_from
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Image, PoseSolution, Sighting
+from chaserdock_protocol.messages import ExpectedPose, Image, PoseSolution, Sighting, WrenchCommand
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
@@ -35,13 +35,30 @@ class RenderedImages:
         self._cameras = make_cameras(scenario)
         self._perceptions = [make_perception(scenario) for _ in scenario.chasers]
         self._last: dict[int, Sighting] = {}
+        self._expected: dict[int, ExpectedPose | None] = {}
         self._on_image = on_image
 
     def __call__(self, chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
-        image = self._cameras.image(chaser, tick // self._ticks_per_image, tick, time_ns, states)
-        predicted = prediction_from(self._last.get(chaser))
+        return self.see(chaser, self.image(chaser, tick, time_ns, states))
+
+    def image(self, chaser: int, tick: int, time_ns: int, states: States) -> Image:
+        """Return a chaser's image."""
+        return self._cameras.image(chaser, tick // self._ticks_per_image, tick, time_ns, states)
+
+    def see(self, chaser: int, image: Image) -> Sighting:
+        """Return the sighting in a chaser's image."""
+        predicted = prediction_from(self._last.get(chaser), self._expected.get(chaser), image.sim_time_ns)
         self._last[chaser] = look(self._perceptions[chaser], self._on_image(image), predicted)
         return self._last[chaser]
+
+    def inform(self, chaser: int, command: WrenchCommand) -> None:
+        """Pass on what a command tells about the target, as the chaser's process does.
+
+        Raises RuntimeError for geometry that the perception refuses.
+        """
+        self._expected[chaser] = command.expected
+        if refused := apply_geometry(self._perceptions[chaser], command.geometry):
+            raise RuntimeError(refused)
 
 
 def measurement_model(

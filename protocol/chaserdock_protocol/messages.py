@@ -95,15 +95,28 @@ Parameters = Annotated[tuple[float, ...], Meta(max_length=64)]
 SquareOfParameters = Annotated[tuple[float, ...], Meta(max_length=64 * 64)]
 
 
-class GeometryMeasurement(Struct, frozen=True, kw_only=True):
-    """Information of one image on the k errors of the target's known geometry, for any pose of it.
+class ExpectedPose(Struct, frozen=True, kw_only=True):
+    """Pose of the target in the camera of a chaser that is expected at ``sim_time_ns``; in the frames of ``PoseSolution``."""
 
-    ``information``: row-major (k, k); ``vector``: it times the estimate (k,). In units of the errors' prior standard deviations, in
-    the order of ``GeometryEstimate.names``.
+    sim_time_ns: Count
+    position_m: Vector3
+    q_wxyz: Quaternion
+
+
+class GeometryMeasurement(Struct, frozen=True, kw_only=True):
+    """Information of one image on the k errors of the target's known geometry.
+
+    ``information``: row-major (k, k), for any pose of the target; ``vector``: it times the estimate (k,); both empty for an image for
+    which no view was rendered. ``position_m``: of the target in IRF as the image shows it if the geometry has no errors;
+    ``position_by_errors``: its change by the errors, row-major (3, k); ``position_covariance_m2``: for known errors.
+    In units of the errors' prior standard deviations, in the order of ``GeometryEstimate.names``.
     """
 
-    information: SquareOfParameters
-    vector: Parameters
+    information: SquareOfParameters = ()
+    vector: Parameters = ()
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    position_by_errors: Annotated[tuple[float, ...], Meta(max_length=3 * 64)] = ()
+    position_covariance_m2: Annotated[tuple[float, ...], Meta(max_length=9)] = ()
 
 
 class GeometryEstimate(Struct, frozen=True, kw_only=True):
@@ -359,8 +372,7 @@ class Sighting(Message, frozen=True, kw_only=True):
     """Target poses that a chaser measured in one image; empty ``solutions`` if it detected nothing.
 
     The best solution comes first; a second one follows if a single small marker is ambiguous.
-    ``corners_px``: u, v of the four corners of each used marker, in the distorted image. ``geometry``: by shape only, in images
-    for which a view was rendered.
+    ``corners_px``: u, v of the four corners of each used marker, in the distorted image. ``geometry``: by shape only.
     """
 
     chaser: ChaserId
@@ -447,7 +459,8 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an operator declared
     healthy, which overrides the chaser's fault detection. ``free``: no contact or latch, so that the motion identifies
     thruster faults. ``geometry``: newest estimate of the target's geometry, by which the chaser corrects what it knows; when it
-    has changed, and once a second. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
+    has changed, and once a second. ``expected``: to a chaser that does not see a target without markers, where it will be in the next
+    tick. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
     """
 
     chaser: ChaserId
@@ -462,6 +475,7 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     free: bool = True
     latch: Latch = "keep"
     geometry: GeometryEstimate | None = None
+    expected: ExpectedPose | None = None
     term: Count = 0
     commander: Text = ""
     instance: Text = ""

@@ -60,9 +60,15 @@ def test_information_of_a_corrected_mesh_is_about_the_errors_before() -> None:
     # Rows measure errors before: of the corrected mesh they measure x with e = mean + C x.
     seen = rows @ correction.factor
     x = np.linalg.solve(correction.factor, error - correction.mean)
-    measured = correction.of_uncorrected(GeometryInformation(seen.T @ seen, seen.T @ (seen @ x)))
+    position, by_x, known = rng.normal(size=3), rng.normal(size=(3, 3)), np.eye(3)
+    measured = correction.of_uncorrected(
+        GeometryInformation(seen.T @ seen, seen.T @ (seen @ x), position, by_x, known)
+    )
     np.testing.assert_allclose(measured.matrix, rows.T @ rows, atol=1e-9)
     np.testing.assert_allclose(measured.vector, rows.T @ (rows @ error), atol=1e-9)
+    np.testing.assert_allclose(
+        measured.position_m + measured.position_by_errors @ error, position + by_x @ x, atol=1e-9
+    )
 
 
 def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_accurate() -> None:
@@ -112,7 +118,13 @@ def test_perception_publishes_what_new_views_tell_and_tracks_on_after_a_correcti
         measured.append(sighting.geometry)
     assert measured[0] is not None
     assert len(measured[0].vector) == 3
-    assert measured[1:] == [None] * 2  # control points reused: no new information
+    # Control points reused: no new information, but a new position.
+    assert [len(m.vector) for m in measured[1:] if m is not None] == [0, 0]
+    for m in measured:
+        assert m is not None
+        # A larger body is farther away.
+        assert np.dot(m.position_m, np.reshape(m.position_by_errors, (3, 3))[:, 2]) > 0.0
+        assert np.linalg.norm(np.subtract(m.position_m, pose.position)) < 0.02
     estimate = GeometryEstimate(
         names=("a", "b", "scale"),
         sigmas=(PANEL_RAD, PANEL_RAD, SCALE),

@@ -19,7 +19,7 @@ from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_world.rendering.background import Light
-from markerless_cases import BOXES, Scene, mesh_of, random_view, satellite_image
+from markerless_cases import BOXES, Scene, mesh_of, perturbed, random_view, satellite_image
 from source_tree import ROOT
 
 CAMERA = Camera.from_hfov(480, 270, np.deg2rad(60.0))
@@ -97,6 +97,44 @@ def test_turning_target_is_acquired_over_images_tracked_lost_in_the_dark_and_acq
     assert [seen() for _ in range(3)] == [1] * 3
 
 
+def test_lost_target_is_seen_again_from_the_expected_pose_without_a_search(acquisition, monkeypatch):
+    def search(pyramid):
+        raise AssertionError("no acquisition is expected")
+
+    scene, perception = Scene(CAMERA), ModelPerception(CAMERA, mesh_of(), acquisition)
+    monkeypatch.setattr(acquisition, "search", search)
+    pose, _ = random_view(np.random.default_rng(3), 2.0, CAMERA)
+    light, rng = Light((-0.5, -0.4, -1.0)), np.random.default_rng(4)
+
+    def images_until_seen(first, expected, most, dark=0):
+        for number in range(most):
+            image = SPACE if number < dark else scene.image(pose, light, first + number)
+            for best in perception.estimate(image, expected).solutions[:1]:
+                assert angle_deg(best, pose) < 0.6
+                return number
+        return most
+
+    near = perturbed(pose, rng, 0.005, np.deg2rad(0.5))
+    expected = near.position, rotations.from_matrix(near.rotation)
+    assert images_until_seen(0, expected, 20) < 20
+    assert 4 < images_until_seen(20, expected, 20, dark=4) < 16
+    perception.reset()
+    # The gate rejects what comes of a wrong expectation.
+    beside = pose.position + np.array([0.5, 0.3, 0.0])
+    assert images_until_seen(40, (beside, rotations.from_matrix(pose.rotation)), 10) == 10
+
+
+def test_wrong_expectation_does_not_keep_the_target_from_being_acquired(acquisition):
+    scene, perception = Scene(CAMERA), ModelPerception(CAMERA, mesh_of(), acquisition)
+    pose, _ = random_view(np.random.default_rng(3), 2.0, CAMERA)
+    expected = np.array([0.0, 0.0, -3.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    image = scene.image(pose, Light((-0.5, -0.4, -1.0)), 0)
+    solutions = (perception.estimate(image, expected).solutions for _ in range(80))
+    found = next((s for s in solutions if s), ())
+    assert found
+    assert angle_deg(found[0], pose) < 0.6
+
+
 def test_acquisition_is_spread_over_short_steps_and_its_result_is_that_of_one_call(acquisition):
     pose, _ = random_view(np.random.default_rng(3), 2.0, CAMERA)
     image = Scene(CAMERA).image(pose, Light((-0.5, -0.4, -1.0)), 1)
@@ -116,7 +154,7 @@ def test_symmetric_target_gives_hypotheses_of_which_one_is_right():
     boxes = (BOXES[0], Box((0.16, 1.2, 0.012), shade=0.25))
     scene, perception = Scene(CAMERA, boxes=boxes), ModelPerception(CAMERA, mesh_of(boxes))
     pose, light = random_view(np.random.default_rng(12), 2.5, CAMERA)
-    # Three hypotheses catch up with the images that waited at four images per three.
+    # Found in the 20th image; three hypotheses then catch up with those that waited by one image in three.
     found = (perception.estimate(scene.image(pose, light, number)).solutions for number in range(90))
     for solutions in itertools.islice((s for s in found if s), 2):
         assert 2 <= len(solutions) <= 4

@@ -14,7 +14,7 @@ from chaserdock_agents.chaser.sighting import BadImage, decode_image, look, pred
 from chaserdock_models import rotations
 from chaserdock_models.targets import target_model
 from chaserdock_protocol import codec
-from chaserdock_protocol.messages import Image, Sighting
+from chaserdock_protocol.messages import ExpectedPose, Image, Sighting
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.rendering.cameras import Cameras
@@ -215,4 +215,11 @@ def test_a_prediction_comes_from_the_best_solution_if_there_is_one(perception: P
     np.testing.assert_array_equal(predicted[0], seen.solutions[0].position_m)
     np.testing.assert_array_equal(predicted[1], seen.solutions[0].q_wxyz)
     assert prediction_from(None) is None
-    assert prediction_from(msgspec.structs.replace(seen, solutions=(), status="nothing")) is None
+    unseen = msgspec.structs.replace(seen, solutions=(), status="nothing")
+    assert prediction_from(unseen) is None
+    expected = ExpectedPose(sim_time_ns=10**9, position_m=(0.0, 0.1, 2.0), q_wxyz=(0.0, 1.0, 0.0, 0.0))
+    for last, position_m in ((seen, seen.solutions[0].position_m), (unseen, expected.position_m)):
+        predicted = prediction_from(last, expected, 10**9)
+        assert predicted is not None
+        np.testing.assert_array_equal(predicted[0], position_m)
+    assert prediction_from(unseen, expected, 10**9 + 4 * 10**8) is None  # too old

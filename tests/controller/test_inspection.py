@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.estimation.target_shape import FLOOR_SIGMAS, ShapeFilter, view_cell
+from chaserdock_controller.estimation.target_shape import FLOOR_SIGMAS, SeenPlace, ShapeFilter, view_cell
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import circuit
@@ -120,26 +120,74 @@ def test_fusion_is_accurate_and_consistent_and_grows_with_coverage() -> None:
             spreads.append(np.trace(fused.covariance()))
         off = fused.mean() - true
         plain = np.linalg.inv(fused.information)
-        nees.append(off @ np.linalg.solve(plain, off) / 7.0)
+        free = plain @ fused.vector - true
+        nees.append(free @ np.linalg.solve(plain, free) / 7.0)
         assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(fused.covariance())))
         assert fused.coverage == len(fused.cells) / 80
         assert np.all(np.diff(spreads) < 1e-9)
         assert spreads[-1] < 0.1 * spreads[0]
     assert 0.7 < np.mean(nees) < 1.3
-    assert np.all(np.linalg.eigvalsh(fused.covariance()) >= FLOOR_SIGMAS**2)
+    least = FLOOR_SIGMAS**2 / (1.0 + FLOOR_SIGMAS**2)
+    assert np.all(np.linalg.eigvalsh(fused.covariance()) >= least)
 
 
 def test_a_direction_counts_once_and_a_contradiction_not_at_all() -> None:
     true = np.array([1.0, -0.5])
     matrix = 25.0 * np.eye(2)
     fused = ShapeFilter.prior(2).with_view(np.array([1.0, 0.0, 0.0]), matrix, matrix @ true)
-    np.testing.assert_allclose(fused.mean(), true * 25.0 / 26.0)
+    known = 1.0 / (1.0 / 25.0 + FLOOR_SIGMAS**2)
+    np.testing.assert_allclose(fused.mean(), true * known / (known + 1.0))
     near = np.array([0.999, 0.02, 0.0])
     assert view_cell(near / np.linalg.norm(near)) == view_cell(np.array([1.0, 0.0, 0.0]))
     assert fused.with_view(near / np.linalg.norm(near), matrix, matrix @ true) is fused
     away = np.array([0.0, 0.0, 1.0])
     assert fused.with_view(away, matrix, matrix @ (true + 9.0)) is fused
     assert len(fused.with_view(away, matrix, matrix @ true).cells) == 2
+
+
+def place(at: Array, true: float, rng: np.random.Generator) -> SeenPlace:
+    """Return a place seen with a scale that is wrong by ``true`` of 0.3 % and a panel angle that is not."""
+    towards, by_errors = at / np.linalg.norm(at), np.zeros((3, 2))
+    by_errors[:, 1] = 0.003 * at
+    seen = at * (1.0 - 0.003 * true) + rng.normal(0.0, 2e-4, 3)
+    return SeenPlace(seen, by_errors, 4e-8 * np.eye(3), view_cell(towards))
+
+
+def test_distances_between_cameras_tell_the_scale_consistently() -> None:
+    rng, common_m, nees, sigmas = np.random.default_rng(5), 7e-4, [], []
+    for _ in range(200):
+        true, common = rng.normal(), rng.normal(0.0, common_m)
+        fused = ShapeFilter.prior(2)
+        for _ in range(12):
+            a = rng.normal(size=3)
+            a /= np.linalg.norm(a)
+            b = -1.3 * a + rng.normal(0.0, 0.1, 3)
+            length = np.linalg.norm(a - b) + common + rng.normal(0.0, 7e-4)
+            fused = fused.with_baseline(
+                place(a, true, rng), place(b, true, rng), float(length), 7e-4, common_m
+            )
+        off, covariance = fused.mean() - (0.0, true), fused.covariance()
+        nees.append(off[1] ** 2 / covariance[1, 1])
+        sigmas.append(0.003 * np.sqrt(covariance[1, 1]))
+        assert len(fused.pairs) >= 9
+        assert not fused.cells
+    assert 0.75 < np.mean(nees) < 1.25
+    # What all distances have in common limits it: 0.7 mm of 2.3 m.
+    assert 0.0003 < np.mean(sigmas) < 0.0004
+
+
+def test_a_baseline_counts_once_and_a_short_or_contradicting_one_not_at_all() -> None:
+    rng = np.random.default_rng(6)
+    a, b = place(np.array([1.0, 0.0, 0.0]), 1.0, rng), place(np.array([-1.0, 0.2, 0.0]), 1.0, rng)
+    length = float(np.linalg.norm(np.subtract([1.0, 0.0, 0.0], [-1.0, 0.2, 0.0])))
+    fused = ShapeFilter.prior(2).with_baseline(a, b, length, 5e-4, 1e-4)
+    assert fused.mean()[1] == pytest.approx(1.0, abs=0.35)
+    assert fused.with_baseline(b, a, length, 5e-4, 1e-4) is fused
+    c = place(np.array([0.0, 1.0, 0.0]), 1.0, rng)
+    assert fused.with_baseline(a, c, 1.5, 5e-4, 1e-4) is fused
+    near = place(np.array([0.98, 0.2, 0.0]), 1.0, rng)
+    assert fused.with_baseline(a, near, 0.2, 5e-4, 1e-4) is fused
+    assert fused.with_baseline(a, c, float(np.sqrt(2.0)), 5e-4, 1e-4) is not fused
 
 
 @pytest.fixture(scope="module")

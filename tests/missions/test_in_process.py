@@ -6,10 +6,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from chaserdock_models import rotations
 from chaserdock_protocol import topics
+from chaserdock_protocol.messages import Sighting
 from chaserdock_protocol.scenario import load_scenario, parse_scenario
+from chaserdock_world.rendering.cameras import States
 from harness import ROOT, SHORT
 
 from chaserdock.evaluation.in_process import InProcessMission
@@ -70,6 +74,34 @@ def mission(**changes: object) -> dict[str, object]:
         "target": still,
         "chasers": chasers,
     } | changes
+
+
+@pytest.mark.parametrize("perception", ["model", "default"])
+def test_chaser_that_does_not_see_a_target_without_markers_gets_its_expected_pose(perception: str) -> None:
+    changes = (*SMALL, "duration_s=3.0", "navigation={grade='exact'}", f"perception.name='{perception}'")
+    scenario = load_scenario(ROOT / "scenarios/two-chaser-tracking.toml", changes)
+    measured, camera = measurement_model(scenario, 1), scenario.camera_model()
+
+    def seen_by_0_only(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+        sighting = measured(chaser, tick, time_ns, states)
+        return sighting if chaser == 0 else msgspec.structs.replace(sighting, status="nothing", solutions=())
+
+    expected, compared = None, 0
+    with InProcessMission(scenario, seen_by_0_only) as mission:
+        for record in mission.ticks():
+            assert record.outputs is not None
+            if expected is not None and record.time_s > 1.0:
+                assert abs(expected.sim_time_ns - record.time_ns) <= 1
+                own, target = record.states["chaser/1"], record.states["target"]
+                lens, axes = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
+                at = rotations.rotate_inverse(axes, target.position_m - lens)
+                q = rotations.multiply(rotations.conjugate(axes), target.q_wxyz)
+                np.testing.assert_allclose(expected.position_m, at, atol=0.002)
+                assert rotations.angle_between(np.array(expected.q_wxyz), q) < np.radians(0.2)
+                compared += 1
+            assert record.outputs.wrenches[0].expected is None or record.time_s < 0.2
+            expected = record.outputs.wrenches[1].expected
+    assert compared > 20 if perception == "model" else expected is None and compared == 0
 
 
 def test_odometry_errors_of_the_scenario_apply() -> None:

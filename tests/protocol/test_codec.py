@@ -60,6 +60,7 @@ def test_there_is_a_sample_of_every_message() -> None:
     parts = {
         m.CameraCalibration,
         m.DrawnBody,
+        m.ExpectedPose,
         m.GeometryEstimate,
         m.GeometryMeasurement,
         m.MassEstimate,

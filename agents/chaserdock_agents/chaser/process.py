@@ -17,6 +17,7 @@ from chaserdock_protocol.messages import (
     ActuatorCommand,
     DockingStatus,
     Event,
+    ExpectedPose,
     Image,
     JoinReply,
     Level,
@@ -100,6 +101,7 @@ class ChaserProcess:
         self.leases = LeaseGrantor(self.number, self.scenario.time.rate_hz)
         self._plan: Plan | None = None
         self._target: TargetEstimate | None = None
+        self._expected: ExpectedPose | None = None
         self._last = LastCommand()
         self._last_tick = -1
         self._fallback: FallbackState | None = None
@@ -273,7 +275,9 @@ class ChaserProcess:
             return
         self._processed_images.append(image.tick)
         started_s = self.node.host.now_s()
-        sighting = look(self.perception, image, prediction_from(self.sighting))
+        sighting = look(
+            self.perception, image, prediction_from(self.sighting, self._expected, image.sim_time_ns)
+        )
         elapsed_s = self.node.host.now_s() - started_s
         if sighting.status == "bad_image" and (self.sighting is None or self.sighting.status != "bad_image"):
             self._publish_warning("bad image", sighting.detail, image.tick, image.sim_time_ns)
@@ -374,12 +378,17 @@ class ChaserProcess:
         self._remember(command)
         self._was_detumbling = command.mode == "detumble"
         # Before the reply, so that the next image is seen with it in lock-step.
-        if (refused := apply_geometry(self.perception, command.geometry)) is not None:
-            self._publish_warning("geometry refused", refused, command.tick, command.sim_time_ns)
+        self.inform_perception(command)
         if self._thrusters is not None:
             self._thrusters.avoid_plumes(known)
             self._thrusters.apply_command(command)
         self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
+
+    def inform_perception(self, command: WrenchCommand) -> None:
+        """Pass on what a command tells about the target: its geometry, and where it is expected in the next image."""
+        self._expected = command.expected
+        if (refused := apply_geometry(self.perception, command.geometry)) is not None:
+            self._publish_warning("geometry refused", refused, command.tick, command.sim_time_ns)
 
     def _remember(self, command: WrenchCommand) -> None:
         """Store the plan and target estimate of a command for the fallback, and end the fallback."""

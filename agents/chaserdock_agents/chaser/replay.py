@@ -13,7 +13,6 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import Node, ReceivedMessage
 
 from .process import ChaserProcess
-from .sighting import apply_geometry
 
 
 def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
@@ -26,7 +25,7 @@ def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage
         is_sighting = received.topic is topics.SIGHTING
         if received.topic is topics.WRENCH:
             if number in chasers:
-                apply_geometry(chasers[number][1].perception, received.message.geometry)
+                chasers[number][1].inform_perception(received.message)
             continue
         if number not in chasers or (is_sighting and seq < last_seq.get(number, -1)):
             node = ReplayNode(f"chaser/{number}")

@@ -8,13 +8,23 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import GeometryEstimate, GeometryMeasurement, Image, PoseSolution, Sighting
+from chaserdock_protocol.messages import (
+    ExpectedPose,
+    GeometryEstimate,
+    GeometryMeasurement,
+    Image,
+    PoseSolution,
+    Sighting,
+)
 from numpy.typing import NDArray
 
 from .perception import GeometryInformation, PerceptionMethod
 
 Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Predicted pose of the target: position (3,) in IRF and rotation (4,) TRF to IRF."""
+
+_EXPECTED_FOR_NS = 300_000_000
+"""Age at which an expected pose is not used any more."""
 
 
 class BadImage(Exception):
@@ -101,14 +111,19 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         marker_ids=tuple(np.asarray(seen.marker_ids).tolist()),
         corners_px=vector(np.asarray(seen.corners_px, dtype=float)),
         rejected_ids=tuple(int(i) for i in seen.rejected_ids),
-        geometry=_geometry(seen.geometry),
+        geometry=None if seen.geometry is None else geometry_message(seen.geometry),
     )
 
 
-def _geometry(found: GeometryInformation | None) -> GeometryMeasurement | None:
-    if found is None:
-        return None
-    return GeometryMeasurement(information=vector(found.matrix), vector=vector(found.vector))
+def geometry_message(found: GeometryInformation) -> GeometryMeasurement:
+    """Return what an image tells about the errors of the geometry as a part of a message."""
+    return GeometryMeasurement(
+        information=vector(found.matrix),
+        vector=vector(found.vector),
+        position_m=vector(found.position_m),
+        position_by_errors=vector(found.position_by_errors),
+        position_covariance_m2=vector(found.position_covariance),
+    )
 
 
 def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | None) -> str | None:
@@ -131,9 +146,14 @@ def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | No
     return None
 
 
-def prediction_from(sighting: Sighting | None) -> Prediction | None:
-    """Return the pose prediction for the next image: the last measured pose, None without one."""
-    if sighting is None or not sighting.solutions:
+def prediction_from(
+    sighting: Sighting | None, expected: ExpectedPose | None = None, time_ns: int = 0
+) -> Prediction | None:
+    """Return the pose prediction for an image of ``time_ns``: the last measured pose, else the one that the controller expects;
+    None without any."""
+    if sighting is not None and sighting.solutions:
+        best = sighting.solutions[0]
+        return np.array(best.position_m), np.array(best.q_wxyz)
+    if expected is None or time_ns - expected.sim_time_ns > _EXPECTED_FOR_NS:
         return None
-    best = sighting.solutions[0]
-    return np.array(best.position_m), np.array(best.q_wxyz)
+    return np.array(expected.position_m), np.array(expected.q_wxyz)

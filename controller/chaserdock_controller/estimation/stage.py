@@ -49,14 +49,14 @@ class EstimationStage:
         self._camera = scenario.camera_model()
         self._converter = SightingConverter(self._camera)
         parameters = shape_parameters(scenario)
-        self.shape = ShapeEstimation(parameters) if parameters else None
+        self.shape = ShapeEstimation(scenario, parameters) if parameters else None
         enabled = scenario.detumble.identification.enabled
         self.identification = StackIdentification(scenario) if enabled else None
 
     def run(self, observation: Observation, inspecting: Collection[int] = ()) -> TargetEstimation:
-        """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the geometry by the
-        images of the chasers that were ``inspecting`` after the tick before, and the identification of the stack, whose result the
-        estimator takes from the next tick on."""
+        """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the geometry by pairs of
+        images and those of the chasers that were ``inspecting`` after the tick before, and the identification of the stack, whose
+        result the estimator takes from the next tick on."""
         estimation = self._estimate(observation)
         if self.shape is not None:
             estimation = replace(estimation, shape=self.shape.update(observation, inspecting))

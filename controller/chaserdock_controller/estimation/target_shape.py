@@ -3,11 +3,12 @@
 
 A view has information on the geometry for any pose (the Schur complement of the tracker's least squares). Views from one direction
 err alike, by texture and shading that the known mesh does not have, and count once. The parameters are in their standard deviations;
-prior: 0 with covariance 1.
+prior: 0 with covariance 1. The distance of two cameras, as their images show it and as odometry measures it, tells the scale.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Collection
 
@@ -15,9 +16,10 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.geometry_errors import GeometryParameter, geometry_parameters
-from chaserdock_protocol.messages import Sighting
+from chaserdock_protocol.messages import GeometryMeasurement, PoseSolution, Sighting
 from chaserdock_protocol.scenario import FlightScenario
 from msgspec import Struct
+from msgspec.structs import replace
 
 from chaserdock_controller.interfaces import EstimatedShape, Observation
 
@@ -26,6 +28,8 @@ VIEW_CELLS = 80
 FLOOR_SIGMAS = 0.15
 """Standard deviation, as a share of the prior one, of what the views of a target have in common."""
 _GATE_SIGMAS = 4.0
+_LEAST_BASELINE = 0.3
+"""Least distance of two cameras, as a share of the range, that tells the scale."""
 
 
 def _spiral() -> Array:
@@ -44,42 +48,104 @@ def view_cell(direction_trf: Array) -> int:
     return int(np.argmax(_CELLS @ direction_trf))
 
 
+class SeenPlace(Struct, frozen=True, eq=False):
+    """Where an image shows the target from: the place (3,) of the lens in TRF for a geometry without errors, its change (3, k) by the
+    errors, its covariance (3, 3) for known errors, and the cell of the direction of view."""
+
+    place_m: Array
+    by_errors: Array
+    covariance: Array
+    cell: int
+
+
 class ShapeFilter(Struct, frozen=True, eq=False):
-    """Information (k, k) and information vector (k,) of the parameters, and the cells of the views that were used."""
+    """Information (k, k) and information vector (k,) of the parameters by single views, with that of the prior, and the cells of the
+    views that were used.
+
+    ``baselines`` (k + 1, k + 1) and ``lengths`` (k + 1,): the same by pairs of views, whose distance odometry measures; the last
+    parameter is the error that all these distances have in common, in its standard deviations. ``pairs``: their cells.
+    """
 
     information: Array
     vector: Array
+    baselines: Array
+    lengths: Array
     cells: frozenset[int] = frozenset()
+    pairs: frozenset[tuple[int, int]] = frozenset()
 
     @classmethod
     def prior(cls, count: int) -> ShapeFilter:
         """Return the filter before the first view of ``count`` parameters."""
-        return cls(np.eye(count), np.zeros(count))
+        both = count + 1
+        return cls(np.eye(count), np.zeros(count), np.zeros((both, both)), np.zeros(both))
 
     @property
     def coverage(self) -> float:
         """Share of all directions of view that were used."""
         return len(self.cells) / VIEW_CELLS
 
+    @property
+    def used(self) -> bool:
+        """Whether there is more than the prior."""
+        return bool(self.cells or self.pairs)
+
     def mean(self) -> Array:
         """Return the estimated parameters (k,)."""
-        return np.asarray(np.linalg.solve(self.information, self.vector), dtype=float)
+        matrix, vector = self._combined()
+        return np.asarray(np.linalg.solve(matrix, vector), dtype=float)[:-1]
 
     def covariance(self) -> Array:
-        """Return the covariance (k, k), with what all views have in common, but nowhere larger than the prior."""
-        covariance = np.asarray(np.linalg.inv(self.information), dtype=float)
-        if not self.cells:
-            return covariance
-        # Both have the prior information in them: the sum is that of the views and their common errors.
-        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-        return (vectors * np.minimum(values + FLOOR_SIGMAS**2, 1.0)) @ vectors.T
+        """Return the covariance (k, k), with what all views have in common."""
+        covariance = np.asarray(np.linalg.inv(self._combined()[0]), dtype=float)[:-1, :-1]
+        return 0.5 * (covariance + covariance.T)
+
+    def _combined(self) -> tuple[Array, Array]:
+        """Return information (k + 1, k + 1) and vector (k + 1,) of all parameters by prior, views and baselines."""
+        k = len(self.vector)
+        values, vectors = np.linalg.eigh(self.information - np.eye(k))
+        values = np.maximum(values, 0.0)
+        known = 1.0 / (1.0 + FLOOR_SIGMAS**2 * values)
+        matrix, vector = self.baselines + np.eye(k + 1), self.lengths.copy()
+        matrix[:k, :k] += (vectors * (values * known)) @ vectors.T
+        vector[:k] += vectors @ (known * (vectors.T @ self.vector))
+        return matrix, vector
 
     def with_view(self, direction_trf: Array, matrix: Array, vector: Array) -> ShapeFilter:
         """Return the filter after a view from a direction (3,); itself for a known direction, or a view that contradicts it."""
         cell = view_cell(direction_trf)
         if cell in self.cells or self._contradicts(matrix, vector):
             return self
-        return ShapeFilter(self.information + matrix, self.vector + vector, self.cells | {cell})
+        information, vector = self.information + matrix, self.vector + vector
+        return replace(self, information=information, vector=vector, cells=self.cells | {cell})
+
+    def with_baseline(
+        self, a: SeenPlace, b: SeenPlace, length_m: float, sigma_m: float, common_m: float
+    ) -> ShapeFilter:
+        """Return the filter after two views at one time from places at a distance of ``length_m``; itself for known directions, or
+        a distance that contradicts it.
+
+        ``sigma_m``, ``common_m``: standard deviations of the distance by noise, and by what all distances have in common.
+        """
+        pair = (min(a.cell, b.cell), max(a.cell, b.cell))
+        between = a.place_m - b.place_m
+        seen_m = float(np.linalg.norm(between))
+        if pair in self.pairs or not seen_m > _LEAST_BASELINE * float(np.linalg.norm(a.place_m)):
+            return self
+        along = between / seen_m
+        row = np.append(along @ (a.by_errors - b.by_errors), common_m)
+        variance = sigma_m**2 + float(along @ (a.covariance + b.covariance) @ along)
+        off = length_m - seen_m
+        matrix, vector = self._combined()
+        expected = float(row @ np.linalg.solve(matrix, vector))
+        spread = variance + float(row @ np.linalg.solve(matrix, row))
+        if not (off - expected) ** 2 <= _GATE_SIGMAS**2 * spread:
+            return self
+        return replace(
+            self,
+            baselines=self.baselines + np.outer(row, row) / variance,
+            lengths=self.lengths + row * (off / variance),
+            pairs=self.pairs | {pair},
+        )
 
     def _contradicts(self, matrix: Array, vector: Array) -> bool:
         """Return whether a view's estimate is farther from this one than their covariances explain."""
@@ -100,12 +166,37 @@ def shape_parameters(scenario: FlightScenario) -> tuple[GeometryParameter, ...]:
     return geometry_parameters(mesh, math.radians(knowledge.panel_deg), knowledge.scale_share)
 
 
-class ShapeEstimation:
-    """Fuses the images of chasers that inspect the target."""
+def seen_place(pose: PoseSolution, measured: GeometryMeasurement, count: int) -> SeenPlace | None:
+    """Return where an image shows the target from; None if it does not tell how that depends on ``count`` errors."""
+    if len(measured.position_by_errors) != 3 * count or len(measured.position_covariance_m2) != 9:
+        return None
+    axes = rotations.to_matrix(np.array(pose.q_wxyz)).T
+    place = -axes @ np.array(measured.position_m)
+    arm = np.cross(place, np.eye(3))
+    attitude = np.array(pose.covariance).reshape(6, 6)[3:, 3:]
+    covariance = (
+        axes @ np.array(measured.position_covariance_m2).reshape(3, 3) @ axes.T + arm @ attitude @ arm.T
+    )
+    by_errors = -axes @ np.array(measured.position_by_errors).reshape(3, count)
+    if not (np.isfinite(place).all() and np.isfinite(by_errors).all() and np.isfinite(covariance).all()):
+        return None
+    if not np.linalg.norm(place) > 0.0:
+        return None
+    return SeenPlace(place, by_errors, covariance, view_cell(place / np.linalg.norm(place)))
 
-    def __init__(self, parameters: tuple[GeometryParameter, ...]) -> None:
+
+class ShapeEstimation:
+    """Fuses images: single ones of chasers that inspect the target, and pairs of any, whose distance odometry measures.
+
+    One image hardly tells the scale, as a larger body farther away looks the same; the distance of two cameras does.
+    """
+
+    def __init__(self, scenario: FlightScenario, parameters: tuple[GeometryParameter, ...]) -> None:
         self.parameters = parameters
         self.filter = ShapeFilter.prior(len(parameters))
+        self._camera, errors = scenario.camera_model(), scenario.navigation.errors()
+        place_m = math.hypot(errors.position_drift_m, errors.position_bias_m, errors.camera_shift_m)
+        self._place_sigma_m, self._focal_share = place_m, errors.camera_focal_share
 
     def update(self, observation: Observation, inspecting: Collection[int]) -> EstimatedShape | None:
         """Return the estimate after a tick; None before the first view."""
@@ -113,7 +204,8 @@ class ShapeEstimation:
         for sighting in observation.sightings:
             if sighting.chaser in inspecting:
                 self.filter = self._with(sighting)
-        if not self.filter.cells:
+        self._add_baselines(observation)
+        if not self.filter.used:
             return None
         return EstimatedShape(
             self.parameters,
@@ -123,6 +215,28 @@ class ShapeEstimation:
             self.filter.coverage,
             self.filter is not before,
         )
+
+    def _add_baselines(self, observation: Observation) -> None:
+        """Fuse the distances between the cameras that see the target in this tick."""
+        seen = []
+        for sighting in observation.sightings:
+            odometry, measured = observation.odometry.get(sighting.chaser), sighting.geometry
+            if measured is None or odometry is None or odometry.sim_time_ns != sighting.sim_time_ns:
+                continue
+            ambiguous = len(sighting.solutions) != 1
+            place = None if ambiguous else seen_place(sighting.solutions[0], measured, len(self.parameters))
+            if place is not None:
+                lens, _ = self._camera.irf_pose_in_world(odometry.position_m, odometry.q_wxyz)
+                noise = np.array(odometry.position_covariance_m2).reshape(3, 3)
+                seen.append((place, lens, noise))
+        for (a, lens_a, noise_a), (b, lens_b, noise_b) in itertools.combinations(seen, 2):
+            between = lens_a - lens_b
+            length_m = float(np.linalg.norm(between))
+            along = between / max(length_m, 1e-9)
+            sigma_m = math.sqrt(max(float(along @ (noise_a + noise_b) @ along), 0.0))
+            focal_m = self._focal_share * math.hypot(*(float(np.linalg.norm(x.place_m)) for x in (a, b)))
+            common_m = math.hypot(math.sqrt(2.0) * self._place_sigma_m, focal_m)
+            self.filter = self.filter.with_baseline(a, b, length_m, sigma_m, common_m)
 
     def _with(self, sighting: Sighting) -> ShapeFilter:
         """Return the filter with a sighting; without it where it has no information on these parameters."""

@@ -10,7 +10,7 @@ from chaserdock_models.braking import brake_wrench
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.setpoint_tracking import Setpoint, track_setpoint
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import GeometryEstimate, WrenchCommand
+from chaserdock_protocol.messages import ExpectedPose, GeometryEstimate, WrenchCommand
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.latency_compensation import CommandHistory
@@ -27,6 +27,7 @@ from chaserdock_controller.interfaces import (
 
 from .message_builders import (
     event_message,
+    expected_pose,
     geometry_estimate,
     plan_message,
     reference_message,
@@ -45,6 +46,7 @@ class OutputStage:
         self._scenario = scenario
         self.history = CommandHistory()
         self._without_plan: set[int] = set()
+        self._camera, self._period_s = scenario.camera_model(), 1.0 / scenario.time.rate_hz
 
     def run(
         self,
@@ -60,6 +62,7 @@ class OutputStage:
         shape = estimation.shape
         renewed = shape is not None and (shape.changed or observation.tick % self._scenario.time.rate_hz == 0)
         geometry = geometry_estimate(shape) if shape is not None and renewed else None
+        expected = self._expected(observation, estimation)
         events = [*observation.events, *estimation.events, *guidance.events, *result.events]
         for i in sorted(observation.odometry):
             directive = guidance.directives[i]
@@ -68,19 +71,28 @@ class OutputStage:
             command = directive.direct
             if command is None:
                 command = self._planned_or_safe(i, observation, estimation, guidance, result, events, out)
-            out.wrenches[i] = self._send(i, observation, guidance, command, geometry)
+            out.wrenches[i] = self._send(i, observation, guidance, command, geometry, expected.get(i))
         for i, reason in observation.invalid.items():
             if i not in self._without_plan:
                 events.append(("error", f"chaser {i}: invalid odometry, coasting: {reason}"))
             self._without_plan.add(i)
             command = guidance.directives[i].direct
             assert command is not None
-            out.wrenches[i] = self._send(i, observation, guidance, command, geometry)
+            out.wrenches[i] = self._send(i, observation, guidance, command, geometry, None)
         self.history.forget_before(observation.time_ns)
         out.safety = {i: safety_message(i, observation, guidance, c) for i, c in result.certificates.items()}
         out.solver = solver_message(observation, self._scenario.controller.solver, result)
         out.events = [event_message(observation, level, text) for level, text in events]
         return out
+
+    def _expected(self, observation: Observation, estimation: TargetEstimation) -> dict[int, ExpectedPose]:
+        """Return where chasers that do not see a target without markers will have it in their next image."""
+        if self._scenario.perception.name != "model" or not estimation.known:
+            return {}
+        unseen = [i for i in observation.odometry if i not in estimation.visible_to]
+        return {
+            i: expected_pose(i, estimation, self._camera, observation.time_ns, self._period_s) for i in unseen
+        }
 
     def _planned_or_safe(
         self,
@@ -126,6 +138,7 @@ class OutputStage:
         guidance: GuidanceResult,
         command: DirectCommand,
         geometry: GeometryEstimate | None,
+        expected: ExpectedPose | None,
     ) -> WrenchCommand:
         thrusts = command.thrusts_N
         # The limits hold on all axes at once; commanded thrusters need none but their own.
@@ -149,6 +162,7 @@ class OutputStage:
             trusted=directive.trusted,
             free=directive.free,
             geometry=geometry,
+            expected=expected,
         )
 
 

@@ -24,11 +24,18 @@ Method = Literal["default", "paper", "paper_iterative"]
 
 @dataclass(frozen=True, eq=False)
 class GeometryInformation:
-    """Information of one image about the k errors of the geometry, whatever the pose: ``matrix`` (k, k) and ``vector`` (k,), the
-    matrix times the estimate; in standard deviations of the errors."""
+    """Information of one image about the k errors of the geometry, in their standard deviations.
+
+    ``matrix`` (k, k) and ``vector`` (k,), the matrix times the estimate: whatever the pose; empty for an image without a new view.
+    ``position_m`` (3,), IRF: of a target whose geometry has no errors; ``position_by_errors`` (3, k): its change by the errors;
+    ``position_covariance`` (3, 3), m²: for known errors.
+    """
 
     matrix: Array
     vector: Array
+    position_m: Array
+    position_by_errors: Array
+    position_covariance: Array
 
 
 @dataclass(frozen=True)

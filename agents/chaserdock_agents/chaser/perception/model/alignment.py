@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from ctypes import c_double, c_int64
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..native import function
 from ..pipeline import GeometryInformation
 from ..refine import PoseInCamera
-from .mesh import TrackerMesh
+from .mesh import NO_PATTERN, WRINKLES, TrackerMesh
 from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 
 _PROFILE, _PER_CELL_MOST = 9, 4
@@ -38,11 +38,15 @@ _NOISE = 2.0
 INLIER_PX = 1.5
 _DISPLACED_INLIER_PX, _REFINED_REACH_PX = 5.0, 3
 MIN_POINTS = 24
+NEAR_PX = 1300.0
+"""Diameter of the target in the image, in pixels of level 0, beyond which it shows texture that the mesh does not have."""
 _BESIDE_PX = 3.0
 """Distance from an edge at which the surfaces beside it are looked up."""
 _CORRELATED_POINTS, _INDEPENDENT_MOST = 5.5, 60.0
 """Number of neighbouring control points that err together, so that their information counts once; and largest number of points
 that count: shading and facets that the mesh does not have do not become more accurate with more pixels."""
+_INDEPENDENT_DIM = 25.0
+"""The same on a side in the shade, where a sun behind the target brightens rims, which move together."""
 _SPREAD_PX = {0: 0.6, 1: 0.45, -1: 1.2}
 """Standard deviation, in pixels of a level, of the point spread that the synthetic view gets."""
 
@@ -81,7 +85,8 @@ class Pyramid:
 class ControlPoints:
     """n control points of a rendering: ``points_m`` (n, 3) and ``ahead_m`` (n, 3), a pixel further along the gradient, in TRF;
     ``profiles`` (n, 9), grey levels; ``owners`` (n,): triangles; ``level``; ``pose`` of the rendering; ``displaced_m`` (k, n, 3):
-    displacements by the modes of the mesh; ``border_m`` (n,): standard deviation of where each is seen."""
+    displacements by the modes of the mesh; ``border_m`` (n,): standard deviation of where each is seen; ``independent``: largest
+    number of them that count as independent."""
 
     points_m: Array
     ahead_m: Array
@@ -91,6 +96,7 @@ class ControlPoints:
     pose: PoseInCamera
     displaced_m: Array
     border_m: Array
+    independent: float = _INDEPENDENT_MOST
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,11 @@ class Alignment:
     def score(self) -> float:
         """How well the synthetic view explains the image, 0 to 1."""
         return self.inlier_share * max(self.correlation, 0.0)
+
+
+def diameter_px(camera: Camera, mesh: TrackerMesh, pose: PoseInCamera) -> float:
+    """Return the diameter of the target in the image."""
+    return 2.0 * mesh.radius_m * camera.fx_px / float(np.linalg.norm(pose.position))
 
 
 def window_of(
@@ -155,21 +166,27 @@ def control_points(
     vertices, triangles, _, _ = mesh.contiguous
     at = pose_array(pose)
     least = _LEAST_GRADIENT[light.shadows]
+    brightness = light.ambient + (0.0 if light.weak else light.direct)
     n = function("control_points", c_int64)(
         address(view), address(synthetic.nearest), address(synthetic.owner), c_int64(h), c_int64(w),
         (c_double * 4)(*window.lens), address(at), address(vertices), address(triangles),
-        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * (light.direct + light.ambient), least), 4.0)),
+        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * brightness, least), 4.0)),
         address(points), address(ahead), address(profiles), address(owners), address(work),
     )  # fmt: skip
     if n < MIN_POINTS:
         return None
     points, owners = points[:n].copy(), owners[:n].copy()
-    used = ~_on_textured(mesh, pose, window, synthetic, points, ahead[:n])
+    near = diameter_px(pyramid.camera, mesh, pose) > NEAR_PX
+    used = ~_on_textured(mesh, pose, window, synthetic, points, ahead[:n], near)
     if used.sum() < MIN_POINTS:
         return None
     points, owners = points[used], owners[used]
     displaced, border = mesh.mode_displacements(owners, points), mesh.border_of(owners)
-    return ControlPoints(points, ahead[:n][used], profiles[:n][used], owners, k, pose, displaced, border)
+    dim = light.weak or (light.shadows and light.direct == 0.0)
+    independent = _INDEPENDENT_DIM if dim else _INDEPENDENT_MOST
+    return ControlPoints(
+        points, ahead[:n][used], profiles[:n][used], owners, k, pose, displaced, border, independent
+    )
 
 
 def _on_textured(
@@ -179,22 +196,25 @@ def _on_textured(
     view: SyntheticView,
     points: Array,
     ahead: Array,
+    near: bool,
 ) -> NDArray[np.bool_]:
-    """Return which points (n,) are edges between surfaces that both have a grid of solar cells: the lines of the grid beside such
-    an edge move it to either side."""
-    if not mesh.border_m.any():
+    """Return which points (n,) are edges between surfaces with the same pattern: the lines of a grid of solar cells beside such an
+    edge or, on a ``near`` target, wrinkles of foil, on which shadows bend, move it to either side."""
+    # From farther away, shadows on foil help more than their bends hurt.
+    patterns = mesh.patterns if near else np.where(mesh.patterns == WRINKLES, NO_PATTERN, mesh.patterns)
+    if not patterns.any():
         return np.zeros(len(points), dtype=bool)
     fx, fy, cx, cy = window.lens
     at, next_to = (p @ pose.rotation.T + pose.position for p in (points, ahead))
     px = at[:, :2] / at[:, 2:] * (fx, fy) + (cx, cy)
     step = next_to[:, :2] / next_to[:, 2:] * (fx, fy) + (cx, cy) - px
     last = np.array([window.width - 1, window.height - 1])
-    both = np.ones(len(points), dtype=bool)
+    beside = []
     for side in (-_BESIDE_PX, _BESIDE_PX):
         column, row = np.clip(np.rint(px + side * step).astype(np.int64), 0, last).T
         owner = view.owner[row, column]
-        both &= (owner >= 0) & (mesh.border_m[owner] > 0.0)
-    return both
+        beside.append(np.where(owner >= 0, patterns[owner], NO_PATTERN))
+    return (beside[0] == beside[1]) & (beside[0] != NO_PATTERN)
 
 
 def image_window(pyramid: Pyramid, k: int, window: PixelWindow, left: int, top: int) -> NDArray[np.float32]:
@@ -314,10 +334,11 @@ def _alignment(pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Ma
     # A rotation phi in camera axes is R dtheta; a displacement in TRF moves a point as that of the position in IRF axes.
     jacobian = np.concatenate([moved, found.rows[used, :3] @ pose.rotation], axis=1)
     shifts = np.einsum("ni,kni->nk", moved @ pose.rotation, points.displaced_m[:, used])
-    solved = _solve(_Fit(residual, weight, jacobian, shifts), modes)
+    solved = _solve(_Fit(residual, weight, jacobian, shifts, points.independent), modes)
     if solved is None:
         return None
     step, covariance, geometry = solved
+    geometry = replace(geometry, position_m=pose.position + geometry.position_m)
     if len(modes):
         turn = rotations.to_matrix(rotations.exp(step[3:6]))
         pose = PoseInCamera(pose.position + step[:3], pose.rotation @ turn)
@@ -330,12 +351,14 @@ def _alignment(pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Ma
 @dataclass(frozen=True)
 class _Fit:
     """Linearized fit of m used control points at a pose: ``residual`` (m,) pixels, ``weight`` (m,), ``jacobian`` (m, 6): of the
-    residual by position (IRF) and rotation (TRF); ``shifts`` (m, k): of each point, pixels, by the k modes of the geometry."""
+    residual by position (IRF) and rotation (TRF); ``shifts`` (m, k): of each point, pixels, by the k modes of the geometry;
+    ``independent``: as in `ControlPoints`."""
 
     residual: Array
     weight: Array
     jacobian: Array
     shifts: Array
+    independent: float
 
 
 def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] | None:
@@ -347,7 +370,7 @@ def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] 
     """
     rows = np.concatenate([fit.jacobian, fit.shifts], axis=1)
     chi_square = float(fit.residual**2 @ fit.weight) / max(len(fit.residual) - 6, 1)
-    correlated = max(_CORRELATED_POINTS, len(fit.residual) / _INDEPENDENT_MOST)
+    correlated = max(_CORRELATED_POINTS, len(fit.residual) / fit.independent)
     weight = fit.weight / (correlated * max(chi_square, 1.0))
     information = rows.T @ (rows * weight[:, None])
     right = rows.T @ (weight * fit.residual)
@@ -364,9 +387,17 @@ def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] 
 
 
 def _without_pose(information: Array, right: Array, modes: Array) -> GeometryInformation:
-    """Return the information about the modes (k,) of a fit (6 + k, 6 + k) that is linearized at ``modes``: its Schur complement."""
-    of_pose = np.linalg.pinv(information[:6, :6], hermitian=True)
+    """Return the information about the modes (k,) of a fit (6 + k, 6 + k) that is linearized at ``modes``, its Schur complement, and
+    how the position depends on them, as a displacement from where the fit is linearized."""
+    of_pose = np.asarray(np.linalg.pinv(information[:6, :6], hermitian=True), dtype=float)
     gain = information[6:, :6] @ of_pose
     matrix = information[6:, 6:] - gain @ information[:6, 6:]
     matrix = 0.5 * (matrix + matrix.T)
-    return GeometryInformation(matrix, right[6:] - gain @ right[:6] + matrix @ modes)
+    moved, by_modes = (of_pose @ right[:6])[:3], -gain.T[:3]
+    return GeometryInformation(
+        matrix,
+        right[6:] - gain @ right[:6] + matrix @ modes,
+        moved - by_modes @ modes,
+        by_modes,
+        of_pose[:3, :3],
+    )

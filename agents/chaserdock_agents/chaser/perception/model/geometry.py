@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,5 +39,10 @@ class GeometryCorrection:
         With e = mean + C x for errors x of the corrected mesh, information L about x is C^-T L C^-1 about e.
         """
         back = np.linalg.inv(self.factor)
+        by_errors = found.position_by_errors @ back
+        position = found.position_m - by_errors @ self.mean
+        if not len(found.vector):
+            return replace(found, position_m=position, position_by_errors=by_errors)
         matrix = back.T @ found.matrix @ back
-        return GeometryInformation(matrix, back.T @ found.vector + matrix @ self.mean)
+        vector = back.T @ found.vector + matrix @ self.mean
+        return GeometryInformation(matrix, vector, position, by_errors, found.position_covariance)

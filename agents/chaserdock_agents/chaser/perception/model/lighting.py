@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from ctypes import c_double, c_int64
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 from ..native import function
 from ..refine import PoseInCamera
 from .alignment import Pyramid, image_window, in_grey_levels, window_of
-from .mesh import ShadowMaps, TrackerMesh
-from .rendering import Lighting, render
+from .mesh import ShadowMaps, TrackerMesh, spread_directions
+from .rendering import Lighting, PixelWindow, render
 
 _MOST_POINTS, _FEWEST_POINTS = 600, 40
 _EVERY_POINT = 3
@@ -34,6 +35,14 @@ _COMPARED, _DISTINCT_RAD = 8, 0.35
 """Number of directions that are compared by synthetic views, and their least distance."""
 _LIKELY = 0.08
 """Increase of the mean squared residual, as a share of its least, at which a direction weighs 1/e in the mean of the likely ones."""
+
+_EVEN_RESIDUAL, _CLEARLY = 0.15, 0.95
+"""Mean squared residual, in standard deviations, below which light from everywhere explains the points: of 40 sunlit views the least
+was 0.45, of views without sun on what is visible the most 0.17. Ratio of residuals below which a sun explains a view better."""
+_COMPARED_SUNS = np.array([d for d in spread_directions(60) if d[2] > -0.1 or d[2] < -0.9])
+"""Directions (n, 3) in IRF, behind the target or of a lamp beside the lens, of which synthetic views are compared."""
+_COMPARED_FINELY = 3
+"""Number of these that are compared at a finer level."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +69,93 @@ def light_at(
     points = lit_points(pyramid, mesh, pose, level)
     if points is None:
         return None
+    even = even_light(mesh, points)
+    if even is not None:
+        return light_by_view(pyramid, mesh, pose, level, even, previous)
     if previous is None and by_view:
         lights = likely_lights(mesh, points)
         previous = max(lights, key=lambda light: appearance(pyramid, mesh, pose, level, light))
     return fit_light(mesh, points, previous)
+
+
+def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:
+    """Return light from everywhere if that alone explains the points within their noise and texture, as of a target that shows
+    its shaded side: a sun that explains them better would be one of noise, and cast shadows that are not there."""
+    rows = points.rows.copy()
+    rows[:, 3:6] = 0.0  # without normals, the sun has no effect
+    anywhere = ShadowMaps(np.eye(3)[:1], np.zeros((1, 12)), np.zeros((1, 0, 0), np.float32))
+    residual, ambient, _ = rate_suns(LitPoints(rows, points.rotation), anywhere)[0].tolist()
+    return Lighting(None, 0.0, ambient) if residual < _EVEN_RESIDUAL and ambient > 1e-3 else None
+
+
+def light_by_view(
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, even: Lighting, previous: Lighting | None
+) -> Lighting:  # fmt: skip
+    """Return the light of a target whose points ``even`` explains, light from everywhere: on a side in the shade a sun behind the
+    target brightens no more than rims, which are no points.
+
+    Synthetic views in several directions of the sun, near that of ``previous`` if it has one, are compared with the image; the
+    levels follow by least squares. Returns ``even`` if no sun explains the image clearly better.
+    """
+    coarse, fine = (_ComparedView.at(pyramid, mesh, pose, k) for k in (level, max(level - 1, 0)))
+    if coarse is None or fine is None:
+        return even
+    if previous is not None and previous.to_sun_irf is not None:
+        fine, nearest = coarse, previous.to_sun_irf
+        found = [(*fine.rate(nearest), nearest)]
+    else:
+        rated = [coarse.rate(to_sun)[0] for to_sun in _COMPARED_SUNS]
+        best = _COMPARED_SUNS[np.argsort(rated)[:_COMPARED_FINELY]]
+        found = [(*fine.rate(to_sun), to_sun) for to_sun in (*best, *_around(best[0], 0.25)[1::2])]
+        nearest = min(found, key=lambda f: f[0])[3]
+    found += [(*fine.rate(to_sun), to_sun) for to_sun in _around(nearest, 0.12)[1::2]]
+    residual, ambient, direct, to_sun = min(found, key=lambda f: f[0])
+    if residual > _CLEARLY * fine.residual:
+        return even
+    return Lighting(to_sun, direct, ambient, weak=True)
+
+
+@dataclass(frozen=True)
+class _ComparedView:
+    """A view of a target at ``pose`` and the image there: n pixels of it without the background, ``grey`` (n,), and of the view in
+    light from everywhere, ``ambient`` (n,); ``pixels`` (h, w): which these are; ``residual``: mean square without a sun."""
+
+    mesh: TrackerMesh
+    pose: PoseInCamera
+    window: PixelWindow
+    pixels: NDArray[np.bool_]
+    grey: Array
+    ambient: Array
+    residual: float
+
+    @classmethod
+    def at(cls, pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> _ComparedView | None:
+        """Return the view at a level; None if the target is out of view."""
+        found = window_of(pyramid, level, mesh, pose)
+        if found is None:
+            return None
+        window, left, top = found
+        patch = image_window(pyramid, level, window, left, top)
+        view = render(mesh, pose, window, Lighting(None, 0.0, 1.0))
+        drawn, gain = in_grey_levels(view, patch)
+        pixels = cv2.dilate(view.coverage, np.ones((5, 5))) > 0.0
+        grey, ambient = smooth(patch - (drawn - gain * view.grey))[pixels], smooth(view.grey)[pixels]
+        level_of = float(ambient @ grey) / max(float(ambient @ ambient), 1e-9)
+        residual = float(np.mean((grey - level_of * ambient) ** 2))
+        return cls(mesh, pose, window, pixels, grey, ambient, residual)
+
+    def rate(self, to_sun: Array) -> tuple[float, float, float]:
+        """Return the mean squared residual with a sun in the direction (3,), IRF, the ambient and the direct level."""
+        view = render(self.mesh, self.pose, self.window, Lighting(to_sun, 1.0, 0.0))
+        columns = np.column_stack([self.ambient, smooth(view.grey)[self.pixels]])
+        levels = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), columns.T @ self.grey)
+        ambient, direct = np.maximum(levels, 0.0).tolist()
+        return float(np.mean((self.grey - columns @ (ambient, direct)) ** 2)), ambient, direct
+
+
+def smooth(grey: NDArray[Any]) -> Array:
+    """Return a view or image (h, w) without noise, as equally smooth as others, so that the lens' point spread does not count."""
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=float)
 
 
 def likely_lights(mesh: TrackerMesh, points: LitPoints) -> list[Lighting]:
@@ -134,7 +226,7 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
 
 def fit_light(mesh: TrackerMesh, points: LitPoints, previous: Lighting | None = None) -> Lighting | None:
     """Return the light that explains the points best; None for a dark image."""
-    if previous is not None and previous.to_sun_irf is not None:
+    if previous is not None and previous.to_sun_irf is not None and not previous.weak:
         best = points.rotation.T @ previous.to_sun_irf
     else:
         few = LitPoints(np.ascontiguousarray(points.rows[::_EVERY_POINT]), points.rotation)

@@ -35,6 +35,8 @@ _FOIL_SLOPE = 0.35
 _CELLS_BORDER_M = 0.0002
 """Standard deviation of where points of the border of solar cells are seen, beside what all have in common (mode ``rim``): the known
 mesh does not have the grid."""
+NO_PATTERN, CELLS, WRINKLES = 0, 1, 2
+"""Patterns of a surface that the known mesh does not have."""
 _SUNS, _SUN_TEXELS = 400, 64
 
 
@@ -177,6 +179,13 @@ class TrackerMesh:
     def border_of(self, owners: NDArray[np.int64]) -> Array:
         """Return the standard deviation (n,), m, of where the borders of the triangles ``owners`` (n,) are seen."""
         return self.border_m[owners] if len(self.border_m) else np.zeros(len(owners))
+
+    @cached_property
+    def patterns(self) -> NDArray[np.int64]:
+        """Pattern (m,) of the surface of each triangle: none, solar cells, or wrinkles."""
+        cells = self.border_m > 0.0 if len(self.border_m) else np.zeros(len(self.triangles), dtype=bool)
+        wrinkled = self.texture_share >= _FOIL_TEXTURE
+        return np.where(cells, CELLS, np.where(wrinkled, WRINKLES, NO_PATTERN))
 
     @cached_property
     def mean_normals(self) -> Array:

@@ -45,6 +45,8 @@ _PER_IMAGE_MS = 30.0
 _POINTS_MS = 6.0
 _MOST_WAITING = 120
 """Number of images that wait until an acquisition has ended; beyond, it is given up for one of the newest image."""
+_MOST_WAITING_PREDICTED, _MOST_FAILED = 30, 15
+"""The same where a pose is predicted; number of images in a row in which a start from it fails before an acquisition is tried."""
 _WORSE = 0.1
 """An ambiguous pose is dropped when its score falls this far below the best one's."""
 
@@ -70,11 +72,20 @@ class PoseTrack:
         return PoseInCamera(2.0 * now.position - self.before.position, step @ now.rotation)
 
 
+@dataclass(frozen=True)
+class _WaitingImage:
+    """An image (h, w) and the pose that others predict in it, position (3,) and rotation (4,), if any."""
+
+    image: NDArray[np.uint8]
+    predicted: tuple[ArrayLike, ArrayLike] | None
+
+
 class ModelPerception:
     """Estimates the pose of the target from its shape. Stateful: equal sequences of images give equal results.
 
     Work that takes longer than the time of an image is spread over several: an acquisition, or starts around a lost pose. Until it
     ends, images wait and give no solution; then the target is tracked through them, several at each new image, up to the newest one.
+    Without a track, a pose that others predict is tried first; an acquisition follows when that has failed for about a second.
     One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be shared. ``solutions`` are ambiguous
     poses, the best first, and without markers.
     """
@@ -83,7 +94,8 @@ class ModelPerception:
         self.camera, self.mesh = camera, mesh
         self._acquisition = acquisition or Acquisition(camera, mesh)
         self._tracks: tuple[PoseTrack, ...] = ()
-        self._waiting: deque[NDArray[np.uint8]] = deque()
+        self._waiting: deque[_WaitingImage] = deque()
+        self._failed = 0
         self._work: Steps[None] | None = None
         self._next_ms = 0.0
         self._uncorrected = mesh
@@ -114,13 +126,15 @@ class ModelPerception:
 
     def reset(self) -> None:
         """Forget all tracks: the next image is searched without a prior."""
-        self._tracks, self._work = (), None
+        self._tracks, self._work, self._failed = (), None, 0
         self._waiting.clear()
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:
-        """Estimate the target's pose in a grey image (h, w), uint8; ``predicted`` is not used, as tracks predict themselves.
+        """Estimate the target's pose in a grey image (h, w), uint8.
+
+        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; used as a start while there is no track.
 
         Raises ValueError for an image of another shape or type than the camera's.
         """
@@ -128,10 +142,12 @@ class ModelPerception:
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
             got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise ValueError(f"expected a uint8 image of {shape}, got {got}")
-        if len(self._waiting) == _MOST_WAITING:
+        if len(self._waiting) >= (
+            _MOST_WAITING if self._tracks or predicted is None else _MOST_WAITING_PREDICTED
+        ):
             self._waiting.clear()
-            self._work, self._tracks = None, ()
-        self._waiting.append(image)
+            self._work, self._tracks, self._failed = None, (), 0
+        self._waiting.append(_WaitingImage(image, predicted))
         self._work_on()
         # Poses in an earlier image are no solutions of this one.
         tracks = () if self._waiting else self._tracks
@@ -140,12 +156,15 @@ class ModelPerception:
         return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), (), geometry)
 
     def _geometry(self) -> GeometryInformation | None:
-        """Return what the image tells about the errors of the mesh before corrections: if the view of the only track is new."""
-        if len(self._tracks) != 1 or self._tracks[0].age or self._tracks[0].missed:
+        """Return what the image tells about the errors of the mesh before corrections, if there is one track; without information
+        for any pose if its view is not new."""
+        if len(self._tracks) != 1 or self._tracks[0].missed:
             return None
         found = self._tracks[0].last.geometry
         if not len(found.vector):
             return None
+        if self._tracks[0].age:
+            found = replace(found, matrix=np.zeros((0, 0)), vector=np.zeros(0))
         return found if self._correction is None else self._correction.of_uncorrected(found)
 
     def _work_on(self) -> None:
@@ -165,17 +184,29 @@ class ModelPerception:
                 self._work = None
                 self._waiting.popleft()
 
-    def _process(self, image: NDArray[np.uint8]) -> Steps[None]:
+    def _process(self, waiting: _WaitingImage) -> Steps[None]:
         """Update the tracks by an image, or acquire the target in it."""
-        pyramid = Pyramid(image, self.camera)
+        pyramid = Pyramid(waiting.image, self.camera)
         if not self._tracks:
-            found = yield from self._acquisition.search(pyramid)
-            self._tracks = tuple(PoseTrack(*one) for one in found)
+            if waiting.predicted is not None and self._failed < _MOST_FAILED:
+                self._tracks = yield from self._start(pyramid, *waiting.predicted)
+            else:
+                found = yield from self._acquisition.search(pyramid)
+                self._tracks = tuple(PoseTrack(*one) for one in found)
+            self._failed = 0 if self._tracks else (self._failed + 1) % (_MOST_FAILED + 1)
             return
         updated: list[PoseTrack] = []
         for track in self._tracks:
             updated.append((yield from advance(pyramid, self.mesh, track)))
-        self._tracks = _distinct([t for t in updated if t.missed < _LOST_AFTER])
+        # A predicted pose is a better start in the next image than a lost track's own.
+        lost_after = _LOST_AFTER if waiting.predicted is None else 1
+        self._tracks = _distinct([t for t in updated if t.missed < lost_after])
+
+    def _start(self, pyramid: Pyramid, position: ArrayLike, q: ArrayLike) -> Steps[tuple[PoseTrack, ...]]:
+        """Return the track that begins near a predicted pose, if the gate accepts one."""
+        prior = PoseInCamera(np.array(position, dtype=float), rotations.to_matrix(np.array(q, dtype=float)))
+        found = yield from prior_steps(pyramid, self.mesh, prior)
+        return (PoseTrack(*found),) if found is not None and is_valid(found[0]) else ()
 
 
 def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[PoseTrack]:

@@ -25,13 +25,14 @@ class Lighting:
 
     ``to_sun_irf`` (3,): unit vector to the sun in IRF; None: the only directed light is the lamp at the lens. ``direct`` and
     ``ambient``: shares of the directed light and of light from all directions. ``shadows``: whether the target casts
-    shadows on itself.
+    shadows on itself. ``weak``: a sun that lights little of what is visible.
     """
 
     to_sun_irf: Array | None
     direct: float = 0.8
     ambient: float = 0.2
     shadows: bool = True
+    weak: bool = False
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,16 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 
 from ..refine import PoseInCamera
-from .alignment import Alignment, ControlPoints, Pyramid, align, control_points, window_of
+from .alignment import (
+    NEAR_PX,
+    Alignment,
+    ControlPoints,
+    Pyramid,
+    align,
+    control_points,
+    diameter_px,
+    window_of,
+)
 from .lighting import light_at
 from .mesh import TrackerMesh
 from .rendering import Lighting
@@ -25,7 +34,7 @@ MIN_SCORE = 0.56
 MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
 """Gate: a larger standard deviation in any direction, of position as a share of the range, rejects a pose."""
 _FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 600_000, 12_000, 24_000
-_LARGEST_PX = (1300.0, 740.0)
+_LARGEST_PX = (NEAR_PX, 740.0)
 """Largest diameter of the target at the finest level, in pixels of it: if that is the image's own, or a coarser one. Nearer targets
 are aligned at a coarser level: they show texture that the mesh does not have at the size of profiles, and a whole image of them
 takes the most time."""
@@ -59,8 +68,8 @@ def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[
         return ()
     area = found[0].height * found[0].width
     finest = -1 if area < _UPSAMPLED_AREA_PX else 0
-    diameter_px = 2.0 * mesh.radius_m * pyramid.camera.fx_px / float(np.linalg.norm(pose.position))
-    while area / 4**finest > _FINEST_AREA_PX or diameter_px / 2**finest > _LARGEST_PX[finest > 0]:
+    diameter = diameter_px(pyramid.camera, mesh, pose)
+    while area / 4**finest > _FINEST_AREA_PX or diameter / 2**finest > _LARGEST_PX[finest > 0]:
         finest += 1
     coarsest = finest
     while area / 4**coarsest > _COARSEST_AREA_PX and coarsest < finest + 4:
@@ -167,6 +176,11 @@ def _settling_steps(
         yield LIGHT_MS + VIEWS_MS
         light = light_at(pyramid, mesh, fine.pose, levels[0], by_view=True) or light
         fine = yield from pose_steps(pyramid, mesh, fine.pose, light, levels[-2:], _NEXT_REACH_PX, fine.modes)
+        if fine is not None and not _is_settled(fine):
+            # Of few points the coarser level turns a pose away by more than that, and the finest one back.
+            fine = yield from pose_steps(
+                pyramid, mesh, fine.pose, light, levels[-1:], _NEXT_REACH_PX, fine.modes
+            )
     return (fine, light) if fine is not None and _is_settled(fine) else None
 
 

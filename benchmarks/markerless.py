@@ -195,7 +195,7 @@ def inspect(views: int) -> Figures:
 
 
 @dataclass(frozen=True)
-class Cameras:
+class CamerasAround:
     """Cameras around the target at one time, with odometry of grade `lab`: ``turns``, (3, 3), of their axes about the target, and
     ``shifts_m`` (n, 3) of their lenses, which flight software does not know."""
 
@@ -203,7 +203,7 @@ class Cameras:
     shifts_m: Array
 
     @classmethod
-    def drawn(cls, turns: tuple[Array, ...], rng: np.random.Generator) -> Cameras:
+    def drawn(cls, turns: tuple[Array, ...], rng: np.random.Generator) -> CamerasAround:
         return cls(turns, rng.normal(0.0, LAB.camera_shift_m, (len(turns), 3)))
 
     def fused(
@@ -242,7 +242,7 @@ class Cameras:
 
 def inspected(scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int) -> ShapeFilter:
     """Return the geometry by the views of two cameras on opposite sides of the target."""
-    cameras, fused = Cameras.drawn((np.eye(3), HALF_TURN), rng), ShapeFilter.prior(len(mesh.modes_m))
+    cameras, fused = CamerasAround.drawn((np.eye(3), HALF_TURN), rng), ShapeFilter.prior(len(mesh.modes_m))
     for number in range(0, _VIEWS_BEFORE, 2):
         fused = cameras.fused(fused, mesh, scene, rng, first + number, inspect=True)
     return fused
@@ -256,7 +256,7 @@ def triangulated(cells: Cells, range_m: float, views: int) -> Figures:
     def view(rng: np.random.Generator, number: int) -> ViewRow:
         mesh = _drawn_mesh(rng)
         before = ShapeFilter.prior(len(mesh.modes_m))
-        fused = Cameras.drawn(turns, rng).fused(before, mesh, scene, rng, 5 * number, inspect=False)
+        fused = CamerasAround.drawn(turns, rng).fused(before, mesh, scene, rng, 5 * number, inspect=False)
         corrected = mesh.corrected(fused.mean(), fused.covariance())
         pose, light = random_view(rng, range_m, CAMERA)
         image = scene.image(pose, light, 5 * number + 4)

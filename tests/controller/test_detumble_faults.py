@@ -131,6 +131,32 @@ def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
     assert flight.failed == ""
 
 
+@pytest.mark.parametrize("count", [6, pytest.param(16, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("plan_s", [None, 13.5])
+def test_a_stack_of_many_chasers_is_stopped(count: int, plan_s: float | None) -> None:
+    """Up to four at each of four faces, side by side. Their thrusters stop it within a few seconds, or at less cost by a plan."""
+    changes = wrong_knowledge(1) + ([] if plan_s is None else [f"detumble.plan_s={plan_s}"])
+    four = stack_scenario(1, (0, 1, 2, 3), changes)
+    ports, chasers = [], []
+    for i in range(count):
+        port, chaser = four.docking.ports[i % 4], four.chasers[i % 4]
+        aside, up = ((-0.22, -0.22), (0.22, 0.22), (-0.22, 0.22), (0.22, -0.22))[i // 4]
+        shift = np.array([-aside * port.axis[1], aside * port.axis[0], up])
+        at_port = {"chaser": i, "position_m": tuple(np.add(port.position_m, shift).tolist())}
+        ports.append(port.model_copy(update=at_port))
+        place = np.add(chaser.position_m, shift).tolist()  # type: ignore[arg-type]
+        chasers.append(chaser.model_copy(update={"position_m": tuple(place)}))
+    docking = four.docking.model_copy(update={"ports": tuple(ports)})
+    flight = fly_controlled(
+        four.model_copy(update={"docking": docking, "chasers": tuple(chasers)}),
+        5.0 if plan_s is None else 16.0,
+    )
+    assert flight.time_s is not None
+    assert flight.time_s < (4.0 if plan_s is None else 15.0)
+    assert flight.least is not None
+    assert flight.impulse_N_s < (1.0 if plan_s is None else 0.85) * flight.least.impulse_N_s
+
+
 def test_a_stopped_stack_turns_to_its_commanded_attitude_and_keeps_it() -> None:
     q = rotations.exp(np.array([0.3, -0.2, 0.1]))
     scenario = stack_scenario(1, (0, 3), wrong_knowledge(1, share=0.1))

@@ -155,6 +155,14 @@ def test_bearing_is_measured_in_the_image_with_the_stated_errors() -> None:
     assert max(squares) < 10.0
 
 
+@pytest.mark.parametrize("range_m", [-1.0, 0.0, 0.3, 1e9, math.inf, math.nan])
+def test_impossible_ranges_give_no_bearing(range_m: float) -> None:
+    finder = BearingFinder(scenario().camera_model(), scenario().target_model())
+    target = RangedTarget(range_m, 0.02, np.array([1.0, 0.0, 0.0, 0.0]), 1e-7 * np.eye(3))
+    with pytest.raises(BearingError, match="too near or too far"):
+        finder.find(decode_image(image((-20.0, 0.0, 0.0))), target)
+
+
 @pytest.mark.parametrize("share", [0.5, 2.0])
 def test_spot_of_another_size_is_not_the_target(share: float) -> None:
     perception, far = make_perception(flight_scenario(scenario())), image((-20.0, 0.2, -0.1))

@@ -42,6 +42,8 @@ _CLEAR_RATIO = 1.5
 """Without a prediction, the target is the brightest spot of its size, by this ratio to the next one."""
 _STAR_PX, _AIM_RAD = 1.2, math.radians(2.0)
 """Below this expected radius stars are as bright, and a first sighting must be within this angle of the optical axis."""
+_NEAREST, _FARTHEST = 2.0, 1e4
+"""Least and greatest range, in radii of the target."""
 _RASTER = 256
 
 
@@ -100,8 +102,8 @@ class BearingFinder:
 
         Raises BearingError if no spot is clearly the target.
         """
-        if not target.range_m > 2.0 * self._reach_m:
-            raise BearingError(f"a range of {target.range_m:.3g} m is too near for a bearing")
+        if not _NEAREST * self._reach_m < target.range_m < _FARTHEST * self._reach_m:
+            raise BearingError(f"a range of {target.range_m:.3g} m is too near or too far for a bearing")
         expected = self._silhouette(np.array([0.0, 0.0, target.range_m]), target.q_wxyz)
         spots = find_spots(image, expected.radius_px)
         plausible = [(s, v) for s in spots if (v := self._shape_at(s, target)) is not None]

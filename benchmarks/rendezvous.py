@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whole rendezvous from 200 m to the verified latch: ``python benchmarks/rendezvous.py [--scenario v-bar r-bar] [--seeds N]``.
 
-One process, with statistical perception. ``--markers``: markers in rendered images instead of statistical ones, and ranging where none
-is seen. ``--images``: only the last leg, with rendered images and without ranging.
+One process, with statistical perception. ``--markers``: markers in rendered images instead of statistical ones, and bearing and
+range where these are more accurate. ``--images``: only the last leg, with rendered images and without ranging.
 ``--leg N``: one leg. Prints time, change of velocity, tracking at the hold points, step of the estimate at the first markers, and
 contact. ``--quick``: only the last leg, from the last hold point on. ``--events``: print the controller's events.
 """

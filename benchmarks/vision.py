@@ -6,7 +6,8 @@ Parts: ``rendering`` (time and corner errors of the renderers), ``speed`` (image
 views by distance), ``near`` (the body fills the image), ``metre`` (a lit and a shadowed face at 1 m), ``accuracy`` (random
 views of both targets with all effects at default strength, by the default perception and by the paper's), ``far`` (the
 servicer at 5 to 7.5 m: views without a pose, errors, and NEES over the stated covariance; ``--strip PX``: fit borders that
-end at neighbours beside a part of a side as strips below this width, 1.5 by default). Gross error: more than 10 degrees or
+end at neighbours beside a part of a side as strips below this width, 1.5 by default), ``bearing`` (the servicer at 7 to 200 m, by
+bearing and range). Gross error: more than 10 degrees or
 10 cm (for an ambiguous view: of the solution nearer to the truth).
 """
 
@@ -21,7 +22,7 @@ import cv2
 import numpy as np
 from chaserdock_agents.chaser.perception import Method, Perception, PerceptionResult, make_perception
 from chaserdock_agents.chaser.perception.corners import SETTINGS
-from chaserdock_agents.chaser.sighting import decode_image
+from chaserdock_agents.chaser.sighting import decode_image, look
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
@@ -31,6 +32,7 @@ from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light
 from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.rendering.effects import CameraEffects
+from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from common import Figures, make_parser, percentiles, run_parts
@@ -322,6 +324,75 @@ def far(count: int) -> Figures:
     return out
 
 
+def bearing(count: int) -> Figures:
+    """Return figures of the position by bearing and range, by range: random attitude and place in the image, eight suns, among stars.
+
+    ``nees_bearing_mean``: per degree of freedom, of the two across the line of sight. With the prediction that a flight has;
+    ``alone``: views that are measured without it, too, and ``alone_wrong``: with something else taken for the target. Views with
+    markers do not count.
+    """
+    suns = np.random.default_rng(24).normal(size=(8, 3)).tolist()
+    scenarios = [
+        load_shipped(
+            "docking-contact", 'navigation.grade="exact"', "ranging={}", f"camera.sun_direction={sun}"
+        )
+        for sun in suns
+    ]
+    lit = [make_cameras(scenario) for scenario in scenarios]
+    perception, camera = make_perception(scenarios[0]), scenarios[0].camera_model()
+    zero, still, out = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), {}
+    for metres in (7.0, 10.0, 15.0, 20.0, 30.0, 50.0, 80.0, 120.0, 160.0, 200.0):
+        rng, errors, squares, ranges, alone, wrong, missed = (
+            np.random.default_rng([24, int(metres)]),
+            [],
+            [],
+            [],
+            0,
+            0,
+            0,
+        )
+        for k in range(count):
+            q, own = (
+                rotations.normalize(rng.normal(size=4)),
+                np.array([-metres, *rng.uniform(-0.2, 0.2, 2) * metres]),
+            )
+            states = {"target": BodyState(zero, zero, q, zero), "chaser/0": BodyState(own, zero, still, zero)}
+            eye, attitude = camera.irf_pose_in_world(own, still)
+            true_m = rotations.rotate_inverse(attitude, -eye)
+            image = lit[k % len(lit)].image(0, k, k, 0, states)
+            sigma_m = 3.0 * metres / camera.fx_px
+            predicted = true_m + rng.normal(0.0, sigma_m, 3), still
+            seen = look(perception, image, predicted)
+            if seen.marker_ids:
+                continue
+            free = look(perception, image, None)
+            if free.solutions:
+                alone += 1
+                wrong += np.linalg.norm(np.array(free.solutions[0].position_m) - true_m) > 10.0 * sigma_m
+            if not seen.solutions:
+                missed += 1
+                continue
+            error = np.array(seen.solutions[0].position_m) - true_m
+            covariance = np.array(seen.solutions[0].covariance).reshape(6, 6)[:3, :3]
+            along = true_m / np.linalg.norm(true_m)
+            basis = np.linalg.svd(along[None])[2][1:]
+            across, part = basis @ error, basis @ covariance @ basis.T
+            errors.append(across / metres * camera.fx_px)
+            squares.append(float(across @ np.linalg.solve(part, across)) / 2.0)
+            ranges.append(float(along @ error) ** 2 / float(along @ covariance @ along))
+        at = f"bearing_{metres:g}m_"
+        out |= {
+            f"{at}measured": len(errors),
+            f"{at}missed": missed,
+            f"{at}rms_px": float(np.sqrt(np.mean(np.square(errors)))),
+            f"{at}nees_bearing_mean": float(np.mean(squares)),
+            f"{at}nees_range_mean": float(np.mean(ranges)),
+            f"{at}alone": alone,
+            f"{at}alone_wrong": int(wrong),
+        }
+    return out
+
+
 def main() -> None:
     counts = {
         "rendering": (rendering, 200, 20),
@@ -331,6 +402,7 @@ def main() -> None:
         "metre": (at_one_metre, 1000, 100),
         "accuracy": (accuracy, 10_000, 150),
         "far": (far, 80, 8),
+        "bearing": (bearing, 80, 8),
     }
     parser = make_parser(__doc__, counts)
     parser.add_argument("--strip", type=float, metavar="PX", help="of far: width in pixels")

@@ -16,7 +16,7 @@ from chaserdock_controller.estimation.types import Estimator
 from .estimation import make_estimator
 from .estimation.composite_body import rows_of, stated_properties
 from .estimation.joint import JointEstimator, JointParameters
-from .estimation.joint.parameters import RANGING, SHAPE, TARGET_NOISE
+from .estimation.joint.parameters import BEARING, RANGING, SHAPE, TARGET_NOISE, SightingNoise
 from .nmpc import NmpcParameters
 from .nmpc.coast_rows import COASTS
 
@@ -50,6 +50,13 @@ def target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]:
     return {
         model: (stated[0] or default[0], stated[1] or default[1]) for model, default in TARGET_NOISE.items()
     }
+
+
+def _far_noise(scenario: FlightScenario) -> SightingNoise:
+    """Return the errors of sightings without markers."""
+    if scenario.ranging is None:
+        return SHAPE
+    return RANGING if scenario.perception.name == "statistical" else BEARING
 
 
 def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
@@ -88,6 +95,6 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
         / scenario.time.rate_hz,
         mean_motion_rad_s=0.0 if scenario.orbit is None else scenario.orbit.elements.mean_motion_rad_s,
         target_noise=target_noise(scenario.estimator),
-        shape=SHAPE if scenario.ranging is None else RANGING,
+        shape=_far_noise(scenario),
     )
     return JointEstimator(joint, len(scenario.chasers))

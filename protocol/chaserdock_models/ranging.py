@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of a far target from its bearing, a range sensor, and the attitude that it sends: the model of ``[ranging]``."""
+"""Range of a far target, the attitude that it sends, and, without images, its bearing: the model of ``[ranging]``."""
 
 from __future__ import annotations
 
@@ -36,6 +36,38 @@ class RangedPose:
     bearing_px: float
 
 
+@dataclass(frozen=True, eq=False)
+class RangeReading:
+    """Distance (m) of TRF's origin from the optical centre with its standard deviation, and the sent attitude, TRF to IRF (4,)."""
+
+    range_m: float
+    sigma_m: float
+    q_wxyz: Array
+
+
+def _in_view(errors: RangingErrors, camera: Camera, position_m: Array) -> bool:
+    """Return whether a target is in reach and in the image."""
+    if float(np.linalg.norm(position_m)) > errors.reach_m:
+        return False
+    u, v = camera.project_ideal(position_m[None])[0]
+    return bool(0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0)
+
+
+def range_reading(
+    errors: RangingErrors, camera: Camera, position_m: Array, q_wxyz: Array, white: Array
+) -> RangeReading | None:
+    """Return range and attitude of a true pose (position (3,) in IRF, rotation (4,) TRF to IRF); None out of the image or of reach.
+
+    ``white`` (4,): standard normal numbers, from which the errors follow.
+    """
+    if not _in_view(errors, camera, position_m):
+        return None
+    distance = float(np.linalg.norm(position_m))
+    sigma = math.hypot(errors.range_m, errors.range_share * distance)
+    turned = rotations.multiply(q_wxyz, rotations.exp(errors.attitude_rad * white[1:]))
+    return RangeReading(distance + sigma * float(white[0]), sigma, turned)
+
+
 def ranged_pose(
     errors: RangingErrors, camera: Camera, position_m: Array, q_wxyz: Array, white: Array
 ) -> RangedPose | None:
@@ -43,12 +75,9 @@ def ranged_pose(
 
     ``white`` (6,): standard normal numbers, from which the errors follow.
     """
+    if not _in_view(errors, camera, position_m):
+        return None
     distance = float(np.linalg.norm(position_m))
-    if distance > errors.reach_m:
-        return None
-    u, v = camera.project_ideal(position_m[None])[0]
-    if not (0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0):
-        return None
     along = position_m / distance
     range_m = math.hypot(errors.range_m, errors.range_share * distance)
     across_m = errors.bearing_rad * distance

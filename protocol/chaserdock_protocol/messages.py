@@ -78,6 +78,19 @@ Latch = Literal["keep", "arm", "release"]
 """Command of a probe's latch: no change; close at a valid touch and stay closed; open and stay open."""
 
 
+class RangeMeasurement(Struct, frozen=True, kw_only=True):
+    """Measurement of a range sensor, and the attitude that the target sends.
+
+    ``range_m``: distance of TRF's origin from the camera's optical centre, with its standard deviation. ``q_wxyz`` takes TRF to IRF;
+    ``attitude_covariance_rad2`` is row-major (3, 3) over dtheta in TRF axes with q_true = q (x) exp(dtheta).
+    """
+
+    range_m: float
+    range_sigma_m: float
+    q_wxyz: Quaternion
+    attitude_covariance_rad2: Square3
+
+
 class PoseSolution(Struct, frozen=True, kw_only=True):
     """One pose of the target in the camera frame.
 
@@ -222,8 +235,8 @@ class MissionEnd(Message, frozen=True, kw_only=True):
 class Image(Message, frozen=True, kw_only=True):
     """An image of chaser ``chaser``'s camera; ``sim_time_ns`` is the middle of the exposure.
 
-    ``ranging``: the target's pose by bearing, range sensor and data link at that time, where the scenario has ``[ranging]`` and the
-    target is in reach and in the image; ``reprojection_rms_px`` is the bearing's standard deviation.
+    ``ranging``: the target's range and sent attitude at that time, where the scenario has ``[ranging]`` and the target is in reach and
+    in the image.
     """
 
     chaser: ChaserId
@@ -231,7 +244,7 @@ class Image(Message, frozen=True, kw_only=True):
     height_px: Annotated[int, Meta(ge=1, le=8192)]
     encoding: Literal["jpeg", "mono8"]
     data: Annotated[bytes, Meta(max_length=16_000_000)]
-    ranging: PoseSolution | None = None
+    ranging: RangeMeasurement | None = None
 
 
 _EXACT = (0.0,) * 9

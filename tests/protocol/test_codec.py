@@ -66,6 +66,7 @@ def test_there_is_a_sample_of_every_message() -> None:
         m.MassEstimate,
         m.PoseSolution,
         m.ProbeTouch,
+        m.RangeMeasurement,
         m.RelativeEstimate,
         m.ThrusterPulse,
     }

@@ -14,11 +14,20 @@ from chaserdock_protocol.messages import (
     GeometryMeasurement,
     Image,
     PoseSolution,
+    RangeMeasurement,
     Sighting,
 )
 from numpy.typing import NDArray
 
-from .perception import GeometryInformation, PerceptionMethod
+from .perception import (
+    BearingError,
+    BearingFinder,
+    FarPerception,
+    GeometryInformation,
+    PerceptionMethod,
+    RangedTarget,
+    TargetPose,
+)
 
 Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Predicted pose of the target: position (3,) in IRF and rotation (4,) TRF to IRF."""
@@ -71,10 +80,12 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def look(perception: PerceptionMethod, image: Image, predicted: Prediction | None) -> Sighting:
-    """Return the sighting of the target in an image, by ranging where nothing is detected; the caller sets ``wall_estimate_s``."""
+    """Return the sighting of the target in an image, by markers or, where that is more accurate, by bearing and range; the caller sets
+    ``wall_estimate_s``."""
     header: dict[str, Any] = {"tick": image.tick, "sim_time_ns": image.sim_time_ns, "chaser": image.chaser}
     try:
-        seen = perception.estimate(decode_image(image), predicted)
+        pixels = decode_image(image)
+        seen = perception.estimate(pixels, predicted)
     except (BadImage, ValueError) as error:
         return Sighting(
             **header,
@@ -85,25 +96,15 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
             rejected_ids=(),
             detail=str(error)[:500],
         )
-    solutions = tuple(
-        PoseSolution(
-            position_m=vector(s.position_irf_m),
-            q_wxyz=vector(s.q_irf_trf_wxyz),
-            covariance=vector(s.covariance),
-            reprojection_rms_px=float(s.reprojection_rms_px),
-        )
-        for s in seen.solutions
-    )
-    if not solutions and image.ranging is not None:
-        rejected = tuple(int(i) for i in seen.rejected_ids)
-        return Sighting(
-            **header,
-            status="seen",
-            solutions=(image.ranging,),
-            marker_ids=(),
-            corners_px=(),
-            rejected_ids=rejected,
-        )
+    solutions, detail = tuple(_solution(pose) for pose in seen.solutions), ""
+    if image.ranging is not None and isinstance(perception, FarPerception):
+        try:
+            far = _by_bearing(perception.by_bearing, pixels, image.ranging, predicted)
+            if not solutions or _variance(far) < _variance(solutions[0]):
+                rejected = tuple(int(i) for i in seen.rejected_ids)
+                return _without_markers(header, far, rejected)
+        except BearingError as error:
+            detail = "" if solutions else str(error)
     return Sighting(
         **header,
         status="seen" if solutions else "nothing",
@@ -111,8 +112,37 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         marker_ids=tuple(np.asarray(seen.marker_ids).tolist()),
         corners_px=vector(np.asarray(seen.corners_px, dtype=float)),
         rejected_ids=tuple(int(i) for i in seen.rejected_ids),
+        detail=detail,
         geometry=None if seen.geometry is None else geometry_message(seen.geometry),
     )
+
+
+def _without_markers(header: dict[str, Any], pose: PoseSolution, rejected: tuple[int, ...]) -> Sighting:
+    return Sighting(
+        **header, status="seen", solutions=(pose,), marker_ids=(), corners_px=(), rejected_ids=rejected
+    )
+
+
+def _variance(pose: PoseSolution) -> float:
+    """Return the sum of the variances of the position, m²."""
+    return pose.covariance[0] + pose.covariance[7] + pose.covariance[14]
+
+
+def _solution(pose: TargetPose) -> PoseSolution:
+    return PoseSolution(
+        position_m=vector(pose.position_irf_m),
+        q_wxyz=vector(pose.q_irf_trf_wxyz),
+        covariance=vector(pose.covariance),
+        reprojection_rms_px=float(pose.reprojection_rms_px),
+    )
+
+
+def _by_bearing(
+    finder: BearingFinder, pixels: NDArray[np.uint8], measured: RangeMeasurement, predicted: Prediction | None
+) -> PoseSolution:
+    covariance = np.array(measured.attitude_covariance_rad2).reshape(3, 3)
+    target = RangedTarget(measured.range_m, measured.range_sigma_m, np.array(measured.q_wxyz), covariance)
+    return _solution(finder.find(pixels, target, None if predicted is None else predicted[0]))
 
 
 def geometry_message(found: GeometryInformation) -> GeometryMeasurement:

@@ -12,10 +12,11 @@ from .fields import Fraction, NotNegative, Positive, Section
 
 
 class Ranging(Section):
-    """Measurements at far range, of a target too small in the image for its markers: its bearing, from the image, its range, from a
-    range sensor, and its attitude, as a cooperative target sends it. The errors are white. With images as with
-    `perception.name = "statistical"`; where markers are detected, they alone are used ([estimation.md](estimation.md#far-range)).
-    Without this section: a target whose markers are too small is not seen."""
+    """Measurements at far range, of a target too small in the image for its markers: its range, from a range sensor, and its attitude,
+    as a cooperative target sends it, with white errors. The bearing is measured in the image, where the target is the spot of the
+    size that it has at that range; with `perception.name = "statistical"`, which has no image, it is drawn with a white error. In
+    images in which markers give the more accurate position, these are used ([estimation.md](estimation.md#far-range)). Without this
+    section: a target whose markers are too small is not seen."""
 
     range_noise_m: Positive = Field(
         default=0.02, description="Standard deviation of the range, m, of a target nearby."
@@ -26,7 +27,8 @@ class Ranging(Section):
     bearing_noise_deg: Positive = Field(
         default=0.005,
         lt=10,
-        description="Standard deviation of the bearing per axis, degrees: about a tenth of a pixel.",
+        description="Standard deviation of the bearing per axis, degrees: about a tenth of a pixel. Used by "
+        '`perception.name = "statistical"` only.',
     )
     attitude_noise_deg: Positive = Field(
         default=0.02, lt=90, description="Standard deviation of the attitude that the target sends, degrees."

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.ranging import ranged_pose
+from chaserdock_models.ranging import range_reading
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Image, PoseSolution
+from chaserdock_protocol.messages import Image, RangeMeasurement
 from chaserdock_protocol.pose_image import WIDTH_PX, encode_pose
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.ranging import Ranging
@@ -31,13 +31,16 @@ class PoseSensor:
         self._focal_px = scenario.camera_model().fx_px
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
 
+    def seen_pose(self, chaser: int, states: States) -> tuple[Array, Array]:
+        """Return the pose as `pose`; with a longer focal length than calibrated, the target seems nearer."""
+        position, q = self.pose(chaser, states)
+        return position * [1.0, 1.0, self._focal_px / self._cameras[chaser].fx_px], q
+
     def pose(self, chaser: int, states: States) -> tuple[Array, Array]:
         """Return position (3,) m in IRF and rotation (4,) TRF to IRF."""
         camera, own, target = self._cameras[chaser], states[f"chaser/{chaser}"], states[TARGET]
         eye, attitude = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
         position = rotations.rotate_inverse(attitude, target.position_m - eye)
-        # With a longer focal length than calibrated, the target seems nearer.
-        position = position * [1.0, 1.0, self._focal_px / camera.fx_px]
         return position, rotations.multiply(rotations.conjugate(attitude), target.q_wxyz)
 
     def drawn(self, chaser: int, number: int) -> tuple[int, int]:
@@ -63,7 +66,7 @@ class PoseCameras:
 
     def image(self, chaser: int, number: int, tick: int, time_ns: int, states: States) -> Image:
         """Return image ``number`` of a chaser, which sees the target as in ``states``."""
-        position, q = self._sensor.pose(chaser, states)
+        position, q = self._sensor.seen_pose(chaser, states)
         return Image(
             tick=tick,
             sim_time_ns=time_ns,
@@ -76,7 +79,7 @@ class PoseCameras:
 
 
 class RangingCameras:
-    """Makes rendered images as ``Cameras`` does, with the measurements of ``[ranging]`` at the same time."""
+    """Makes rendered images as ``Cameras`` does, with the range and the sent attitude of ``[ranging]`` at the same time."""
 
     def __init__(self, scenario: Scenario, ranging: Ranging) -> None:
         self._cameras, self._sensor = Cameras(scenario), PoseSensor(scenario)
@@ -95,17 +98,17 @@ class RangingCameras:
 
     def _ranged(self, image: Image, number: int, states: States) -> Image:
         position, q = self._sensor.pose(image.chaser, states)
-        white = np.random.default_rng(self._sensor.drawn(image.chaser, number)).standard_normal(6)
-        found = ranged_pose(self._errors, self._calibrated, position, q, white)
+        white = np.random.default_rng(self._sensor.drawn(image.chaser, number)).standard_normal(4)
+        found = range_reading(self._errors, self._calibrated, position, q, white)
         if found is None:
             return image
-        pose = PoseSolution(
-            position_m=vector(found.position_m),
+        measured = RangeMeasurement(
+            range_m=found.range_m,
+            range_sigma_m=found.sigma_m,
             q_wxyz=vector(found.q_wxyz),
-            covariance=vector(found.covariance),
-            reprojection_rms_px=found.bearing_px,
+            attitude_covariance_rad2=vector(self._errors.attitude_rad**2 * np.eye(3)),
         )
-        return msgspec.structs.replace(image, ranging=pose)
+        return msgspec.structs.replace(image, ranging=measured)
 
 
 def make_cameras(scenario: Scenario) -> Cameras | PoseCameras | RangingCameras:

@@ -11,6 +11,7 @@ from chaserdock_protocol.scenario import PERCEPTIONS, FlightScenario
 from chaserdock_protocol.scenario.bodies import FlightTarget
 from numpy.typing import ArrayLike, NDArray
 
+from .bearing import BearingError, BearingFinder, RangedTarget
 from .model.mesh import TrackerMesh
 from .model.perception import ModelPerception
 from .pipeline import GeometryInformation, Method, Perception, PerceptionResult, TargetPose
@@ -25,13 +26,30 @@ class PerceptionMethod(Protocol):
     ) -> PerceptionResult: ...
 
 
+class FarPerception:
+    """A perception by markers that measures a target too far for these by its bearing, at a measured range."""
+
+    def __init__(self, by_markers: Perception, by_bearing: BearingFinder) -> None:
+        self.by_markers, self.by_bearing = by_markers, by_bearing
+
+    def estimate(
+        self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
+    ) -> PerceptionResult:
+        """Return what is measured by markers."""
+        return self.by_markers.estimate(image, predicted)
+
+
 def make_perception(scenario: FlightScenario) -> PerceptionMethod:
     """Return the perception that the scenario names: a built-in one, or an installed ``chaserdock.perceptions`` entry point,
     a function of (camera: Camera, target: TargetModel). Raises PluginError if it is not installed."""
     camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:
         case "default" | "paper" | "paper_iterative" as method:
-            return Perception(camera, target, method)
+            by_markers = Perception(camera, target, method)
+            if scenario.ranging is None:
+                return by_markers
+            focal_share = scenario.navigation.errors().camera_focal_share
+            return FarPerception(by_markers, BearingFinder(camera, target, focal_share))
         case "statistical":
             return StatisticalPerception(camera, target, scenario.ranging)
         case "model":
@@ -51,11 +69,15 @@ def tracker_mesh(target: FlightTarget) -> TrackerMesh:
 
 
 __all__ = [
+    "BearingError",
+    "BearingFinder",
+    "FarPerception",
     "GeometryInformation",
     "Method",
     "Perception",
     "PerceptionMethod",
     "PerceptionResult",
+    "RangedTarget",
     "TargetPose",
     "make_perception",
     "tracker_mesh",

@@ -38,8 +38,10 @@ SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
 # Errors of geometry and shading change only with the view, and are alike in the images of several cameras.
 SHAPE = SightingNoise(white_ratio=1.0, view_ratio=2.4, view_time_s=10.0)
-# Range, bearing and attitude of `[ranging]` have white errors of the stated size.
+# Without images, range, bearing and attitude of `[ranging]` have white errors of the stated size.
 RANGING = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
+# A bearing from an image: light, markers and the pixel grid shift the centroid as long as the view stays the same.
+BEARING = SightingNoise(white_ratio=1.0, view_ratio=1.0, view_time_s=25.0)
 
 
 @dataclass(frozen=True)

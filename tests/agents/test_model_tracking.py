@@ -107,7 +107,9 @@ def test_sun_behind_a_target_is_estimated_from_its_rims(number):
     image = satellite_image(pose, Light(tuple(sun.tolist()), 1.0 - ambient, ambient), number)
     mesh = TrackerMesh.of_mesh(satellite("geo_servicer"), 0.0, 0.0)
     prior = perturbed(pose, rng, 0.003, np.deg2rad(0.3))
-    alignment, light = tracking.refine_from_prior(Pyramid(image, WIDE), mesh, prior)
+    found = tracking.refine_from_prior(Pyramid(image, WIDE), mesh, prior)
+    assert found is not None
+    alignment, light = found
     assert tracking.is_valid(alignment)
     assert light.to_sun_irf @ sun > np.cos(np.deg2rad(10.0)) * np.linalg.norm(sun)
     error = tracking.pose_error(alignment.pose, pose)

@@ -51,7 +51,7 @@ from chaserdock.analysis.time_series import OUTCOMES, ActuatorHistory, ImageOutc
 from chaserdock.analysis.video import _ExternalView, frames, wrapped, write_video
 
 TICK_NS = 1_000_000_000 // 15
-SIZE = {"width_px": 96, "height_px": 64}
+SIZE: dict[str, Any] = {"width_px": 96, "height_px": 64}
 
 
 def put(writer: LogWriter, topic: topics.Topic, place: Any, message: Any) -> None:

@@ -56,7 +56,9 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
             assert all(inner[0][k] == v for k, v in plain.items())
         elif isinstance(value, msgspec.Struct):
             for part, whole_part in msgspec.to_builtins(value).items():
-                if f"{name}_{part}" in row:
+                if part == "q_wxyz":
+                    assert [row[f"{name}_q_{axis}"] for axis in "wxyz"] == list(whole_part)
+                elif f"{name}_{part}" in row:
                     assert row[f"{name}_{part}"] == (
                         list(whole_part) if isinstance(whole_part, tuple) else whole_part
                     )

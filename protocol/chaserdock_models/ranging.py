@@ -24,6 +24,10 @@ class RangingErrors:
     attitude_rad: float
     reach_m: float
 
+    def range_sigma_m(self, distance_m: float) -> float:
+        """Return the standard deviation of the range at a distance."""
+        return math.hypot(self.range_m, self.range_share * distance_m)
+
 
 @dataclass(frozen=True, eq=False)
 class RangedPose:
@@ -63,7 +67,7 @@ def range_reading(
     if not _in_view(errors, camera, position_m):
         return None
     distance = float(np.linalg.norm(position_m))
-    sigma = math.hypot(errors.range_m, errors.range_share * distance)
+    sigma = errors.range_sigma_m(distance)
     turned = rotations.multiply(q_wxyz, rotations.exp(errors.attitude_rad * white[1:]))
     return RangeReading(distance + sigma * float(white[0]), sigma, turned)
 
@@ -79,7 +83,7 @@ def ranged_pose(
         return None
     distance = float(np.linalg.norm(position_m))
     along = position_m / distance
-    range_m = math.hypot(errors.range_m, errors.range_share * distance)
+    range_m = errors.range_sigma_m(distance)
     across_m = errors.bearing_rad * distance
     covariance = np.zeros((6, 6))
     line = np.outer(along, along)

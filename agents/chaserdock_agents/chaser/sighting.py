@@ -97,11 +97,11 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
             detail=str(error)[:500],
         )
     solutions, detail = tuple(_solution(pose) for pose in seen.solutions), ""
+    rejected = tuple(int(i) for i in seen.rejected_ids)
     if image.ranging is not None and isinstance(perception, FarPerception):
         try:
             far = _by_bearing(perception.by_bearing, pixels, image.ranging, predicted)
             if not solutions or _variance(far) < _variance(solutions[0]):
-                rejected = tuple(int(i) for i in seen.rejected_ids)
                 return _without_markers(header, far, rejected)
         except BearingError as error:
             detail = "" if solutions else str(error)
@@ -111,7 +111,7 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         solutions=solutions,
         marker_ids=tuple(np.asarray(seen.marker_ids).tolist()),
         corners_px=vector(np.asarray(seen.corners_px, dtype=float)),
-        rejected_ids=tuple(int(i) for i in seen.rejected_ids),
+        rejected_ids=rejected,
         detail=detail,
         geometry=None if seen.geometry is None else geometry_message(seen.geometry),
     )

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.random_numbers import generator
 from chaserdock_models.ranging import range_reading
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Image, RangeMeasurement
@@ -98,7 +99,7 @@ class RangingCameras:
 
     def _ranged(self, image: Image, number: int, states: States) -> Image:
         position, q = self._sensor.pose(image.chaser, states)
-        white = np.random.default_rng(self._sensor.drawn(image.chaser, number)).standard_normal(4)
+        white = generator(self._sensor.drawn(image.chaser, number)).standard_normal(4)
         found = range_reading(self._errors, self._calibrated, position, q, white)
         if found is None:
             return image

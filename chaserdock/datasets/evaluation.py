@@ -37,7 +37,7 @@ def perception_of(name: str | None, flight: FlightScenario, camera: Camera) -> P
         raise DatasetError(f"--perception {used}: needs no images, it draws measurements; give another one")
     if used in get_args(Method) and not flight.target_model().markers:
         raise DatasetError(f"--perception {used}: needs markers; the target {flight.target.model!r} has none")
-    return make_perception(flight.model_copy(update=updated))
+    return make_perception(flight.model_copy(update=updated), single_images=True)
 
 
 def _of_class(name: str, flight: FlightScenario, camera: Camera) -> PerceptionMethod:

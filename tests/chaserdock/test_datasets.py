@@ -212,6 +212,20 @@ def test_evaluate_scores_markers_in_both_layouts(tmp_path: Path, capsys: pytest.
     assert "images 3, with a pose 3 (100.0%)" in capsys.readouterr().out
 
 
+def test_evaluate_scores_shapes_without_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An acquisition, which a flight spreads over several images, ends in the image in which it begins."""
+    folder = tmp_path / "made"
+    export_dataset(
+        scenario("seed=1"), folder, 3, ViewLimits((1.0, 2.0), 0.2, (20.0, 60.0)), ("speed+",), 1.0
+    )
+    app(["evaluate", "perception", str(folder), "--json"], standalone_mode=False)
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["perception"] == "model"
+    assert (figures["images"], figures["with_pose"]) == (3, 3)
+    assert figures["attitude_rad_p95"] < np.deg2rad(1.0)
+    assert figures["position_share_p95"] < 0.01
+
+
 BROKEN = {
     "no folder": (lambda d: shutil.rmtree(d), "no such folder"),
     "no labels": (lambda d: shutil.rmtree(d / "synthetic"), "no dataset; expected"),

@@ -39,9 +39,13 @@ class FarPerception:
         return self.by_markers.estimate(image, predicted)
 
 
-def make_perception(scenario: FlightScenario) -> PerceptionMethod:
+def make_perception(scenario: FlightScenario, single_images: bool = False) -> PerceptionMethod:
     """Return the perception that the scenario names: a built-in one, or an installed ``chaserdock.perceptions`` entry point,
-    a function of (camera: Camera, target: TargetModel). Raises PluginError if it is not installed."""
+    a function of (camera: Camera, target: TargetModel).
+
+    ``single_images``: images do not follow each other, so that an acquisition ends in the image in which it begins. Raises
+    PluginError for a perception that is not installed.
+    """
     camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:
         case "default" | "paper" | "paper_iterative" as method:
@@ -53,7 +57,7 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
         case "statistical":
             return StatisticalPerception(camera, target, scenario.ranging)
         case "model":
-            perception = ModelPerception(camera, tracker_mesh(scenario.target))
+            perception = ModelPerception(camera, tracker_mesh(scenario.target), single_images=single_images)
             perception.prepare()
             return perception
         case name:

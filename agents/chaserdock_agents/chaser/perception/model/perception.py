@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 
@@ -86,12 +87,20 @@ class ModelPerception:
     Work that takes longer than the time of an image is spread over several: an acquisition, or starts around a lost pose. Until it
     ends, images wait and give no solution; then the target is tracked through them, several at each new image, up to the newest one.
     Without a track, a pose that others predict is tried first; an acquisition follows when that has failed for about a second.
-    One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be shared. ``solutions`` are ambiguous
-    poses, the best first, and without markers.
+    One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be shared. With ``single_images``, which
+    do not follow each other, an acquisition ends in the image in which it begins. ``solutions`` are ambiguous poses, the best
+    first, and without markers.
     """
 
-    def __init__(self, camera: Camera, mesh: TrackerMesh, acquisition: Acquisition | None = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        mesh: TrackerMesh,
+        acquisition: Acquisition | None = None,
+        single_images: bool = False,
+    ) -> None:
         self.camera, self.mesh = camera, mesh
+        self._per_image_ms = math.inf if single_images else _PER_IMAGE_MS
         self._acquisition = acquisition or Acquisition(camera, mesh)
         self._tracks: tuple[PoseTrack, ...] = ()
         self._waiting: deque[_WaitingImage] = deque()
@@ -175,7 +184,7 @@ class ModelPerception:
                 if not self._tracks:  # the newest image is nearest to those to come
                     self._waiting = deque([self._waiting[-1]])
                 self._work, self._next_ms = self._process(self._waiting[0]), 0.0
-            if spent_ms > 0.0 and spent_ms + self._next_ms > _PER_IMAGE_MS:
+            if spent_ms > 0.0 and spent_ms + self._next_ms > self._per_image_ms:
                 return
             spent_ms += self._next_ms
             try:

@@ -215,9 +215,7 @@ def test_evaluate_scores_markers_in_both_layouts(tmp_path: Path, capsys: pytest.
 def test_evaluate_scores_shapes_without_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An acquisition, which a flight spreads over several images, ends in the image in which it begins."""
     folder = tmp_path / "made"
-    export_dataset(
-        scenario("seed=1"), folder, 3, ViewLimits((1.0, 2.0), 0.2, (20.0, 60.0)), ("speed+",), 1.0
-    )
+    export_dataset(scenario("seed=1"), folder, 3, ViewLimits((1.0, 2.0), 0.2, (20.0, 60.0)), ("speed+",), 1.0)
     app(["evaluate", "perception", str(folder), "--json"], standalone_mode=False)
     figures = json.loads(capsys.readouterr().out)
     assert figures["perception"] == "model"

@@ -83,6 +83,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
             position_by_errors=(0.001, 0.0, 0.0, 0.0, 0.0, 0.003),
             position_covariance_m2=(1e-8, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 1e-6),
         ),
+        acquiring=True,
         wall_estimate_s=0.01,
     ),
     m.TargetEstimate(

@@ -386,6 +386,7 @@ class Sighting(Message, frozen=True, kw_only=True):
 
     The best solution comes first; a second one follows if a single small marker is ambiguous.
     ``corners_px``: u, v of the four corners of each used marker, in the distorted image. ``geometry``: by shape only.
+    ``acquiring``: the chaser is still searching an earlier image for the target, or tracking it through those since then.
     """
 
     chaser: ChaserId
@@ -396,6 +397,7 @@ class Sighting(Message, frozen=True, kw_only=True):
     rejected_ids: MarkerIds
     detail: Text = ""
     geometry: GeometryMeasurement | None = None
+    acquiring: bool = False
     wall_estimate_s: float = 0.0
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import CameraPose, Measurement, Mekf, MekfParameters, PoseHypothesis
 from chaserdock_controller.estimation.camera_calibration import predict_measurement
+from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.pointing import (
     CALIBRATION_S,
@@ -20,6 +22,7 @@ from chaserdock_controller.guidance.pointing import (
     search_angles,
     search_wrench,
 )
+from chaserdock_controller.guidance.target_search import SearchProgress, TargetSearch
 from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
@@ -70,6 +73,33 @@ def test_search_rings_grow_without_jumps_of_the_line_of_sight() -> None:
     assert np.abs(np.diff(at, axis=0)).max() < math.radians(2.5)
     largest = [np.abs(at[int(20 * a) : int(20 * b)]).max() for a, b in ((0, 14), (14, 40), (40, 80))]
     assert largest[0] < largest[1] < largest[2] <= math.radians(170.0)
+
+
+def test_chaser_pauses_its_search_while_it_acquires_the_target_for_8_s_at_most_and_turns_2_s_between() -> (
+    None
+):
+    def turned_s(acquiring: Callable[[float], bool | None]) -> float:
+        progress = SearchProgress(1.0, np.array([1.0, 0.0, 0.0, 0.0]), 1.0)
+        for k in range(15 * 20 + 1):
+            progress = progress.at(1.0 + k / 15, acquiring(k / 15))
+        return 20.0 - progress.paused_s
+
+    assert turned_s(lambda t: False) == 20.0
+    assert turned_s(lambda t: t < 5.0) == pytest.approx(15.0, abs=0.1)
+    # Images without a sighting do not end a pause.
+    assert turned_s(lambda t: None if int(15 * t) % 3 else t < 5.0) == pytest.approx(15.0, abs=0.3)
+    assert turned_s(lambda t: None) == 20.0
+    assert turned_s(lambda t: True) == pytest.approx(4.0, abs=0.2)
+
+
+def test_paused_search_goes_on_where_it_stopped() -> None:
+    s = scenario()
+    target = TargetState(0, V, V, np.array([1.0, 0.0, 0.0, 0.0]), W, np.eye(12), "none", 0, ())
+    search, q = TargetSearch(s.chaser, CAMERA), np.array([1.0, 0.0, 0.0, 0.0])
+    x = np.concatenate([np.zeros(6), q, np.zeros(3)])
+    for k in range(61):
+        wrench = search.wrench(_odometry(0, k, x), 0.0, target, acquiring=k <= 30)
+    np.testing.assert_array_equal(wrench, search_wrench(_odometry(0, 60, x), s.chaser, CAMERA, q, 2.0))
 
 
 def test_chaser_tracks_search_pattern_within_torque_limit() -> None:

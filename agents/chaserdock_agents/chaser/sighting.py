@@ -114,6 +114,7 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         rejected_ids=rejected,
         detail=detail,
         geometry=None if seen.geometry is None else geometry_message(seen.geometry),
+        acquiring=seen.acquiring,
     )
 
 

@@ -22,6 +22,7 @@ import foxglove.messages as fox
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.meshes import TriangleMesh
 from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box, cuboid_corners
 from chaserdock_protocol import topics
@@ -119,9 +120,9 @@ class ViewerLayer:
         ]
         self._put("scene", fox.SceneUpdate(entities=entities), time_ns)
         body = self._scenario.chaser
-        chaser = _mesh_points(body.mesh) if body.mesh else _outline([Box(body.size_m)])
-        model = self._scenario.target_model()
-        target = _mesh_points(model.satellite) if model.satellite else _outline(model.boxes)
+        chaser = _mesh_points(satellite(body.mesh, _SPACING_M)) if body.mesh else _outline([Box(body.size_m)])
+        mesh = self._scenario.target.nominal_mesh(_SPACING_M)
+        target = _outline(self._scenario.target_model().boxes) if mesh is None else _mesh_points(mesh)
         self._put("target/points", _cloud(stamp, "target", target), time_ns)
         for i in range(len(self._scenario.chasers)):
             self._put(f"chaser/{i}/points", _cloud(stamp, f"chaser/{i}", chaser), time_ns)
@@ -174,10 +175,9 @@ def _outline(boxes: Iterable[Box]) -> Array:
     return np.concatenate(points)
 
 
-def _mesh_points(name: str) -> Array:
-    """Return points (N, 3) on a satellite: along the edges of its triangles."""
-    parts = satellite(name, _SPACING_M).parts
-    corners = np.concatenate([part.vertices_m[part.triangles] for part in parts])
+def _mesh_points(mesh: TriangleMesh) -> Array:
+    """Return points (N, 3) along the edges of the triangles of a mesh."""
+    corners = np.concatenate([part.vertices_m[part.triangles] for part in mesh.parts])
     ends = np.roll(corners, -1, axis=1)
     shares = np.linspace(0.0, 1.0, 6)[:-1, None, None, None]
     points = ((1.0 - shares) * corners + shares * ends).reshape(-1, 3)

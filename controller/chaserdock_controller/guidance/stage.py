@@ -297,7 +297,8 @@ class GuidanceStage:
         if i not in observation.odometry:
             return None
         if c.phase is Phase.SEARCHING:
-            wrench = self.search.wrench(estimation.own[i], c.since_s, estimation.target)
+            acquiring = next((s.acquiring for s in observation.sightings if s.chaser == i), None)
+            wrench = self.search.wrench(estimation.own[i], c.since_s, estimation.target, acquiring)
             return DirectCommand("search", wrench)
         if attached:
             pull_N = self.machine.pull_N(i, observation.time_s)

@@ -32,6 +32,7 @@ from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.docking import DockingObservation
+from chaserdock_controller.guidance.target_search import SearchProgress
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan, PlanningFailure
 
@@ -124,7 +125,7 @@ class CommandHistoryState(Struct, forbid_unknown_fields=True):
 
 
 class SearchState(Struct, forbid_unknown_fields=True):
-    _starts: dict[int, tuple[float, Array]]
+    _progress: dict[int, SearchProgress]
 
 
 class LostChaserState(Struct, forbid_unknown_fields=True):

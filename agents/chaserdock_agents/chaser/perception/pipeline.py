@@ -45,7 +45,7 @@ class PerceptionResult:
     ``solutions``: best first; empty without a trustworthy pose, two if a plane's tilt is ambiguous. ``marker_ids`` (n,)
     and ``corners_px`` (n, 4, 2), distorted image: the used markers. ``rejected_ids``: detected but not used, ascending: not
     on this target, duplicate, inconsistent with the others, or with an unusable side. ``geometry``: what the image tells about the
-    errors of a known shape, by a perception that estimates them.
+    errors of a known shape, by a perception that estimates them. ``acquiring``: work on an earlier image has not ended.
     """
 
     solutions: tuple[TargetPose, ...]
@@ -53,6 +53,7 @@ class PerceptionResult:
     corners_px: Array
     rejected_ids: tuple[int, ...]
     geometry: GeometryInformation | None = None
+    acquiring: bool = False
 
 
 class Perception:

@@ -162,7 +162,8 @@ class ModelPerception:
         tracks = () if self._waiting else self._tracks
         valid = [_target_pose(t.last) for t in tracks if t.missed == 0]
         geometry = self._geometry() if tracks else None
-        return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), (), geometry)
+        no_ids, no_corners = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
+        return PerceptionResult(tuple(valid), no_ids, no_corners, (), geometry, acquiring=bool(self._waiting))
 
     def _geometry(self) -> GeometryInformation | None:
         """Return what the image tells about the errors of the mesh before corrections, if there is one track; without information

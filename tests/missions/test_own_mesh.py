@@ -26,7 +26,9 @@ def test_own_mesh_is_acquired_by_a_single_chaser_and_drawn(tmp_path: Path) -> No
         "camera.height_px=360",
     )
     assert status == 0, text
-    assert summary(tmp_path / "run")["events"][-1]["what"].endswith("goto (from searching: the target is found)")
+    assert summary(tmp_path / "run")["events"][-1]["what"].endswith(
+        "goto (from searching: the target is found)"
+    )
     log = open_log(tmp_path / "run")
     assert list(log.messages("controller/target"))[-1].status == "tracking"
     shape = np.concatenate([face.corners_m for face in scene_of(log.scenario).target])

@@ -12,7 +12,8 @@ front of the target are random. Parts:
 - ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are averaged by their covariances;
 - ``triangulated``: as ``knowledge``, after one image of each of four cameras around the target at 1 to 1.6 m, whose distances odometry
   of grade `lab` measures, which tells the scale;
-- ``independent``: as ``exact``, with images by the ray tracer Embree, without texture;
+- ``independent`` and ``independent-knowledge``: as ``exact`` and ``knowledge``, with images by the ray tracer Embree, without
+  texture;
 - ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
   target is darker than 5 grey levels are left out, here and with the lamp;
 - ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp, that of `harsh-light`, and at 1 to 3 m
@@ -57,7 +58,7 @@ from chaserdock_controller.estimation.target_shape import ShapeFilter, seen_plac
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.meshes import with_geometry_errors
+from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
 from chaserdock_models.satellites import satellite
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import PoseSolution
@@ -355,7 +356,7 @@ def crossed(cells: Cells, range_m: float, views: int) -> Figures:
     return tracking_figures(key, cells.rows(key, views, view))
 
 
-def independent(cells: Cells, range_m: float, views: int) -> Figures:
+def independent(cells: Cells, name: str, range_m: float, views: int) -> Figures:
     """Track images of an independent renderer at one range."""
     from embree_images import plain, trace
 
@@ -364,13 +365,14 @@ def independent(cells: Cells, range_m: float, views: int) -> Figures:
     tracker = TrackerMesh.of_mesh(mesh, 0.0, 0.0)
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
+        drawn = tracker if name == "independent" else _drawn_mesh(rng, plain(KNOWN))
         pose, light = random_view(rng, range_m, CAMERA)
         exact = trace(mesh, CAMERA, pose.position, rotations.from_matrix(pose.rotation), light, 3).level
         spread = cv2.GaussianBlur(exact, (0, 0), Effects().point_spread_px)
         image = effects.apply(np.rint(np.clip(spread, 0.0, 255.0)).astype(np.uint8), 0, number)
-        return tracked_view(image, tracker, pose, perturbed(pose, rng, *PRIOR))
+        return tracked_view(image, drawn, pose, perturbed(pose, rng, *PRIOR))
 
-    key = f"independent_{range_m:g}m"
+    key = f"{name}_{range_m:g}m"
     return tracking_figures(key, cells.rows(key, views, view))
 
 
@@ -532,10 +534,10 @@ def _track(image: NDArray[np.uint8], mesh: TrackerMesh, prior: PoseInCamera) -> 
     return refined[0] if refined else None
 
 
-def _drawn_mesh(rng: np.random.Generator) -> TrackerMesh:
+def _drawn_mesh(rng: np.random.Generator, known: TriangleMesh = KNOWN) -> TrackerMesh:
     """Return a tracker mesh with drawn errors."""
-    turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in KNOWN.joints}
-    wrong = with_geometry_errors(KNOWN, rng.normal(0.0, SCALE_SIGMA), turns)
+    turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in known.joints}
+    wrong = with_geometry_errors(known, rng.normal(0.0, SCALE_SIGMA), turns)
     return TrackerMesh.of_mesh(wrong, PANEL_SIGMA_RAD, SCALE_SIGMA)
 
 
@@ -555,6 +557,7 @@ def main() -> None:
         "triangulated",
         "inspect",
         "independent",
+        "independent-knowledge",
         "behind",
         "backlit",
         "lamp",
@@ -592,7 +595,10 @@ def main() -> None:
             "crossed": lambda: at_ranges(lambda m: crossed(cells, m, views)),
             "triangulated": lambda: at_ranges(lambda m: triangulated(cells, m, views)),
             "inspect": lambda: inspect(views),
-            "independent": lambda: at_ranges(lambda m: independent(cells, m, views)),
+            "independent": lambda: at_ranges(lambda m: independent(cells, "independent", m, views)),
+            "independent-knowledge": lambda: at_ranges(
+                lambda m: independent(cells, "independent-knowledge", m, views)
+            ),
             "behind": lambda: behind(cells, views),
             "backlit": lambda: backlit(cells, views),
             "lamp": lambda: lamp(cells, views),

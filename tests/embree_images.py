@@ -60,7 +60,16 @@ def trace(
     h, w = camera.height_px, camera.width_px
     sums = np.zeros((6, h, w))
     first, same = np.zeros((h, w), dtype=np.int64), np.ones((h, w), dtype=bool)
-    y, x = np.mgrid[0:h, 0:w].astype(float)
+    # No ray outside of this cone hits.
+    radius_m, distance_m = np.linalg.norm(soup.corners_m, axis=-1).max(), np.linalg.norm(position)
+    widest = np.arcsin(min(radius_m / distance_m, 1.0)) + 2.0 / camera.fx_px
+    y, x = (axis.ravel() for axis in np.mgrid[0:h, 0:w].astype(float))
+    centres = np.stack(
+        [(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px, np.ones_like(x)], axis=-1
+    )
+    cosines = centres @ position / distance_m / np.linalg.norm(centres, axis=1)
+    near = np.flatnonzero(cosines > np.cos(widest))
+    x, y = x[near], y[near]
     steps = (np.arange(samples) + 0.5) / samples - 0.5
     surfaces = np.array([(p.material.diffuse, p.material.specular, p.material.shininess) for p in mesh.parts])
     for number, (j, i) in enumerate((j, i) for j in steps for i in steps):
@@ -68,12 +77,13 @@ def trace(
             [(x + i - camera.cx_px) / camera.fx_px, (y + j - camera.cy_px) / camera.fy_px, np.ones_like(x)],
             axis=-1,
         )
-        rays = rays.reshape(-1, 3) / np.linalg.norm(rays.reshape(-1, 3), axis=1, keepdims=True)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         hit = scene.run(np.zeros_like(rays, dtype=np.float32), rays.astype(np.float32), output=1)
-        seen = np.flatnonzero(hit["primID"] >= 0)
-        lit, dark, sunlit = _shade(scene, hit, seen, rays[seen], corners, normals, soup.part, surfaces, light)
+        hits = np.flatnonzero(hit["primID"] >= 0)
+        lit, dark, sunlit = _shade(scene, hit, hits, rays[hits], corners, normals, soup.part, surfaces, light)
+        seen = near[hits]
         part = np.full(h * w, -1)
-        part[seen] = soup.part[hit["primID"][seen]]
+        part[seen] = soup.part[hit["primID"][hits]]
         level = np.full(h * w, float(SPACE_LEVEL))
         level[seen] = np.where(sunlit, lit, dark)
         for k, values in enumerate((level[seen], np.ones(len(seen)), sunlit, lit, dark)):

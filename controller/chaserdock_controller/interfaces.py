@@ -89,7 +89,7 @@ class Observation:
     """Result of ingest: checked inputs and what follows from them about the chasers; mappings by chaser.
 
     ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states, of ``outdated`` chasers extrapolated;
-    ``invalid``: why a state is not. ``outdated``: valid odometry of earlier ticks, with the times of these, of chasers without a newer.
+    ``invalid``: why a state is not. ``outdated``: valid odometry of earlier ticks, with the times of these, of chasers without newer.
     ``lost``: last odometry of chasers that are obstacles to the others. ``ahead``: what acts on a chaser until
     ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
     ``isolated``: thrusters that chasers report as closed. ``thruster_impulses``: of the thrusters (n,) since the tick before, N s,

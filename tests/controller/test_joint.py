@@ -246,7 +246,7 @@ def test_late_odometry_counts_at_its_tick() -> None:
     than the records, changes nothing."""
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 5)
     prompt, late = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
-    measured: list[Odometry] = []
+    measured, missing = [], flight.inputs()
     for tick in range(30):
         inputs = flight.inputs()
         measured.append(inputs.odometry[1])

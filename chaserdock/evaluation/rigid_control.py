@@ -91,6 +91,7 @@ class ControlledStack:
             time_ns=now_ns,
             effective_ns=effective_ns,
             odometry=odometry,
+            outdated={},
             invalid={},
             lost={},
             sightings=(),

@@ -46,7 +46,11 @@ ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search", "detu
 
 @dataclass(frozen=True)
 class TickInputs:
-    """Messages of a tick. Sightings may belong to earlier ticks."""
+    """Messages of a tick. Sightings may belong to earlier ticks.
+
+    ``odometry``: of the tick; a lost one is extrapolated for a while. ``outdated``: the newest odometry of chasers that have none of
+    this tick, by chaser.
+    """
 
     tick: int
     time_ns: int
@@ -55,6 +59,7 @@ class TickInputs:
     commands: tuple[OperatorCommand, ...] = ()
     thrusters: Mapping[int, ThrusterReport] = field(default_factory=dict)
     docking: Mapping[int, DockingStatus] = field(default_factory=dict)
+    outdated: Mapping[int, Odometry] = field(default_factory=dict)
 
 
 @dataclass
@@ -83,7 +88,8 @@ class AppliedImpulse(NamedTuple):
 class Observation:
     """Result of ingest: checked inputs and what follows from them about the chasers; mappings by chaser.
 
-    ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states; ``invalid``: why a state is not.
+    ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states, of ``outdated`` chasers extrapolated;
+    ``invalid``: why a state is not. ``outdated``: valid odometry of earlier ticks, with the times of these, of chasers without newer.
     ``lost``: last odometry of chasers that are obstacles to the others. ``ahead``: what acts on a chaser until
     ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
     ``isolated``: thrusters that chasers report as closed. ``thruster_impulses``: of the thrusters (n,) since the tick before, N s,
@@ -94,6 +100,7 @@ class Observation:
     time_ns: int
     effective_ns: int
     odometry: Mapping[int, Odometry]
+    outdated: Mapping[int, Odometry]
     invalid: Mapping[int, str]
     lost: Mapping[int, Odometry]
     sightings: tuple[Sighting, ...]

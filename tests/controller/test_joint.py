@@ -241,6 +241,28 @@ def test_late_sightings_give_the_same_state() -> None:
     np.testing.assert_array_equal(prompt.state.extra, late.state.extra)
 
 
+def test_late_odometry_counts_at_its_tick() -> None:
+    """Odometry that arrives two ticks late gives the same state as odometry that arrived in time. What is known already, or older
+    than the records, changes nothing."""
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 5)
+    prompt, late = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
+    measured, missing = [], flight.inputs()
+    for tick in range(30):
+        inputs = flight.inputs()
+        measured.append(inputs.odometry[1])
+        missing = replace(inputs, odometry={0: inputs.odometry[0]})
+        prompt.update(inputs if tick < 28 else missing)
+        late.update(inputs if tick < 10 else replace(missing, outdated={1: measured[-3]}))
+        flight.step()
+    late.update(replace(missing, time_ns=flight.time_ns, sightings=(), outdated={1: measured[0]}))
+    prompt.update(replace(missing, time_ns=flight.time_ns, sightings=()))
+    assert prompt.state is not None
+    assert late.state is not None
+    np.testing.assert_array_equal(prompt.state.covariance, late.state.covariance)
+    np.testing.assert_array_equal(prompt.state.position_m, late.state.position_m)
+    np.testing.assert_array_equal(prompt.state.positions_m, late.state.positions_m)
+
+
 @pytest.mark.parametrize(("channel", "shift"), [("position", 0.05), ("velocity", 0.02)])
 def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) -> None:
     """The position of chaser 1 jumps by 50 mm, or it states 20 mm/s too much: it is reported within a second, and the relative

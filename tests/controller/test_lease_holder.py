@@ -94,6 +94,24 @@ def test_minority_waits_then_gives_its_lease_back_and_counts_it_no_more() -> Non
     assert holder.claim(tick(last + 1))
 
 
+@pytest.mark.parametrize(
+    ("renewed", "idle_ticks"),
+    [((0, 1), 1), ((0,), PATIENCE_TICKS), ((), PATIENCE_TICKS)],
+)
+def test_minority_gives_its_lease_back_sooner_while_the_other_commands(
+    renewed: tuple[int, ...], idle_ticks: int
+) -> None:
+    """A long lease alone does not show that its holder still commands: a majority must have executed a command meanwhile."""
+    holder, mine = standby(*(lease(i, 4, "controller", term=1, until_tick=18) for i in (0, 1))), []
+    for number in range(5, 6 + PATIENCE_TICKS):
+        for i in (0, 1):
+            until = 18 + number if i in renewed else 18
+            holder.add(lease(i, number, "controller", term=1, until_tick=until))
+        holder.add(lease(2, number, until_tick=20))
+        mine.append(holder.take_idle(tick(number))[2][1])
+    assert mine.index(True) == idle_ticks
+
+
 def test_chaser_whose_lease_is_lost_need_not_wait_for_a_command() -> None:
     holder = standby(lease(0, 5, "controller"))
     holder.add_lost(1, 5)

@@ -10,7 +10,9 @@ import msgspec
 import pytest
 from chaserdock_agents.chaser.process import ChaserProcess
 from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.ingest.tick_inputs import TickInputCollector
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_controller.process import ControllerProcess
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage
@@ -353,6 +355,37 @@ def test_controller_commands_without_lost_odometry_or_sightings(
     assert "none" not in {c.mode for c in without.values()}
     extrapolated = run_tick(controller, scenario, 3, {topics.ODOMETRY: {1}})
     assert {i: c.mode == "none" for i, c in extrapolated.items()} == {0: False, 1: False}
+
+
+def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
+    """In place of a lost odometry the controller takes its own prediction, and late odometry at its tick, whatever its clock says."""
+    core, inputs, states = ControllerCore(scenario, lambda: 0.0), TickInputCollector(scenario), {}
+    late = {4: 2, 5: 3}
+    for tick in range(6):
+        for i in (0, 1):
+            if i == 0 or tick < 2:
+                inputs.add_odometry(odometry(scenario, i, tick))
+            else:
+                inputs.add_lost(topics.ODOMETRY, i, tick)
+        if tick in late:
+            behind = msgspec.structs.replace(odometry(scenario, 1, late[tick]), sim_time_ns=0)
+            inputs.add_odometry(behind)
+        taken = inputs.take(tick_of(scenario, tick, (0, 1)), ())
+        assert set(taken.odometry) == {0, 1}
+        assert {i: o.tick for i, o in taken.outdated.items()} == ({1: late.get(tick, 1)} if tick > 1 else {})
+        core.step(taken)
+        assert isinstance(core.estimator, JointEstimator)
+        assert core.estimator.state is not None
+        states[tick] = core.estimator.state.odometry_ns[1]
+    assert states == {t: scenario.timing.tick_time_ns(late.get(t, min(t, 1))) for t in range(6)}
+
+
+def test_state_extrapolated_from_an_invalid_one_is_invalid(scenario: Scenario) -> None:
+    core, now = ControllerCore(scenario, lambda: 0.0), odometry(scenario, 0, 1)
+    invalid = msgspec.structs.replace(odometry(scenario, 0, 0), q_wxyz=(0.5, 0.0, 0.0, 0.0))
+    taken = TickInputs(1, now.sim_time_ns, {0: now}, (), outdated={0: invalid})
+    observation = core.ingest.run(taken, core.output.history)
+    assert (observation.odometry, observation.outdated, set(observation.invalid)) == ({}, {}, {0})
 
 
 def test_chaser_without_recent_odometry_gets_no_command(

@@ -106,7 +106,7 @@ def test_planning_cancels_the_wrench_of_the_orbit() -> None:
     observation = Observation(
         tick=0, time_ns=0, effective_ns=0, odometry={0: odometry(STATE)}, invalid={}, lost={}, sightings=(),
         commands=(), docking={}, impulses={}, ahead={0: ()}, input_limits={}, isolated={}, events=(),
-        thruster_impulses={}, last_commands={},
+        thruster_impulses={}, last_commands={}, outdated={},
     )  # fmt: skip
     found = EstimationStage(scenario, estimator_of(scenario)).run(observation).disturbances[0]
     body = scenario.chaser

@@ -127,11 +127,12 @@ class EstimationStage:
         latched = self.composite.latched
         return JointInputs(
             time_ns=o.time_ns,
-            odometry=o.odometry,
+            odometry={i: odometry for i, odometry in o.odometry.items() if i not in o.outdated},
             sightings=o.sightings,
             impulses=impulses,
             covered_s=self._period_s,
             last_commands=o.last_commands,
+            outdated=o.outdated,
             latched=latched,
             contacts=frozenset(touched | (latched ^ latched_before)),
         )
@@ -175,7 +176,7 @@ def _without_drift(
 
 
 def _estimated(state: JointState | None, odometry: Mapping[int, Odometry]) -> dict[int, Odometry]:
-    """Return the estimated states of the chasers that have odometry, in place of it."""
+    """Return the estimated states of the chasers that have odometry, in place of it, where they are known."""
     assert state is not None
     return {
         i: msgspec.structs.replace(
@@ -185,6 +186,8 @@ def _estimated(state: JointState | None, odometry: Mapping[int, Odometry]) -> di
             q_wxyz=vector(state.attitudes_wxyz[i]),
             omega_rad_s=vector(state.omegas_rad_s[i]),
         )
+        if state.alive[i]
+        else o
         for i, o in odometry.items()
     }
 

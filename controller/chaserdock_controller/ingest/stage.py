@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 
+import msgspec
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import AppliedImpulse, Observation, TickInputs
@@ -28,7 +30,9 @@ class IngestStage:
 
     def run(self, inputs: TickInputs, history: CommandHistory) -> Observation:
         """Return the checked inputs of a tick. ``history``: the commands sent so far."""
-        invalid = {i: reason for i, o in inputs.odometry.items() if (reason := why_invalid(o))}
+        # What is extrapolated from an invalid state is invalid.
+        sources = {i: inputs.outdated.get(i, o) for i, o in inputs.odometry.items()}
+        invalid = {i: reason for i, o in sources.items() if (reason := why_invalid(o))}
         odometry = {i: o for i, o in inputs.odometry.items() if i not in invalid}
         self.thrusters.update(inputs.thrusters)
         effective_ns = self._scenario.timing.effective_ns(inputs.tick)
@@ -39,6 +43,7 @@ class IngestStage:
             time_ns=inputs.time_ns,
             effective_ns=effective_ns,
             odometry=odometry,
+            outdated=self._outdated(inputs),
             invalid=invalid,
             lost=self.lost_chasers.obstacles(inputs.time_ns),
             sightings=sightings,
@@ -52,6 +57,15 @@ class IngestStage:
             isolated=self.thrusters.isolated(),
             events=tuple(events),
         )
+
+    def _outdated(self, inputs: TickInputs) -> dict[int, Odometry]:
+        """Return the valid odometry of earlier ticks, with the times of these: the clock of a chaser may be wrong."""
+        tick_time_ns = self._scenario.timing.tick_time_ns
+        return {
+            i: msgspec.structs.replace(o, sim_time_ns=tick_time_ns(o.tick))
+            for i, o in inputs.outdated.items()
+            if not why_invalid(o)
+        }
 
     def _ahead(
         self, i: int, inputs: TickInputs, effective_ns: int, history: CommandHistory

@@ -122,6 +122,7 @@ class TickInputCollector:
             commands,
             dict(self._thrusters),
             {i: d for i, d in self._docking.items() if d.tick == tick.tick and i in tick.chasers},
+            {i: o for i, o in sorted(self._odometry.items()) if o.tick < tick.tick and i in tick.chasers},
         )
         self._sightings.clear()
         self._received_sightings = {key for key in self._received_sightings if key[0] > tick.tick}

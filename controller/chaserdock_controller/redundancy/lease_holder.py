@@ -13,7 +13,7 @@ from chaserdock_protocol.leases import is_majority, next_term
 from chaserdock_protocol.messages import Lease, Tick
 
 PATIENCE_TICKS = 3
-"""A controller gives a lease back after it had no majority for so many ticks."""
+"""A controller gives a lease back after it had no majority for so many ticks; after one if the other commands meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,16 @@ class Commander:
 
 @dataclass
 class LeaseHolder:
-    """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this controller."""
+    """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this controller.
+
+    ``_renewed``: tick in which a chaser has last stated a longer lease of the same holder, and so has executed a command.
+    """
 
     name: str
     instance: str = ""
     term: int = 0
     leases: dict[int, Lease] = field(default_factory=dict)
+    _renewed: dict[int, int] = field(default_factory=dict)
     _lost: dict[int, int] = field(default_factory=dict)
     _given_back: dict[int, int] = field(default_factory=dict)
     _idle_since: dict[int, int] = field(default_factory=dict)
@@ -40,8 +44,11 @@ class LeaseHolder:
     def add(self, lease: Lease) -> None:
         """Add a lease, unless a newer one of that chaser is known."""
         known = self.leases.get(lease.chaser)
-        if known is None or _age(lease) > _age(known):
-            self.leases[lease.chaser] = lease
+        if known is not None and _age(lease) <= _age(known):
+            return
+        if known is not None and lease.instance == known.instance and lease.until_tick > known.until_tick:
+            self._renewed[lease.chaser] = lease.tick
+        self.leases[lease.chaser] = lease
 
     def add_lost(self, chaser: int, tick: int) -> None:
         """Note that the lease that a chaser states in a tick will not arrive."""
@@ -93,6 +100,15 @@ class LeaseHolder:
             self.term = next_term(max(newest, found.term) - 1, self.name)
         return True
 
+    def _is_commanded_since(self, since: int, tick: Tick) -> bool:
+        """Return whether another controller holds a majority at a tick, all of which has executed its commands since a tick."""
+        granted = [
+            lease for name in tick.controllers if name != self.name for lease in self._granted(name, tick)
+        ]
+        return is_majority(
+            {x.chaser for x in granted if self._renewed.get(x.chaser, -1) >= since}, tick.chasers
+        )
+
     def take_idle(self, tick: Tick) -> dict[int, tuple[int, bool]]:
         """Return the chasers that may wait for a command of this controller, which does not command the tick.
 
@@ -103,7 +119,10 @@ class LeaseHolder:
         self._idle_since = {i: self._idle_since.get(i, tick.tick) for i in held}
         idle = {i: (self.term, False) for i in tick.chasers if self._lost.get(i) == tick.tick}
         for i, term in held.items():
-            gives_back = tick.tick - self._idle_since[i] >= PATIENCE_TICKS
+            since = self._idle_since[i]
+            gives_back = tick.tick - since >= PATIENCE_TICKS or (
+                tick.tick > since and self._is_commanded_since(since, tick)
+            )
             if gives_back:
                 self._given_back[i] = tick.tick
             idle[i] = (term, gives_back)

@@ -75,11 +75,12 @@ _BLAS = ThreadpoolController()
 
 @dataclass(frozen=True)
 class JointInputs:
-    """Inputs of a tick: odometry by chaser, and sightings, which may belong to earlier ticks.
+    """Inputs of a tick: measured odometry by chaser, and sightings, which may belong to earlier ticks.
 
     impulses (N, 6): N s and N m s, body axes, that the chasers' actuators gave in the last ``covered_s``. latched: chasers
     whose latch holds the target. contacts: chasers with a contact since the tick before. last_commands: last
     commands (6,), N and N m, of chasers without odometry in this tick, which fly by plans that the controller does not know.
+    outdated: newest odometry of chasers that have none of this tick, with the times of the ticks at which it was measured.
     """
 
     time_ns: int
@@ -90,6 +91,7 @@ class JointInputs:
     latched: frozenset[int] = frozenset()
     contacts: frozenset[int] = frozenset()
     last_commands: Mapping[int, Array] = field(default_factory=dict)
+    outdated: Mapping[int, Odometry] = field(default_factory=dict)
 
 
 class JointFilterState(HypothesisSet[JointState], frozen=True, eq=False):
@@ -106,7 +108,7 @@ class JointFilterState(HypothesisSet[JointState], frozen=True, eq=False):
 
 @dataclass(kw_only=True)
 class JointTickRecord(ReplayRecord[JointFilterState]):
-    """A tick's inputs without sightings, and the sightings that were exposed at it, by chaser."""
+    """A tick's inputs without sightings and outdated odometry, and the sightings that were exposed at it, by chaser."""
 
     inputs: JointInputs
     sightings: dict[int, Sighting] = field(default_factory=dict)
@@ -139,11 +141,13 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
 
     def update(self, inputs: JointInputs) -> TargetState:
         """Process a tick and return the target's estimate at its time. Ticks must come in order."""
-        records, own = self._buffer.records, dataclasses.replace(inputs, sightings=())
+        records, own = self._buffer.records, dataclasses.replace(inputs, sightings=(), outdated={})
         records.append(JointTickRecord(time_ns=inputs.time_ns, parameters=self.target, inputs=own))
         first = len(records) - 1
         for sighting in sorted(inputs.sightings, key=lambda s: (s.sim_time_ns, s.chaser)):
             first = min(first, self._insert(sighting))
+        for odometry in inputs.outdated.values():
+            first = min(first, self._insert_odometry(odometry))
         self._buffer.replay(first, self._process)
         self._buffer.trim(self.parameters.target.buffer_s)
         return self._reported(self.estimate_at(inputs.time_ns))
@@ -209,6 +213,15 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
             self.duplicates += 1
             return newest
         record.sightings[sighting.chaser] = sighting
+        return i
+
+    def _insert_odometry(self, odometry: Odometry) -> int:
+        """Add odometry to the record of its tick, if that is known without it; return the record's index, or that of the newest."""
+        i, record = self._buffer.find(odometry.sim_time_ns)
+        if record is None or odometry.chaser in record.inputs.odometry:
+            return len(self._buffer.records) - 1
+        known = dict(sorted({**record.inputs.odometry, odometry.chaser: odometry}.items()))
+        record.inputs = dataclasses.replace(record.inputs, odometry=known)
         return i
 
     def _process(

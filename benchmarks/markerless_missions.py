@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -51,7 +52,8 @@ class MarkerlessOutcome(msgspec.Struct, frozen=True):
     """How one flight ended.
 
     ``steady_position_m``, ``steady_orientation_rad``: RMS tracking errors of the worst chaser in the steady interval.
-    ``estimate_*``: of the target's estimate from its first sighting on, RMS and most; ``nees``: mean, 6 expected.
+    ``estimate_*``: of the target's estimate from its first sighting on, RMS and most; ``nees``: mean, 6 expected, and of position and
+    rotation alone, 3 expected.
     ``seen_share``: of the images, by chaser. ``unseen_s``: longest time without a sighting after the first, by chaser.
     ``*_ms``: CPU time per tick by part; ``image_*_ms``: of the perception, per image. ``touch_m``, ``touch_deg``: at the latch.
     ``geometry_views``: views of an inspection; ``geometry_nees``: normalized squared error of its estimate per parameter, 1 expected.
@@ -79,6 +81,8 @@ class MarkerlessOutcome(msgspec.Struct, frozen=True):
     perception_ms: float
     controller_ms: float
     tick_ms: float
+    nees_position: float = math.nan
+    nees_rotation: float = math.nan
     geometry_views: int = 0
     geometry_nees: float | None = None
     touch_m: float | None = None
@@ -124,18 +128,31 @@ class TimedMission(InProcessMission):
         return outputs
 
 
-def estimate_error(record: TickRecord) -> tuple[float, float, float] | None:
-    """Return the error of the target's estimate: m, rad, and normalized squared; None before the first sighting."""
+class EstimateError(NamedTuple):
+    """Error of the target's estimate, and its normalized squares: of the pose, of position and of rotation alone."""
+
+    position_m: float
+    rotation_rad: float
+    nees: float = math.nan
+    nees_position: float = math.nan
+    nees_rotation: float = math.nan
+
+
+def estimate_error(record: TickRecord) -> EstimateError | None:
+    """Return the error of the target's estimate; None before the first sighting."""
     estimate = record.outputs.target if record.outputs is not None else None
     if estimate is None or estimate.status == "none":
         return None
     truth = record.states[TARGET]
     known = np.array(estimate.position_m), np.array(estimate.q_wxyz)
     e = pose_error(truth.position_m, truth.q_wxyz, *known)
-    nees = math.nan
-    if len(estimate.covariance):
-        nees = float(normalized_square(e, pose_covariance(estimate.covariance)))
-    return float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:])), nees
+    error = EstimateError(float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:])))
+    if not len(estimate.covariance):
+        return error
+    covariance = pose_covariance(estimate.covariance)
+    parts = (slice(0, 6), slice(0, 3), slice(3, 6))
+    squares = [float(normalized_square(e[p], covariance[p, p])) for p in parts]
+    return EstimateError(error.position_m, error.rotation_rad, *squares)
 
 
 def fly(seed: int, scenario: Scenario) -> MarkerlessOutcome:
@@ -163,16 +180,17 @@ def print_progress(
     seed: int,
     record: TickRecord,
     images: TimedImages,
-    error: tuple[float, float, float] | None,
+    error: EstimateError | None,
     phases: list[str],
 ) -> None:
-    position_m, angle_rad, nees = error or (math.nan,) * 3
+    error = error or EstimateError(math.nan, math.nan)
     tracking = ", ".join(
         f"{phase} {1e3 * e[0]:.1f} mm {math.degrees(e[1]):.2f} deg"
         for phase, e in zip(phases, record.tracking_errors.values(), strict=True)
     )
     print(
-        f"  {seed}: {record.time_s:.0f} s; estimate {1e3 * position_m:.2f} mm {math.degrees(angle_rad):.3f} deg, NEES {nees:.1f}; "
+        f"  {seed}: {record.time_s:.0f} s; estimate {1e3 * error.position_m:.2f} mm {math.degrees(error.rotation_rad):.3f} deg, "
+        f"NEES {error.nees:.1f}; "
         f"{tracking}; perception {1e3 * np.mean(images.perception_s):.1f} ms, most {1e3 * max(images.perception_s):.0f} ms",
         file=sys.stderr,
         flush=True,
@@ -193,7 +211,7 @@ def outcome(
     flight: TimedMission,
     images: TimedImages,
     errors: list[list[tuple[float, float]]],
-    rows: list[tuple[float, float, float] | None],
+    rows: list[EstimateError | None],
     total_s: float,
 ) -> MarkerlessOutcome:
     scenario, capture = flight.scenario, flight.scenario.docking.kind == "capture"
@@ -205,7 +223,7 @@ def outcome(
     late = (tick_s >= scenario.settling_s) & (tick_s <= until_s)
     steady = np.array(errors)[late] if late.any() else np.full((1, 1, 2), np.nan)
     rms = np.sqrt(np.mean(steady**2, axis=0)).max(axis=0)
-    known = np.array([r for r in rows if r is not None] or [(math.nan,) * 3])
+    known = np.array([r for r in rows if r is not None] or [EstimateError(math.nan, math.nan)])
     retreats = [text for i in flight.chasers for text in flight.retreats(i)]
     touch = next((t for t in flight.touches if t.latched), None)
     if flight.contacts:
@@ -229,6 +247,8 @@ def outcome(
         estimate_max_m=float(known[:, 0].max()),
         estimate_max_rad=float(known[:, 1].max()),
         nees=float(np.nanmean(known[:, 2])),
+        nees_position=float(np.nanmean(known[:, 3])),
+        nees_rotation=float(np.nanmean(known[:, 4])),
         first_seen_s=[s.index(True) * image_s if True in s else math.inf for s in images.seen],
         seen_share=[float(np.mean(s)) for s in images.seen],
         unseen_s=[longest_gap(s) * image_s for s in images.seen],
@@ -263,7 +283,8 @@ def line_of(o: MarkerlessOutcome) -> str:
     text = (
         f"{o.seed}: {o.cause} at {o.time_s:.1f} s; steady {1e3 * o.steady_position_m:.2f} mm "
         f"{math.degrees(o.steady_orientation_rad):.3f} deg; estimate {1e3 * o.estimate_rms_m:.2f} mm "
-        f"{math.degrees(o.estimate_rms_rad):.3f} deg, NEES {o.nees:.1f}; {o.tick_ms:.0f} ms a tick"
+        f"{math.degrees(o.estimate_rms_rad):.3f} deg, NEES {o.nees:.1f} "
+        f"(position {o.nees_position:.1f}, rotation {o.nees_rotation:.1f}); {o.tick_ms:.0f} ms a tick"
     )
     if o.touch_m is not None and o.touch_deg is not None:
         text += f"; contact {1e3 * o.touch_m:.2f} mm {o.touch_deg:.2f} deg"
@@ -303,6 +324,8 @@ def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | 
         f"{part}_estimate_rms_m": worst(lambda o: o.estimate_rms_m),
         f"{part}_estimate_rms_rad": worst(lambda o: o.estimate_rms_rad),
         f"{part}_nees_mean": float(np.mean([o.nees for o in outcomes])),
+        f"{part}_nees_position_mean": float(np.mean([o.nees_position for o in outcomes])),
+        f"{part}_nees_rotation_mean": float(np.mean([o.nees_rotation for o in outcomes])),
         f"{part}_geometry_views": min(o.geometry_views for o in outcomes),
         f"{part}_first_seen_s": worst(lambda o: max(o.first_seen_s)),
         f"{part}_unseen_s": worst(lambda o: max(o.unseen_s)),

@@ -27,9 +27,9 @@ static Measurement *measurement_of(int64_t n) {
     fill_quaternion(camera);
     fill_quaternion(odometry + QUATERNION);
     fill_quaternion(sighting + 3);
-    double *axes = doubles(9, -1.0, 1.0);
+    double *axes = doubles(9, -1.0, 1.0), *stated = covariances(6), *view = whole(0, 1) ? stated : covariances(6);
     *z = (Measurement){n, whole(0, n - 1), doubles(3, -0.1, 0.1), axes, camera, kind & 1 ? odometry : NULL, covariances(12),
-                       kind & 2 ? sighting : NULL, covariances(6), value(0.5, 2.0), value(0.2, 2.0)};
+                       kind & 2 ? sighting : NULL, stated, view, value(0.5, 2.0), value(0.2, 2.0)};
     return z;
 }
 

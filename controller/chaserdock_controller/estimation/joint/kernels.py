@@ -52,7 +52,7 @@ class _Measurement(Structure):
         ("i", c_int64),
         *(
             (name, c_void_p)
-            for name in ("lens", "axes", "camera", "odometry", "odometry_noise", "sighting", "stated")
+            for name in ("lens", "axes", "camera", "odometry", "odometry_noise", "sighting", "stated", "view")
         ),
         ("white_ratio", c_double),
         ("view_ratio", c_double),
@@ -74,7 +74,7 @@ class ChaserMeasurement:
     """Measurements of chaser ``i`` of ``n``, of which one may be None.
 
     mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting: pose (7,) in IRF, stated
-    covariance (6, 6), and the ratios of white noise and view error to it.
+    covariance (6, 6), covariance (6, 6) in whose units the view error is, and the ratios of white noise and view error to them.
     """
 
     def __init__(
@@ -83,16 +83,16 @@ class ChaserMeasurement:
         i: int,
         mounting: tuple[Array, Array, Array],
         odometry: tuple[Array, Array] | None,
-        sighting: tuple[Array, Array, float, float] | None,
+        sighting: tuple[Array, Array, Array, float, float] | None,
     ) -> None:
         self.rows = (0 if odometry is None else 12) + (0 if sighting is None else 6)
         self.chaser, self.n = i, n
         self._kept = mounting, odometry, sighting  # the kernels use the addresses of these arrays
         state, noise = (None, None) if odometry is None else map(location, odometry)
-        pose, stated, *ratios = (
-            (None, None, 0.0, 0.0) if sighting is None else (*map(location, sighting[:2]), *sighting[2:])
-        )
-        self.native = _Measurement(n, i, *map(location, mounting), state, noise, pose, stated, *ratios)
+        seen = (None, None, None, 0.0, 0.0)
+        if sighting is not None:
+            seen = (*map(location, sighting[:3]), *sighting[3:])
+        self.native = _Measurement(n, i, *map(location, mounting), state, noise, *seen)
 
 
 class JointInnovation:

@@ -55,9 +55,10 @@ def measurement(
     markers: int,
     mounting: CameraMounting,
     p: JointParameters,
+    view: Array | None = None,
 ) -> kernels.ChaserMeasurement:
     """Return what chaser ``i`` of ``chasers`` measures in a tick, for the kernels: odometry, a solution from ``markers``
-    markers, or both."""
+    markers, or both. ``view`` (6, 6): covariance in whose units the view error is; the stated one by default."""
     measured = sighted = None
     if odometry is not None:
         o = odometry
@@ -66,7 +67,8 @@ def measurement(
     if solution is not None:
         noise = p.sighting_noise(markers)
         pose = np.array([*solution.position_m, *solution.q_wxyz])
-        sighted = pose, sighting_covariance(solution, p), noise.white_ratio, noise.view_ratio
+        stated = sighting_covariance(solution, p)
+        sighted = pose, stated, stated if view is None else view, noise.white_ratio, noise.view_ratio
     return kernels.ChaserMeasurement(chasers, i, mounting, measured, sighted)
 
 

@@ -26,18 +26,20 @@ class SightingNoise(NamedTuple):
 
     white_ratio: of white noise with the same effect on an average over seconds as the true errors, half of which are correlated
         over about 0.5 s. view_ratio: of an error that persists while the view stays the same, with the time constant
-        ``view_time_s``.
+        ``view_time_s``. units_time_s: the persistent error is a ratio to the mean of the stated covariances over so long; 0: to the
+        newest one.
     """
 
     white_ratio: float
     view_ratio: float
     view_time_s: float
+    units_time_s: float = 0.0
 
 
 SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
-# Errors of geometry and shading change only with the view, and are alike in the images of several cameras.
-SHAPE = SightingNoise(white_ratio=1.0, view_ratio=2.4, view_time_s=10.0)
+# Errors of geometry and shading change only with the view, and are alike in the images of several cameras (docs/markerless.md).
+SHAPE = SightingNoise(white_ratio=1.0, view_ratio=1.6, view_time_s=30.0, units_time_s=15.0)
 # Without images, range, bearing and attitude of `[ranging]` have white errors of the stated size.
 RANGING = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
 # A bearing from an image: light, markers and the pixel grid shift the centroid as long as the view stays the same.

@@ -54,6 +54,8 @@ class JointState(TargetHypothesis, frozen=True, eq=False, kw_only=True):
     odometry_ns (N,): time of the newest odometry. measured_ns (N,): time of the newest measurement that was used.
     rejections (N, len(CHANNELS)): counts that decide which channel is used.
     markers (N,): number of markers in the newest sighting of each chaser; 1 before the first one.
+    view_units (N, 6, 6), view_units_ns (N,): mean of the stated covariances of sightings, and the time of the newest one, where the
+    view error is in units of such a mean; 0 before, and where it is in units of the newest one.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
     updates: ticks with sightings since the start of the target.
     """
@@ -69,6 +71,8 @@ class JointState(TargetHypothesis, frozen=True, eq=False, kw_only=True):
     rejections: NDArray[np.int64]
     nis: Array
     markers: NDArray[np.int64]
+    view_units: Array
+    view_units_ns: NDArray[np.int64]
     target_known: bool = False
     updates: int = 0
     shape: BodyShape | None = None
@@ -107,6 +111,8 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
         rejections=np.zeros((n, len(CHANNELS)), dtype=np.int64),
         nis=np.full((n, len(CHANNELS) - 1), 3.0),
         markers=np.ones(n, dtype=np.int64),
+        view_units=np.zeros((n, 6, 6)),
+        view_units_ns=np.zeros(n, dtype=np.int64),
     )
 
 

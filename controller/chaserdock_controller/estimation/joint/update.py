@@ -244,6 +244,38 @@ class RunningUpdate:
         )
 
 
+def with_view_units(state: JointState, sightings: Mapping[int, Sighting], p: JointParameters) -> JointState:
+    """Return the state with the means of the stated covariances after these sightings.
+
+    A stated covariance changes from image to image with the points in use, the error that persists does not: in units of the newest
+    covariance it would seem observable by these changes.
+    """
+    units, units_ns = state.view_units.copy(), state.view_units_ns.copy()
+    for i, sighting in sightings.items():
+        memory_s = p.sighting_noise(len(sighting.marker_ids)).units_time_s
+        if not (memory_s and sighting.solutions):
+            continue
+        stated = sighting_covariance(sighting.solutions[0], p)
+        if not _is_positive_definite(stated):
+            continue
+        age_s = (state.time_ns - units_ns[i]) * 1e-9 if units[i].any() else math.inf
+        kept = math.exp(-age_s / memory_s)
+        units[i], units_ns[i] = kept * units[i] + (1.0 - kept) * stated, state.time_ns
+    return replace(state, view_units=units, view_units_ns=units_ns)
+
+
+def _is_positive_definite(covariance: Array) -> bool:
+    try:
+        return bool(np.isfinite(np.linalg.cholesky(covariance)).all())
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _view_units(state: JointState, i: int, markers: int, p: JointParameters) -> Array | None:
+    """Return the covariance (6, 6) in whose units the view error of a sighting is; None for the stated one."""
+    return state.view_units[i] if p.sighting_noise(markers).units_time_s else None
+
+
 def update(
     state: JointState,
     odometry: Mapping[int, Odometry],
@@ -254,6 +286,7 @@ def update(
     """Update the state at its time with the odometry and the sightings of the chasers."""
     accepted: list[int] = []
     rejected: list[int] = []
+    state = with_view_units(state, sightings, p)
     running, measured = RunningUpdate(state), state.measured_ns.copy()
     for i in sorted(odometry.keys() | sightings.keys()):
         if not state.alive[i]:
@@ -285,7 +318,8 @@ def _update_chaser(
     solution = _likeliest(running, i, sighting, mounting, p)
     if odometry is None and solution is None:
         return {}
-    z = measurement(chasers, i, odometry, solution, markers, mounting, p)
+    view = _view_units(running.state, i, markers, p)
+    z = measurement(chasers, i, odometry, solution, markers, mounting, p, view)
     channels = _channels(odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry)
     gates = _gate(running, i, channels, running.values(z), p)
     if not all(gates.fits.values()) and any(
@@ -373,7 +407,9 @@ def _likeliest(
 
     def log_density(solution: PoseSolution) -> float:
         markers = len(sighting.marker_ids)
-        values = running.values(measurement(running.state.chasers, i, None, solution, markers, mounting, p))
+        view = _view_units(running.state, i, markers, p)
+        z = measurement(running.state.chasers, i, None, solution, markers, mounting, p, view)
+        values = running.values(z)
         return -0.5 * (values[SIGHTING_CHANNEL] + math.log(values[-1]))
 
     return max(solutions, key=log_density)

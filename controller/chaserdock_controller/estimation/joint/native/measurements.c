@@ -4,10 +4,10 @@
 
 /* Measurements of chaser i of n. lens (3), axes (3, 3), camera (4): nominal mounting. odometry (13): position, velocity,
  * attitude, rate; noise (12, 12). sighting (7): position, attitude in IRF; stated covariance (6, 6) with the floor.
- * odometry and sighting may be null, not both. */
+ * view (6, 6): covariance in whose units the view's error is. odometry and sighting may be null, not both. */
 typedef struct {
     int64_t n, i;
-    const double *lens, *axes, *camera, *odometry, *odometry_noise, *sighting, *stated;
+    const double *lens, *axes, *camera, *odometry, *odometry_noise, *sighting, *stated, *view;
     double white_ratio, view_ratio;
 } Measurement;
 
@@ -76,14 +76,18 @@ static void turn_between(const double *predicted, const double *measured, double
     logarithmic_map(q, turn);
 }
 
-/* Residual (6), Jacobian (6, SEEN) and noise, in rows of length `k`. Without the view's error if the stated covariance is
+/* Residual (6), Jacobian (6, SEEN) and noise, in rows of length `k`. Without the view's error if a covariance is
  * not positive definite; the noise is then NaN. */
 static void linearize_sighting(const Measurement *z, const double *t, const double *x, double *residual, double *h,
                                double *noise, int k) {
     double position[3], attitude[4], factor[36], turn[3];
     predict_pose(t, x, z->lens, z->axes, z->camera, position, attitude, h);
     copy(z->stated, factor, 36);
-    const int valid = factorize(factor, SIGHTING_ROWS);
+    int valid = factorize(factor, SIGHTING_ROWS);
+    if (z->view != z->stated) {
+        copy(z->view, factor, 36);
+        valid = factorize(factor, SIGHTING_ROWS) && valid;
+    }
     turn_between(attitude, z->sighting + 3, turn);
     for (int i = 0; i < SIGHTING_ROWS; i++) {
         residual[i] = i < 3 ? z->sighting[i] - position[i] : turn[i - 3];

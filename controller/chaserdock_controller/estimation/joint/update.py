@@ -250,17 +250,21 @@ def with_view_units(state: JointState, sightings: Mapping[int, Sighting], p: Joi
     A stated covariance changes from image to image with the points in use, the error that persists does not: in units of the newest
     covariance it would seem observable by these changes.
     """
+    stated = {
+        i: sighting_covariance(s.solutions[0], p)
+        for i, s in sightings.items()
+        if s.solutions and p.sighting_noise(len(s.marker_ids)).units_time_s
+    }
+    if not stated:
+        return state
     units, units_ns = state.view_units.copy(), state.view_units_ns.copy()
-    for i, sighting in sightings.items():
-        memory_s = p.sighting_noise(len(sighting.marker_ids)).units_time_s
-        if not (memory_s and sighting.solutions):
+    for i, covariance in stated.items():
+        if not _is_positive_definite(covariance):
             continue
-        stated = sighting_covariance(sighting.solutions[0], p)
-        if not _is_positive_definite(stated):
-            continue
+        memory_s = p.sighting_noise(len(sightings[i].marker_ids)).units_time_s
         age_s = (state.time_ns - units_ns[i]) * 1e-9 if units[i].any() else math.inf
         kept = math.exp(-age_s / memory_s)
-        units[i], units_ns[i] = kept * units[i] + (1.0 - kept) * stated, state.time_ns
+        units[i], units_ns[i] = kept * units[i] + (1.0 - kept) * covariance, state.time_ns
     return replace(state, view_units=units, view_units_ns=units_ns)
 
 

@@ -177,7 +177,6 @@ static void direct_light(void) {
     for (int64_t i = 0; i < texels; i++) depth[i] = (float)value(-1.0, 1.0);
     for (int64_t i = 0; i < n; i++) points[14 * i + 9] = value(0.0, 1.0), points[14 * i + 10] = value(0.0, 1.0), points[14 * i + 11] = value(0.0, 60.0);
     NAME(direct_light)((const LitPoint *)points, n, sun, &map, depth, out);
-    for (int64_t i = 0; i < n; i++) CHECK(!(out[i] < 0.0f));
 }
 
 static void control_points(void) {

@@ -38,7 +38,7 @@ mesh does not have the grid."""
 NO_PATTERN, CELLS, WRINKLES = 0, 1, 2
 """Patterns of a surface that the known mesh does not have."""
 _SUNS, _SUN_TEXELS = 400, 64
-_FEW_SUNS, _FEW_SUN_TEXELS = 60, 128
+_FEW_SUNS, _FEW_SUN_TEXELS = 60, 256
 
 
 class MeshError(ValueError):

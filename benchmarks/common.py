@@ -15,7 +15,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
     from chaserdock.launch.launcher import Fleet
@@ -24,6 +26,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 Figures = dict[str, float]
 """Flat: name with SI unit -> number. Truth values are 0 and 1."""
+
+
+def use_one_thread() -> None:
+    """Compute in one thread, as the processes of a flight do: others of BLAS and OpenCV wait for work, which is CPU time as well."""
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
 
 
 def make_parser(description: str | None, parts: Iterable[str] = ()) -> argparse.ArgumentParser:

@@ -31,7 +31,7 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
-from common import Figures, append_line, commit, make_parser, read_lines, run_parts
+from common import Figures, append_line, commit, make_parser, read_lines, run_parts, use_one_thread
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
@@ -345,6 +345,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
     parser.add_argument("--results", type=Path, metavar="FILE", help="append flights; those in it are kept")
     options = parser.parse_args()
+    use_one_thread()
     flights = 1 if options.quick else options.flights
     seeds, changes = range(options.first, options.first + flights), tuple(options.set)
     changes += QUICK if options.quick else ()

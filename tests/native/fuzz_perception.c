@@ -168,6 +168,17 @@ static void rate_suns(void) {
     for (int64_t j = 0; j < k; j++) CHECK(!(out[3 * j] < 0.0));
 }
 
+static void direct_light(void) {
+    const int64_t n = whole(0, 20);
+    const ShadowMap map = shadow_settings();
+    const int64_t texels = (int64_t)map.size * (int64_t)map.size;
+    double *points = doubles(14 * n, -1.0, 1.0), *sun = doubles(3, -1.0, 1.0);
+    float *depth = floats(texels), *out = floats(n);
+    for (int64_t i = 0; i < texels; i++) depth[i] = (float)value(-1.0, 1.0);
+    for (int64_t i = 0; i < n; i++) points[14 * i + 9] = value(0.0, 1.0), points[14 * i + 10] = value(0.0, 1.0), points[14 * i + 11] = value(0.0, 60.0);
+    NAME(direct_light)((const LitPoint *)points, n, sun, &map, depth, out);
+}
+
 static void control_points(void) {
     const int64_t height = whole(1, 40), width = whole(1, 40), all = height * width;
     Mesh m = any_mesh();
@@ -233,6 +244,7 @@ static const Target TARGETS[] = {
     {"shadow_map", shadow_map},
     {"render_mesh", render_mesh},
     {"rate_suns", rate_suns},
+    {"direct_light", direct_light},
     {"control_points", control_points},
     {"align_points", align_points},
     {"measure_pose", measure_pose},

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from ..refine import PoseInCamera
 from .alignment import Alignment, Pyramid
-from .lighting import appearance, light_at, points_on, rate_suns
+from .lighting import appearance, light_steps, points_on, rate_suns
 from .mesh import ShadowMaps, TrackerMesh, spread_directions
 from .rendering import Lighting, PixelWindow, render
-from .steps import LIGHT_MS, Steps, result_of
+from .steps import Steps, result_of
 from .tracking import is_valid, levels_of, pose_steps, rough_prior_steps, turn_between
 
 _TEMPLATES, _SIDE_PX = 3000, 40
@@ -145,8 +145,9 @@ class Acquisition:
         coarse: list[Alignment] = []
         for pose in candidates:
             levels = levels_of(pyramid, self._mesh, pose)
-            yield LIGHT_MS
-            light = light_at(pyramid, self._mesh, pose, levels[0]) if levels else None
+            if not levels:
+                continue
+            light = yield from light_steps(pyramid, self._mesh, pose, levels[0])
             if light is not None:
                 aligned = yield from pose_steps(pyramid, self._mesh, pose, light, levels[:1])
                 coarse += [aligned] if aligned is not None else []

@@ -144,6 +144,12 @@ def window_of(
     return PixelWindow(bottom - top, right - left, (fx, fy, cx - left, cy - top)), left, top
 
 
+def area_px(pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera) -> float:
+    """Return the area of the window of level ``k``, 0 if the target is out of view."""
+    found = window_of(pyramid, k, mesh, pose)
+    return float(found[0].height * found[0].width) if found else 0.0
+
+
 def control_points(
     pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting
 ) -> ControlPoints | None:

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from ..native import function
 from ..refine import PoseInCamera
-from .alignment import Pyramid, image_window, in_grey_levels, window_of
-from .mesh import ShadowMaps, TrackerMesh, spread_directions
-from .rendering import Lighting, PixelWindow, render
+from .alignment import Pyramid, area_px, image_window, in_grey_levels, window_of
+from .mesh import ShadowMaps, TrackerMesh
+from .rendering import Lighting, PixelWindow, SyntheticView, render
+from .steps import LIGHT_MS, LIKELY_MS, SUNS_MS, VIEWS_MS, Steps, compared_ms, result_of
 
 _MOST_POINTS, _FEWEST_POINTS = 600, 40
 _EVERY_POINT = 3
@@ -39,8 +40,9 @@ _LIKELY = 0.08
 _EVEN_RESIDUAL, _CLEARLY = 0.15, 0.95
 """Mean squared residual, in standard deviations, below which light from everywhere explains the points: of 40 sunlit views the least
 was 0.45, of views without sun on what is visible the most 0.17. Ratio of residuals below which a sun explains a view better."""
-_COMPARED_SUNS = np.array([d for d in spread_directions(60) if d[2] > -0.1 or d[2] < -0.9])
-"""Directions (n, 3) in IRF, behind the target or of a lamp beside the lens, of which synthetic views are compared."""
+_LEAST_BEHIND, _LEAST_IN_FRONT = -0.1, -0.9
+"""Directions of which synthetic views are compared have a z in IRF above the one, behind the target, or below the other, as of a
+lamp beside the lens."""
 _COMPARED_FINELY = 3
 """Number of these that are compared at a finer level."""
 
@@ -66,14 +68,29 @@ def light_at(
     With ``previous``, only directions near that light are tried. With ``by_view``, a synthetic view in each of several likely
     lights decides: on few textured faces, directions far apart explain the points about equally well, but not the shadows' edges.
     """
+    return result_of(light_steps(pyramid, mesh, pose, level, previous, by_view))
+
+
+def light_steps(
+    pyramid: Pyramid,
+    mesh: TrackerMesh,
+    pose: PoseInCamera,
+    level: int,
+    previous: Lighting | None = None,
+    by_view: bool = False,
+) -> Steps[Lighting | None]:
+    """Do what `light_at` does, in steps."""
+    yield LIGHT_MS
     points = lit_points(pyramid, mesh, pose, level)
     if points is None:
         return None
     even = even_light(mesh, points)
     if even is not None:
-        return light_by_view(pyramid, mesh, pose, level, even, previous)
+        return (yield from _view_steps(pyramid, mesh, pose, level, even, previous))
     if previous is None and by_view:
+        yield LIKELY_MS
         lights = likely_lights(mesh, points)
+        yield VIEWS_MS
         previous = max(lights, key=lambda light: appearance(pyramid, mesh, pose, level, light))
     return fit_light(mesh, points, previous)
 
@@ -88,29 +105,36 @@ def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:
     return Lighting(None, 0.0, ambient) if residual < _EVEN_RESIDUAL and ambient > 1e-3 else None
 
 
-def light_by_view(
+def _view_steps(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, even: Lighting, previous: Lighting | None
-) -> Lighting:  # fmt: skip
-    """Return the light of a target whose points ``even`` explains, light from everywhere: on a side in the shade a sun behind the
-    target brightens no more than rims, which are no points.
+) -> Steps[Lighting]:  # fmt: skip
+    """Return, in steps, the light of a target whose points ``even`` explains, light from everywhere: on a side in the shade a sun
+    behind the target brightens no more than rims, which are no points.
 
     Synthetic views in several directions of the sun, near that of ``previous`` if it has one, are compared with the image; the
     levels follow by least squares. Returns ``even`` if no sun explains the image clearly better.
     """
-    coarse, fine = (_ComparedView.at(pyramid, mesh, pose, k) for k in (level, max(level - 1, 0)))
-    if coarse is None or fine is None:
-        return even
-    if previous is not None and previous.to_sun_irf is not None:
-        fine, nearest = coarse, previous.to_sun_irf
-        found = [(*fine.rate(nearest), nearest)]
+    near = previous.to_sun_irf if previous is not None else None
+    if near is None:
+        yield SUNS_MS
+        view = _ComparedView.at(pyramid, mesh, pose, level)
+        if view is None:
+            return even
+        best, level = view.likely_suns(), max(level - 1, 0)
+        tried = (*best, *_around(best[0], 0.25)[1::2])
     else:
-        rated = [coarse.rate(to_sun)[0] for to_sun in _COMPARED_SUNS]
-        best = _COMPARED_SUNS[np.argsort(rated)[:_COMPARED_FINELY]]
-        found = [(*fine.rate(to_sun), to_sun) for to_sun in (*best, *_around(best[0], 0.25)[1::2])]
-        nearest = min(found, key=lambda f: f[0])[3]
-    found += [(*fine.rate(to_sun), to_sun) for to_sun in _around(nearest, 0.12)[1::2]]
+        tried = (near,)
+    one_ms = compared_ms(area_px(pyramid, level, mesh, pose))
+    yield (1 + len(tried)) * one_ms
+    view = _ComparedView.at(pyramid, mesh, pose, level)
+    if view is None:
+        return even
+    found = [(*view.rate(to_sun), to_sun) for to_sun in tried]
+    around = _around(min(found, key=lambda f: f[0])[3], 0.12)[1::2]
+    yield len(around) * one_ms
+    found += [(*view.rate(to_sun), to_sun) for to_sun in around]
     residual, ambient, direct, to_sun = min(found, key=lambda f: f[0])
-    if residual > _CLEARLY * fine.residual:
+    if residual > _CLEARLY * view.residual:
         return even
     return Lighting(to_sun, direct, ambient, weak=True)
 
@@ -146,11 +170,34 @@ class _ComparedView:
 
     def rate(self, to_sun: Array) -> tuple[float, float, float]:
         """Return the mean squared residual with a sun in the direction (3,), IRF, the ambient and the direct level."""
-        view = render(self.mesh, self.pose, self.window, Lighting(to_sun, 1.0, 0.0))
-        columns = np.column_stack([self.ambient, smooth(view.grey)[self.pixels]])
+        return self._fit(render(self.mesh, self.pose, self.window, Lighting(to_sun, 1.0, 0.0)).grey)
+
+    def _fit(self, sunlit: NDArray[Any]) -> tuple[float, float, float]:
+        """Return the mean squared residual with the view (h, w) in sunlight of level 1, the ambient and the direct level."""
+        columns = np.column_stack([self.ambient, smooth(sunlit)[self.pixels]])
         levels = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), columns.T @ self.grey)
         ambient, direct = np.maximum(levels, 0.0).tolist()
         return float(np.mean((self.grey - columns @ (ambient, direct)) ** 2)), ambient, direct
+
+    def likely_suns(self) -> Array:
+        """Return the directions (n, 3), IRF, of the few suns that explain the image best, best first.
+
+        The view is drawn once: in each direction only light and shadow of its samples are computed, two by two in a pixel.
+        """
+        h, w = self.window.height, self.window.width
+        fx, fy, cx, cy = self.window.lens
+        fine = PixelWindow(2 * h, 2 * w, (2.0 * fx, 2.0 * fy, 2.0 * cx + 0.5, 2.0 * cy + 0.5))
+        view = render(self.mesh, self.pose, fine, Lighting(None, 0.0, 1.0, shadows=False), samples=1)
+        samples = np.flatnonzero(view.owner.ravel() >= 0)
+        points = _points_in(self.mesh, self.pose, fine, view, samples)
+        maps = self.mesh.few_suns
+        towards = maps.to_sun_trf @ self.pose.rotation.T
+        tried = np.flatnonzero((towards[:, 2] > _LEAST_BEHIND) | (towards[:, 2] < _LEAST_IN_FRONT))
+        sunlit, rated = np.zeros((2 * h, 2 * w), np.float32), []
+        for k in tried:
+            sunlit.ravel()[samples] = direct_light(points, maps, int(k))
+            rated.append(self._fit(cv2.resize(sunlit, (w, h), interpolation=cv2.INTER_AREA))[0])
+        return towards[tried[np.argsort(rated)[:_COMPARED_FINELY]]]
 
 
 def smooth(grey: NDArray[Any]) -> Array:
@@ -190,19 +237,26 @@ def lit_points(
     if len(pixels) < _FEWEST_POINTS:
         return None
     pixels = pixels[np.linspace(0, len(pixels) - 1, min(most, len(pixels))).astype(np.int64)]
+    return _points_in(mesh, pose, window, view, pixels, patch.ravel()[pixels].astype(float))
+
+
+def _points_in(
+    mesh: TrackerMesh, pose: PoseInCamera, window: PixelWindow, view: SyntheticView, pixels: NDArray[np.int64],
+    grey: Array | float = 0.0,
+) -> LitPoints:  # fmt: skip
+    """Return the points that n pixels (n,) of a view show, with their grey levels ``grey`` in the image."""
     row, column = np.divmod(pixels, window.width)
     fx, fy, cx, cy = window.lens
     rays = np.column_stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(pixels))])
     at = rays / view.nearest.ravel()[pixels, None]
     to_camera = -(at / np.linalg.norm(at, axis=1, keepdims=True)) @ pose.rotation
-    grey = patch.ravel()[pixels].astype(float)
     return points_on(
         mesh, view.owner.ravel()[pixels], (at - pose.position) @ pose.rotation, to_camera, grey, pose.rotation
     )
 
 
 def points_on(
-    mesh: TrackerMesh, owners: NDArray[np.integer], at_trf: Array, to_camera_trf: Array, grey: Array, rotation: Array
+    mesh: TrackerMesh, owners: NDArray[np.integer], at_trf: Array, to_camera_trf: Array, grey: Array | float, rotation: Array
 ) -> LitPoints:  # fmt: skip
     """Return n points on the triangles ``owners`` (n,), with grey levels (n,), at (n, 3), seen in directions (n, 3), all in TRF."""
     rows = np.empty((len(owners), 14))
@@ -220,6 +274,16 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
     function("rate_suns")(
         address(points.rows), c_int64(n), address(maps.to_sun_trf), address(maps.settings), address(maps.depths),
         c_int64(k), c_double(_LEAST_AMBIENT), address(out), address(work),
+    )  # fmt: skip
+    return out
+
+
+def direct_light(points: LitPoints, maps: ShadowMaps, k: int) -> NDArray[np.float32]:
+    """Return the light (n,) that each of n points reflects of a sun of level 1 in the direction ``k`` of ``maps``."""
+    out = np.empty(len(points.rows), np.float32)
+    function("direct_light")(
+        address(points.rows), c_int64(len(out)), (c_double * 3)(*maps.to_sun_trf[k]), (c_double * 12)(*maps.settings[k]),
+        address(maps.depths[k]), address(out),
     )  # fmt: skip
     return out
 

@@ -38,6 +38,7 @@ mesh does not have the grid."""
 NO_PATTERN, CELLS, WRINKLES = 0, 1, 2
 """Patterns of a surface that the known mesh does not have."""
 _SUNS, _SUN_TEXELS = 400, 64
+_FEW_SUNS, _FEW_SUN_TEXELS = 60, 256
 
 
 class MeshError(ValueError):
@@ -156,8 +157,7 @@ class TrackerMesh:
             vertices_m=self.vertices_m + np.einsum("k,kni->ni", mean, self.modes_m),
             modes_m=np.einsum("kj,kni->jni", factor, self.modes_m),
         )
-        if "suns" in self.__dict__:
-            new.__dict__["suns"] = self.suns
+        new.__dict__.update({k: v for k, v in self.__dict__.items() if k in ("suns", "few_suns")})
         return new
 
     @cached_property
@@ -197,6 +197,11 @@ class TrackerMesh:
     def suns(self) -> ShadowMaps:
         """Shadow maps of directions all around, made when first used."""
         return self.shadow_maps(spread_directions(_SUNS), _SUN_TEXELS)
+
+    @cached_property
+    def few_suns(self) -> ShadowMaps:
+        """Shadow maps of fewer directions all around, made when first used."""
+        return self.shadow_maps(spread_directions(_FEW_SUNS), _FEW_SUN_TEXELS)
 
     def shadow_maps(self, to_sun_trf: Array, texels: int) -> ShadowMaps:
         """Return a shadow map of ``texels`` squared for each of k unit vectors (k, 3) to the sun in TRF."""

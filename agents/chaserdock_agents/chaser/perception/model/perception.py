@@ -19,20 +19,19 @@ from ..refine import PoseInCamera
 from .acquisition import Acquisition
 from .alignment import Alignment, Pyramid
 from .geometry import GeometryCorrection
-from .lighting import light_at
+from .lighting import light_steps
 from .mesh import TrackerMesh
 from .rendering import Lighting
-from .steps import LIGHT_MS, Steps
+from .steps import Steps
 from .tracking import (
     is_valid,
     levels_of,
+    pose_steps,
     prior_steps,
-    refine_pose,
     start_steps,
     starts_around,
     track_points,
     turn_between,
-    view_ms,
 )
 
 _KEY_EVERY = 8
@@ -113,7 +112,7 @@ class ModelPerception:
     def prepare(self) -> None:
         """Compute what depends on the mesh alone; takes one to two seconds, which the first image would take otherwise."""
         self._acquisition.prepare()
-        _ = self.mesh.suns
+        _ = self.mesh.suns, self.mesh.few_suns
 
     def correct_geometry(self, mean: Array, covariance: Array) -> None:
         """Correct the mesh by its estimated errors (k,) with covariance (k, k), in its standard deviations; tracks go on.
@@ -228,20 +227,20 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
     # The light of a new view is estimated in the image before, which leaves more time for the view.
     view_is_next = track.age + 2 == _KEY_EVERY
     if fresh and not track.missed:
-        yield _POINTS_MS + view_is_next * LIGHT_MS
+        yield _POINTS_MS
         found = track_points(pyramid, track.last.points, prior, modes)
         if is_valid(found):
-            light = _light_near(pyramid, mesh, found.pose, track.light) if view_is_next else None
+            near = _light_near(pyramid, mesh, found.pose, track.light)
+            light = (yield from near) if view_is_next else None
             return PoseTrack(found, light or track.light, track.last.pose, track.age + 1)
     levels = levels_of(pyramid, mesh, prior)
     if not levels:
         return missed
-    yield view_ms(pyramid, mesh, prior, levels[-1])
     known = track.age + 1 == _KEY_EVERY and not track.missed
-    light = track.light if known else _light_near(pyramid, mesh, prior, track.light)
+    light = track.light if known else (yield from _light_near(pyramid, mesh, prior, track.light))
     if light is None:
         return missed
-    found = refine_pose(pyramid, mesh, prior, light, levels[-1:], modes=modes)
+    found = yield from pose_steps(pyramid, mesh, prior, light, levels[-1:], modes=modes)
     if is_valid(found):
         return PoseTrack(found, light, track.last.pose)
     refined = yield from prior_steps(pyramid, mesh, prior, modes)
@@ -253,9 +252,12 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
     return PoseTrack(found, light) if is_valid(found) else missed
 
 
-def _light_near(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting) -> Lighting | None:
+def _light_near(
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting
+) -> Steps[Lighting | None]:
+    """Return, in steps, the light on a target at ``pose`` near a previous one; None if too little of the target is in view."""
     levels = levels_of(pyramid, mesh, pose)
-    return light_at(pyramid, mesh, pose, levels[0], light) if levels else None
+    return (yield from light_steps(pyramid, mesh, pose, levels[0], light)) if levels else None
 
 
 def _distinct(tracks: list[PoseTrack]) -> tuple[PoseTrack, ...]:

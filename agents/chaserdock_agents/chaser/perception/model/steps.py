@@ -12,10 +12,13 @@ Steps = Generator[float, None, T]
 """Yields the expected CPU time of the next step, ms, and returns a result. The time decides only how work is spread."""
 
 LIGHT_MS = 5.0
-"""Time to estimate the light without a previous one."""
-VIEWS_MS = 10.0
-"""Time to compare likely lights by synthetic views."""
+"""Time to estimate the light by points."""
+LIKELY_MS, VIEWS_MS = 6.0, 12.0
+"""Times to find likely lights, and to compare them by synthetic views."""
+SUNS_MS = 10.0
+"""Time to compare all directions of a sun behind the target."""
 _LEVEL_MS, _MS_PER_PX = 3.0, 5.5e-5
+_COMPARED_MS, _COMPARED_MS_PER_PX = 0.9, 1.4e-5
 
 
 def result_of(steps: Steps[T]) -> T:
@@ -30,3 +33,8 @@ def result_of(steps: Steps[T]) -> T:
 def level_ms(area_px: float) -> float:
     """Return the time to render a level on a window of ``area_px`` pixels and to align its control points."""
     return _LEVEL_MS + _MS_PER_PX * area_px
+
+
+def compared_ms(area_px: float) -> float:
+    """Return the time to render a view on a window of ``area_px`` pixels and to compare it with the image."""
+    return _COMPARED_MS + _COMPARED_MS_PER_PX * area_px

@@ -18,14 +18,15 @@ from .alignment import (
     ControlPoints,
     Pyramid,
     align,
+    area_px,
     control_points,
     diameter_px,
     window_of,
 )
-from .lighting import light_at
+from .lighting import light_steps
 from .mesh import TrackerMesh
 from .rendering import Lighting
-from .steps import LIGHT_MS, VIEWS_MS, Steps, level_ms, result_of
+from .steps import Steps, level_ms, result_of
 
 MIN_INLIER_SHARE = 0.66
 """Gate: a smaller share of inliers rejects a pose."""
@@ -133,8 +134,7 @@ def prior_steps(
     levels = levels_of(pyramid, mesh, prior)
     if (found is not None and found[0].inlier_share >= _SETTLED_SHARE) or not levels:
         return found
-    yield LIGHT_MS + VIEWS_MS
-    light = light_at(pyramid, mesh, prior, levels[0], by_view=True)
+    light = yield from light_steps(pyramid, mesh, prior, levels[0], by_view=True)
     if light is None:
         return found
     other = yield from _settling_steps(pyramid, mesh, prior, light, levels, modes)
@@ -156,8 +156,7 @@ def rough_prior_steps(
     for by_view in (False, True):
         coarse = yield from pose_steps(pyramid, mesh, pose, light, levels[:1], modes=modes)
         pose = coarse.pose if coarse else pose
-        yield LIGHT_MS + by_view * VIEWS_MS
-        found = light_at(pyramid, mesh, pose, levels[0], by_view=by_view)
+        found = yield from light_steps(pyramid, mesh, pose, levels[0], by_view=by_view)
         if found is None:
             return None
         light = found
@@ -173,8 +172,7 @@ def _settling_steps(
         if fine is None or _is_settled(fine, 0.0 if number else _SETTLED_SHARE):
             break
         # The light of a coarse pose that is wrong by degrees is wrong as well, and leaves the fine one between the two.
-        yield LIGHT_MS + VIEWS_MS
-        light = light_at(pyramid, mesh, fine.pose, levels[0], by_view=True) or light
+        light = (yield from light_steps(pyramid, mesh, fine.pose, levels[0], by_view=True)) or light
         fine = yield from pose_steps(pyramid, mesh, fine.pose, light, levels[-2:], _NEXT_REACH_PX, fine.modes)
         if fine is not None and not _is_settled(fine):
             # Of few points the coarser level turns a pose away by more than that, and the finest one back.
@@ -230,8 +228,7 @@ def start_steps(
 
 def view_ms(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> float:
     """Return the expected CPU time to align a view of one level."""
-    found = window_of(pyramid, level, mesh, pose)
-    return level_ms(float(found[0].height * found[0].width) if found else 0.0)
+    return level_ms(area_px(pyramid, level, mesh, pose))
 
 
 def turn_between(a: PoseInCamera, b: PoseInCamera) -> float:

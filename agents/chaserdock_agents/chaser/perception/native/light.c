@@ -30,6 +30,20 @@ static void solve_levels(double aa, double ab, double bb, double ag, double bg, 
     }
 }
 
+/* Light of level 1 from the sun in the direction ``sun`` that a point reflects to the camera; 0 in the shade. */
+static inline double reflected(const LitPoint *p, const double *sun, const ShadowMap *map, const float *depth) {
+    double cosine = dot3(p->normal, sun);
+    if (!(cosine > 0.0) || (map->size > 0.0 && in_shadow(map, depth, p->at))) return 0.0;
+    double shine = p->gloss > 0.0 ? p->gloss * gloss_factor(p->normal, p->to_camera, sun, p->exponent) : 0.0;
+    return p->reflectance * cosine + shine;
+}
+
+/* Compute the light of level 1 from the sun in the direction ``sun`` that each of ``n`` points reflects, ``out`` (n), float. */
+EXPORT void NAME(direct_light)(const LitPoint *points, int64_t n, const double *sun, const ShadowMap *map, const float *depth,
+                              float *out) {
+    for (int64_t i = 0; i < n; i++) out[i] = (float)reflected(points + i, sun, map, depth);
+}
+
 /* Rate ``k`` directions of the sun. ``points``: n LitPoint; ``directions``: k unit vectors in TRF; ``maps``: k ShadowMap of equal size
  * with ``depths`` (k, size, size). Output, (k, 3): mean robust squared residual, a and d. ``work``: 2 n doubles. */
 EXPORT void NAME(rate_suns)(const LitPoint *points, int64_t n, const double *directions, const ShadowMap *maps, const float *depths,
@@ -40,12 +54,8 @@ EXPORT void NAME(rate_suns)(const LitPoint *points, int64_t n, const double *dir
         int64_t texels = (int64_t)maps[j].size * (int64_t)maps[j].size;
         const float *depth = depths + j * texels;
         for (int64_t i = 0; i < n; i++) {
-            const LitPoint *p = points + i;
-            double cosine = dot3(p->normal, sun);
-            direct[i] = 0.0, weight[i] = 1.0 / (p->sigma * p->sigma);
-            if (!(cosine > 0.0) || (maps[j].size > 0.0 && in_shadow(maps + j, depth, p->at))) continue;
-            direct[i] = p->reflectance * cosine;
-            if (p->gloss > 0.0) direct[i] += p->gloss * gloss_factor(p->normal, p->to_camera, sun, p->exponent);
+            direct[i] = reflected(points + i, sun, maps + j, depth);
+            weight[i] = 1.0 / (points[i].sigma * points[i].sigma);
         }
         double a = 0.0, d = 0.0, cost = 0.0;
         for (int round = 0; round < LIGHT_ROUNDS; round++) {

@@ -97,8 +97,9 @@ def test_paused_search_goes_on_where_it_stopped() -> None:
     target = TargetState(0, V, V, np.array([1.0, 0.0, 0.0, 0.0]), W, np.eye(12), "none", 0, ())
     search, q = TargetSearch(s.chaser, CAMERA), np.array([1.0, 0.0, 0.0, 0.0])
     x = np.concatenate([np.zeros(6), q, np.zeros(3)])
-    for k in range(61):
-        wrench = search.wrench(_odometry(0, k, x), 0.0, target, acquiring=k <= 30)
+    for k in range(60):
+        search.wrench(_odometry(0, k, x), 0.0, target, acquiring=k <= 30)
+    wrench = search.wrench(_odometry(0, 60, x), 0.0, target, acquiring=False)
     np.testing.assert_array_equal(wrench, search_wrench(_odometry(0, 60, x), s.chaser, CAMERA, q, 2.0))
 
 

@@ -153,9 +153,9 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         mesh_faces(satellite(body.mesh, _FACET_M)) if body.mesh else box_faces(Box(body.size_m, shade=0.42))
     )
     mesh = scenario.target.nominal_mesh(_FACET_M)
-    boxes = model.boxes if mesh is None else ()
-    target = [] if mesh is None else mesh_faces(mesh)
-    target += [face for box in boxes for face in box_faces(box, model)]
+    target = (
+        [face for box in model.boxes for face in box_faces(box, model)] if mesh is None else mesh_faces(mesh)
+    )
     if body.probe_reach_m > front:
         chaser += _probe(front, body.probe_reach_m)
     camera = scenario.camera_model()

@@ -30,7 +30,7 @@ OFF = (0.01, np.deg2rad(1.5))
 def track(scene, mesh, pose, light, prior, number=0):
     pyramid = Pyramid(scene.image(pose, light, number), scene.camera)
     levels = tracking.levels_of(pyramid, mesh, prior)
-    return tracking.refine_pose(pyramid, mesh, prior, lighting_of(light), levels)
+    return result_of(tracking.pose_steps(pyramid, mesh, prior, lighting_of(light), levels))
 
 
 def tracked_errors(scene, meshes, range_m, seed):
@@ -138,7 +138,7 @@ def test_gate_rejects_a_wrong_attitude_and_images_without_the_target():
             pyramid = Pyramid(image, CAMERA)
             levels = tracking.levels_of(pyramid, mesh_of(), pose)
             assert not tracking.is_valid(
-                tracking.refine_pose(pyramid, mesh_of(), pose, lighting_of(light), levels)
+                result_of(tracking.pose_steps(pyramid, mesh_of(), pose, lighting_of(light), levels))
             )
 
 

@@ -23,7 +23,7 @@ from ..refine import PoseInCamera
 from .alignment import Pyramid, area_px, image_window, in_grey_levels, window_of
 from .mesh import ShadowMaps, TrackerMesh
 from .rendering import Lighting, PixelWindow, SyntheticView, render
-from .steps import LIGHT_MS, LIKELY_MS, SUNS_MS, VIEWS_MS, Steps, compared_ms, result_of
+from .steps import LIGHT_MS, LIKELY_MS, SUNS_MS, VIEWS_MS, Steps, compared_ms
 
 _MOST_POINTS, _FEWEST_POINTS = 600, 40
 _EVERY_POINT = 3
@@ -55,22 +55,6 @@ class LitPoints:
     rotation: Array
 
 
-def light_at(
-    pyramid: Pyramid,
-    mesh: TrackerMesh,
-    pose: PoseInCamera,
-    level: int,
-    previous: Lighting | None = None,
-    by_view: bool = False,
-) -> Lighting | None:
-    """Return the light, in grey levels, that the image shows on a target at ``pose``; None if too little of it is in view.
-
-    With ``previous``, only directions near that light are tried. With ``by_view``, a synthetic view in each of several likely
-    lights decides: on few textured faces, directions far apart explain the points about equally well, but not the shadows' edges.
-    """
-    return result_of(light_steps(pyramid, mesh, pose, level, previous, by_view))
-
-
 def light_steps(
     pyramid: Pyramid,
     mesh: TrackerMesh,
@@ -79,7 +63,11 @@ def light_steps(
     previous: Lighting | None = None,
     by_view: bool = False,
 ) -> Steps[Lighting | None]:
-    """Do what `light_at` does, in steps."""
+    """Return, in steps, the light, in grey levels, that the image shows on a target at ``pose``; None if too little of it is in view.
+
+    With ``previous``, only directions near that light are tried. With ``by_view``, a synthetic view in each of several likely
+    lights decides: on few textured faces, directions far apart explain the points about equally well, but not the shadows' edges.
+    """
     yield LIGHT_MS
     points = lit_points(pyramid, mesh, pose, level)
     if points is None:

@@ -78,19 +78,6 @@ def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[
     return tuple(range(coarsest, finest - 1, -1))
 
 
-def refine_pose(
-    pyramid: Pyramid,
-    mesh: TrackerMesh,
-    prior: PoseInCamera,
-    light: Lighting,
-    levels: tuple[int, ...],
-    first_reach_px: int = _FIRST_REACH_PX,
-    modes: Array | None = None,
-) -> Alignment | None:
-    """Align the mesh with an image from ``prior``, level by level; None without an alignment at the last level."""
-    return result_of(pose_steps(pyramid, mesh, prior, light, levels, first_reach_px, modes))
-
-
 def pose_steps(
     pyramid: Pyramid,
     mesh: TrackerMesh,
@@ -100,7 +87,7 @@ def pose_steps(
     first_reach_px: int = _FIRST_REACH_PX,
     modes: Array | None = None,
 ) -> Steps[Alignment | None]:
-    """Do what `refine_pose` does, one level in each step."""
+    """Align the mesh with an image from ``prior``, one level in each step; None without an alignment at the last level."""
     pose, alignment = prior, None
     for number, k in enumerate(levels):
         yield view_ms(pyramid, mesh, pose, k)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.estimator import JointInputs
-from chaserdock_controller.estimation.joint.parameters import SHAPE, SightingNoise
+from chaserdock_controller.estimation.joint.parameters import SHAPE, JointParameters, SightingNoise
+from chaserdock_controller.estimation.joint.state import SIGHTING_CHANNEL
 from chaserdock_controller.estimation.target_hypotheses import POSE
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
@@ -20,6 +21,7 @@ from joint_cases import PERIOD_S, SIGHTING_SIGMAS, SyntheticFlight, navigation, 
 
 SCENARIO = scenario()
 CHASERS, FLIGHT_S, FLIGHTS = 3, 40.0, 6
+REJECTIONS = JointParameters.rejections_to_new_view
 SPREAD, SPREAD_TIME_S = 0.5, 2.0
 """Relative spread of the stated sigmas of position and rotation, and its time constant."""
 
@@ -115,3 +117,23 @@ def test_an_invalid_covariance_does_not_change_the_units() -> None:
     assert after is not None
     assert np.array_equal(after.view_units[0], before.view_units[0])
     assert not np.array_equal(after.view_units[1], before.view_units[1])
+
+
+@pytest.mark.parametrize(("sigmas", "follows"), [(3.0, True), (40.0, False)])
+def test_error_that_jumps_as_with_a_new_view_is_followed(sigmas: float, follows: bool) -> None:
+    """A jump by some stated sigmas per axis is a new view; a far larger one is a fault of the camera, and is reported."""
+    flight = ShapeFlight(3)
+    estimator = JointEstimator(parameters(SCENARIO, flight.errors), CHASERS)
+    ticks, jump_tick, rejections = round(15.0 / PERIOD_S), round(10.0 / PERIOD_S), []
+    for k in range(ticks):
+        if k == jump_tick:
+            flight.persistent[1] = sigmas * SIGHTING_SIGMAS * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
+        estimator.update(flight.inputs())
+        state = estimator.state
+        assert state is not None
+        rejections.append(int(state.rejections[1, SIGHTING_CHANNEL]))
+        flight.step()
+    assert max(rejections[:jump_tick]) <= 1
+    assert (max(rejections[jump_tick:]) == REJECTIONS - 1) is follows
+    warnings = [e.text for e in estimator.drain_events() if e.level == "warning"]
+    assert warnings == ([] if follows else ["chaser 1 gated out: 5 in a row"])

@@ -71,6 +71,8 @@ class JointParameters:
         as by a stuck thruster: for the velocity about a third of the greatest change under commands; for the rate all of it, as
         the torque of a stuck thruster exceeds that of commands. It is assumed only where velocity or rate does not fit otherwise.
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
+    rejections_to_new_view: a chaser's sightings by shape that are rejected this many times in a row are taken for those of a new
+        view, whose error is unknown, if they then fit: where the tracker draws its view anew, its error can jump by several sigmas.
     collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
     restart_after_s: a chaser whose odometry was missing, or of which no measurement was used, for so long is started again from its
         odometry.
@@ -116,6 +118,7 @@ class JointParameters:
     unexpected_velocity_m_s: float = 0.003
     unexpected_omega_rad_s: float = 0.05
     rejections_to_drop: int = 5
+    rejections_to_new_view: int = 3
     collective_rejections: int = 3
     iterated_updates: int = 5
     iterations: int = 4

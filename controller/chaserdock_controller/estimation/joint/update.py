@@ -5,9 +5,10 @@ A channel whose residual does not fit is not used in that tick. After ``rejectio
 until it has fitted as often: a jump or a constant error then changes nothing. A chaser of which no measurement was used for
 ``restart_after_s`` is started again from its odometry: an estimate that contradicts all measurements cannot recover otherwise.
 A velocity or rate that does not fit in two ticks in a row, by no more than the thrusters can cause within a tick, is followed.
-Noise that exceeds the gate in a single tick, which happens in about every flight, must not pass for a force. When most cameras
-are rejected together, the target has moved in an unexpected way: its rates are widened, and if that does not help its pose is
-reinitialized.
+Noise that exceeds the gate in a single tick, which happens in about every flight, must not pass for a force. A sighting by shape
+that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can cause, is followed as well.
+When most cameras are rejected together, the target has moved in an unexpected way: its rates are widened, and if that does not
+help its pose is reinitialized.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ from .state import (
     TORQUE,
     TURN,
     VELOCITY,
+    VIEW,
     JointState,
     block,
     mean_fields,
@@ -63,6 +65,7 @@ from .state import (
 )
 
 _RATES = (CHANNELS.index("velocity"), CHANNELS.index("rate"))
+_SIGHTING, _ODOMETRY = frozenset({SIGHTING_CHANNEL}), frozenset(range(1, len(CHANNELS)))
 _TICK_S = 0.1
 """Time, at most about a tick, in which unexpected motion displaces a chaser."""
 
@@ -329,7 +332,12 @@ def _update_chaser(
     if not all(gates.fits.values()) and any(
         not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES
     ):
-        gates = _follow_unexpected_motion(running, i, z, channels, gates, p)
+        gates = _follow(running, i, z, channels, gates, _unexpected_motion(i, running, p), _ODOMETRY, p)
+    if (
+        view is not None
+        and p.rejections_to_new_view <= gates.rejections[SIGHTING_CHANNEL] <= p.rejections_to_drop
+    ):
+        gates = _follow(running, i, z, channels, gates, _new_view(i, running), _SIGHTING, p)
     running.rejections[i], running.nis[i] = gates.rejections, gates.nis
     running.log_likelihood = gates.log_likelihood
     used = _rows(tuple(c.rows for c in channels if gates.fits[c.number]))
@@ -339,31 +347,33 @@ def _update_chaser(
     return gates.fits
 
 
-def _follow_unexpected_motion(
+def _follow(
     running: RunningUpdate,
     i: int,
     z: kernels.ChaserMeasurement,
     channels: Sequence[_Channel],
     gates: _Gates,
+    change: Array,
+    judged: frozenset[int],
     p: JointParameters,
 ) -> _Gates:
-    """Widen the covariance by a change of a chaser's rates without a command, if all odometry then fits; return the gates.
+    """Widen the covariance by the variances of an unexpected ``change``, if the channels ``judged`` then fit; return the gates.
 
     The running innovation is afterwards that of the covariance."""
     diagonal = np.einsum("ii->i", running.covariance)
     before = diagonal.copy()
-    diagonal += _unexpected_motion(i, len(before), p)
+    diagonal += change
     wider = _gate(running, i, channels, running.values(z), p)
-    if all(fit for k, fit in wider.fits.items() if k != SIGHTING_CHANNEL):
+    if all(fit for k, fit in wider.fits.items() if k in judged):
         return wider._replace(nis=gates.nis)
     diagonal[:] = before
     running.values(z)
     return gates
 
 
-def _unexpected_motion(i: int, size: int, p: JointParameters) -> Array:
-    """Return the variances (``size``,) that a force and a torque without a command add to chaser ``i`` within a tick."""
-    variances, own = np.zeros(size), block(i).start
+def _unexpected_motion(i: int, running: RunningUpdate, p: JointParameters) -> Array:
+    """Return the variances (D,) that a force and a torque without a command add to chaser ``i`` within a tick."""
+    variances, own = np.zeros(len(running.covariance)), block(i).start
     for part, sigma in (
         (VELOCITY, p.unexpected_velocity_m_s),
         (POSITION, p.unexpected_velocity_m_s * _TICK_S),
@@ -373,6 +383,13 @@ def _unexpected_motion(i: int, size: int, p: JointParameters) -> Array:
         (TORQUE, p.torque_max_N_m),
     ):
         variances[own + part.start : own + part.stop] = sigma**2
+    return variances
+
+
+def _new_view(i: int, running: RunningUpdate) -> Array:
+    """Return the variances (D,) that the error of the sightings of chaser ``i`` gains where it changes at once to any other one."""
+    variances, own = np.zeros(len(running.covariance)), block(i).start
+    variances[own + VIEW.start : own + VIEW.stop] = 1.0
     return variances
 
 

@@ -44,10 +44,11 @@ def whitened_error(true_position_m: Array, true_q: Array, solution: PoseSolution
     axes = np.eye(6)
     axes[:3, :3] = rotations.to_matrix(q).T
     covariance = axes @ np.reshape(solution.covariance, (6, 6)) @ axes.T
-    whitened = [
-        np.linalg.solve(np.linalg.cholesky(covariance[k, k]), (axes @ error)[k]) for k in KINDS.values()
-    ]
-    return np.concatenate(whitened)
+    error = axes @ error
+    return np.concatenate(
+        [np.linalg.solve(np.linalg.cholesky(covariance[k, k]), error[k]) for k in KINDS.values()],
+        dtype=np.float64,
+    )
 
 
 class JudgedImages(RenderedImages):

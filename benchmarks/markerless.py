@@ -16,6 +16,7 @@ front of the target are random. Parts:
   texture;
 - ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
   target is darker than 5 grey levels are left out, here and with the lamp;
+- ``backlit-flight``: the views of ``backlit`` as in flight, each the last of 30 images of a target that turns;
 - ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp, that of `harsh-light`, and at 1 to 3 m
   of a target that moves by four pixels during the exposure; the pose is that in the middle of it;
 - ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and those that pass the
@@ -79,7 +80,10 @@ EXACT = TrackerMesh.of_mesh(satellite(TARGET), 0.0, 0.0)
 KNOWN = satellite(TARGET, 0.001)
 EARTH_RADIUS_RAD = 1.1
 PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
-PRIOR = (0.01, np.deg2rad(1.5))
+PRIOR, NEAR_PRIOR = (0.01, np.deg2rad(1.5)), (0.003, np.deg2rad(0.3))
+FLIGHT_IMAGES = 30
+TURN = np.deg2rad(4.0) / 15.0 * np.array([0.6, 0.64, 0.48])
+"""Turn of a tumbling target from image to image."""
 LEAST_GREY = 5.0
 MOST_UNSEEN = 120
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
@@ -153,13 +157,15 @@ class Cells:
     path: Path | None
 
     def rows(
-        self, cell: str, views: int, view: Callable[[np.random.Generator, int], ViewRow]
+        self, cell: str, views: int, view: Callable[[np.random.Generator, int], ViewRow], like: str = ""
     ) -> list[ViewRow]:
-        """Return the rows of a cell; ``view`` makes that of a number with a generator of its own."""
+        """Return the rows of a cell; ``view`` makes that of a number with a generator of its own, or that of the cell ``like``."""
         known = {line["number"]: line["row"] for line in read_lines(self.path) if line["cell"] == cell}
         for number in range(views):
             if number not in known:
-                known[number] = view(np.random.default_rng([zlib.crc32(cell.encode()), number]), number)
+                known[number] = view(
+                    np.random.default_rng([zlib.crc32((like or cell).encode()), number]), number
+                )
                 append_line(self.path, {"cell": cell, "number": number, "row": known[number]})
         return [known[number] for number in range(views)]
 
@@ -288,16 +294,20 @@ def tracked_view(
     took_s = time.process_time() - begin_s
     if found is None:
         return {"s": took_s, "valid": 0.0, "wrong": 1.0}
-    e, range_m = tracking.pose_error(found.pose, pose), float(np.linalg.norm(pose.position))
-    error = error_of(found.pose, pose)
+    figures = {"s": took_s, "valid": float(tracking.is_valid(found))}
+    return figures | pose_figures(found.pose, found.covariance, pose)
+
+
+def pose_figures(estimate: PoseInCamera, covariance: Array, truth: PoseInCamera) -> ViewRow:
+    """Return the errors of a pose, and its squared error by the covariance (6, 6)."""
+    e, range_m = tracking.pose_error(estimate, truth), float(np.linalg.norm(truth.position))
+    error = error_of(estimate, truth)
     return {
-        "s": took_s,
-        "valid": float(tracking.is_valid(found)),
         "wrong": float(is_gross(error, range_m)),
         "m": error[0],
         "rad": error[1],
-        "along_m": abs(float(e[:3] @ pose.position)) / range_m,
-        "nees": float(e @ np.linalg.solve(found.covariance, e)),
+        "along_m": abs(float(e[:3] @ truth.position)) / range_m,
+        "nees": float(e @ np.linalg.solve(covariance, e)),
     }
 
 
@@ -403,20 +413,68 @@ def bright_figures(key: str, rows: list[ViewRow]) -> Figures:
     return tracking_figures(key, [row for row in rows if row["grey"] >= LEAST_GREY])
 
 
+def backlit_view(rng: np.random.Generator) -> tuple[PoseInCamera, Light]:
+    """Return a pose at 1 to 3 m, and a sun behind the target."""
+    pose, _ = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
+    sun = (rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0)
+    ambient = float(rng.uniform(0.01, 0.2))
+    return pose, Light(sun, 1.0 - ambient, ambient)
+
+
 def backlit(cells: Cells, views: int) -> Figures:
     """Track single images with the sun behind the target."""
     scene = SatelliteImages()
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        pose, _ = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
-        sun = (rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0)
-        ambient = float(rng.uniform(0.01, 0.2))
-        light = Light(sun, 1.0 - ambient, ambient)
+        pose, light = backlit_view(rng)
         image = scene.image(pose, light, number)
-        row = tracked_view(image, EXACT, pose, perturbed(pose, rng, 0.003, np.deg2rad(0.3)))
+        row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *NEAR_PRIOR))
         return row | {"grey": scene.mean_grey(image, pose)}
 
     return bright_figures("backlit", cells.rows("backlit", views, view))
+
+
+def backlit_flight(cells: Cells, views: int) -> Figures:
+    """Follow the target to each view of ``backlit`` through the images of two seconds.
+
+    Images without a track start from the pose that others expect. Figures: of the last images; images without a pose before the first
+    one, the most of a view, and after it, as a share; and the mean NEES of all images.
+    """
+    scene = SatelliteImages()
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        pose, light = backlit_view(rng)
+        row: ViewRow = {"grey": scene.mean_grey(scene.image(pose, light, number), pose)}
+        if row["grey"] < LEAST_GREY:
+            return row
+        perception, seen, nees = ModelPerception(CAMERA, EXACT), [], []
+        perception.prepare()
+        for k in range(1 - FLIGHT_IMAGES, 1):
+            moved = PoseInCamera(pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation)
+            near = perturbed(moved, rng, *NEAR_PRIOR)
+            expected = near.position, rotations.from_matrix(near.rotation)
+            image = scene.image(moved, light, number)
+            begin_s = time.process_time()
+            solutions = perception.estimate(image, expected).solutions
+            row |= {"s": time.process_time() - begin_s, "valid": float(bool(solutions)), "wrong": 0.0}
+            seen.append(bool(solutions))
+            if solutions:
+                best = solutions[0]
+                found = PoseInCamera(best.position_irf_m, rotations.to_matrix(best.q_irf_trf_wxyz))
+                row |= pose_figures(found, best.covariance, moved)
+                nees.append(row["nees"])
+        first = seen.index(True) if any(seen) else FLIGHT_IMAGES
+        lost = float(np.mean(np.logical_not(seen[first:]))) if any(seen) else 1.0
+        return row | {"first": first, "lost": lost, "nees_all": float(np.mean(nees)) if nees else np.nan}
+
+    rows = cells.rows("backlit-flight", views, view, "backlit")
+    bright = [row for row in rows if row["grey"] >= LEAST_GREY]
+    return bright_figures("backlit_flight", rows) | {
+        "backlit_flight_images_until_seen": max(row["first"] for row in bright),
+        "backlit_flight_lost_share": float(np.mean([row["lost"] for row in bright])),
+        "backlit_flight_nees_all_mean": float(np.nanmean([row["nees_all"] for row in bright])),
+        "backlit_flight_nees_all_median": float(np.nanmedian([row["nees_all"] for row in bright])),
+    }
 
 
 def lamp(cells: Cells, views: int) -> Figures:
@@ -510,10 +568,9 @@ def follow(key: str, images: int, first_m: float, closing_m: float) -> Figures:
     scene, perception = SatelliteImages(), ModelPerception(CAMERA, EXACT)
     perception.prepare()
     pose, _ = random_view(np.random.default_rng(9), first_m, CAMERA)
-    axis = np.deg2rad(4.0) / 15.0 * np.array([0.6, 0.64, 0.48])
     errors, times, missed, acquired_after = [], [], 0, 0
     for number in range(MOST_UNSEEN + images):
-        turn = rotations.to_matrix(rotations.exp(number * axis))
+        turn = rotations.to_matrix(rotations.exp(number * TURN))
         nearer = max(0, number - acquired_after) * closing_m / first_m
         moved = PoseInCamera(pose.position * (1.0 - nearer), turn @ pose.rotation)
         image = scene.image(moved, Light((-0.5, -0.4, -1.0)), number)
@@ -542,15 +599,14 @@ def follow(key: str, images: int, first_m: float, closing_m: float) -> Figures:
 
 def shaded() -> Figures:
     """Start from expected poses, and follow, on the shaded side of targets that turn at 4 degrees/s; 40 images of each."""
-    scene, axis = SatelliteImages(), np.deg2rad(4.0) / 15.0 * np.array([0.6, 0.64, 0.48])
-    least_s, seen = [], 0
+    scene, least_s, seen = SatelliteImages(), [], 0
     for number, (range_m, sun) in enumerate(_SHADED):
         rng = np.random.default_rng(number)
         pose, _ = random_view(rng, range_m, CAMERA)
         views = []
         for k in range(_SHADED_IMAGES):
-            moved = PoseInCamera(pose.position, rotations.to_matrix(rotations.exp(k * axis)) @ pose.rotation)
-            near = perturbed(moved, rng, 0.003, np.deg2rad(0.3))
+            moved = PoseInCamera(pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation)
+            near = perturbed(moved, rng, *NEAR_PRIOR)
             expected = near.position, rotations.from_matrix(near.rotation)
             views.append((scene.image(moved, Light(sun, 0.92, 0.08), k), expected))
         repeated = []
@@ -604,6 +660,7 @@ def main() -> None:
         "independent-knowledge",
         "behind",
         "backlit",
+        "backlit-flight",
         "lamp",
         "blur",
         "gate",
@@ -647,6 +704,7 @@ def main() -> None:
             ),
             "behind": lambda: behind(cells, views),
             "backlit": lambda: backlit(cells, views),
+            "backlit-flight": lambda: backlit_flight(cells, views),
             "lamp": lambda: lamp(cells, views),
             "blur": lambda: blur(cells, views),
             "gate": lambda: gate(cells, views),

@@ -119,6 +119,11 @@ class Observation:
         """Return the simulated time in seconds."""
         return self.time_ns / 1e9
 
+    @property
+    def measured(self) -> dict[int, Odometry]:
+        """Return the odometry of this tick without extrapolated states, which leave out the thrust."""
+        return {i: odometry for i, odometry in self.odometry.items() if i not in self.outdated}
+
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedStack:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 
 import numpy as np
 from chaserdock_models.camera import Camera
@@ -22,9 +22,9 @@ class SightingConverter:
         self._camera = camera
         self._odometry: dict[tuple[int, int], Odometry] = {}
 
-    def add_odometry(self, odometry: Mapping[int, Odometry], now_ns: int) -> None:
-        """Add a tick's odometry and remove what is too old."""
-        for o in odometry.values():
+    def add_odometry(self, odometry: Iterable[Odometry], now_ns: int) -> None:
+        """Add measured odometry of this tick or earlier ones and remove what is too old."""
+        for o in odometry:
             self._odometry[o.chaser, o.sim_time_ns] = o
         for key in [k for k in self._odometry if k[1] < now_ns - _ODOMETRY_KEPT_NS]:
             del self._odometry[key]

@@ -116,7 +116,7 @@ class EstimationStage:
 
     def _target_only(self, o: Observation, estimator: Estimator) -> TargetState:
         """Update an estimator that takes odometry as exact."""
-        self._converter.add_odometry(o.odometry, o.time_ns)
+        self._converter.add_odometry((*o.measured.values(), *o.outdated.values()), o.time_ns)
         return estimator.update(self._converter.measurements(o.sightings), o.time_ns)
 
     def _joint_inputs(self, o: Observation, chasers: int, latched_before: frozenset[int]) -> JointInputs:
@@ -127,7 +127,7 @@ class EstimationStage:
         latched = self.composite.latched
         return JointInputs(
             time_ns=o.time_ns,
-            odometry={i: odometry for i, odometry in o.odometry.items() if i not in o.outdated},
+            odometry=o.measured,
             sightings=o.sightings,
             impulses=impulses,
             covered_s=self._period_s,

@@ -83,11 +83,11 @@ class StackIdentification:
         if not estimation.known or not latched & observation.odometry.keys():
             self._composite = None
             return None
-        states = {
-            i: body_state(observation.odometry[i]) for i in sorted(latched & observation.odometry.keys())
-        }
+        states = {i: body_state(o) for i, o in sorted(observation.measured.items()) if i in latched}
         composite = self._composite
         if composite is None or set(composite.filter.chasers) != latched:
+            if not states:
+                return None
             composite = self._composite = self._begin(estimation, states)
         else:
             self._predict(composite, observation)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller extrapolates in place of lost odometry leaves out the thrust: no estimator may take it for a measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pytest
+from chaserdock_controller.estimation.identification.stage import StackIdentification
+from chaserdock_controller.estimation.stage import EstimationStage
+from chaserdock_controller.estimation.types import Measurement
+from chaserdock_controller.interfaces import Observation, TargetEstimation
+from chaserdock_models import rotations
+from chaserdock_protocol.messages import Odometry, Sighting
+from chaserdock_protocol.scenario import load_scenario
+from flight_cases import scenario
+from joint_cases import SyntheticFlight, navigation
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
+ZERO = (0.0, 0.0, 0.0)
+
+
+def observation_of(
+    time_ns: int,
+    odometry: Mapping[int, Odometry],
+    sightings: tuple[Sighting, ...] = (),
+    outdated: Mapping[int, Odometry] | None = None,
+) -> Observation:
+    return Observation(
+        tick=0, time_ns=time_ns, effective_ns=time_ns, odometry=odometry, invalid={}, lost={}, sightings=sightings,
+        commands=(), docking={}, impulses={}, ahead=dict.fromkeys(odometry, ()), input_limits={}, isolated={}, events=(),
+        thruster_impulses={}, last_commands={}, outdated=outdated or {},
+    )  # fmt: skip
+
+
+class Recorded:
+    """An estimator that keeps the measurements of each tick."""
+
+    def __init__(self) -> None:
+        self.ticks: list[list[Measurement]] = []
+
+    def update(self, measurements: list[Measurement], now_ns: int) -> Any:
+        self.ticks.append(measurements)
+        raise StopIteration
+
+
+def test_estimators_of_the_target_alone_take_measured_odometry_only() -> None:
+    """A sighting whose odometry is lost becomes a measurement when that odometry arrives, not before."""
+    flight = SyntheticFlight(scenario(), navigation("lab"), 2, 1)
+    recorded = Recorded()
+    stage = EstimationStage(scenario(), cast(Any, recorded))
+    first = flight.inputs()
+    flight.step()
+    second = flight.inputs()
+    moved = msgspec.structs.replace(second.odometry[1], position_m=(9.0, 9.0, 9.0))
+    late = second.sightings[1]
+    for observation in (
+        observation_of(
+            second.time_ns, {**second.odometry, 1: moved}, second.sightings, {1: first.odometry[1]}
+        ),
+        observation_of(second.time_ns + 1, {}, (late,), {1: second.odometry[1]}),
+    ):
+        with pytest.raises(StopIteration):
+            stage.run(observation)
+    assert [[m.chaser for m in tick] for tick in recorded.ticks] == [[0], [1]]
+
+
+def test_identification_of_the_stack_takes_measured_odometry_only() -> None:
+    """An extrapolated state changes nothing, however wrong it is."""
+    detumble = load_scenario(SCENARIOS / "detumble-pair.toml")
+    chasers = [i for i in range(len(detumble.chasers)) if detumble.docking.port_of(i) is not None]
+    motions = []
+    for wrong in (False, True):
+        stage, odometry = StackIdentification(detumble), {}
+        for i in chasers:
+            position, q = detumble.start_pose(i)
+            odometry[i] = Odometry(
+                tick=0, sim_time_ns=0, chaser=i, position_m=tuple(position.tolist()), q_wxyz=tuple(q.tolist()),
+                velocity_m_s=ZERO, omega_rad_s=ZERO,
+            )  # fmt: skip
+        estimation = latched_estimation(frozenset(chasers), odometry)
+        stage.run(observation_of(0, odometry), estimation)
+        last, kept = chasers[-1], {i: odometry[i] for i in chasers[:-1]}
+        moving = msgspec.structs.replace(odometry[last], velocity_m_s=(0.05, 0.0, 0.0))
+        found = stage.run(
+            observation_of(1, {**kept, last: moving} if wrong else kept, (), {last: odometry[last]}),
+            estimation,
+        )
+        assert found is not None
+        motions.append([*found.motion.velocity_m_s, *found.motion.omega_rad_s])
+    assert motions[0] == motions[1]
+
+
+def latched_estimation(chasers: frozenset[int], own: Mapping[int, Odometry]) -> TargetEstimation:
+    """Return an estimation with the target at the origin, at rest, and latched chasers."""
+    target: Any = type("Target", (), {"position_m": np.zeros(3), "q_wxyz": rotations.IDENTITY})()
+    return TargetEstimation(
+        target=target, at_effect=target, own=own, own_at_effect={}, disturbances={}, motion_covariances={}, relative=(),
+        visible_to=frozenset(), cameras=(), latched=chasers, body=cast(Any, None), events=(),
+    )  # fmt: skip

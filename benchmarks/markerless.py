@@ -462,14 +462,14 @@ def in_flight(
     Images without a track start from the pose that others expect. Figures: of the last images; images without a pose before the first
     one, the most of a view, and after it, as a share; and the mean NEES of all images.
     """
-    scene, key = SatelliteImages(), f"{cell}_flight"
+    scene, key, acquisition = SatelliteImages(), f"{cell}_flight", Acquisition(CAMERA, EXACT)
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
         pose, light = draw(rng)
         row: ViewRow = {"grey": scene.mean_grey(scene.image(pose, light, number), pose)}
         if row["grey"] < LEAST_GREY:
             return row
-        perception, seen, nees = ModelPerception(CAMERA, EXACT), [], []
+        perception, seen, nees = ModelPerception(CAMERA, EXACT, acquisition), [], []
         perception.prepare()
         for k in range(1 - FLIGHT_IMAGES, 1):
             moved = PoseInCamera(pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation)

@@ -71,7 +71,7 @@ from chaserdock_protocol.scenario.navigation import NavigationSection
 from chaserdock_world.rendering.background import SPACE_LEVEL, Earth, Light
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
-from markerless_cases import perturbed, random_view
+from markerless_cases import backlit_view, perturbed, random_view
 from numpy.typing import NDArray
 
 CAMERA = Camera.from_hfov(960, 540, np.deg2rad(60.0))
@@ -414,20 +414,12 @@ def bright_figures(key: str, rows: list[ViewRow]) -> Figures:
     return tracking_figures(key, [row for row in rows if row["grey"] >= LEAST_GREY])
 
 
-def backlit_view(rng: np.random.Generator) -> tuple[PoseInCamera, Light]:
-    """Return a pose at 1 to 3 m, and a sun behind the target."""
-    pose, _ = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
-    sun = (rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0)
-    ambient = float(rng.uniform(0.01, 0.2))
-    return pose, Light(sun, 1.0 - ambient, ambient)
-
-
 def backlit(cells: Cells, views: int) -> Figures:
     """Track single images with the sun behind the target."""
     scene = SatelliteImages()
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        pose, light = backlit_view(rng)
+        pose, light = backlit_view(rng, CAMERA)
         image = scene.image(pose, light, number)
         row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *NEAR_PRIOR))
         return row | {"grey": scene.mean_grey(image, pose)}
@@ -714,7 +706,9 @@ def main() -> None:
             ),
             "behind": lambda: behind(cells, views),
             "backlit": lambda: backlit(cells, views),
-            "backlit-flight": lambda: in_flight(cells, "backlit", views, backlit_view),
+            "backlit-flight": lambda: in_flight(
+                cells, "backlit", views, lambda rng: backlit_view(rng, CAMERA)
+            ),
             "lamp": lambda: lamp(cells, views),
             "lamp-flight": lambda: in_flight(cells, "lamp", views, lamp_view),
             "blur": lambda: blur(cells, views),

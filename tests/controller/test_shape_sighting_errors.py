@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import msgspec
@@ -137,3 +138,20 @@ def test_error_that_jumps_as_with_a_new_view_is_followed(sigmas: float, follows:
     assert (max(rejections[jump_tick:]) == REJECTIONS - 1) is follows
     warnings = [e.text for e in estimator.drain_events() if e.level == "warning"]
     assert warnings == ([] if follows else ["chaser 1 gated out: 5 in a row"])
+
+
+def test_pushed_target_is_no_new_view() -> None:
+    """Where most cameras disagree with the estimate, the target has moved: its motion is followed as without this rule."""
+    velocities: list[list[list[float]]] = []
+    for rejections in (REJECTIONS, 1000):
+        flight = ShapeFlight(2)
+        p = dataclasses.replace(parameters(SCENARIO, flight.errors), rejections_to_new_view=rejections)
+        estimator = JointEstimator(p, CHASERS)
+        velocities.append([])
+        for k in range(round(14.0 / PERIOD_S)):
+            if k == round(10.0 / PERIOD_S):
+                flight.target[3:6] += [0.02, -0.01, 0.0]
+            velocities[-1].append(estimator.update(flight.inputs()).velocity_m_s.tolist())
+            flight.step()
+    assert velocities[0] == velocities[1]
+    assert np.linalg.norm(velocities[0][-1] - flight.target[3:6]) < 1e-3

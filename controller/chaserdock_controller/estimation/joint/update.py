@@ -6,7 +6,8 @@ until it has fitted as often: a jump or a constant error then changes nothing. A
 ``restart_after_s`` is started again from its odometry: an estimate that contradicts all measurements cannot recover otherwise.
 A velocity or rate that does not fit in two ticks in a row, by no more than the thrusters can cause within a tick, is followed.
 Noise that exceeds the gate in a single tick, which happens in about every flight, must not pass for a force. A sighting by shape
-that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can cause, is followed as well.
+that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can cause, is followed as well, unless
+most cameras disagree with the estimate.
 When most cameras are rejected together, the target has moved in an unexpected way: its rates are widened, and if that does not
 help its pose is reinitialized.
 """
@@ -295,11 +296,14 @@ def update(
     rejected: list[int] = []
     state = with_view_units(state, sightings, p)
     running, measured = RunningUpdate(state), state.measured_ns.copy()
+    # Where most cameras disagree with the estimate, the target has moved.
+    disagreeing = sum(bool(state.rejections[i, SIGHTING_CHANNEL]) for i in sightings)
+    new_views = 2 * disagreeing <= len(sightings)
     for i in sorted(odometry.keys() | sightings.keys()):
         if not state.alive[i]:
             continue
         sighting = sightings.get(i) if state.target_known else None
-        fits = _update_chaser(running, i, odometry.get(i), sighting, mounting, p)
+        fits = _update_chaser(running, i, odometry.get(i), sighting, new_views, mounting, p)
         if any(fits.values()):
             measured[i] = state.time_ns
         if sighting is not None and sighting.solutions:
@@ -317,10 +321,11 @@ def _update_chaser(
     i: int,
     odometry: Odometry | None,
     sighting: Sighting | None,
+    new_views: bool,
     mounting: CameraMounting,
     p: JointParameters,
 ) -> dict[int, bool]:
-    """Update with the measurements of one chaser; return which channels were used."""
+    """Update with the measurements of one chaser; return which channels were used. ``new_views``: follow errors of views that jump."""
     chasers, markers = running.state.chasers, len(sighting.marker_ids) if sighting is not None else 0
     solution = _likeliest(running, i, sighting, mounting, p)
     if odometry is None and solution is None:
@@ -334,7 +339,8 @@ def _update_chaser(
     ):
         gates = _follow(running, i, z, channels, gates, _unexpected_motion(i, running, p), _ODOMETRY, p)
     if (
-        view is not None
+        new_views
+        and view is not None
         and p.rejections_to_new_view <= gates.rejections[SIGHTING_CHANNEL] <= p.rejections_to_drop
     ):
         gates = _follow(running, i, z, channels, gates, _new_view(i, running), _SIGHTING, p)

@@ -16,7 +16,8 @@ front of the target are random. Parts:
   texture;
 - ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
   target is darker than 5 grey levels are left out, here and with the lamp;
-- ``backlit-flight``: the views of ``backlit`` as in flight, each the last of 30 images of a target that turns;
+- ``backlit-flight`` and ``lamp-flight``: the views of ``backlit`` and ``lamp`` as in flight, each the last of 30 images of a target
+  that turns;
 - ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp, that of `harsh-light`, and at 1 to 3 m
   of a target that moves by four pixels during the exposure; the pose is that in the middle of it;
 - ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and those that pass the
@@ -70,7 +71,7 @@ from chaserdock_protocol.scenario.navigation import NavigationSection
 from chaserdock_world.rendering.background import SPACE_LEVEL, Earth, Light
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
-from markerless_cases import perturbed, random_view
+from markerless_cases import backlit_view, perturbed, random_view
 from numpy.typing import NDArray
 
 CAMERA = Camera.from_hfov(960, 540, np.deg2rad(60.0))
@@ -413,20 +414,12 @@ def bright_figures(key: str, rows: list[ViewRow]) -> Figures:
     return tracking_figures(key, [row for row in rows if row["grey"] >= LEAST_GREY])
 
 
-def backlit_view(rng: np.random.Generator) -> tuple[PoseInCamera, Light]:
-    """Return a pose at 1 to 3 m, and a sun behind the target."""
-    pose, _ = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
-    sun = (rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0)
-    ambient = float(rng.uniform(0.01, 0.2))
-    return pose, Light(sun, 1.0 - ambient, ambient)
-
-
 def backlit(cells: Cells, views: int) -> Figures:
     """Track single images with the sun behind the target."""
     scene = SatelliteImages()
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        pose, light = backlit_view(rng)
+        pose, light = backlit_view(rng, CAMERA)
         image = scene.image(pose, light, number)
         row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *NEAR_PRIOR))
         return row | {"grey": scene.mean_grey(image, pose)}
@@ -434,20 +427,41 @@ def backlit(cells: Cells, views: int) -> Figures:
     return bright_figures("backlit", cells.rows("backlit", views, view))
 
 
-def backlit_flight(cells: Cells, views: int) -> Figures:
-    """Follow the target to each view of ``backlit`` through the images of two seconds.
+def lamp_view(rng: np.random.Generator) -> tuple[PoseInCamera, Light]:
+    """Return a pose at 1 to 2 m, and the light of the camera's lamp."""
+    pose, _ = random_view(rng, rng.uniform(1.0, 2.0), CAMERA)
+    return pose, Light(sun=0.0, ambient=0.01, lamp=_LAMP)
+
+
+def lamp(cells: Cells, views: int) -> Figures:
+    """Track single images in eclipse, by the light of the camera's lamp."""
+    scene = SatelliteImages()
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        pose, light = lamp_view(rng)
+        image = scene.image(pose, light, number)
+        row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
+        return row | {"grey": scene.mean_grey(image, pose)}
+
+    return bright_figures("lamp", cells.rows("lamp", views, view))
+
+
+def in_flight(
+    cells: Cells, cell: str, views: int, draw: Callable[[np.random.Generator], tuple[PoseInCamera, Light]]
+) -> Figures:
+    """Follow the target to each view of a cell through the images of two seconds.
 
     Images without a track start from the pose that others expect. Figures: of the last images; images without a pose before the first
     one, the most of a view, and after it, as a share; and the mean NEES of all images.
     """
-    scene = SatelliteImages()
+    scene, key, acquisition = SatelliteImages(), f"{cell}_flight", Acquisition(CAMERA, EXACT)
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        pose, light = backlit_view(rng)
+        pose, light = draw(rng)
         row: ViewRow = {"grey": scene.mean_grey(scene.image(pose, light, number), pose)}
         if row["grey"] < LEAST_GREY:
             return row
-        perception, seen, nees = ModelPerception(CAMERA, EXACT), [], []
+        perception, seen, nees = ModelPerception(CAMERA, EXACT, acquisition), [], []
         perception.prepare()
         for k in range(1 - FLIGHT_IMAGES, 1):
             moved = PoseInCamera(pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation)
@@ -467,27 +481,14 @@ def backlit_flight(cells: Cells, views: int) -> Figures:
         lost = float(np.mean(np.logical_not(seen[first:]))) if any(seen) else 1.0
         return row | {"first": first, "lost": lost, "nees_all": float(np.mean(nees)) if nees else np.nan}
 
-    rows = cells.rows("backlit-flight", views, view, "backlit")
+    rows = cells.rows(f"{cell}-flight", views, view, cell)
     bright = [row for row in rows if row["grey"] >= LEAST_GREY]
-    return bright_figures("backlit_flight", rows) | {
-        "backlit_flight_images_until_seen": max(row["first"] for row in bright),
-        "backlit_flight_lost_share": float(np.mean([row["lost"] for row in bright])),
-        "backlit_flight_nees_all_mean": float(np.nanmean([row["nees_all"] for row in bright])),
-        "backlit_flight_nees_all_median": float(np.nanmedian([row["nees_all"] for row in bright])),
+    return bright_figures(key, rows) | {
+        f"{key}_images_until_seen": max(row["first"] for row in bright),
+        f"{key}_lost_share": float(np.mean([row["lost"] for row in bright])),
+        f"{key}_nees_all_mean": float(np.nanmean([row["nees_all"] for row in bright])),
+        f"{key}_nees_all_median": float(np.nanmedian([row["nees_all"] for row in bright])),
     }
-
-
-def lamp(cells: Cells, views: int) -> Figures:
-    """Track single images in eclipse, by the light of the camera's lamp."""
-    scene = SatelliteImages()
-
-    def view(rng: np.random.Generator, number: int) -> ViewRow:
-        pose, _ = random_view(rng, rng.uniform(1.0, 2.0), CAMERA)
-        image = scene.image(pose, Light(sun=0.0, ambient=0.01, lamp=_LAMP), number)
-        row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
-        return row | {"grey": scene.mean_grey(image, pose)}
-
-    return bright_figures("lamp", cells.rows("lamp", views, view))
 
 
 def blur(cells: Cells, views: int) -> Figures:
@@ -662,6 +663,7 @@ def main() -> None:
         "backlit",
         "backlit-flight",
         "lamp",
+        "lamp-flight",
         "blur",
         "gate",
         "acquisition",
@@ -704,8 +706,11 @@ def main() -> None:
             ),
             "behind": lambda: behind(cells, views),
             "backlit": lambda: backlit(cells, views),
-            "backlit-flight": lambda: backlit_flight(cells, views),
+            "backlit-flight": lambda: in_flight(
+                cells, "backlit", views, lambda rng: backlit_view(rng, CAMERA)
+            ),
             "lamp": lambda: lamp(cells, views),
+            "lamp-flight": lambda: in_flight(cells, "lamp", views, lamp_view),
             "blur": lambda: blur(cells, views),
             "gate": lambda: gate(cells, views),
             "acquisition": lambda: acquire(cells, "acquisition", views),

@@ -169,6 +169,14 @@ def lighting_of(light: Light) -> Lighting:
     return Lighting(np.array(light.direction_w), light.sun, light.ambient)
 
 
+def backlit_view(rng: np.random.Generator, camera: Camera) -> tuple[PoseInCamera, Light]:
+    """Draw a pose at 1 to 3 m, and a sun behind the target."""
+    pose, _ = random_view(rng, rng.uniform(1.0, 3.0), camera)
+    sun = (rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0)
+    ambient = float(rng.uniform(0.01, 0.2))
+    return pose, Light(sun, 1.0 - ambient, ambient)
+
+
 def satellite_image(pose: PoseInCamera, light: Light, number: int) -> NDArray[np.uint8]:
     """Return an image (540, 960), 60 degrees wide, of `geo_servicer` by the world's renderer, as benchmarks/markerless.py makes it."""
     camera = Camera.from_hfov(960, 540, np.deg2rad(60.0))

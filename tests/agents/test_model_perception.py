@@ -20,7 +20,7 @@ from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_world.rendering.background import Light
-from markerless_cases import BOXES, Scene, mesh_of, perturbed, random_view, satellite_image
+from markerless_cases import BOXES, Scene, backlit_view, mesh_of, perturbed, random_view, satellite_image
 from source_tree import ROOT
 
 CAMERA = Camera.from_hfov(480, 270, np.deg2rad(60.0))
@@ -209,10 +209,8 @@ def test_search_for_the_sun_behind_a_target_is_spread_over_images(monkeypatch):
     wide = Camera.from_hfov(960, 540, np.deg2rad(60.0))
     mesh = TrackerMesh.of_mesh(satellite("geo_servicer"), 0.0, 0.0)
     rng = np.random.default_rng([zlib.crc32(b"backlit"), 254])
-    pose, _ = random_view(rng, rng.uniform(1.0, 3.0), wide)
-    sun = (rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0)
-    ambient = float(rng.uniform(0.01, 0.2))
-    image = satellite_image(pose, Light(sun, 1.0 - ambient, ambient), 254)
+    pose, light = backlit_view(rng, wide)
+    image = satellite_image(pose, light, 254)
     prior = perturbed(pose, rng, 0.003, np.deg2rad(0.3))
     drawn = []
 
@@ -231,3 +229,22 @@ def test_search_for_the_sun_behind_a_target_is_spread_over_images(monkeypatch):
     assert most.max() <= 10
     assert all(ms >= 0.8 * count for ms, count in zip(stated_ms, most, strict=True))
     assert max(stated_ms) <= 30.0
+
+
+@pytest.mark.parametrize("number", [167, 171])
+def test_backlit_target_is_tracked_while_it_turns(number):
+    """Views of benchmarks/markerless.py, `backlit-flight`, in which the track was lost."""
+    wide = Camera.from_hfov(960, 540, np.deg2rad(60.0))
+    mesh = TrackerMesh.of_mesh(satellite("geo_servicer"), 0.0, 0.0)
+    rng = np.random.default_rng([zlib.crc32(b"backlit"), number])
+    pose, light = backlit_view(rng, wide)
+    perception = ModelPerception(wide, mesh)
+    step, lost = np.deg2rad(4.0) / 15.0 * np.array([0.6, 0.64, 0.48]), []
+    for k in range(-29, 1):
+        turn = rotations.to_matrix(rotations.exp(k * step))
+        moved = PoseInCamera(pose.position, turn @ pose.rotation)
+        near = perturbed(moved, rng, 0.003, np.deg2rad(0.3))
+        expected = near.position, rotations.from_matrix(near.rotation)
+        lost.append(not perception.estimate(satellite_image(moved, light, number), expected).solutions)
+    assert False in lost
+    assert not any(lost[lost.index(False) :])

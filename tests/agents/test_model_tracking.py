@@ -17,7 +17,16 @@ from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.satellites import satellite
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
-from markerless_cases import Scene, lighting_of, mesh_of, perturbed, random_view, satellite_image, wrong_boxes
+from markerless_cases import (
+    Scene,
+    backlit_view,
+    lighting_of,
+    mesh_of,
+    perturbed,
+    random_view,
+    satellite_image,
+    wrong_boxes,
+)
 
 SIZE = (480, 270)
 CAMERA = Camera.from_hfov(*SIZE, np.deg2rad(60.0))
@@ -101,10 +110,8 @@ def test_docking_port_that_fills_the_image_is_tracked(position, q, sun):
 def test_sun_behind_a_target_is_estimated_from_its_rims(number):
     """Views of benchmarks/markerless.py, `backlit`: 0.5 and 0.7 deg off with light from everywhere, or with a sun in front."""
     rng = np.random.default_rng([zlib.crc32(b"backlit"), number])
-    pose, _ = random_view(rng, rng.uniform(1.0, 3.0), WIDE)
-    sun = np.array([rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0])
-    ambient = float(rng.uniform(0.01, 0.2))
-    image = satellite_image(pose, Light(tuple(sun.tolist()), 1.0 - ambient, ambient), number)
+    pose, lit = backlit_view(rng, WIDE)
+    image, sun = satellite_image(pose, lit, number), np.array(lit.to_sun_w)
     mesh = TrackerMesh.of_mesh(satellite("geo_servicer"), 0.0, 0.0)
     prior = perturbed(pose, rng, 0.003, np.deg2rad(0.3))
     found = tracking.refine_from_prior(Pyramid(image, WIDE), mesh, prior)

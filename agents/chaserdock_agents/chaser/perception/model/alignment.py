@@ -45,8 +45,9 @@ _BESIDE_PX = 3.0
 _CORRELATED_POINTS, _INDEPENDENT_MOST = 5.5, 60.0
 """Number of neighbouring control points that err together, so that their information counts once; and largest number of points
 that count: shading and facets that the mesh does not have do not become more accurate with more pixels."""
-_INDEPENDENT_DIM = 25.0
-"""The same on a side in the shade, where a sun behind the target brightens rims, which move together."""
+_INDEPENDENT_DIM, _BEHIND_Z = 25.0, 0.3
+"""The same on a side in the shade, or with the sun behind the target, where it brightens rims, which move together; and least z in IRF
+of the direction of such a sun."""
 _SPREAD_PX = {0: 0.6, 1: 0.45, -1: 1.2}
 """Standard deviation, in pixels of a level, of the point spread that the synthetic view gets."""
 
@@ -188,7 +189,8 @@ def control_points(
         return None
     points, owners = points[used], owners[used]
     displaced, border = mesh.mode_displacements(owners, points), mesh.border_of(owners)
-    dim = light.weak or (light.shadows and light.direct == 0.0)
+    behind = light.to_sun_irf is not None and light.to_sun_irf[2] > _BEHIND_Z
+    dim = behind or light.weak or (light.shadows and light.direct == 0.0)
     independent = _INDEPENDENT_DIM if dim else _INDEPENDENT_MOST
     return ControlPoints(
         points, ahead[:n][used], profiles[:n][used], owners, k, pose, displaced, border, independent

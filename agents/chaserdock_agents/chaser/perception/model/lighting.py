@@ -80,7 +80,13 @@ def light_steps(
         lights = likely_lights(mesh, points)
         yield VIEWS_MS
         previous = max(lights, key=lambda light: appearance(pyramid, mesh, pose, level, light))
-    return fit_light(mesh, points, previous)
+    found = fit_light(mesh, points, previous)
+    if previous is None or not previous.weak:
+        return found
+    # A sun that explains points in the shade a little better than light from everywhere can be one of noise.
+    yield 2.0 * compared_ms(area_px(pyramid, level, mesh, pose))
+    lights = [light for light in (found, previous) if light is not None]
+    return max(lights, key=lambda light: appearance(pyramid, mesh, pose, level, light))
 
 
 def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:

@@ -38,6 +38,8 @@ _KEY_EVERY = 8
 """A view is rendered at least at every eighth image; between, its control points are reused."""
 _KEY_TURN_RAD = 0.04
 """Points of a view are not reused when the target has turned by more since."""
+_STOPGAP_TURN_RAD = 0.08
+"""Where the gate rejects a new view, as in changing weak light, the points of the one before are reused up to this turn."""
 _LOST_AFTER = 3
 """Number of images in a row without a valid pose after which a track ends."""
 _PER_IMAGE_MS = 30.0
@@ -219,8 +221,8 @@ class ModelPerception:
 
 
 def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[PoseTrack]:
-    """Return a track after the next image: with the points of its view while they hold, else by a new view, else from a rough
-    prior; before it is lost, from several starts."""
+    """Return a track after the next image: with the points of its view while they hold, else by a new view, else with the old
+    points once more, else from a rough prior; before it is lost, from several starts."""
     prior, modes = track.predicted(), track.last.modes
     missed = replace(track, missed=track.missed + 1)
     fresh = track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
@@ -243,6 +245,11 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
     found = yield from pose_steps(pyramid, mesh, prior, light, levels[-1:], modes=modes)
     if is_valid(found):
         return PoseTrack(found, light, track.last.pose)
+    if not track.missed and turn_between(prior, track.last.points.pose) < _STOPGAP_TURN_RAD:
+        yield _POINTS_MS
+        found = track_points(pyramid, track.last.points, prior, modes)
+        if is_valid(found):
+            return PoseTrack(found, track.light, track.last.pose, track.age + 1)
     refined = yield from prior_steps(pyramid, mesh, prior, modes)
     if refined and is_valid(refined[0]):
         return PoseTrack(*refined)

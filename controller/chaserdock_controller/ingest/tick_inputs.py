@@ -141,6 +141,8 @@ class TickInputCollector:
             last = self._odometry.get(i)
             if i in odometry or last is None or not self._is_lost(topics.ODOMETRY, i, tick):
                 continue
+            # A sighting from an extrapolated position is not a measurement.
+            self._sightings = [s for s in self._sightings if (s.chaser, s.tick) != (i, tick.tick)]
             if tick.sim_time_ns - last.sim_time_ns <= self._extrapolation_ns:
                 odometry[i] = extrapolate(last, tick.tick, tick.sim_time_ns)
         return dict(sorted(odometry.items()))

@@ -358,7 +358,10 @@ def test_controller_commands_without_lost_odometry_or_sightings(
 
 
 def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
-    """In place of a lost odometry the controller takes its own prediction, and late odometry at its tick, whatever its clock says."""
+    """In place of a lost odometry the controller takes its own prediction, and late odometry at its tick, whatever its clock says.
+
+    What the chaser sees meanwhile is a measurement.
+    """
     core, inputs, states = ControllerCore(scenario, lambda: 0.0), TickInputCollector(scenario), {}
     late = {4: 2, 5: 3}
     for tick in range(6):
@@ -367,17 +370,28 @@ def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
                 inputs.add_odometry(odometry(scenario, i, tick))
             else:
                 inputs.add_lost(topics.ODOMETRY, i, tick)
+            inputs.add_sighting(sighting(scenario, i, tick))
         if tick in late:
             behind = msgspec.structs.replace(odometry(scenario, 1, late[tick]), sim_time_ns=0)
             inputs.add_odometry(behind)
         taken = inputs.take(tick_of(scenario, tick, (0, 1)), ())
         assert set(taken.odometry) == {0, 1}
+        assert [(s.chaser, s.tick) for s in taken.sightings] == [(0, tick), (1, tick)]
         assert {i: o.tick for i, o in taken.outdated.items()} == ({1: late.get(tick, 1)} if tick > 1 else {})
         core.step(taken)
         assert isinstance(core.estimator, JointEstimator)
         assert core.estimator.state is not None
         states[tick] = core.estimator.state.odometry_ns[1]
     assert states == {t: scenario.timing.tick_time_ns(late.get(t, min(t, 1))) for t in range(6)}
+
+
+def test_sightings_are_taken_in_the_order_of_chasers(scenario: Scenario) -> None:
+    """Two invalid sightings in a tick were reported in the order of their arrival, which differs from process to process."""
+    inputs = TickInputCollector(scenario)
+    for i, tick in ((1, 2), (0, 2), (1, 1), (0, 1)):
+        inputs.add_sighting(sighting(scenario, i, tick))
+    taken = inputs.take(tick_of(scenario, 2, (0, 1)), ())
+    assert [(s.tick, s.chaser) for s in taken.sightings] == [(1, 0), (1, 1), (2, 0), (2, 1)]
 
 
 def test_state_extrapolated_from_an_invalid_one_is_invalid(scenario: Scenario) -> None:

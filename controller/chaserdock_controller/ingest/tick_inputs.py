@@ -118,7 +118,8 @@ class TickInputCollector:
             tick.tick,
             tick.sim_time_ns,
             odometry,
-            tuple(self._sightings),
+            # Equal inputs in any order of arrival give equal results.
+            tuple(sorted(self._sightings, key=lambda s: (s.tick, s.chaser))),
             commands,
             dict(self._thrusters),
             {i: d for i, d in self._docking.items() if d.tick == tick.tick and i in tick.chasers},
@@ -141,8 +142,6 @@ class TickInputCollector:
             last = self._odometry.get(i)
             if i in odometry or last is None or not self._is_lost(topics.ODOMETRY, i, tick):
                 continue
-            # A sighting from an extrapolated position is not a measurement.
-            self._sightings = [s for s in self._sightings if (s.chaser, s.tick) != (i, tick.tick)]
             if tick.sim_time_ns - last.sim_time_ns <= self._extrapolation_ns:
                 odometry[i] = extrapolate(last, tick.tick, tick.sim_time_ns)
         return dict(sorted(odometry.items()))

@@ -358,7 +358,7 @@ def test_controller_commands_without_lost_odometry_or_sightings(
 
 
 def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
-    """In place of a lost odometry the controller takes its own prediction, and late odometry at its tick, whatever its clock says.
+    """In place of a lost odometry the controller takes its own prediction, and late odometry at its tick, whatever its time stamp is.
 
     What the chaser sees meanwhile is a measurement.
     """

@@ -72,7 +72,7 @@ class JointParameters:
         the torque of a stuck thruster exceeds that of commands. It is assumed only where velocity or rate does not fit otherwise.
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
     rejections_to_new_view: a chaser's sightings by shape that are rejected this many times in a row are taken for those of a new
-        view, whose error is unknown, if they then fit: where the tracker draws its view anew, its error can jump by several sigmas.
+        view, whose error is unknown, if they then fit: where the tracker renders its view again, its error can jump by several sigmas.
     collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
     restart_after_s: a chaser whose odometry was missing, or of which no measurement was used, for so long is started again from its
         odometry.

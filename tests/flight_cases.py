@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.trajectories import Motion
+from chaserdock_controller.interfaces import Observation
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.messages import Odometry, Sighting
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -60,3 +62,17 @@ def start(seed: int) -> Array:
     x = rng.normal(size=13)
     x[6:10] = rotations.normalize(x[6:10])
     return x
+
+
+def observation_of(
+    time_ns: int,
+    odometry: Mapping[int, Odometry],
+    sightings: tuple[Sighting, ...] = (),
+    outdated: Mapping[int, Odometry] | None = None,
+) -> Observation:
+    """Return an observation of chasers without docking, thrusters or commands."""
+    return Observation(
+        tick=0, time_ns=time_ns, effective_ns=time_ns, odometry=odometry, invalid={}, lost={}, sightings=sightings,
+        commands=(), docking={}, impulses={}, ahead=dict.fromkeys(odometry, ()), input_limits={}, isolated={}, events=(),
+        thruster_impulses={}, last_commands={}, outdated=outdated or {},
+    )  # fmt: skip

@@ -13,28 +13,15 @@ import pytest
 from chaserdock_controller.estimation.identification.stage import StackIdentification
 from chaserdock_controller.estimation.stage import EstimationStage
 from chaserdock_controller.estimation.types import Measurement
-from chaserdock_controller.interfaces import Observation, TargetEstimation
+from chaserdock_controller.interfaces import TargetEstimation
 from chaserdock_models import rotations
-from chaserdock_protocol.messages import Odometry, Sighting
+from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import load_scenario
-from flight_cases import scenario
+from flight_cases import observation_of, scenario
 from joint_cases import SyntheticFlight, navigation
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 ZERO = (0.0, 0.0, 0.0)
-
-
-def observation_of(
-    time_ns: int,
-    odometry: Mapping[int, Odometry],
-    sightings: tuple[Sighting, ...] = (),
-    outdated: Mapping[int, Odometry] | None = None,
-) -> Observation:
-    return Observation(
-        tick=0, time_ns=time_ns, effective_ns=time_ns, odometry=odometry, invalid={}, lost={}, sightings=sightings,
-        commands=(), docking={}, impulses={}, ahead=dict.fromkeys(odometry, ()), input_limits={}, isolated={}, events=(),
-        thruster_impulses={}, last_commands={}, outdated=outdated or {},
-    )  # fmt: skip
 
 
 class Recorded:

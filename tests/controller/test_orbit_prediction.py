@@ -10,7 +10,6 @@ from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.prediction import predict
 from chaserdock_controller.estimation.joint.state import POSITION, VELOCITY, JointState, block, empty_state
 from chaserdock_controller.estimation.stage import EstimationStage
-from chaserdock_controller.interfaces import Observation
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -19,6 +18,7 @@ from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario, parse_scenario
+from flight_cases import observation_of
 
 STATE = np.array([80.0, -60.0, 20.0, 0.02, -0.15, 0.01, 0.8, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0])
 
@@ -103,11 +103,7 @@ def odometry(row: Array) -> Odometry:
 def test_planning_cancels_the_wrench_of_the_orbit() -> None:
     scenario = mission()
     assert scenario.orbit is not None
-    observation = Observation(
-        tick=0, time_ns=0, effective_ns=0, odometry={0: odometry(STATE)}, invalid={}, lost={}, sightings=(),
-        commands=(), docking={}, impulses={}, ahead={0: ()}, input_limits={}, isolated={}, events=(),
-        thruster_impulses={}, last_commands={}, outdated={},
-    )  # fmt: skip
+    observation = observation_of(0, {0: odometry(STATE)})
     found = EstimationStage(scenario, estimator_of(scenario)).run(observation).disturbances[0]
     body = scenario.chaser
     mean_motion = scenario.orbit.elements.mean_motion_rad_s

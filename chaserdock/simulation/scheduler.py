@@ -30,6 +30,8 @@ Due = tuple[float, float]
 NEVER: Due = (0.0, 0.0)
 SPREAD, WAKE_SPREAD = 32.0, 128.0
 """How many later events of the same time may come before an event, and before a task that is woken continues."""
+MOST_EVENTS = 1_000_000
+"""Most events at one virtual time: a flight has at most a few thousand."""
 
 
 class Task:
@@ -97,13 +99,20 @@ class Scheduler:
         return task
 
     def run(self, limit_s: float, over: Callable[[], bool] | None = None) -> bool:
-        """Run until all tasks have ended; return False if they have not by ``limit_s``, or when ``over`` holds."""
+        """Run until all tasks have ended; return False if they have not by ``limit_s``, or when ``over`` holds.
+
+        Also returns False after ``MOST_EVENTS`` events at one time: they would go on forever.
+        """
         self._hub = getcurrent()
-        events = self._events
+        events, last = self._events, self._count + MOST_EVENTS
         while self._alive:
             if not events or events[0][0] > limit_s or (over is not None and over()):
                 return False
-            self.now_s, _, _, call, args = heapq.heappop(events)
+            time_s, _, _, call, args = heapq.heappop(events)
+            if time_s != self.now_s:
+                self.now_s, last = time_s, self._count + MOST_EVENTS
+            elif self._count > last:
+                return False
             call(*args)
         return True
 
@@ -124,8 +133,12 @@ class Scheduler:
         if timeout_s is None:
             task.until_s = None
         else:
+            until_s = self.now_s + timeout_s
+            if until_s == self.now_s and timeout_s > 0.0:
+                # Below the resolution of virtual time: a reader that waits for its own, finer clock would wait forever.
+                until_s = math.nextafter(until_s, math.inf)
+            task.until_s = until_s
             # One timer per task: a pause that outlasts the pending one sets no other.
-            task.until_s = until_s = self.now_s + timeout_s
             if until_s < task.timer_s:
                 self._set_timer(task, until_s)
         self._hub.switch()

@@ -15,6 +15,7 @@ from chaserdock_protocol.scenario.simulation import SimulationSection
 from chaserdock_protocol.transport import Link, Node
 from message_samples import BY_TYPE
 
+from chaserdock.simulation import scheduler as scheduler_module
 from chaserdock.simulation.network import LEASE_S, SimulatedNetwork, matches
 from chaserdock.simulation.scheduler import Killed, Scheduler, VirtualQueue
 
@@ -100,6 +101,33 @@ def test_a_run_that_never_ends_is_stopped() -> None:
     scheduler.end()
     assert task.done
     assert not task.error
+
+
+def test_a_task_that_never_waits_for_a_later_time_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler_module, "MOST_EVENTS", 1000)
+    scheduler = Scheduler(0)
+
+    def forever() -> None:
+        while True:
+            scheduler.pause(0.0)
+
+    scheduler.spawn("forever", forever)
+    assert not scheduler.run(10.0)
+    assert scheduler.now_s == 0.0
+    scheduler.end()
+
+
+@pytest.mark.parametrize("timeout_s", [1e-300, 1e-17, 1.7e-15])
+def test_a_wait_below_the_resolution_of_virtual_time_passes(timeout_s: float) -> None:
+    """The clock of a process may be finer than virtual time: with an offset of -30 s at 17.8 s it is."""
+
+    def work(scheduler: Scheduler) -> None:
+        scheduler.pause(17.8)
+        begin_s = scheduler.now_s
+        scheduler.pause(timeout_s)
+        assert begin_s < scheduler.now_s < begin_s + 1e-14
+
+    flown(work)
 
 
 @pytest.mark.parametrize(

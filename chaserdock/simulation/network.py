@@ -128,9 +128,11 @@ class SimulatedNetwork:
         """Send a sample to all who have subscribed to its key, as far as the sender knows."""
         if sender.closed:
             return
-        if self.first_tick_s is None and raw.key == topics.TICK.key:
-            self.first_tick_s = self.scheduler.now_s
-            self._schedule_partitions()
+        if raw.key == topics.TICK.key:
+            self.scheduler.note_progress()
+            if self.first_tick_s is None:
+                self.first_tick_s = self.scheduler.now_s
+                self._schedule_partitions()
         self.traffic.sent += 1
         if self.tap is not None:
             self.tap(sender.name, raw)

@@ -31,7 +31,7 @@ NEVER: Due = (0.0, 0.0)
 SPREAD, WAKE_SPREAD = 32.0, 128.0
 """How many later events of the same time may come before an event, and before a task that is woken continues."""
 MOST_EVENTS = 1_000_000
-"""Most events at one virtual time: a flight has at most a few thousand."""
+"""Most events at one virtual time without progress: a tick has a few hundred, with a flood 100,000."""
 
 
 class Task:
@@ -72,6 +72,7 @@ class Scheduler:
         self._draw = random.Random(f"scheduler {seed}").random
         self._events: list[tuple[float, float, int, Callable[..., object], tuple[Any, ...]]] = []
         self._count = self._alive = 0
+        self._last_event = MOST_EVENTS
         self._hub: greenlet = getcurrent()
         self._running: Task | None = None
 
@@ -101,20 +102,26 @@ class Scheduler:
     def run(self, limit_s: float, over: Callable[[], bool] | None = None) -> bool:
         """Run until all tasks have ended; return False if they have not by ``limit_s``, or when ``over`` holds.
 
-        Also returns False after ``MOST_EVENTS`` events at one time: they would go on forever.
+        Also returns False after ``MOST_EVENTS`` events at one time without ``note_progress``: they would go on forever.
         """
         self._hub = getcurrent()
-        events, last = self._events, self._count + MOST_EVENTS
+        self.note_progress()
+        events = self._events
         while self._alive:
             if not events or events[0][0] > limit_s or (over is not None and over()):
                 return False
             time_s, _, _, call, args = heapq.heappop(events)
             if time_s != self.now_s:
-                self.now_s, last = time_s, self._count + MOST_EVENTS
-            elif self._count > last:
+                self.now_s = time_s
+                self.note_progress()
+            elif self._count > self._last_event:
                 return False
             call(*args)
         return True
+
+    def note_progress(self) -> None:
+        """Note that events at the present time lead somewhere: without latency, a flight in lock-step has a single time."""
+        self._last_event = self._count + MOST_EVENTS
 
     def end(self) -> None:
         """End all tasks where they wait."""

@@ -117,6 +117,24 @@ def test_a_task_that_never_waits_for_a_later_time_is_stopped(monkeypatch: pytest
     scheduler.end()
 
 
+def test_ticks_at_one_virtual_time_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without latency and jitter all ticks of a flight in lock-step have the same virtual time."""
+    monkeypatch.setattr(scheduler_module, "MOST_EVENTS", 100)
+    ended_s: list[float] = []
+
+    def ticks(scheduler: Scheduler) -> None:
+        network = SimulatedNetwork(scheduler, SimulationSection(), 0, True)
+        world = Node("world", "world", Link(network=network))
+        for _ in range(50):
+            for _ in range(10):
+                scheduler.pause(0.0)
+            world.publish(topics.TICK, Tick(tick=0, sim_time_ns=0, images=False, chasers=()))
+        ended_s.append(scheduler.now_s)
+
+    flown(ticks)
+    assert ended_s == [0.0]
+
+
 @pytest.mark.parametrize("timeout_s", [1e-300, 1e-17, 1.7e-15])
 def test_a_wait_below_the_resolution_of_virtual_time_passes(timeout_s: float) -> None:
     """The clock of a process may be finer than virtual time: with an offset of -30 s at 17.8 s it is."""

@@ -62,9 +62,12 @@ def main(options: ProcessOptions) -> int:
         node.message_filter = create_fault_layer(faults, node.name, scenario.timing, not realtime, node.host)
         controller.open(instance, options.stall_s)
         node.host.finish_startup()
-        while not (controller.ended or stop() or controller.heartbeat.world_is_gone()):
+        while not (
+            controller.ended or controller.replaced or stop() or controller.heartbeat.world_is_gone()
+        ):
             controller.listen()
-        controller.farewell()
+        if not controller.replaced:
+            controller.farewell()
         return 0 if controller.ended else 1
 
     return run_member("standby" if options.standby else "controller", "controller", options, work)
@@ -92,7 +95,7 @@ class ControllerProcess:
         self.core = core
         self.realtime, self.replaying = realtime, replaying
         self.now_s = now_s
-        self.ended = False
+        self.ended = self.replaced = False
         self.tick: Tick | None = None
         self.done_tick = -1
         self.inputs = TickInputCollector(scenario)
@@ -320,6 +323,9 @@ class ControllerProcess:
                 self._decide()
                 return True
             case Tick() as tick:
+                self.replaced |= self.heartbeat.is_replaced(tick.controllers.get(self.name))
+                if self.replaced:
+                    return True
                 self.heartbeat.in_flight.set()
                 led = self.standby.leads
                 self.standby.update(tick)

@@ -244,6 +244,6 @@ def without_wall_time(message: Message) -> dict[str, Any]:
     return {
         name: value
         for name in message.__struct_fields__
-        if not name.startswith("wall_") and name not in ("instance", "controllers")
+        if not name.startswith("wall_") and name not in ("instance", "controllers", "chaser_instances")
         if (value := getattr(message, name)) or name not in _LATER_FIELDS
     }

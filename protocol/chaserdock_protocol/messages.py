@@ -215,7 +215,8 @@ class Tick(Message, frozen=True, kw_only=True):
 
     ``chasers``: those whose reply the world expects. ``controllers``: connected controllers with their instances, in the
     order of succession. ``since``: by process, the tick since which it takes part without a break; a lease that was stated
-    before is void.
+    before is void. ``chaser_instances``: instances of ``chasers``, by process. A process that is listed with another instance
+    was lost and replaced; it ends.
     """
 
     revision: Count = 0
@@ -223,6 +224,7 @@ class Tick(Message, frozen=True, kw_only=True):
     chasers: ChaserIds
     controllers: Names = msgspec.field(default_factory=dict)
     since: Counts = msgspec.field(default_factory=dict)
+    chaser_instances: Names = msgspec.field(default_factory=dict)
 
 
 class MissionEnd(Message, frozen=True, kw_only=True):
@@ -548,6 +550,7 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     ``plan`` to its end, comes to rest (``brake``) and then keeps clear of the target (``hold``).
     With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, ``isolated`` the
     thrusters whose shut-off valves are closed from ``effective_time_ns`` on, and force and torque the demand.
+    ``instance``: that of the chaser's process.
     """
 
     chaser: ChaserId
@@ -559,6 +562,7 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     pulses: Annotated[tuple[ThrusterPulse, ...], Meta(max_length=10_000)] = ()
     isolated: Thrusters = ()
     term: Count = 0
+    instance: Text = ""
 
 
 class Lease(Message, frozen=True, kw_only=True):
@@ -680,13 +684,15 @@ class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):
 class Presence(Message, frozen=True, kw_only=True):
     """Heartbeat of a process. ``heard``: processes whose presence it has received, name to instance.
 
-    ``waiting_for``: keys of the messages that it waits for, if it has nothing else to do.
+    ``waiting_for``: keys of the messages that it waits for, if it has nothing else to do. ``world``: identity of the session
+    of its mission's world, empty if unknown.
     """
 
     process: Text
     instance: Text
     heard: Names
     waiting_for: Annotated[tuple[Text, ...], Meta(max_length=1024)] = ()
+    world: Text = ""
 
 
 class Farewell(Message, frozen=True, kw_only=True):

@@ -56,6 +56,10 @@ class SilentHeartbeat:
     def take(self, message: Any) -> None:
         """Ignore a presence."""
 
+    def is_replaced(self, listed: Any) -> bool:
+        """Take a recorded process for the one that the world lists."""
+        return False
+
     def report_waiting(self, received: Any, missing_keys: Any) -> None:
         """Ignore what the process waits for."""
 

@@ -257,6 +257,45 @@ def test_realtime_chaser_survives_frozen_controller(tmp_path: Path) -> None:
             assert newest_ns - record.message.sim_time_ns < 0.5e9 + 0.5e9
 
 
+def test_frozen_chaser_that_was_replaced_ends_when_it_wakes(tmp_path: Path) -> None:
+    """It commands no actuators beside its successor."""
+    hand, lease = ByHand.at_free_port("replaced"), ("--lease", "2")
+    single = (
+        "world",
+        "single",
+        "--mode",
+        "realtime",
+        "--rejoin-timeout",
+        "30",
+        *sets(*SHORT, "duration_s=20.0"),
+    )
+    try:
+        world = hand.start("world", *single, *lease)
+        hand.start("recorder", "record", "--out", str(tmp_path), *lease)
+        hand.start("controller", "controller", *lease)
+        frozen = hand.start("frozen", "chaser", "0", *lease)
+        wait_for_log(tmp_path / "mission.mcap", FLYING_BYTES)
+        frozen.send_signal(signal.SIGSTOP)
+        assert world.stdout is not None
+        assert any(b"process lost: chaser/0" in line for line in world.stdout)
+        hand.start("chaser", "chaser", "0", *lease)
+        assert any(b"joined" in line for line in hand.processes["chaser"].stdout or ())
+        time.sleep(2.0)
+        frozen.send_signal(signal.SIGCONT)
+        status, text = hand.output_of("frozen", 30.0)
+        assert status == 1
+        assert "another chaser/0 has replaced this one, which was lost" in text
+        assert hand.output_of("world")[0] == 0
+        assert hand.output_of("recorder")[0] == 0
+    finally:
+        hand.end()
+    instances = [r.message.instance for r in read_log(tmp_path / "mission.mcap", ["chaser/0/actuators"])]
+    first, last = instances[0], instances[-1]
+    assert first != last
+    # What it sends before it reads of its successor, the world rejects (tests/world/test_tick_barrier.py).
+    assert instances[instances.index(last) :].count(first) <= 2
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_closes_log(how: signal.Signals, tmp_path: Path) -> None:
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), *sets(*LONG))

@@ -8,9 +8,13 @@ import time
 
 import pytest
 from chaserdock_protocol.messages import JoinRequest, Presence
+from chaserdock_protocol.scenario.simulation import SimulationSection
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.session import Heartbeat
 from chaserdock_world.lockstep.membership import Membership
+
+from chaserdock.simulation.network import SimulatedNetwork
+from chaserdock.simulation.scheduler import Scheduler
 
 
 def membership(chasers: int = 2, mode: str = "lockstep") -> Membership:
@@ -224,3 +228,45 @@ def test_heartbeat_ends_with_its_node() -> None:
     node.close()
     assert not [t for t in threading.enumerate() if t.name == "repeat"]
     heartbeat.stop()  # twice does no harm
+
+
+@pytest.fixture
+def heartbeat() -> Heartbeat:
+    """That of a controller in the mission of the world whose session is ``w``."""
+    node = Node(
+        "controller", "controller", Link(network=SimulatedNetwork(Scheduler(0), SimulationSection(), 0, True))
+    )
+    node.expect_world("w", lambda key, source, newest: None)
+    return Heartbeat(node, "controller-1")
+
+
+def presence(instance: str, world: str = "w") -> Presence:
+    return Presence(process="chaser/0", instance=instance, heard={}, world=world)
+
+
+def test_presence_of_an_earlier_mission_is_ignored(heartbeat: Heartbeat) -> None:
+    heartbeat.take(presence("chaser/0-1"))
+    heartbeat.take(presence("chaser/0-0", world="earlier"))
+    assert heartbeat.heard() == first("chaser/0")
+    heartbeat.take(presence("chaser/0-2", world=""))  # of a process that does not know its world's session
+    assert heartbeat.heard() == {"chaser/0": "chaser/0-2"}
+
+
+def test_presence_of_a_replaced_process_that_goes_on_is_ignored(heartbeat: Heartbeat) -> None:
+    heartbeat.take(presence("chaser/0-1"))
+    heartbeat.forget("chaser/0")  # a lost process may return
+    heartbeat.take(presence("chaser/0-1"))
+    assert heartbeat.heard() == first("chaser/0")
+    heartbeat.forget("chaser/0")
+    heartbeat.take(presence("chaser/0-2"))
+    heartbeat.take(presence("chaser/0-1"))
+    assert heartbeat.heard() == {"chaser/0": "chaser/0-2"}
+
+
+def test_a_process_is_replaced_when_the_world_lists_another_instance(
+    heartbeat: Heartbeat, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert not heartbeat.is_replaced("controller-1")
+    assert not heartbeat.is_replaced(None)  # not listed, or by a world that lists none
+    assert heartbeat.is_replaced("controller-2")
+    assert "another controller has replaced this one" in capsys.readouterr().err

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lock-step barrier after all processes were lost and have returned."""
+"""The lock-step barrier after processes were lost and have returned."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 from unittest.mock import Mock
 
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import Tick
+from chaserdock_protocol.messages import ActuatorCommand, Tick
 from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.transport import ReceivedMessage
+from chaserdock_protocol.transport.node import TrafficCounters
 from chaserdock_world.lockstep.tick_barrier import _MOST_REPEATS, TickBarrier
 from harness import ROOT
 
@@ -16,14 +18,16 @@ TIMING = load_scenario(ROOT / "scenarios" / "fault-drill.toml").timing
 
 
 class Network:
-    """A node that receives nothing; waiting takes its time. ``ticks``: those published."""
+    """A node that receives ``received``; waiting takes its time. ``ticks``: those published."""
 
     def __init__(self) -> None:
         self.time_s, self.ticks = 0.0, list[Tick]()
         self.host = Mock(now_s=lambda: self.time_s)
+        self.counts, self.received = TrafficCounters(), list[Any]()
 
-    def receive(self, timeout_s: float) -> None:
+    def receive(self, timeout_s: float) -> Any:
         self.time_s += timeout_s
+        return self.received.pop(0) if self.received else None
 
     def publish(self, topic: topics.Topic, message: Any, place: Any = None) -> None:
         if topic is topics.TICK:
@@ -53,3 +57,29 @@ def test_first_tick_after_a_return_is_repeated_until_it_is_answered() -> None:
         assert "stalled" in barrier.await_replies(lambda: False, stall_s=10.0)
         assert [t.revision for t in network.ticks] == list(range(repeats + 1))
         assert network.time_s - begin_s < 20.0
+
+
+def test_commands_of_a_replaced_chaser_are_rejected() -> None:
+    """A chaser that was frozen and replaced may send a command before it reads that another one flies in its place."""
+    network, chaser = Network(), Mock()
+    membership: Any = Mock(realtime=True, connected=lambda heard: {"chaser/0"}, take_departed=list)
+    membership.instance_of = lambda name: "second"
+    arguments: list[Any] = [network, membership, Mock(), TIMING, {"chaser/0": chaser}, lambda: 0, Mock()]
+    barrier = TickBarrier(*arguments, recorder_expected=False)
+    barrier.open_tick(0, images=False)
+    assert network.ticks[-1].chaser_instances == {"chaser/0": "second"}
+    for instance in ("first", "second"):
+        command = ActuatorCommand(
+            tick=0,
+            sim_time_ns=0,
+            chaser=0,
+            effective_time_ns=TIMING.effective_ns(0),
+            source="brake",
+            force_N=(0.0, 0.0, 0.0),
+            torque_N_m=(0.0, 0.0, 0.0),
+            instance=instance,
+        )
+        network.received.append(ReceivedMessage(topics.ACTUATORS, "0", command, 0))
+        barrier.process_message(0.1)
+    assert [c.args[0].instance for c in chaser.command.call_args_list] == ["second"]
+    assert network.counts.rejected == {"actuators:replaced": 1}

@@ -63,9 +63,10 @@ def main(options: ProcessOptions) -> int:
         chaser = ChaserProcess(node, scenario, number, reports=FailureReports(faults.reported_failures))
         chaser.open(instance, realtime=not lockstep, stall_s=options.stall_s)
         node.host.finish_startup()
-        while not (chaser.ended or stop() or chaser.heartbeat.world_is_gone()):
+        while not (chaser.ended or chaser.replaced or stop() or chaser.heartbeat.world_is_gone()):
             chaser.listen()
-        chaser.publish_farewell()
+        if not chaser.replaced:
+            chaser.publish_farewell()
         return 0 if chaser.ended else 1
 
     return run_member(f"chaser/{number}", "chaser", options, work)
@@ -77,12 +78,14 @@ class ChaserProcess:
 
     ``executed_tick`` and ``executed_ns``: tick of the last actuator command for which the world need not wait any more, and
     time of the last executed command of the controller. ``reports``: the thruster failures that the test bed reports.
+    ``replaced``: this process was lost, and the mission goes on with another one of its name.
     """
 
     node: Node
     scenario: FlightScenario
     number: int
     ended: bool = False
+    replaced: bool = False
     odometry: Odometry | None = None
     docking: DockingStatus | None = None
     sighting: Sighting | None = None
@@ -97,7 +100,7 @@ class ChaserProcess:
         # Whether the current series of missing, refused or stale commands has been reported.
         self._reported_missing = self._reported_refusal = self._reported_stale = False
         self._refused = 0  # commands refused since the last one that was executed
-        self._term = 0
+        self._term, self._instance = 0, ""
         self.leases = LeaseGrantor(self.number, self.scenario.time.rate_hz)
         self._plan: Plan | None = None
         self._target: TargetEstimate | None = None
@@ -127,7 +130,7 @@ class ChaserProcess:
     def open(self, instance: str, realtime: bool, stall_s: float = DEFAULT_STALL_S) -> None:
         """Advertise and subscribe the topics, then start the heartbeat."""
         node, i = self.node, self.number
-        self.realtime = realtime
+        self.realtime, self._instance = realtime, instance
         node.advertise(topics.SIGHTING, i)
         node.advertise(topics.ACTUATORS, i)
         node.advertise(topics.LEASE, i)
@@ -194,6 +197,9 @@ class ChaserProcess:
 
     def _begin_tick(self, tick: Tick) -> None:
         if self.tick is not None and (tick.tick, tick.revision) < (self.tick.tick, self.tick.revision):
+            return
+        self.replaced |= self.heartbeat.is_replaced(tick.chaser_instances.get(self.name))
+        if self.replaced:
             return
         self.tick = tick
         self.heartbeat.in_flight.set()
@@ -482,7 +488,8 @@ class ChaserProcess:
     def _actuate(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> None:
         if self._thrusters is not None:
             command = self._thrusters.add_pulses(command, thrusts_N)
-        self.node.publish(topics.ACTUATORS, command, self.number)
+        own = msgspec.structs.replace(command, instance=self._instance)
+        self.node.publish(topics.ACTUATORS, own, self.number)
 
     def _publish_warning(self, what: str, detail: str, tick: int, time_ns: int) -> None:
         self._publish_event("warning", what, detail, tick, time_ns)

@@ -89,6 +89,11 @@ class Node:
         """Identity of this node's session on the network."""
         return self._connection.source
 
+    @property
+    def world_source(self) -> str:
+        """Identity of the session of the mission's world, empty if unknown."""
+        return self.source if self.role == "world" else self._world_source
+
     def expect_world(self, source: str, on_foreign: Callable[[str, str, Message | None], None]) -> None:
         """Ignore messages on the world's keys that another session than ``source`` publishes; empty: accept all.
 

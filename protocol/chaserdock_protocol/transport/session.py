@@ -156,6 +156,8 @@ class Heartbeat:
         self.hangs: Callable[[], bool] = lambda: False
         """Whether the process' loop has stopped: its presence, published in the background, then stops, too."""
         self._heard: dict[str, str] = {}
+        self._newest: dict[str, str] = {}
+        self._replaced: set[str] = set()
         self._lock = threading.Lock()
         self.in_flight = threading.Event()
         """Set at the first tick: presence is then published once a second only."""
@@ -167,11 +169,22 @@ class Heartbeat:
         node.on_close(self.stop)
 
     def take(self, message: Presence) -> None:
-        """Record a presence that the process' loop received."""
+        """Record a presence that the process' loop received.
+
+        Ignores that of an earlier mission in this namespace, and that of a process that was replaced and goes on.
+        """
+        own = self._node.world_source
+        if own and message.world and message.world != own:
+            return
         if message.process == "world":
             self.world_heard()
         with self._lock:
-            self._heard[message.process] = message.instance
+            if message.instance in self._replaced:
+                return
+            before = self._newest.get(message.process, message.instance)
+            if message.instance != before:
+                self._replaced.add(before)
+            self._newest[message.process] = self._heard[message.process] = message.instance
 
     def report_waiting(
         self, received: ReceivedMessage | None, missing_keys: Callable[[], tuple[str, ...]]
@@ -198,6 +211,13 @@ class Heartbeat:
         with self._lock:
             return dict(sorted(self._heard.items()))
 
+    def is_replaced(self, listed: str | None) -> bool:
+        """Return, and print, whether the world lists another instance of this process, which was lost and started again."""
+        replaced = listed is not None and listed != self._instance
+        if replaced:
+            print_status(self._node.name, f"another {self._node.name} has replaced this one, which was lost")
+        return replaced
+
     def forget(self, process: str) -> None:
         """Forget a process that was lost."""
         with self._lock:
@@ -212,6 +232,7 @@ class Heartbeat:
             instance=self._instance,
             heard=self.heard(),
             waiting_for=self.waiting_for,
+            world=self._node.world_source,
         )
         self._node.publish(topics.PRESENCE, message, self._node.name)
         return STEADY_PERIOD_S if self.in_flight.is_set() else EARLY_PERIOD_S

@@ -58,6 +58,7 @@ class TickBarrier:
         self._commander = ObservedCommander()
         self._controllers: dict[str, str] = {}
         self._since: dict[str, int] = {}
+        self._instances: dict[str, str] = {}
         self._standby_expected = standby_expected
         self._node = node
         self._membership = membership
@@ -102,7 +103,8 @@ class TickBarrier:
         self._controllers = {
             name: self._membership.instance_of(name) for name in topics.CONTROLLERS if name in connected
         }
-        present = [f"chaser/{i}" for i in self.chasers] + list(self._controllers)
+        self._instances = {f"chaser/{i}": self._membership.instance_of(f"chaser/{i}") for i in self.chasers}
+        present = [*self._instances, *self._controllers]
         self._since = {name: self._since.get(name, tick) for name in present}
         # A recorder that returns paces the flight again.
         self._recorder_expected |= self._recorder_configured and "recorder" in connected
@@ -251,6 +253,9 @@ class TickBarrier:
         """Note who commands and record the reply; return why the command is rejected, empty if it is not."""
         if f"chaser/{command.chaser}" not in self._actuators or command.tick > self._tick:
             return "unexpected"
+        listed = self._instances.get(f"chaser/{command.chaser}", "")
+        if listed and command.instance and command.instance != listed:
+            return "replaced"  # by another process of this chaser, while this one was taken for lost
         if command.tick < self._executed_tick.get(command.chaser, -1):
             return "overtaken"  # by a command that the same chaser has executed later
         if command.source == "command":
@@ -314,6 +319,7 @@ class TickBarrier:
             images=self._images,
             chasers=self.chasers,
             controllers=self._controllers,
+            chaser_instances={name: self._instances[name] for name in map("chaser/{}".format, self.chasers)},
             since=self._since,
         )
         self._node.publish(topics.TICK, message)

@@ -53,7 +53,7 @@ def with_status(status: str, rows: tuple[int, ...] = (0, 1)) -> Disturbed:
     return change
 
 
-def mission() -> Scenario:
+def mission(overrides: Sequence[str] = ()) -> Scenario:
     turned = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
     return parse_scenario(
         {
@@ -70,6 +70,7 @@ def mission() -> Scenario:
             "timeline": [{"at_s": 0.0, "command": "approach", "chasers": [0]}],
         },
         "test",
+        overrides,
     )
 
 
@@ -104,6 +105,12 @@ def distances_m(records: list[TickRecord], chaser: int = 0) -> np.ndarray:
 def modes(record: TickRecord) -> tuple[str, ...]:
     assert record.outputs is not None
     return tuple(record.outputs.wrenches[i].mode for i in (0, 1))
+
+
+def replies_to(flight: InProcessMission, *commands: OperatorCommand) -> list[tuple[bool, str]]:
+    record = flight.step(commands)
+    assert record.outputs is not None
+    return [(r.accepted, r.reason) for r in record.outputs.replies]
 
 
 def warnings(flight: InProcessMission) -> list[str]:
@@ -178,12 +185,27 @@ def test_commands_without_a_plan_are_refused_with_the_reason(flight: InProcessMi
     fly_until(flight, 1.0)
     solver.active = True
     fly_until(flight, 1.0 + 1.2 * FAILED_S)
-    commands = (
-        OperatorCommand(command="goto", chaser=0, offset_m=(-1.5, 0.0, 0.0)),
-        OperatorCommand(command="abort", chaser=1),
-    )
-    record = flight.step(commands)
-    assert record.outputs is not None
-    replies = {r.command: (r.accepted, r.reason) for r in record.outputs.replies}
-    assert replies["goto"] == (False, "no usable plan for 1 s")
-    assert replies["abort"][0]
+    goto = OperatorCommand(command="goto", chaser=0, offset_m=(-1.5, 0.0, 0.0))
+    refused, aborted = replies_to(flight, goto, OperatorCommand(command="abort", chaser=1))
+    assert refused == (False, "no usable plan for 1 s")
+    assert aborted[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (breaks, "no usable plan for 1 s"),
+        (with_status("infeasible_relaxed"), "plans infeasible or over budget for 5 s"),
+    ],
+    ids=["without a plan", "degraded"],
+)
+def test_an_inspection_is_refused_while_planning_fails(change: Disturbed, reason: str) -> None:
+    with InProcessMission(mission(["timeline=[]", "chasers.1.position_m=[0.0, -3.5, 0.0]"])) as flight:
+        solver = install(flight, change)
+        fly_until(flight, 1.0)
+        assert replies_to(flight, OperatorCommand(command="inspect", chaser=0)) == [(True, "phase inspect")]
+        solver.active = True
+        fly_until(flight, 25.0)
+        assert f"chaser 0: retreat (from inspect: {reason})" in warnings(flight)
+        assert flight.phase(0) == "hold"
+        assert replies_to(flight, OperatorCommand(command="inspect", chaser=0)) == [(False, reason)]

@@ -41,7 +41,8 @@ class PlanningFailure:
     @property
     def refused(self) -> tuple[str, ...]:
         """Return the operator commands that are refused meanwhile; an operator may lead a chaser out by degraded plans."""
-        return ("approach", "goto", "calibrate") if self.without_plan else ("approach",)
+        always = ("approach", "inspect")
+        return (*always, "goto", "calibrate") if self.without_plan else always
 
     def text(self) -> str:
         """Return the reason for a retreat."""

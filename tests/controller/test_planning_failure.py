@@ -209,3 +209,18 @@ def test_an_inspection_is_refused_while_planning_fails(change: Disturbed, reason
         assert f"chaser 0: retreat (from inspect: {reason})" in warnings(flight)
         assert flight.phase(0) == "hold"
         assert replies_to(flight, OperatorCommand(command="inspect", chaser=0)) == [(False, reason)]
+
+
+def test_a_chaser_led_by_degraded_plans_retreats_once_they_fail(flight: InProcessMission) -> None:
+    solver = install(flight, with_status("infeasible_relaxed", (0,)))
+    fly_until(flight, 2.0)
+    solver.active = True
+    fly_until(flight, 2.2 + DEGRADED_S)
+    out = OperatorCommand(command="goto", chaser=0, offset_m=(-2.2, 0.0, 0.0))
+    assert replies_to(flight, out) == [(True, "phase goto")]
+    solver.change = with_status("failed", (0,))
+    fly_until(flight, flight.time_s + 1.2 * FAILED_S)
+    assert flight.retreats(0) == [
+        "from approach: plans infeasible or over budget for 5 s",
+        "from goto: no usable plan for 1 s",
+    ]

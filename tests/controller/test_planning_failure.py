@@ -39,6 +39,26 @@ def breaks(plan: NmpcPlan) -> NmpcPlan:
     raise RuntimeError("singular")
 
 
+def lacks_a_key(plan: NmpcPlan) -> NmpcPlan:
+    raise KeyError("x")
+
+
+def input_not_finite(plan: NmpcPlan) -> NmpcPlan:
+    inputs = plan.inputs.copy()
+    inputs[0, 0, 0] = np.nan
+    return replace(plan, inputs=inputs)
+
+
+def state_not_finite(plan: NmpcPlan) -> NmpcPlan:
+    states = plan.states.copy()
+    states[0, -1, 0] = np.inf
+    return replace(plan, states=states)
+
+
+def of_one_chaser(plan: NmpcPlan) -> NmpcPlan:
+    return replace(plan, status=plan.status[:1])
+
+
 def with_status(status: str, rows: tuple[int, ...] = (0, 1)) -> Disturbed:
     """Change the status of these rows; the inputs of a failed row are worthless."""
 
@@ -117,7 +137,10 @@ def warnings(flight: InProcessMission) -> list[str]:
     return [text for _, level, text in flight.events if level != "info"]
 
 
-@pytest.mark.parametrize("change", [breaks, with_status("failed")], ids=["raises", "status failed"])
+@pytest.mark.parametrize(
+    "change",
+    [breaks, lacks_a_key, with_status("failed"), input_not_finite, state_not_finite, of_one_chaser],
+)
 def test_a_failed_solve_flies_the_shifted_plan(flight: InProcessMission, change: Disturbed) -> None:
     solver = install(flight, change)
     before = fly_until(flight, FAILS_AT_S)[-1]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -197,10 +198,33 @@ def test_lasting_degraded_plans_make_a_chaser_retreat(flight: InProcessMission, 
     assert warnings(flight) == ["chaser 0: retreat (from approach: plans infeasible or over budget for 5 s)"]
     flight.step((OperatorCommand(command="approach", chaser=0),))
     assert flight.phase(0) == "retreat"
+    fly_until(flight, flight.time_s + 3.0)
     solver.active = False
-    fly_until(flight, flight.time_s + 0.2)
+    fly_until(flight, flight.time_s + DEGRADED_S - 0.2)
+    reason = "plans infeasible or over budget for 5 s"
+    assert replies_to(flight, OperatorCommand(command="approach", chaser=0)) == [(False, reason)]
+    fly_until(flight, flight.time_s + 0.4)
     flight.step((OperatorCommand(command="approach", chaser=0),))
     assert flight.phase(0) == "approach"
+
+
+@pytest.mark.parametrize(
+    ("change", "sound_each", "retreats"),
+    [
+        (breaks, 15, ["from approach: plans infeasible or over budget for 5 s"]),
+        (with_status("infeasible_relaxed"), 60, ["from approach: plans infeasible or over budget for 5 s"]),
+        (with_status("infeasible_relaxed"), 2, []),
+    ],
+)
+def test_a_chaser_retreats_if_most_plans_are_degraded(
+    flight: InProcessMission, change: Disturbed, sound_each: int, retreats: list[str]
+) -> None:
+    solves = itertools.count(1)
+    solver = install(flight, lambda plan: change(plan) if next(solves) % sound_each else plan)
+    fly_until(flight, 2.0)
+    solver.active = True
+    fly_until(flight, 2.0 + 1.2 * DEGRADED_S)
+    assert flight.retreats(0) == retreats
 
 
 def test_commands_without_a_plan_are_refused_with_the_reason(flight: InProcessMission) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -39,6 +40,26 @@ def breaks(plan: NmpcPlan) -> NmpcPlan:
     raise RuntimeError("singular")
 
 
+def lacks_a_key(plan: NmpcPlan) -> NmpcPlan:
+    raise KeyError("x")
+
+
+def input_not_finite(plan: NmpcPlan) -> NmpcPlan:
+    inputs = plan.inputs.copy()
+    inputs[0, 0, 0] = np.nan
+    return replace(plan, inputs=inputs)
+
+
+def state_not_finite(plan: NmpcPlan) -> NmpcPlan:
+    states = plan.states.copy()
+    states[0, -1, 0] = np.inf
+    return replace(plan, states=states)
+
+
+def of_one_chaser(plan: NmpcPlan) -> NmpcPlan:
+    return replace(plan, status=plan.status[:1])
+
+
 def with_status(status: str, rows: tuple[int, ...] = (0, 1)) -> Disturbed:
     """Change the status of these rows; the inputs of a failed row are worthless."""
 
@@ -53,7 +74,7 @@ def with_status(status: str, rows: tuple[int, ...] = (0, 1)) -> Disturbed:
     return change
 
 
-def mission() -> Scenario:
+def mission(overrides: Sequence[str] = ()) -> Scenario:
     turned = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
     return parse_scenario(
         {
@@ -70,6 +91,7 @@ def mission() -> Scenario:
             "timeline": [{"at_s": 0.0, "command": "approach", "chasers": [0]}],
         },
         "test",
+        overrides,
     )
 
 
@@ -106,11 +128,20 @@ def modes(record: TickRecord) -> tuple[str, ...]:
     return tuple(record.outputs.wrenches[i].mode for i in (0, 1))
 
 
+def replies_to(flight: InProcessMission, *commands: OperatorCommand) -> list[tuple[bool, str]]:
+    record = flight.step(commands)
+    assert record.outputs is not None
+    return [(r.accepted, r.reason) for r in record.outputs.replies]
+
+
 def warnings(flight: InProcessMission) -> list[str]:
     return [text for _, level, text in flight.events if level != "info"]
 
 
-@pytest.mark.parametrize("change", [breaks, with_status("failed")], ids=["raises", "status failed"])
+@pytest.mark.parametrize(
+    "change",
+    [breaks, lacks_a_key, with_status("failed"), input_not_finite, state_not_finite, of_one_chaser],
+)
 def test_a_failed_solve_flies_the_shifted_plan(flight: InProcessMission, change: Disturbed) -> None:
     solver = install(flight, change)
     before = fly_until(flight, FAILS_AT_S)[-1]
@@ -167,10 +198,33 @@ def test_lasting_degraded_plans_make_a_chaser_retreat(flight: InProcessMission, 
     assert warnings(flight) == ["chaser 0: retreat (from approach: plans infeasible or over budget for 5 s)"]
     flight.step((OperatorCommand(command="approach", chaser=0),))
     assert flight.phase(0) == "retreat"
+    fly_until(flight, flight.time_s + 3.0)
     solver.active = False
-    fly_until(flight, flight.time_s + 0.2)
+    fly_until(flight, flight.time_s + DEGRADED_S - 0.2)
+    reason = "plans infeasible or over budget for 5 s"
+    assert replies_to(flight, OperatorCommand(command="approach", chaser=0)) == [(False, reason)]
+    fly_until(flight, flight.time_s + 0.4)
     flight.step((OperatorCommand(command="approach", chaser=0),))
     assert flight.phase(0) == "approach"
+
+
+@pytest.mark.parametrize(
+    ("change", "sound_each", "retreats"),
+    [
+        (breaks, 15, ["from approach: plans infeasible or over budget for 5 s"]),
+        (with_status("infeasible_relaxed"), 60, ["from approach: plans infeasible or over budget for 5 s"]),
+        (with_status("infeasible_relaxed"), 2, []),
+    ],
+)
+def test_a_chaser_retreats_if_most_plans_are_degraded(
+    flight: InProcessMission, change: Disturbed, sound_each: int, retreats: list[str]
+) -> None:
+    solves = itertools.count(1)
+    solver = install(flight, lambda plan: change(plan) if next(solves) % sound_each else plan)
+    fly_until(flight, 2.0)
+    solver.active = True
+    fly_until(flight, 2.0 + 1.2 * DEGRADED_S)
+    assert flight.retreats(0) == retreats
 
 
 def test_commands_without_a_plan_are_refused_with_the_reason(flight: InProcessMission) -> None:
@@ -178,12 +232,42 @@ def test_commands_without_a_plan_are_refused_with_the_reason(flight: InProcessMi
     fly_until(flight, 1.0)
     solver.active = True
     fly_until(flight, 1.0 + 1.2 * FAILED_S)
-    commands = (
-        OperatorCommand(command="goto", chaser=0, offset_m=(-1.5, 0.0, 0.0)),
-        OperatorCommand(command="abort", chaser=1),
-    )
-    record = flight.step(commands)
-    assert record.outputs is not None
-    replies = {r.command: (r.accepted, r.reason) for r in record.outputs.replies}
-    assert replies["goto"] == (False, "no usable plan for 1 s")
-    assert replies["abort"][0]
+    goto = OperatorCommand(command="goto", chaser=0, offset_m=(-1.5, 0.0, 0.0))
+    refused, aborted = replies_to(flight, goto, OperatorCommand(command="abort", chaser=1))
+    assert refused == (False, "no usable plan for 1 s")
+    assert aborted[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (breaks, "no usable plan for 1 s"),
+        (with_status("infeasible_relaxed"), "plans infeasible or over budget for 5 s"),
+    ],
+    ids=["without a plan", "degraded"],
+)
+def test_an_inspection_is_refused_while_planning_fails(change: Disturbed, reason: str) -> None:
+    with InProcessMission(mission(["timeline=[]", "chasers.1.position_m=[0.0, -3.5, 0.0]"])) as flight:
+        solver = install(flight, change)
+        fly_until(flight, 1.0)
+        assert replies_to(flight, OperatorCommand(command="inspect", chaser=0)) == [(True, "phase inspect")]
+        solver.active = True
+        fly_until(flight, 25.0)
+        assert f"chaser 0: retreat (from inspect: {reason})" in warnings(flight)
+        assert flight.phase(0) == "hold"
+        assert replies_to(flight, OperatorCommand(command="inspect", chaser=0)) == [(False, reason)]
+
+
+def test_a_chaser_led_by_degraded_plans_retreats_once_they_fail(flight: InProcessMission) -> None:
+    solver = install(flight, with_status("infeasible_relaxed", (0,)))
+    fly_until(flight, 2.0)
+    solver.active = True
+    fly_until(flight, 2.2 + DEGRADED_S)
+    out = OperatorCommand(command="goto", chaser=0, offset_m=(-2.2, 0.0, 0.0))
+    assert replies_to(flight, out) == [(True, "phase goto")]
+    solver.change = with_status("failed", (0,))
+    fly_until(flight, flight.time_s + 1.2 * FAILED_S)
+    assert flight.retreats(0) == [
+        "from approach: plans infeasible or over budget for 5 s",
+        "from goto: no usable plan for 1 s",
+    ]

@@ -145,9 +145,11 @@ class PhaseMachine:
     # -- planning ------------------------------------------------------------------------------------------------
 
     def update_planning(self, now_s: float, failures: Mapping[int, PlanningFailure]) -> None:
-        """Let every chaser retreat for which planning fails, once per failure."""
+        """Let every chaser retreat for which planning fails, once per failure, and again when it becomes one without plans."""
         for i, failure in failures.items():
-            if i not in self._planning_failures and self._permits(i, Trigger.PLANNING_FAILED):
+            before = self._planning_failures.get(i)
+            worse = before is None or (failure.without_plan and not before.without_plan)
+            if worse and self._permits(i, Trigger.PLANNING_FAILED):
                 self._back_out(i, Trigger.PLANNING_FAILED, now_s, failure.text())
         self._planning_failures = dict(failures)
 

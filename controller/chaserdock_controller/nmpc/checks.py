@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation of a problem and its warm start, common to all back ends."""
+"""Validation of a problem, its warm start and its plan, common to all back ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .kernels import normalize_rows, shifted, sign_of
-from .types import Array, NmpcInput, NmpcParameters
+from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
 
 # Measured quaternions are normalized; a larger deviation is an error, not rounding.
 QUATERNION_NORM_TOLERANCE = 0.1
@@ -117,6 +117,15 @@ def _check_corridors(corridors: Array) -> None:
     angle = corridors[..., 3][used]
     if not ((angle > 0.0) & (angle < math.pi / 2)).all():
         raise ValueError("corridors must have half angles above 0 and below pi / 2")
+
+
+def check_plan(plan: NmpcPlan, n: int, d: int) -> None:
+    """Raise ValueError for a plan of other than ``n`` chasers or ``d`` stages, or with a value that is not finite."""
+    for name, value, shape in (("inputs", plan.inputs, (n, d, 6)), ("states", plan.states, (n, d + 1, 13))):
+        if sign_of(_array(name, value, shape)) == 1:
+            raise ValueError(f"{name} holds a value that is not finite")
+    if len(plan.status) != n:
+        raise ValueError(f"status must be of {n} chasers, not {len(plan.status)}")
 
 
 def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:

@@ -14,8 +14,8 @@ FAILED_S = 1.0
 """Time (s) without a usable plan after which a chaser retreats. Until then it flies its last plan, which is longer (3 s by
 default) but was made for an approach that must not go on without feedback."""
 DEGRADED_S = 5.0
-"""Time (s) with plans that violate distances or are cut short after which a chaser retreats. Such plans lead out of a
-keep-out zone at a few cm/s, which takes seconds."""
+"""Time (s) with failed solves, or with plans that violate distances or are cut short, after which a chaser retreats. Such
+plans lead out of a keep-out zone at a few cm/s, which takes seconds. The clock runs back while plans are sound."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,15 @@ class ChaserPlan:
 
 @dataclass(frozen=True)
 class PlanningFailure:
-    """``without_plan``: no usable plan for `FAILED_S`; otherwise degraded plans for `DEGRADED_S`."""
+    """``without_plan``: no usable plan for `FAILED_S`; otherwise degraded plans for `DEGRADED_S`, until sound ones for as long."""
 
     without_plan: bool
 
     @property
     def refused(self) -> tuple[str, ...]:
         """Return the operator commands that are refused meanwhile; an operator may lead a chaser out by degraded plans."""
-        return ("approach", "goto", "calibrate") if self.without_plan else ("approach",)
+        always = ("approach", "inspect")
+        return (*always, "goto", "calibrate") if self.without_plan else always
 
     def text(self) -> str:
         """Return the reason for a retreat."""
@@ -57,6 +58,8 @@ class PlanMonitor:
         self._last: dict[int, ChaserPlan] = {}
         self._failed_since_ns: dict[int, int] = {}
         self._degraded_since_ns: dict[int, int] = {}
+        self._degraded: set[int] = set()
+        self._time_ns = 0
 
     def update(
         self, chasers: tuple[int, ...], plan: NmpcPlan | None, time_ns: int, effective_ns: int
@@ -65,12 +68,17 @@ class PlanMonitor:
         for by_chaser in (self._last, self._failed_since_ns, self._degraded_since_ns):
             for i in by_chaser.keys() - set(chasers):
                 del by_chaser[i]
+        self._degraded &= set(chasers)
         for row, i in enumerate(chasers):
             status = FAILED if plan is None else plan.status[row]
             if plan is not None and status != FAILED:
                 self._last[i] = ChaserPlan(effective_ns, plan.states[row], plan.inputs[row])
-            _follow(self._failed_since_ns, i, time_ns, status == FAILED)
-            _follow(self._degraded_since_ns, i, time_ns, status in (FAILED, BUDGET, INFEASIBLE_RELAXED))
+            if status == FAILED:
+                self._failed_since_ns.setdefault(i, time_ns)
+            else:
+                self._failed_since_ns.pop(i, None)
+            self._follow_degraded(i, time_ns, status in (FAILED, BUDGET, INFEASIBLE_RELAXED))
+        self._time_ns = time_ns
 
     def plans(self, time_ns: int) -> Mapping[int, ChaserPlan]:
         """Return what chasers may fly at ``time_ns``: the newest plans, or older ones within `FAILED_S`."""
@@ -88,13 +96,19 @@ class PlanMonitor:
             failed_ns = time_ns - self._failed_since_ns.get(i, time_ns)
             if failed_ns >= FAILED_S * 1e9:
                 out[i] = PlanningFailure(without_plan=True)
-            elif time_ns - since_ns >= DEGRADED_S * 1e9:
+            elif i in self._degraded or time_ns - since_ns >= DEGRADED_S * 1e9:
                 out[i] = PlanningFailure(without_plan=False)
         return out
 
-
-def _follow(since_ns: dict[int, int], i: int, time_ns: int, applies: bool) -> None:
-    if applies:
-        since_ns.setdefault(i, time_ns)
-    else:
-        since_ns.pop(i, None)
+    def _follow_degraded(self, i: int, time_ns: int, degraded: bool) -> None:
+        """Let the clock of degraded plans run, or back to zero, where a failure ends; it shows `DEGRADED_S` at most."""
+        since_ns, limit_ns = self._degraded_since_ns.get(i, time_ns), round(DEGRADED_S * 1e9)
+        if time_ns - since_ns >= limit_ns:
+            self._degraded.add(i)
+        if not degraded:
+            since_ns += 2 * (time_ns - self._time_ns)
+        if degraded or since_ns < time_ns:
+            self._degraded_since_ns[i] = max(since_ns, time_ns - limit_ns)
+        else:
+            self._degraded_since_ns.pop(i, None)
+            self._degraded.discard(i)

@@ -26,6 +26,7 @@ from chaserdock_controller.interfaces import (
 
 from . import make_solver
 from .budget import Bounded, SolveBudget
+from .checks import check_plan
 from .lost_chasers import with_lost_chasers
 from .passive_safety import PassiveSafetyMonitor
 from .plan_monitor import PlanMonitor, PlanningFailure
@@ -111,9 +112,11 @@ class PlanningStage:
         start_s = self._now_s()
         try:
             plan = self.solver.solve(problem, since_ns / 1e9, (*horizon.chasers, *observation.lost))
+            check_plan(plan, len(problem.states), self._parameters.stages)
             self._last_solve_ns = observation.time_ns
-        except (ValueError, ArithmeticError, RuntimeError) as error:
-            events = (("error", f"solver error: {error}"),)
+        except Exception as error:  # an installed solver may raise anything
+            plan = None
+            events = (("error", f"solver error: {type(error).__name__}: {error}"),)
         wall_s = self._now_s() - start_s
         if self._budget is not None and plan is not None:
             self._budget.note(wall_s, int(plan.iterations.sum()))

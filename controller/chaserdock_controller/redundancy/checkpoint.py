@@ -64,6 +64,8 @@ class PlanMonitorState(Struct, forbid_unknown_fields=True):
     _last: dict[int, ChaserPlan]
     _failed_since_ns: dict[int, int]
     _degraded_since_ns: dict[int, int]
+    _degraded: set[int]
+    _time_ns: int
 
 
 class OutputState(Struct, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
-from chaserdock_protocol.leases import defect_of
+from chaserdock_protocol.leases import defect_of, no_command
 from chaserdock_protocol.messages import (
     CommandReply,
     ControllerState,
@@ -38,7 +38,6 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health, run_
 from .core import ControllerCore
 from .ingest.tick_inputs import TickInputCollector
 from .interfaces import TickOutputs
-from .output.message_builders import no_command
 from .redundancy.checkpoint import Checkpoint, CheckpointError
 from .redundancy.operator_requests import OperatorRequests
 from .redundancy.standby import HotStandby

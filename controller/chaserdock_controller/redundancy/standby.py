@@ -12,10 +12,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from chaserdock_protocol.lease_holder import Commander, LeaseHolder
 from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
 from chaserdock_protocol.transport import ReceivedMessage
-
-from .lease_holder import Commander, LeaseHolder
 
 _MISSABLE_TICKS = 10
 """In real time a standby may miss this many ticks and keep its state."""

@@ -124,7 +124,8 @@ state that their lease
 
 Its `WrenchCommand` carries its name (`commander`), its `instance`, and as `term` the smallest number of its own that no
 stated `term` exceeds: odd for `controller`, even for `standby`. A chaser refuses commands of another sender than its
-holder, or of a lower term (`stale term` among the rejected), and copies `term` into its `ActuatorCommand`. In lock-step a
+holder, of a lower term (`stale term` among the rejected), or for a tick more than 2 s ahead of the newest (`early tick`),
+and copies `term` into its `ActuatorCommand`. In lock-step a
 controller that holds leases, but no majority, lets their chasers `wait`.
 
 In real time the world does not wait; a late reply acts late. Messages that a reader does not receive in time are

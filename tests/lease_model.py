@@ -18,7 +18,7 @@ import sys
 from dataclasses import dataclass, field
 
 from chaserdock_agents.chaser.lease_grantor import LeaseGrantor
-from chaserdock_controller.redundancy.lease_holder import LeaseHolder
+from chaserdock_protocol.lease_holder import LeaseHolder
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 

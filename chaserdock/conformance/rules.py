@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from chaserdock_agents.chaser.command_gate import refusal
-from chaserdock_controller.redundancy.lease_holder import LeaseHolder
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.lease_holder import LeaseHolder
 from chaserdock_protocol.messages import ActuatorCommand, Farewell, Lease, Message, Presence, WrenchCommand
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.topics import Role, Topic

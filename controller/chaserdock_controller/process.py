@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
-from chaserdock_protocol.leases import defect_of
+from chaserdock_protocol.leases import defect_of, no_command
 from chaserdock_protocol.messages import (
     CommandReply,
     ControllerState,
@@ -38,7 +38,6 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health, run_
 from .core import ControllerCore
 from .ingest.tick_inputs import TickInputCollector
 from .interfaces import TickOutputs
-from .output.message_builders import no_command
 from .redundancy.checkpoint import Checkpoint, CheckpointError
 from .redundancy.operator_requests import OperatorRequests
 from .redundancy.standby import HotStandby
@@ -227,8 +226,11 @@ class ControllerProcess:
         if self.realtime:
             self._decide(tick)
         leads = self.standby.leads_at(tick.tick)
-        requests = self.requests.take()
-        commands = tuple(c for c, _ in requests) if leads else self.standby.take_leader_commands(tick.tick)
+        requests = self.requests.take() if leads else []
+        if not self.standby.leads:
+            self._refuse_requests(tick)
+        operated = tuple(command for command, _ in requests)
+        commands = self.standby.take_leader_commands(tick.tick) + operated
         out = self.core.step(self.inputs.take(tick, commands))
         if leads:
             replies = out.replies[len(out.replies) - len(requests) :]
@@ -243,7 +245,7 @@ class ControllerProcess:
         self._last_result = (tick, out, wall_s)
         self.done_tick = tick.tick
         if leads:
-            self._publish(tick, out, wall_s, commands)
+            self._publish(tick, out, wall_s, operated)
         if tick.tick % self.scenario.time.rate_hz == 0:
             health = create_health(self.node, tick.tick, tick.sim_time_ns)
             self.node.publish(topics.HEALTH, health, self.name)
@@ -287,7 +289,8 @@ class ControllerProcess:
         self.node.publish(topics.WRENCH, msgspec.structs.replace(wrench, **head), wrench.chaser)
 
     def _publish_state(self, tick: Tick, **fields: Any) -> None:
-        state = ControllerState(process=self.name, term=self.standby.authority.term, **fields)
+        sender = self.standby.authority
+        state = ControllerState(process=self.name, term=sender.term, instance=sender.instance, **fields)
         stamp = {"tick": tick.tick, "sim_time_ns": tick.sim_time_ns}
         self.node.publish(topics.STATE, msgspec.structs.replace(state, **stamp))
 
@@ -367,8 +370,7 @@ class ControllerProcess:
             self.node.declare_queryable(topics.OPERATE_KEY, OperatorCommand, self.operate)
         elif self._on_network:
             self.node.undeclare_queryable(topics.OPERATE_KEY)
-            leader = self.standby.leader
-            self.requests.refuse(tick, "" if leader is None else leader.name)
+            self._refuse_requests(tick)
         if term > 1 or not leads:
             self._report_role(f"commands in term {term}" if leads else "stands by", tick)
         result = self._last_result
@@ -376,8 +378,14 @@ class ControllerProcess:
             # Processed already as a standby, for a leader that cannot publish its own result any more.
             self._publish(tick, result[1], result[2], ())
 
+    def _refuse_requests(self, tick: Tick) -> None:
+        leader = self.standby.leader
+        self.requests.refuse(tick, "" if leader is None else leader.name)
+
     def _apply_leader_state(self, state: ControllerState) -> None:
-        if not state.state:
+        if self.standby.is_deposed(state):
+            self.node.counts.stale += 1
+        elif not state.state:
             self.standby.add_leader_commands(state)
         elif self.standby.needs_state(state.tick, self.done_tick):
             try:

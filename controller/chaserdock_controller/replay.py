@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 from chaserdock_protocol import topics
+from chaserdock_protocol.lease_holder import Commander
 from chaserdock_protocol.messages import WrenchCommand
 from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbeat, Stage
 from chaserdock_protocol.scenario import FlightScenario
@@ -17,7 +18,6 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 from .core import ControllerCore
 from .interfaces import TickInputs, TickOutputs
 from .process import ControllerProcess
-from .redundancy.lease_holder import Commander
 
 
 class _EstimationOnly:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 
-from .messages import Lease
+from .messages import Lease, Tick, WrenchCommand
 from .topics import CONTROLLERS
 
 LEASE_S, LEASE_MAX_S = 0.18, 2.0
@@ -58,3 +58,18 @@ def is_majority(granted: Collection[int], live: Collection[int]) -> bool:
     if not live or not granted:
         return False
     return 2 * len(granted) + (min(live) in granted) > len(live)
+
+
+def no_command(chaser: int, tick: Tick) -> WrenchCommand:
+    """Return the message for a chaser that waits for the command of a tick for which there is none."""
+    zero = (0.0, 0.0, 0.0)
+    return WrenchCommand(
+        tick=tick.tick,
+        sim_time_ns=tick.sim_time_ns,
+        chaser=chaser,
+        effective_time_ns=tick.sim_time_ns,
+        expires_ns=tick.sim_time_ns,
+        mode="none",
+        force_N=zero,
+        torque_N_m=zero,
+    )

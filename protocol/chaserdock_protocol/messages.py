@@ -660,12 +660,14 @@ class ControllerState(Message, frozen=True, kw_only=True):
     """The commanding controller's report to standbys: the tick is complete; ``operated``: its operator commands.
 
     ``state``, at intervals: serialized controller state after the tick, for standbys that joined late; else empty.
+    ``process``, ``instance`` and ``term``: of the sender; see ``Lease``.
     """
 
     process: Text
     term: Count
     operated: Annotated[tuple[OperatorCommand, ...], Meta(max_length=1024)] = ()
     state: Annotated[bytes, Meta(max_length=4_000_000)] = b""
+    instance: Text = ""
 
 
 class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):

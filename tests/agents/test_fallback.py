@@ -25,6 +25,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
+from chaserdock_protocol.leases import longest_lease_ticks
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate, Tick, WrenchCommand
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
@@ -348,6 +349,30 @@ def test_stale_terms_are_rejected_counted_and_reported_once(
     deliver(chaser, topics.ODOMETRY, at(scenario, 3))
     published = deliver(chaser, topics.WRENCH, command(scenario, 3, "standby", 2))
     assert not [m for t, m in published if t is topics.EVENT]
+
+
+@pytest.mark.parametrize("mode", ["nmpc", "none", "yield"])
+def test_command_far_ahead_of_the_newest_tick_is_refused(
+    chaser: ChaserProcess, scenario: Scenario, mode: Any
+) -> None:
+    def deliver_tick(tick: int) -> list[tuple[Any, Any]]:
+        deliver(chaser, topics.TICK, tick_of(scenario, tick, "controller"))
+        return deliver(chaser, topics.ODOMETRY, at(scenario, tick))
+
+    deliver_tick(3)
+    until_tick, latest = chaser.leases.until_tick, 3 + longest_lease_ticks(scenario.time.rate_hz)
+    far = msgspec.structs.replace(command(scenario, latest + 1, "controller", 1), mode=mode)
+    published = deliver(chaser, topics.WRENCH, far)
+    assert sources(published) == [("hold", 0)]  # the reply that the world waits for
+    events = [(m.what, m.tick) for t, m in published if t is topics.EVENT]
+    assert events == [("command refused", 3), ("no command", 3), ("fallback: hold", 3)]
+    assert chaser.leases.until_tick == until_tick
+    assert chaser.node.counts.rejected["wrench:early tick"] == 1
+    deliver_tick(4)
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == [("command", 1)]
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, latest, "controller", 1))) == [
+        ("command", 1)
+    ]
 
 
 def test_new_leader_within_a_tick_does_not_repeat_a_command(

@@ -10,16 +10,27 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from chaserdock_agents.chaser.lease_grantor import LeaseGrantor
 from chaserdock_agents.ros2 import conversion, process, services, wrench_control
 from chaserdock_agents.ros2.rmw_zenoh import Attachment, endpoint_token, topic_key
 from chaserdock_agents.ros2.types import GOTO, INTERFACES, SELECT_THRUSTER, TRIGGER, TYPES, type_hash
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import CommandReply, JoinReply, JoinRequest, MissionEnd, OperatorCommand
+from chaserdock_protocol.lease_holder import PATIENCE_TICKS, LeaseHolder
+from chaserdock_protocol.messages import (
+    CommandReply,
+    JoinReply,
+    JoinRequest,
+    MissionEnd,
+    OperatorCommand,
+    Tick,
+)
 from chaserdock_protocol.process import ProcessOptions, RosLink
+from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.scenario.flight import flight_scenario_json
 from chaserdock_protocol.transport import Link, Node
@@ -327,6 +338,78 @@ def test_wrench_becomes_a_command_of_the_newest_tick() -> None:
 )
 def test_wrench_in_another_frame_or_not_finite_is_refused(message: Any, reason: str | None) -> None:
     assert wrench_control.why_invalid(message, 1) == reason
+
+
+class ControlledFlight:
+    """``ros2 --control`` beside a standby, and the leases of three chasers, without a network."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        scenario = load_scenario(ROOT / "scenarios" / "two-chaser-tracking.toml")
+        self.timing, self.node = scenario.timing, ReplayNode("controller")
+        for name in ("advertise", "subscribe", "restart_numbering"):
+            monkeypatch.setattr(self.node, name, lambda *_: None, raising=False)
+        monkeypatch.setattr(wrench_control, "Heartbeat", lambda *_: SilentHeartbeat())
+        mission: Any = SimpleNamespace(scenario_json=flight_scenario_json(scenario))
+        ros: Any = SimpleNamespace(subscribe=lambda *_: None)
+        self.control = wrench_control.WrenchControl(cast(Node, self.node), ros, mission, "c", 10.0)
+        self.standby = LeaseHolder("standby", "s")
+        self.grantors = [LeaseGrantor(i, self.timing.rate_hz) for i in range(3)]
+
+    def fly(self, number: int, wrenches: tuple[int, ...]) -> list[tuple[int, str]]:
+        """Fly a tick with wrenches for some chasers; return to which chasers what was sent."""
+        tick = Tick(
+            tick=number,
+            sim_time_ns=self.timing.tick_time_ns(number),
+            images=False,
+            chasers=(0, 1, 2),
+            controllers={"controller": "c", "standby": "s"},
+        )
+        self.control._take(tick)
+        for grantor in self.grantors:
+            self._state(grantor.update(tick))
+        for chaser in wrenches:
+            self.control._command(chaser, wrench(""))
+        self.control._complete_tick()
+        sent: list[Any] = [message for _, _, message in self.node.take_published()]
+        for command in sent:
+            grantor = self.grantors[command.chaser]
+            if grantor.refusal(command) is None and command.mode == "yield":
+                grantor.give_back(command)
+            elif grantor.refusal(command) is None and command.mode != "wait":
+                grantor.renew(command)
+                self._state(grantor.stated(tick))
+        assert not (sent and sent[0].mode in ("nmpc", "none") and self.standby.claim(tick))
+        return [(command.chaser, command.mode) for command in sent]
+
+    def _state(self, lease: Any) -> None:
+        self.control._take(lease)
+        self.standby.add(lease)
+
+
+def test_wrenches_without_a_majority_of_leases_are_refused_and_the_leases_given_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = ControlledFlight(monkeypatch)
+    for grantor in flight.grantors[1:]:
+        grantor.holder, grantor.instance, grantor.term, grantor.until_tick = "standby", "s", 2, 1000
+    sent = [flight.fly(number, (0, 1, 2)) for number in range(1, 6)]
+    assert sent == [[(0, "wait")]] * PATIENCE_TICKS + [[(0, "yield")], []]
+    assert [grantor.holder for grantor in flight.grantors] == ["standby"] * 3
+
+
+def test_chasers_without_a_wrench_keep_their_leases_while_one_is_valid(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = ControlledFlight(monkeypatch)
+    period = flight.timing.ticks_in(0.4)
+    for number in range(5 * period):
+        expected = [(0, "none"), (1, "none"), (2, "none")]
+        if number % period == 0:
+            expected = [(1, "nmpc"), (0, "none"), (2, "none")]
+        assert flight.fly(number, (1,) if number % period == 0 else ()) == expected
+    for number in range(5 * period, 8 * period):
+        flight.fly(number, ())
+    assert [grantor.holder for grantor in flight.grantors] == ["standby"] * 3
 
 
 def test_lock_step_mission_is_refused(mission: Mission, capsys: pytest.CaptureFixture[str]) -> None:

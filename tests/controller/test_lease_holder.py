@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from chaserdock_agents.chaser import lease_grantor
-from chaserdock_controller.redundancy.lease_holder import PATIENCE_TICKS, Commander, LeaseHolder
 from chaserdock_controller.redundancy.standby import HotStandby
+from chaserdock_protocol.lease_holder import PATIENCE_TICKS, Commander, LeaseHolder
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from lease_model import Chaser, Model, TwoCommanders, walk
 

@@ -68,8 +68,9 @@ def ticks() -> dict[int, list[ReceivedMessage]]:
     return {tick: messages for tick, messages in sorted(out.items()) if tick <= last}
 
 
-def member(scenario: Scenario, name: str, instance: str) -> ControllerProcess:
-    process = ControllerProcess(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
+def member(scenario: Scenario, name: str, instance: str, realtime: bool = False) -> ControllerProcess:
+    core = ControllerCore(scenario, lambda: 0.0)
+    process = ControllerProcess(cast(Node, ReplayNode(name)), scenario, core, realtime)
     process.heartbeat = cast(Any, SilentHeartbeat())
     process.standby.join(instance)
     return process
@@ -203,6 +204,72 @@ def test_standby_follows_the_operator_commands_of_the_commander(scenario: Scenar
         deliver(second, *ticks[tick], *state_messages(published))
     assert [a.accepted for a in answers] == [True]
     assert second.core.guidance.chasers[0].phase == first.core.guidance.chasers[0].phase == "goto"
+
+
+def held_by(messages: list[ReceivedMessage], holder: str, term: int) -> list[ReceivedMessage]:
+    """Return the messages of a tick in which both controllers take part and one holds all leases."""
+    tick = next(r.message for r in messages if r.topic is topics.TICK)
+    leases = [granted(tick, i, holder, term) for i in tick.chasers]
+    return leases + [r for r in messages if r.topic is not topics.LEASE]
+
+
+def operated_by(instance: str, term: int, tick: int) -> ReceivedMessage:
+    """Return the message by which a start of ``controller`` reports that it executed an operator's command."""
+    command = OperatorCommand(command="goto", chaser=0, offset_m=(-1.2, 0.0, 0.0))
+    state = ControllerState(
+        process="controller", instance=instance, term=term, tick=tick, operated=(command,)
+    )
+    return ReceivedMessage(topics.STATE, None, state, 0)
+
+
+def test_operator_command_of_a_deposed_controller_is_ignored(scenario: Scenario, ticks: Any) -> None:
+    """The commander freezes with tick 4 open, and continues with it when the standby has taken over."""
+    second = member(scenario, "standby", "s", realtime=True)
+    phases = second.core.guidance.chasers
+    for tick in range(10):
+        deliver(second, *held_by(ticks[tick], *(("controller", 1) if tick < 5 else ("standby", 2))))
+        if tick == 6:
+            assert second.standby.leads
+            deliver(second, operated_by("c", 1, 4))
+    for tick in range(10, 13):
+        deliver(second, *held_by(ticks[tick], "controller", 3))
+        assert phases[0].phase != "goto"
+    deliver(second, operated_by("replaced", 1, 12), *held_by(ticks[13], "controller", 3))
+    assert phases[0].phase != "goto"
+    deliver(second, operated_by("c", 3, 13), *held_by(ticks[14], "controller", 3))
+    assert phases[0].phase == "goto"
+
+
+def test_standby_that_takes_over_executes_the_last_operator_command_of_the_commander(
+    scenario: Scenario, ticks: Any
+) -> None:
+    second = member(scenario, "standby", "s", realtime=True)
+    for tick in range(10):
+        deliver(second, *held_by(ticks[tick], "controller", 1))
+    deliver(second, operated_by("c", 1, 9))
+    published = deliver(second, *held_by(ticks[10], "standby", 2))
+    assert second.core.guidance.chasers[0].phase == "goto"
+    assert not any(m.operated for t, m in published if t is topics.STATE)
+
+
+def test_operator_request_waits_for_the_first_tick_of_a_new_commander(scenario: Scenario, ticks: Any) -> None:
+    second = member(scenario, "standby", "s")
+    answers: list[Any] = []
+    for tick in range(4):  # without state messages of the commander
+        deliver(second, *ticks[tick])
+    second.operate(OperatorCommand(command="hold", chaser=0), answers.append)
+    deliver(second, *reassigned(ticks[3], "standby", 2))
+    assert [(a.tick, a.accepted) for a in answers] == [(3, True)]
+
+
+def test_operator_request_to_a_standby_is_refused(scenario: Scenario, ticks: Any) -> None:
+    second = member(scenario, "standby", "s", realtime=True)
+    answers: list[Any] = []
+    second.operate(OperatorCommand(command="hold", chaser=0), answers.append)
+    deliver(second, *ticks[0])
+    assert [(a.accepted, a.reason) for a in answers] == [
+        (False, "controller commands now: repeat the command")
+    ]
 
 
 # -- the state ----------------------------------------------------------------------------------------------

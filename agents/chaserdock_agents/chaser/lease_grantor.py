@@ -2,7 +2,7 @@
 """Leases that a chaser grants: to which controller, in which term, until which tick. No I/O; ticks are the only clock.
 
 As in PaxosLease (M. Trencseni et al., 2012) the acceptors decide: a chaser has promised each tick to at most one controller,
-and a controller commands a tick that a majority has promised to it (``controller/redundancy/lease_holder.py``). Every executed
+and a controller commands a tick that a majority has promised to it (``chaserdock_protocol.lease_holder``). Every executed
 command renews the lease. When it has run out, or its holder is lost, the next controller gets it in a higher term.
 """
 

@@ -13,6 +13,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
+from chaserdock_protocol.leases import longest_lease_ticks
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     DockingStatus,
@@ -316,15 +317,20 @@ class ChaserProcess:
     def _handle_command(self, command: WrenchCommand) -> None:
         """Execute a command of the controller, or refuse it."""
         now_ns = self._now_ns()
-        if stale := self.leases.refusal(command):
-            self.node.counts.rejected["wrench:stale term"] += 1
+        newest = -1 if self.tick is None else self.tick.tick
+        # It would count as newer than all commands to come, and extend the lease.
+        early = command.tick > newest + longest_lease_ticks(self.scenario.time.rate_hz)
+        stale = f"for tick {command.tick}, the newest is {newest}" if early else self.leases.refusal(command)
+        tick = newest if early else command.tick
+        if stale:
+            self.node.counts.rejected["wrench:early tick" if early else "wrench:stale term"] += 1
             self._refused += 1
             if not self._reported_stale:  # the first of a series
-                self._publish_warning("command refused", stale, command.tick, now_ns)
+                self._publish_warning("command refused", stale, tick, now_ns)
             self._reported_stale = True
             # A holder that does not know its term sends nothing else in this tick.
             if self.leases.is_of_holder(command) and not self.realtime:
-                self._mark_uncommanded(command.tick)
+                self._mark_uncommanded(tick)
             return
         if command.mode in ("none", "wait", "yield"):
             self._take_no_command(command)

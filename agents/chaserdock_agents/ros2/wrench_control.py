@@ -2,7 +2,8 @@
 """A node of ROS 2 as the controller of a mission in real time: wrenches of a topic per chaser become its commands.
 
 This process takes the controller's place and name. It estimates and plans nothing: a chaser for which no wrench arrives has no
-commands, and does what it does without a controller (docs/faults.md).
+commands, and does what it does without a controller (docs/faults.md). As every controller it commands a tick while a majority
+of the chasers has granted it their leases.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ from collections import Counter
 from functools import partial
 from typing import Any
 
+import msgspec
 from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.lease_holder import LeaseHolder
+from chaserdock_protocol.leases import defect_of, no_command
 from chaserdock_protocol.messages import JoinReply, Lease, MissionEnd, Presence, Tick, WrenchCommand
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import flight_scenario_from_json
@@ -30,6 +34,8 @@ ROS_NODE = "chaserdock_control"
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
 _LIFETIME_NS = 500_000_000
 _RECEIVE_S = 0.1
+_PATIENCE_TICKS = 0.5
+"""Share of a tick's period after which chasers without a wrench are told that none has come."""
 
 
 class ControlError(ChaserdockError):
@@ -95,8 +101,10 @@ class WrenchControl:
         self._node, self._timing, self._instance = node, scenario.timing, instance
         self._lock = threading.Lock()
         self._tick: Tick | None = None
-        self._leases: dict[int, Lease] = {}
+        self._leases = LeaseHolder(NAME, instance)
         self._commanded: dict[int, int] = {}
+        self._expires_ns, self._deadline_s = 0, math.inf
+        self._leads = False
         self._refused: Counter[str] = Counter()
         for i in range(len(scenario.chasers)):
             node.advertise(topics.WRENCH, i)
@@ -109,10 +117,14 @@ class WrenchControl:
         """Command until the mission ends; return the exit status."""
         ended = False
         while not (ended or stop() or self._heartbeat.world_is_gone()):
-            received = self._node.receive(_RECEIVE_S)
-            if received is not None:
-                with self._lock:
+            received = self._node.receive(
+                max(0.0, min(_RECEIVE_S, self._deadline_s - self._node.host.now_s()))
+            )
+            with self._lock:
+                if received is not None:
                     ended = self._take(received.message)
+                if self._node.host.now_s() >= self._deadline_s:
+                    self._complete_tick()
         tick = self._tick
         self._heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)
         for reason, number in self._refused.items():
@@ -125,8 +137,9 @@ class WrenchControl:
             case Tick() as tick:
                 self._heartbeat.in_flight.set()
                 self._tick = tick
-            case Lease() as lease:
-                self._leases[lease.chaser] = lease
+                self._deadline_s = self._node.host.now_s() + _PATIENCE_TICKS / self._timing.rate_hz
+            case Lease() as lease if not defect_of(lease, self._timing.rate_hz):
+                self._leases.add(lease)
             case Presence() as presence:
                 self._heartbeat.take(presence)
             case MissionEnd():
@@ -139,17 +152,44 @@ class WrenchControl:
             self._command_now(chaser, wrench)
 
     def _command_now(self, chaser: int, wrench: Any) -> None:
-        tick, lease = self._tick, self._leases.get(chaser)
-        reason = why_invalid(wrench, chaser)
+        tick, reason = self._tick, why_invalid(wrench, chaser)
         if reason is None and (tick is None or chaser not in tick.chasers):
             reason = f"chaser {chaser} does not fly"
-        if reason is None and (lease is None or lease.instance != self._instance):
-            reason = f"chaser {chaser} has not granted its lease"
-        if reason is not None or tick is None or lease is None:
+        if reason is None and tick is not None and not self._leases.claim(tick):
+            reason = "no majority of the chasers has granted its lease"
+        if reason is not None or tick is None:
             self._refused[reason or ""] += 1
             return
         if self._commanded.get(chaser, -1) >= tick.tick:
             return
+        self._set_leads(True)
         self._commanded[chaser] = tick.tick
-        command = wrench_command(wrench, chaser, tick, self._timing, lease.term, self._instance)
+        command = wrench_command(wrench, chaser, tick, self._timing, self._leases.term, self._instance)
+        self._expires_ns = command.expires_ns
         self._node.publish(topics.WRENCH, command, chaser)
+
+    def _complete_tick(self) -> None:
+        """Renew the leases of chasers without a wrench while one is valid; without a majority, give the leases back."""
+        self._deadline_s, tick, leases = math.inf, self._tick, self._leases
+        if tick is None:
+            return
+        if not leases.claim(tick):
+            self._set_leads(False)
+            for i, (term, gives_back) in leases.take_idle(tick).items():
+                self._publish_without_wrench(i, tick, "yield" if gives_back else "wait", term)
+        elif tick.sim_time_ns < self._expires_ns:
+            for i in tick.chasers:
+                if self._commanded.get(i) != tick.tick:
+                    self._publish_without_wrench(i, tick, "none", leases.term)
+
+    def _publish_without_wrench(self, chaser: int, tick: Tick, mode: str, term: int) -> None:
+        head = {"mode": mode, "term": term, "commander": NAME, "instance": self._instance}
+        self._node.publish(topics.WRENCH, msgspec.structs.replace(no_command(chaser, tick), **head), chaser)
+
+    def _set_leads(self, leads: bool) -> None:
+        """Note, and print, whether this process commands."""
+        if leads and not self._leads:
+            self._node.restart_numbering()
+        if leads != self._leads:
+            print_status(NAME, f"commands in term {self._leases.term}" if leads else "stands by")
+        self._leads = leads

@@ -21,8 +21,6 @@ from chaserdock_protocol.messages import (
     SolverStatus,
     StackEstimate,
     TargetEstimate,
-    Tick,
-    WrenchCommand,
 )
 from numpy.typing import ArrayLike
 
@@ -210,19 +208,4 @@ def event_message(observation: Observation, level: Level, text: str) -> Event:
         process="controller",
         level=level,
         what=text,
-    )
-
-
-def no_command(chaser: int, tick: Tick) -> WrenchCommand:
-    """Return the message for a chaser that waits for the command of a tick for which there is none."""
-    zero = (0.0, 0.0, 0.0)
-    return WrenchCommand(
-        tick=tick.tick,
-        sim_time_ns=tick.sim_time_ns,
-        chaser=chaser,
-        effective_time_ns=tick.sim_time_ns,
-        expires_ns=tick.sim_time_ns,
-        mode="none",
-        force_N=zero,
-        torque_N_m=zero,
     )

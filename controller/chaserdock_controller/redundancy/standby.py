@@ -12,10 +12,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from chaserdock_protocol.lease_holder import Commander, LeaseHolder
 from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
 from chaserdock_protocol.transport import ReceivedMessage
-
-from .lease_holder import Commander, LeaseHolder
 
 _MISSABLE_TICKS = 10
 """In real time a standby may miss this many ticks and keep its state."""
@@ -152,6 +151,19 @@ class HotStandby:
             self._synced = False
         return self.leads
 
+    def is_deposed(self, state: ControllerState) -> bool:
+        """Return whether the sender of a state message has lost the command, in real time, and may not know it yet.
+
+        A term above all known ones is of a commander whose leases are on their way. In lock-step a standby uses messages of its own
+        tick only.
+        """
+        leader = self.leader
+        if not self.realtime:
+            return False
+        if leader is not None and (leader.name, leader.instance) == (state.process, state.instance):
+            return False
+        return state.term <= max(self.leases.term, 0 if leader is None else leader.term)
+
     def add_leader_commands(self, state: ControllerState) -> None:
         """Add the operator commands that the leader has processed in a tick."""
         self.leader_commands[state.tick] = state.operated
@@ -163,7 +175,7 @@ class HotStandby:
         return tick in self.leader_commands or self.leader is None
 
     def take_leader_commands(self, tick: int) -> tuple[OperatorCommand, ...]:
-        """Return the leader's operator commands of a tick; in real time, since the last call."""
+        """Return the operator commands of a tick that another leader has accepted; in real time, since the last call."""
         commands = [c for t, c in sorted(self.leader_commands.items()) if t == tick or self.realtime]
         self.leader_commands = {
             t: c for t, c in self.leader_commands.items() if t > tick and not self.realtime

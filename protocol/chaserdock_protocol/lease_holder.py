@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from chaserdock_protocol.leases import is_majority, next_term
-from chaserdock_protocol.messages import Lease, Tick
+from .leases import is_majority, next_term
+from .messages import Lease, Tick
 
 PATIENCE_TICKS = 3
 """A controller gives a lease back after it had no majority for so many ticks; after one if the other commands meanwhile."""

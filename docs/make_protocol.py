@@ -88,7 +88,8 @@ reply arrives, for instance every 0.05 s.
    process is alive or lost.
 3. Declare all subscriptions and queryables, the one on `**/presence` last.
 4. Publish `Presence` on `NAME/presence`, with the instance that joined, and in `heard` every process whose
-   presence was received, with its instance, and in `world` the session of the mission's world. Do so each {EARLY_PERIOD_S:g} s; after the first tick, each
+   presence was received, with its instance, and in `world` the session of the mission's world. Do so each
+   {EARLY_PERIOD_S:g} s; after the first tick, each
    {STEADY_PERIOD_S:g} s is enough.
 
 Zenoh propagates declarations one by one, so that an early message may miss a subscriber. A writer whose presence

@@ -61,9 +61,7 @@ def main(options: ProcessOptions) -> int:
         node.message_filter = create_fault_layer(faults, node.name, scenario.timing, not realtime, node.host)
         controller.open(instance, options.stall_s)
         node.host.finish_startup()
-        while not (
-            controller.ended or controller.replaced or stop() or controller.heartbeat.world_is_gone()
-        ):
+        while not (controller.ended or controller.replaced or stop() or controller.heartbeat.world_is_gone()):
             controller.listen()
         if not controller.replaced:
             controller.farewell()

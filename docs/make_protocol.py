@@ -123,6 +123,9 @@ state that their lease
 - includes the tick: `from_tick` and `from_revision` are not after it, `until_tick` not before;
 - was stated (`tick`) no earlier than `since` says for the chaser and for the controller.
 
+In a repeated tick (`revision` > 0) that lists both controllers, `chasers` and `since` of its first `Tick` apply. A
+controller that did not receive that one does not command the tick.
+
 Its `WrenchCommand` carries its name (`commander`), its `instance`, and as `term` the smallest number of its own that no
 stated `term` exceeds: odd for `controller`, even for `standby`. A chaser refuses commands of another sender than its
 holder, of a lower term (`stale term` among the rejected), or for a tick more than 2 s ahead of the newest (`early tick`),

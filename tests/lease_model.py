@@ -3,10 +3,10 @@
 
 Random walks through the state machines that fly (``LeaseGrantor`` of each chaser, ``LeaseHolder`` of each controller) with the
 worst network there is: messages come in any order, late, twice or never; processes restart without memory, some while their
-predecessor still runs; the world takes living processes for lost. Checked after every step: no tick (in one revision) has two
-commanders; a chaser flies the holder of its lease only, and no two controllers in one tick; what is flown was commanded with
-authority; ticks and terms that a chaser states never fall. At the end of a walk the network recovers, and within ``UNITED_TICKS``
-one controller must command all chasers, for good.
+predecessor still runs; the world takes living processes for lost. Checked after every step: no tick has two commanders, unless a
+controller is lost in it; a chaser flies the holder of its lease only, and no two controllers in one tick; what is flown was
+commanded with authority; ticks and terms that a chaser states never fall. At the end of a walk the network recovers, and within
+``UNITED_TICKS`` one controller must command all chasers, for good.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ class Chaser:
 
 
 class Model:
-    """World, network, chasers and controllers; ``steps`` counts what has happened."""
+    """World, network, chasers and controllers; ``steps`` counts what has happened.
+
+    ``claims``: who commands, by tick and the number of its controllers, negative so that later claims are greater.
+    """
 
     def __init__(self, seed: int) -> None:
         self.draw = random.Random(seed)
@@ -151,6 +154,7 @@ class Model:
                 self._chaser_command(to, message)
             case Controller(), Tick():
                 to.ticks = [*to.ticks[-3:], message]
+                to.leases.add_tick(message)
             case Controller(), Lease():
                 to.leases.add(message)
             case _:
@@ -205,9 +209,9 @@ class Model:
         tick = self.draw.choice(controller.ticks)
         me, term = (controller.leases.name, controller.leases.instance), 0
         if controller.leases.claim(tick):
-            stamp, term = (tick.tick, tick.revision), controller.leases.term
+            stamp, term = (tick.tick, -len(tick.controllers)), controller.leases.term
             if self.claims.setdefault(stamp, me) != me:
-                raise TwoCommanders(f"tick {stamp}: {self.claims[stamp]} and {me} command it")
+                raise TwoCommanders(f"tick {tick.tick}: {self.claims[stamp]} and {me} command it")
             self.claimed_ticks.add((tick.tick, *me))
             for i in tick.chasers:
                 self.send(self.chasers[i], command_of(tick, i, "nmpc", me, term))

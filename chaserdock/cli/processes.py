@@ -49,6 +49,13 @@ def world(
     recorder: Annotated[bool, typer.Option(help="wait for a recorder before the first tick")] = True,
     *,
     link: LinkOptions,
+    timeout: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            help="seconds to wait for a router and, before the first tick, for another process to connect; unlimited by default",
+        ),
+    ] = None,
     rejoin_timeout: Annotated[
         float, typer.Option(min=0.0, help="lock-step: seconds to wait after all processes were lost")
     ] = 0.0,
@@ -60,12 +67,13 @@ def world(
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
     options = ProcessOptions(
-        link=link.link("world"),
+        link=link.link("world", timeout),
         scenario=find_scenario(scenario),
         overrides=tuple(overrides or ()),
         seed=seed,
         mode=mode.value,
         recorder_expected=recorder,
+        patience_s=timeout,
         rejoin_s=rejoin_timeout,
         stall_s=stall_s,
         watch_parent=watch_parent,

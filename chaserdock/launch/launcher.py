@@ -346,7 +346,7 @@ def start_all(
     timeout = ["--timeout", str(_START_TIMEOUT_S)]
     sets = [item for override in overrides for item in ("--set", override)]
     listen = [] if "--keys" in network else ["-l", "tcp/127.0.0.1:0"]
-    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, *listen], output)
+    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, *listen, *timeout], output)
     fleet.start("controller", ["controller", *network, *timeout], output)
     if scenario.controller.standby:
         fleet.start("standby", ["controller", "--standby", *network, *timeout], output)

@@ -134,7 +134,8 @@ class Invariants:
     _drawn: dict[str, Any] = field(default_factory=dict)
     _flown: dict[int, ActuatorCommand] = field(default_factory=dict)
     _commanders: dict[int, str] = field(default_factory=dict)
-    _repeated: set[int] = field(default_factory=set)
+    _controllers: dict[str, str] = field(default_factory=dict)
+    _controller_lost: set[int] = field(default_factory=set)
     _touching: set[str] = field(default_factory=set)
     _begin: dict[str, float] = field(default_factory=dict)
     _commanded: dict[int, int] = field(default_factory=dict)
@@ -214,9 +215,10 @@ class Invariants:
     # -- bodies --------------------------------------------------------------------------------------------------
 
     def _on_tick(self, tick: Tick) -> None:
-        if tick.revision:
-            self._repeated.add(tick.tick)
+        if tick.tick == self._tick and len(tick.controllers) < len(self._controllers):
+            self._controller_lost.add(tick.tick)
         if tick.tick > self._tick:
+            self._controllers = tick.controllers
             self._opened.append((self._now_s, tick.tick))
             self._tick = tick.tick
             self._check_distances()
@@ -485,8 +487,8 @@ class Invariants:
             self.violate("no superseded command", name, f"flies term {command.term} after {before.term}")
         sender = commander_of(command.term)
         other = self._commanders.setdefault(command.tick, sender)
-        # A tick is repeated when the commander is lost in it: chasers may have executed its command before.
-        if other != sender and command.tick not in self._repeated:
+        # If the commander is lost in a tick, chasers may have executed its command before.
+        if other != sender and command.tick not in self._controller_lost:
             text = f"flies a command of {sender} for tick {command.tick}, in which {other} commands"
             self.violate("one commander", name, text)
 

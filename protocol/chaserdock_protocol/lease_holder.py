@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Leases that chasers have granted, as a controller knows them: who commands a tick. No I/O; ticks are the only clock.
 
-A controller commands a tick (in its newest revision) while a majority of the chasers that take part in it have promised it to
-that controller. Any two majorities share a chaser, and a chaser promises a tick to one controller only.
+A controller commands a tick while a majority of the chasers that take part in it have promised it to that controller. Any two
+majorities share a chaser, and a chaser promises a tick to one controller only. A chaser that is lost in a tick still counts in
+it: a majority of the others need not share a chaser with one that included it.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
 
 from .leases import is_majority, next_term
 from .messages import Lease, Tick
 
 PATIENCE_TICKS = 3
 """A controller gives a lease back after it had no majority for so many ticks; after one if the other commands meanwhile."""
+_MOST_KNOWN = 8
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class LeaseHolder:
     """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this controller.
 
     ``_renewed``: tick in which a chaser has last stated a longer lease of the same holder, and so has executed a command.
+    ``_first``: the first revisions of the last ticks.
     """
 
     name: str
@@ -40,6 +47,12 @@ class LeaseHolder:
     _lost: dict[int, int] = field(default_factory=dict)
     _given_back: dict[int, int] = field(default_factory=dict)
     _idle_since: dict[int, int] = field(default_factory=dict)
+    _first: deque[Tick] = field(default_factory=lambda: deque(maxlen=_MOST_KNOWN))
+
+    def add_tick(self, tick: Tick) -> None:
+        """Note which chasers a tick begins with."""
+        if tick.revision == 0:
+            self._first.append(tick)
 
     def add(self, lease: Lease) -> None:
         """Add a lease, unless a newer one of that chaser is known."""
@@ -79,8 +92,22 @@ class LeaseHolder:
                 granted += [lease] if lease.until_tick >= tick.tick else []
         return granted
 
+    def _with_lost_chasers(self, tick: Tick) -> Tick:
+        """Return a tick with the chasers that it began with, none if these are not known.
+
+        With one controller only, the chasers that are lost do not count.
+        """
+        if tick.revision == 0 or len(tick.controllers) < 2:
+            return tick
+        first = next((t for t in self._first if t.tick == tick.tick), None)
+        changes: dict[str, Any] = (
+            {"chasers": ()} if first is None else {"chasers": first.chasers, "since": first.since}
+        )
+        return msgspec.structs.replace(tick, **changes)
+
     def commander_of(self, tick: Tick) -> Commander | None:
         """Return who commands a tick by the leases known, None if no controller does."""
+        tick = self._with_lost_chasers(tick)
         for name, instance in tick.controllers.items():
             granted = self._granted(name, tick)
             if is_majority({lease.chaser for lease in granted}, tick.chasers):

@@ -53,7 +53,8 @@ class RosLink:
 class ProcessOptions:
     """Start options of a process. Each process uses a subset.
 
-    ``rejoin_s``: wall-clock time (s) that a lock-step world waits after it lost all processes. ``by_run``: the recorder
+    ``patience_s``: wall-clock time (s) that a process waits for a world, and the world for another process to connect before the
+    first tick. ``rejoin_s``: wall-clock time (s) that a lock-step world waits after it lost all processes. ``by_run``: the recorder
     creates one folder per run in ``out``. ``until``: the router ends when this process has joined and left.
     ``standby``: the controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM.
     ``ros``: for the bridge.

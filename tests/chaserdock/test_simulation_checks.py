@@ -199,9 +199,9 @@ class Log:
         )
         self.checks.observe(sender, raw)
 
-    def tick(self, tick: int, revision: int = 0) -> None:
+    def tick(self, tick: int, **changes: Any) -> None:
         time_ns = tick * 100_000_000
-        sample = msgspec.structs.replace(BY_TYPE[Tick], tick=tick, sim_time_ns=time_ns, revision=revision)
+        sample = msgspec.structs.replace(BY_TYPE[Tick], tick=tick, sim_time_ns=time_ns, **changes)
         self.publish(topics.TICK, sample)
 
     def bodies(self, tick: int, *bodies: BodyTruth, contacts: tuple[tuple[str, str], ...] = ()) -> None:
@@ -538,16 +538,18 @@ def test_commands_may_be_older_than_the_ticks_that_a_frozen_world_opens_at_once(
     assert log.found == ["no stale command"]
 
 
-def test_chasers_fly_different_commanders_only_in_a_tick_that_is_repeated(log: Log) -> None:
-    log.tick(20)
+def test_chasers_fly_different_commanders_only_in_a_tick_in_which_a_controller_is_lost(log: Log) -> None:
+    log.tick(20, controllers={"controller": "c", "standby": "s"})
     log.flies(1, 20, term=1)
-    log.tick(20, revision=1)
+    log.tick(20, revision=1, controllers={"standby": "s"})
     log.flies(0, 20, term=2)
     log.tick(21)
     log.flies(0, 21, term=2)
     log.flies(1, 21, term=4)
     assert log.found == []
+    log.tick(22, controllers={"controller": "c", "standby": "s"})
     log.flies(1, 22, term=5)
+    log.tick(22, revision=1, chasers=(0,), controllers={"controller": "c", "standby": "s"})
     log.flies(0, 22, term=4)
     assert log.found == ["one commander"]
 

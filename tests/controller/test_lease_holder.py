@@ -13,6 +13,7 @@ from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from lease_model import Chaser, Model, TwoCommanders, walk
 
 BOTH = {"controller": "c", "standby": "s"}
+ALONE = {"revision": 1, "controllers": {"standby": "s"}}
 
 
 def tick(number: int, chasers: tuple[int, ...] = (0, 1, 2), **changes: Any) -> Tick:
@@ -49,7 +50,7 @@ def standby(*leases: Lease) -> LeaseHolder:
         ([lease(1, 5), lease(2, 5, instance="s2")], 5, {}, False),
         ([lease(1, 5), lease(2, 5, from_tick=5)], 4, {}, False),  # another's tick
         ([lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)], 5, {}, False),  # another's revision
-        ([lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)], 5, {"revision": 1}, True),
+        ([lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)], 5, ALONE, True),
         ([lease(1, 5), lease(2, 5)], 6, {"since": {"chaser/2": 6}}, False),  # it may have forgotten
         ([lease(1, 5), lease(2, 5)], 6, {"since": {"standby": 6}}, False),
         ([lease(1, 5), lease(2, 5)], 6, {"since": {"controller": 6, "standby": 5, "chaser/2": 5}}, True),
@@ -62,6 +63,17 @@ def test_commander_of_a_tick(
     at = tick(number, **changes)
     assert holder.claim(at) is claimed
     assert holder.commander_of(at) == (Commander("standby", "s", 2) if claimed else None)
+
+
+def test_chaser_that_is_lost_in_a_tick_still_counts_in_it_while_both_controllers_take_part() -> None:
+    holder = standby(lease(1, 5))
+    assert not holder.claim(tick(5, (0, 1), revision=1))
+    holder.add_tick(tick(5, (0, 1)))
+    assert not holder.claim(tick(5, (1,), revision=1))
+    assert holder.claim(tick(5, (1,), **ALONE | {"revision": 2}))
+    holder.add(lease(0, 5))
+    assert holder.claim(tick(5, (1,), revision=1))
+    assert holder.claim(tick(6, (1,)))
 
 
 def test_older_statement_does_not_replace_a_newer_one() -> None:
@@ -134,6 +146,17 @@ def test_lockstep_decides_with_all_leases_and_real_time_as_they_come() -> None:
         assert role.leads
 
 
+def test_commander_goes_on_in_a_tick_in_which_a_chaser_is_lost() -> None:
+    role = HotStandby("standby", realtime=False)
+    role.join("s")
+    role.update(tick(3, (0, 1)))
+    role.leases.add(lease(0, 3))
+    role.leases.add(lease(1, 3, revision=1))
+    role.update(tick(3, (1,), revision=1))
+    role.decide()
+    assert role.leads
+
+
 def test_real_time_commander_continues_until_a_tick_without_leases() -> None:
     role = HotStandby("standby", realtime=True)
     role.join("s")
@@ -187,7 +210,7 @@ class IgnoresYield(lease_grantor.LeaseGrantor):
         (GrantsWhileALeaseRuns, 1, "command it"),
         (IgnoresInstance, 95, "holds its lease"),
         (IgnoresTerm, 5, "states"),
-        (IgnoresYield, 5, "after the last loss"),
+        (IgnoresYield, 6, "after the last loss"),
     ],
 )
 def test_model_finds_errors_of_a_chaser(
@@ -197,6 +220,12 @@ def test_model_finds_errors_of_a_chaser(
     monkeypatch.setattr("lease_model.LeaseGrantor", wrong)
     with pytest.raises(TwoCommanders, match=words):
         walk(seed)
+
+
+def test_model_finds_a_controller_that_does_not_count_lost_chasers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LeaseHolder, "_with_lost_chasers", lambda _, tick: tick)
+    with pytest.raises(TwoCommanders, match="command it"):
+        walk(21)
 
 
 def test_model_finds_a_chaser_that_does_not_ignore_older_ticks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,6 +34,7 @@ from harness import (
 )
 
 from chaserdock.analysis.flight import load_flight
+from chaserdock.launch import launcher
 
 TWO = "two-chaser-tracking"
 FLYING_BYTES = 300_000
@@ -345,3 +346,29 @@ def test_process_lost_before_first_tick_ends_run(tmp_path: Path) -> None:
         mission.kill()
         mission.wait()
     assert status == 1
+
+
+def test_world_names_the_processes_that_do_not_connect() -> None:
+    endpoint = f"tcp/127.0.0.1:{launcher.free_port()}"
+    status, output = finished("world", "single", "-l", endpoint, "--timeout", "1.5", timeout_s=60)
+    assert status == 1
+    assert "not connected within 1.5 s: chaser/0, controller, recorder" in output
+
+
+def test_process_that_hangs_before_the_first_tick_ends_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = launcher.Fleet.start
+
+    def start_suspended(self: launcher.Fleet, name: str, arguments: list[str], folder: Path) -> None:
+        start(self, name, arguments, folder)
+        if name == "chaser/1":
+            self.children[-1].process.send_signal(signal.SIGSTOP)
+
+    monkeypatch.setattr(launcher.Fleet, "start", start_suspended)
+    monkeypatch.setattr(launcher, "_START_TIMEOUT_S", 20)
+    monkeypatch.setattr(launcher, "_END_TIMEOUT_S", 5.0)
+    outcome = launcher.fly_mission(TWO, tmp_path / "run")
+    assert outcome.status == 1
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("not connected within 20 s: chaser/1")

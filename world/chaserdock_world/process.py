@@ -7,6 +7,8 @@ Real time: the wall clock ends a tick.
 
 from __future__ import annotations
 
+import math
+
 import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
@@ -22,6 +24,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario_json, load_scenario
 from chaserdock_protocol.scenario.faults import faults_of
+from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node, TransportError
 from chaserdock_protocol.transport.session import Heartbeat
 
@@ -152,8 +155,8 @@ class World:
 
     def run(self, stop: StopSignal) -> int:
         """Wait for the processes, simulate all ticks and end the mission; return the exit status."""
-        if not self._wait_for_processes(stop):
-            return self._end_mission(0, "stopped before the first tick", complete=False)
+        if reason := self._wait_for_processes(stop):
+            return self._end_mission(0, reason, complete=False)
         self._node.host.finish_startup()
         self._node.publish(topics.TRUTH_DRAWN, drawn_truth(self._scenario, self._odometry))
         self._started_s, tick = self._node.host.now_s(), 0
@@ -171,17 +174,29 @@ class World:
                 return self._end_mission(tick, "stopped" if stop() else "no chaser is left", complete=False)
             tick += 1
 
-    def _wait_for_processes(self, stop: StopSignal) -> bool:
-        """Wait until all expected processes are connected; return False if stopped before."""
-        barrier = self._barrier
+    def _wait_for_processes(self, stop: StopSignal) -> str:
+        """Wait until all expected processes are connected; return why they are not, empty if they are.
 
-        def missing() -> str:
-            return ", ".join(barrier.missing_processes())
+        ``ProcessOptions.patience_s`` limits the time in which no process connects.
+        """
+        barrier, patience_s = self._barrier, self._options.patience_s or math.inf
+        timer, missing = StallTimer(self._node.host.now_s), barrier.missing_processes()
 
-        print_status("world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing()}")
-        started = barrier.wait_until(lambda: not barrier.missing_processes(), stop, missing)
+        def over() -> bool:
+            nonlocal missing
+            before, missing = missing, barrier.missing_processes()
+            if missing != before:
+                timer.reset()
+            return not missing or timer.update() >= patience_s
+
+        def missing_names() -> str:
+            return ", ".join(missing)
+
+        print_status("world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing_names()}")
+        if not barrier.wait_until(over, stop, missing_names):
+            return "stopped before the first tick"
         barrier.start_flight()
-        return started
+        return f"not connected within {patience_s:g} s: {missing_names()}" if missing else ""
 
     def _publish_state(self, tick: int) -> States:
         """Publish odometry, docking sensors and ground truth at the beginning of a tick; return the bodies' states."""

@@ -137,6 +137,7 @@ class WrenchControl:
             case Tick() as tick:
                 self._heartbeat.in_flight.set()
                 self._tick = tick
+                self._leases.add_tick(tick)
                 self._deadline_s = self._node.host.now_s() + _PATIENCE_TICKS / self._timing.rate_hz
             case Lease() as lease if not defect_of(lease, self._timing.rate_hz):
                 self._leases.add(lease)

@@ -54,6 +54,7 @@ class HotStandby:
 
     def update(self, tick: Tick) -> None:
         """Take a new tick, before held messages."""
+        self.leases.add_tick(tick)
         before = self.newest
         if before is not None and (tick.tick, tick.revision) < (before.tick, before.revision):
             return

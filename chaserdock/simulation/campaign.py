@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import re
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -18,12 +19,15 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.toml_text import toml_document
 
+from .invariants import Violation
 from .shrinking import shrink
 from .swarm import Case, SimulationResult, draw_case, fly_case
 
 NEES_LIMITS = (1.5, 12.0)
 """Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights without lying sensors."""
 LEAST_NEES_FLIGHTS = 20
+_NOT_DOCKED = "ends in phase "
+"""Begin of the text on a chaser that should have docked, or should be safe."""
 
 
 @dataclass(frozen=True)
@@ -65,16 +69,37 @@ def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Sim
 
 
 def shrink_result(result: SimulationResult, attempts: int = 200) -> Case:
-    """Return the simplest case found that violates the first violated invariant of a result."""
+    """Return the simplest case found with the first violation of a result, in other numbers."""
     first = result.violations[0]
+    judges_docking = _NOT_DOCKED in first.text
 
     def fails(case: Case) -> bool:
+        # Without its command to approach, no chaser docks.
+        if judges_docking and _approaches(case) != _approaches(result.case):
+            return False
         try:
-            return any(v.invariant == first.invariant for v in fly_case(case, result.seed).violations)
+            violations = fly_case(case, result.seed).violations
         except ScenarioError:  # a simplification that leaves the scenario inconsistent
             return False
+        return any(_without_numbers(v) == _without_numbers(first) for v in violations)
 
     return shrink(result.case, fails, first.time_s, attempts)
+
+
+def _approaches(case: Case) -> int:
+    """Return the number of commands to approach."""
+    return sum(entry["command"] == "approach" for entry in case.get("timeline", ()))
+
+
+def _without_numbers(violation: Violation) -> tuple[str, str, str]:
+    """Return what violations of one defect share: invariant, subject and the words of the text.
+
+    Of a chaser that has not docked, the phase and the reason may differ.
+    """
+    subject, _, text = violation.text.partition(": ")
+    if text.startswith(_NOT_DOCKED):
+        text = _NOT_DOCKED
+    return violation.invariant, subject, re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "", text)
 
 
 def write_case(case: Case, result: SimulationResult, folder: Path) -> Path:

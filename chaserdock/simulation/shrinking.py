@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reduce a failing case: fewest faults, shortest duration, simplest values that still violate the same invariant.
+"""Reduce a failing case: fewest faults, shortest duration, simplest values with the same violation.
 
 Greedy delta debugging (A. Zeller, R. Hildebrandt, 2002): each pass proposes simpler cases, coarse ones first, and keeps one
 whenever it still fails, until a whole pass changes nothing.
@@ -91,11 +91,12 @@ def _at(case: Case, path: tuple[str, ...]) -> Any:
 
 
 def _shorter(case: Case, violated_s: float) -> Iterator[Case]:
-    """Yield the case cut soon after the violation."""
+    """Yield the case cut soon after the violation; whether chasers dock is not judged in it."""
     for extra_s in (0.5, 2.0):
         end_s = math.ceil(2.0 * (violated_s + extra_s)) / 2.0
         if end_s < case.get("duration_s", math.inf):
             shorter = {**copy.deepcopy(case), "duration_s": end_s}
+            shorter["success"] = {**case.get("success", {}), "docked": [], "latched": []}
             for path in (("fault",), ("timeline",), ("thruster_failure",)):
                 kept = [row for row in _at(case, path) if row["at_s"] < end_s]
                 if path[0] in case:

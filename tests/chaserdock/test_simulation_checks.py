@@ -41,7 +41,7 @@ from harness import ROOT
 from message_samples import BY_TYPE
 from pydantic import ValidationError
 
-from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
+from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency, shrink_result
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
 from chaserdock.simulation.network import EPOCH_NS
@@ -741,6 +741,70 @@ def test_shrinking_stops_after_its_attempts(scenario: Scenario) -> None:
     case = draw_case("fault-drill", 5, scenario)
     assert shrink(case, fails, 3.0, attempts=7) == case
     assert calls <= 7
+
+
+def a_result(case: Case, *violations: Violation) -> SimulationResult:
+    return SimulationResult(1, case, violations, "", "", (), True, 1.0)
+
+
+STALL = Violation("liveness", 13.2, "world: has not ended")
+NOT_DOCKED = Violation("liveness", 25.0, "chaser/0: ends in phase hold without a named reason")
+FLOOD = {
+    "kind": "flood",
+    "at_s": 5.0,
+    "duration_s": 12.0,
+    "process": "world",
+    "topic": "odometry",
+    "copies": 200,
+}
+
+
+def test_shrinking_keeps_the_violation_not_only_its_invariant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight that is cut before its chasers can dock violates liveness, too."""
+
+    def flown(case: Case, seed: int) -> SimulationResult:
+        wanted = case.get("success", {}).get("docked", [0])
+        cut = [NOT_DOCKED] if wanted and case.get("duration_s", 25.0) < 20.0 else []
+        return a_result(case, *([STALL] if case["fault"] else cut))
+
+    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    case: Case = {"extends": "fault-drill", "fault": [FLOOD]}
+    small = shrink_result(a_result(case, STALL))
+    assert [fault["kind"] for fault in small["fault"]] == ["flood"]
+    assert small["duration_s"] == 14.0
+    assert flown({**small, "fault": []}, 1).violations == ()
+
+
+def test_shrinking_keeps_the_commands_to_approach_of_a_chaser_that_does_not_dock(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def flown(case: Case, seed: int) -> SimulationResult:
+        commands = [entry["command"] for entry in case["timeline"]]
+        docks = "approach" in commands and not case["fault"]
+        return a_result(case, *([] if docks else [NOT_DOCKED]))
+
+    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    timeline = [
+        {"at_s": 5.0, "command": "approach", "chasers": [0]},
+        {"at_s": 9.0, "command": "hold", "chasers": [1]},
+    ]
+    case: Case = {"extends": "fault-drill", "fault": [FLOOD], "timeline": timeline}
+    small = shrink_result(a_result(case, NOT_DOCKED))
+    assert [entry["command"] for entry in small["timeline"]] == ["approach"]
+    assert len(small["fault"]) == 1
+
+
+def test_shrinking_takes_violations_that_differ_in_numbers_only_as_equal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def flown(case: Case, seed: int) -> SimulationResult:
+        chaser = 2 if case["seed"] else 1
+        return a_result(case, Violation("no contact", 1.0, f"chaser/{chaser}: {len(case['fault'])}e-05 m"))
+
+    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    case: Case = {"extends": "fault-drill", "fault": [FLOOD], "seed": 3}
+    small = shrink_result(flown(case, 1))
+    assert (small["fault"], small["seed"]) == ([], 3)
 
 
 def test_violations_print_as_one_line() -> None:

@@ -60,6 +60,7 @@ def simulate(
     """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if all of them hold."""
     from chaserdock.simulation.campaign import (
         Swarm,
+        UnflownSeed,
         consistency,
         fly_seeds,
         inconsistency,
@@ -75,6 +76,10 @@ def simulate(
     outcomes: Counter[str] = Counter()
     swarm = Swarm(scenario, images, None if mode is None else mode.value, to_violation=stop)
     for result in fly_seeds(swarm, _seed_range(seeds), jobs):
+        if isinstance(result, UnflownSeed):
+            outcomes["not flown"] += 1
+            print(f"seed {result.seed}: not flown: {result.reason}", flush=True)
+            continue
         results.append(result)
         outcomes[result.outcome] += 1
         if not result.violations:
@@ -88,11 +93,11 @@ def simulate(
         if stop:
             break
     elapsed_s = time.monotonic() - begin_s
-    failed = sum(bool(r.violations) for r in results)
+    failed = sum(bool(r.violations) for r in results) + outcomes["not flown"]
     counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common())
     mean, flights = consistency(results)
     print(
-        f"{len(results)} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 over {flights} flights"
+        f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 over {flights} flights"
     )
     if reason := inconsistency(results):
         print(f"chaserdock: {reason}", file=sys.stderr)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from chaserdock_protocol.process import SINGLE_THREADED
-from chaserdock_protocol.scenario import ScenarioError, load_scenario
+from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.toml_text import toml_document
@@ -40,20 +40,40 @@ class Swarm:
     to_violation: bool = False
 
 
+@dataclass(frozen=True)
+class UnflownSeed:
+    """A seed that could not be flown, and why."""
+
+    seed: int
+    reason: str
+
+
+def _load(swarm: Swarm) -> tuple[str, Scenario]:
+    """Return the scenario and what cases extend it by. Raises ScenarioError if no seed can fly it."""
+    path = find_scenario(swarm.scenario)
+    scenario = load_scenario(path)
+    if not (swarm.images or scenario.target_model().markers):
+        raise ScenarioError(f"{path}: the target has no markers to draw measurements of; use --images")
+    return (str(path.resolve()) if path == Path(swarm.scenario) else path.stem), scenario
+
+
 def fly_seed(swarm: Swarm, seed: int) -> SimulationResult:
     """Draw and fly the case of a seed. Raises ScenarioError."""
-    path = find_scenario(swarm.scenario)
-    name = str(path.resolve()) if path == Path(swarm.scenario) else path.stem
-    case = draw_case(name, seed, load_scenario(path), images=swarm.images, mode=swarm.mode)
+    name, scenario = _load(swarm)
+    case = draw_case(name, seed, scenario, images=swarm.images, mode=swarm.mode)
     return fly_case(case, seed, to_violation=swarm.to_violation)
 
 
-def _fly(job: tuple[Swarm, int]) -> SimulationResult:
-    return fly_seed(*job)
+def _fly(job: tuple[Swarm, int]) -> SimulationResult | UnflownSeed:
+    try:
+        return fly_seed(*job)
+    except ScenarioError as error:
+        return UnflownSeed(job[1], str(error))
 
 
-def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[SimulationResult]:
-    """Yield the results of the seeds, in their order."""
+def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[SimulationResult | UnflownSeed]:
+    """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can be flown."""
+    _load(swarm)
     if jobs == 1:
         yield from map(_fly, ((swarm, seed) for seed in seeds))
         return

@@ -12,7 +12,7 @@ from harness import ROOT, finished
 
 from chaserdock.simulation.campaign import Swarm, fly_seed, shrink_result, write_case
 from chaserdock.simulation.invariants import Invariants
-from chaserdock.simulation.swarm import fly_case
+from chaserdock.simulation.swarm import draw_case, fly_case
 
 SHORT = """
 extends = "single"
@@ -44,6 +44,34 @@ def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Pat
     assert status == 0, text
     assert "2 seeds in" in text
     assert not out.exists()
+
+
+def test_a_seed_that_cannot_be_flown_does_not_end_the_others(good: Path) -> None:
+    """A goto beside the only distance that the limits allow is refused."""
+    text = good.read_text() + "limits = {min_distance_target_m = 1.0, max_reference_distance_m = 1.0}\n"
+    good.write_text(text)
+    base = load_scenario(good)
+    cases = [draw_case("good", s, base) for s in range(60)]
+    wrong = next(
+        s
+        for s in range(59)
+        if "goto" in {e["command"] for e in cases[s].get("timeline", ())} and "timeline" not in cases[s + 1]
+    )
+    status, text = finished("simulate", str(good), "--seeds", f"{wrong}:{wrong + 1}")
+    assert status == 1
+    assert f"seed {wrong}: not flown: (scenario): timeline." in text
+    assert "scenario.toml" not in text
+    assert "\n2 seeds in" in text
+    assert "1 not flown" in text
+
+
+def test_targets_without_markers_need_images() -> None:
+    status, text = finished("simulate", "markerless-docking", "--seeds", "1:3")
+    assert status == 2
+    (line,) = text.splitlines()
+    assert line.endswith(
+        "markerless-docking.toml: the target has no markers to draw measurements of; use --images"
+    )
 
 
 def test_a_flight_without_seeds_keeps_its_log_once(good: Path, tmp_path: Path) -> None:

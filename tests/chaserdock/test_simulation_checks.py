@@ -109,6 +109,15 @@ def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario,
     assert sections >= {"truth", "timeline", "partition", "slow", "clock", "loss", "duplicate", "reorder"}
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
+def test_seeds_draw_valid_variants_of_every_shipped_scenario(path: Path, tmp_path: Path) -> None:
+    base = load_scenario(path)
+    for seed in range(15):
+        case = draw_case(path.stem, seed, base, images=not base.target_model().markers)
+        (tmp_path / "case.toml").write_text(toml_document(case))
+        load_scenario(tmp_path / "case.toml")
+
+
 def test_seeds_draw_faults_of_latches_where_there_are_ports(tmp_path: Path) -> None:
     base = load_scenario(ROOT / "scenarios" / "four-chaser-capture.toml")
     kinds, chasers = set(), set()

@@ -337,8 +337,7 @@ def fly_case(
             return to_violation and bool(checks.violations)
 
         flight = simulate(path, path.parent / "run", tap=tap, over=over)
-        lies = _LIES & {f["kind"] for f in case.get("fault", [])}
-        honest = not (lies or "truth" in case or "thruster_failure" in case)
+        honest = _is_honest(checks.scenario)
         if not over():
             checks.check_end(flight.crashes, flight.stalled)
             _check_recording(checks, flight, published)
@@ -355,6 +354,12 @@ def fly_case(
         honest=honest,
         sim_time_s=checks.time_s,
     )
+
+
+def _is_honest(scenario: Scenario) -> bool:
+    """Return whether no sensor lies and the plant is as stated."""
+    lies = _LIES & {fault.kind for fault in scenario.fault}
+    return not (lies or scenario.thruster_failure or "truth" in scenario.model_fields_set)
 
 
 def _check_consistency(checks: Invariants) -> None:

@@ -103,6 +103,29 @@ def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_pat
     assert [v.invariant for v in fly_case({"extends": str(path)}, seed).violations] == ["liveness"]
 
 
+@pytest.mark.parametrize(
+    ("keys", "honest"),
+    [
+        ("", True),
+        (
+            '[[fault]]\nkind = "odometry_lie"\nat_s = 0.5\nduration_s = 1.0\nprocess = "chaser/0"\noffset_m = [1.0, 0.0, 0.0]\n',
+            False,
+        ),
+        ("[truth.chaser]\nforce_N = 0.005\n", False),
+    ],
+    ids=["nothing", "lie", "truth"],
+)
+def test_a_case_is_as_honest_as_the_scenario_that_it_extends(keys: str, honest: bool, good: Path) -> None:
+    good.write_text(good.read_text() + keys)
+    assert fly_case({"extends": str(good), "duration_s": 0.3}, 0).honest == honest
+
+
+def test_a_case_inherits_thruster_failures() -> None:
+    statistical = {"name": "statistical"}
+    case = {"extends": "thruster-failure", "duration_s": 0.3, "perception": statistical}
+    assert not fly_case(case, 0).honest
+
+
 def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(checks: Invariants, tick: Tick) -> None:
         checks._tick = tick.tick

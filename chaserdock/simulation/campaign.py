@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-import multiprocessing
+import multiprocessing.connection
 import os
 import re
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+import signal
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
@@ -64,46 +68,107 @@ def fly_seed(swarm: Swarm, seed: int) -> SimulationResult:
     return fly_case(case, seed, to_violation=swarm.to_violation)
 
 
-def _fly(job: tuple[Swarm, int]) -> SimulationResult | UnflownSeed:
+def _fly(swarm: Swarm, seed: int) -> SimulationResult | UnflownSeed:
     try:
-        return fly_seed(*job)
+        return fly_seed(swarm, seed)
     except ScenarioError as error:
-        return UnflownSeed(job[1], str(error))
+        return UnflownSeed(seed, str(error))
 
 
 def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can be flown."""
+    """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can be flown.
+
+    With several ``jobs``, these processes end at once when the generator does.
+    """
     _load(swarm)
     if jobs == 1:
-        yield from map(_fly, ((swarm, seed) for seed in seeds))
+        yield from (_fly(swarm, seed) for seed in seeds)
         return
     os.environ.update(SINGLE_THREADED)  # read by the numerical libraries of the new processes when they start
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        remaining, running = iter(seeds), []
-        for seed in itertools.islice(remaining, 2 * jobs):
-            running.append(pool.submit(_fly, (swarm, seed)))
-        while running:
-            yield running.pop(0).result()
-            running += [pool.submit(_fly, (swarm, seed)) for seed in itertools.islice(remaining, 1)]
+    workers: list[_Worker] = []
+    try:
+        workers += [_Worker(swarm) for _ in range(jobs)]
+        yield from _fly_on(workers, iter(seeds))
+    finally:
+        for worker in workers:
+            worker.end()
 
 
-def shrink_result(result: SimulationResult, attempts: int = 200) -> Case:
-    """Return the simplest case found with the first violation of a result, in other numbers."""
-    first = result.violations[0]
+class _Worker:
+    """A process that flies one seed after the other. ``turn``: the place of its seed in the order of all."""
+
+    def __init__(self, swarm: Swarm) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.turn = 0
+        self.connection, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(swarm, theirs), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def end(self) -> None:
+        """End the process at once."""
+        self._process.terminate()
+        self._process.join()
+        self.connection.close()
+
+
+def _work(swarm: Swarm, connection: Connection) -> None:
+    """Fly the seeds that arrive until the connection closes, and send back results, or errors that concern all seeds."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent ends this one
+    with contextlib.suppress(EOFError):
+        while True:
+            seed = connection.recv()
+            try:
+                connection.send(_fly(swarm, seed))
+            except ChaserdockError as error:
+                connection.send(error)
+
+
+def _fly_on(workers: Sequence[_Worker], seeds: Iterator[int]) -> Iterator[SimulationResult | UnflownSeed]:
+    """Yield the results of the seeds in their order; each worker that is free flies the next one."""
+    flying: dict[Connection, _Worker] = {}
+    flown: dict[int, SimulationResult | UnflownSeed] = {}
+    turns, turn = itertools.count(), 0
+
+    def assign(worker: _Worker) -> None:
+        for seed in itertools.islice(seeds, 1):
+            worker.turn = next(turns)
+            worker.connection.send(seed)
+            flying[worker.connection] = worker
+
+    for worker in workers:
+        assign(worker)
+    while flying:
+        for connection in multiprocessing.connection.wait(list(flying)):
+            worker = flying.pop(cast(Connection, connection))
+            answer = worker.connection.recv()
+            if isinstance(answer, ChaserdockError):
+                raise answer
+            flown[worker.turn] = answer
+            assign(worker)
+        while turn in flown:
+            yield flown.pop(turn)
+            turn += 1
+
+
+def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
+    """Yield flights of simpler and simpler cases with the first violation of a result, in other numbers."""
+    first, flown = result.violations[0], result
     judges_docking = _NOT_DOCKED in first.text
 
     def fails(case: Case) -> bool:
+        nonlocal flown
         # Without its command to approach, no chaser docks.
         if judges_docking and _approaches(case) != _approaches(result.case):
             return False
         try:
-            violations = fly_case(case, result.seed).violations
+            flown = fly_case(case, result.seed)
         except ScenarioError:  # a simplification that leaves the scenario inconsistent
             return False
-        return any(_without_numbers(v) == _without_numbers(first) for v in violations)
+        return any(_without_numbers(v) == _without_numbers(first) for v in flown.violations)
 
-    return shrink(result.case, fails, first.time_s, attempts)
+    for _ in shrink(result.case, fails, first.time_s, attempts):
+        yield flown
 
 
 def _approaches(case: Case) -> int:
@@ -122,12 +187,12 @@ def _without_numbers(violation: Violation) -> tuple[str, str, str]:
     return violation.invariant, subject, re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "", text)
 
 
-def write_case(case: Case, result: SimulationResult, folder: Path) -> Path:
+def write_case(result: SimulationResult, folder: Path) -> Path:
     """Write a case that fails as a scenario file, with what it violates in its first lines; return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"seed-{result.seed}.toml"
     lines = [f"# {violation}" for violation in result.violations]
-    path.write_text("\n".join([*lines, toml_document(case)]), encoding="utf-8")
+    path.write_text("\n".join([*lines, toml_document(result.case)]), encoding="utf-8")
     return path
 
 

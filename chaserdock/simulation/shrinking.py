@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 from .swarm import Case
@@ -26,8 +26,8 @@ _LISTS = (
 _SECTIONS = ("truth", "simulation", "controller")
 
 
-def shrink(case: Case, fails: Fails, violated_s: float, attempts: int = 200) -> Case:
-    """Return the simplest case found for which ``fails`` holds, as it does for ``case``.
+def shrink(case: Case, fails: Fails, violated_s: float, attempts: int = 200) -> Iterator[Case]:
+    """Yield simpler and simpler cases for which ``fails`` holds, as it does for ``case``.
 
     ``violated_s``: mission time of the violation; what comes later is cut first. ``fails`` is called ``attempts`` times at
     most.
@@ -39,33 +39,29 @@ def shrink(case: Case, fails: Fails, violated_s: float, attempts: int = 200) -> 
         left -= 1
         return left >= 0 and fails(candidate)
 
-    for simplify in (
-        lambda c: _shorter(c, violated_s),
-        _without_halves,
-        _without_items,
-        _without_keys,
-        _shorter_faults,
-        _rounder,
-    ):
-        case = _fixed_point(case, simplify, still)
+    steps = (_without_items, _without_keys, _shorter_faults, _rounder)
+    first = (lambda c: _shorter(c, violated_s), _without_halves)
+    for simplify in (*first, *steps):
+        case = yield from _fixed_point(case, simplify, still)
     before = None
     while before != case and left > 0:
         before = case
-        for simplify in (_without_items, _without_keys, _shorter_faults, _rounder):
-            case = _fixed_point(case, simplify, still)
-    return case
+        for simplify in steps:
+            case = yield from _fixed_point(case, simplify, still)
 
 
-def _fixed_point(case: Case, simplify: Callable[[Case], Iterator[Case]], still: Fails) -> Case:
-    """Apply simplifications one after the other until none of them fails any more."""
-    changed = True
-    while changed:
-        changed = False
+def _fixed_point(
+    case: Case, simplify: Callable[[Case], Iterator[Case]], still: Fails
+) -> Generator[Case, None, Case]:
+    """Apply simplifications one after the other until none of them fails any more; yield and return the cases."""
+    while True:
         for candidate in simplify(case):
             if candidate != case and still(candidate):
-                case, changed = candidate, True
+                case = candidate
+                yield case
                 break
-    return case
+        else:
+            return case
 
 
 def _changed(case: Case, path: tuple[Any, ...], value: Any) -> Case:

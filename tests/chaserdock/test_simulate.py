@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 from chaserdock_protocol.messages import Tick
 from chaserdock_protocol.scenario import load_scenario
-from harness import ROOT, finished
+from harness import ROOT, chaserdock, finished
 
 from chaserdock.simulation.campaign import Swarm, fly_seed, shrink_result, write_case
 from chaserdock.simulation.invariants import Invariants
@@ -92,8 +96,9 @@ def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_pat
     assert status == 1
     assert "\n1 seeds in" in text
     assert fly_seed(Swarm(str(bad)), seed).fingerprint == result.fingerprint
-    case = shrink_result(result, attempts=60)
-    path = write_case(case, fly_case(case, seed), tmp_path / "out")
+    *_, simplest = shrink_result(result, attempts=60)
+    path = write_case(simplest, tmp_path / "out")
+    case = simplest.case
     assert not case["fault"]
     assert case.keys() <= {"extends", "name", "seed", "perception", "fault", "duration_s"}
     assert path.read_text().startswith(
@@ -138,6 +143,38 @@ def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest
         result = fly_case({"extends": str(good)}, 0, to_violation=to_violation)
         assert [v.text for v in result.violations] == ["test: third tick"]
         assert result.sim_time_s == pytest.approx(end_s)
+
+
+def test_ctrl_c_ends_flights_on_several_processes_at_once() -> None:
+    """The parent alone receives the signal; a flight of ``detumble`` takes minutes."""
+    arguments = ("simulate", "detumble", "--seeds", "1:20", "--jobs", "2")
+    process = chaserdock(*arguments, stdout=subprocess.PIPE)
+    try:
+        while len(psutil.Process(process.pid).children()) < 2:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=30.0)
+    finally:
+        for left in (*psutil.Process(process.pid).children(), process) if process.poll() is None else ():
+            left.kill()
+    assert process.returncode == 130
+    assert out.startswith(b"0 seeds in")
+
+
+def test_ctrl_c_while_shrinking_writes_the_simplest_case_so_far(bad: Path, tmp_path: Path) -> None:
+    arguments = ("simulate", str(bad), "--seeds", "2:5", "--out", str(tmp_path / "out"))
+    process = chaserdock(*arguments, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    lines = iter(process.stdout.readline, b"")
+    shrinking = next(line for line in lines if line.endswith(b": shrinking; Ctrl-C ends it\n"))
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=30.0)
+    assert process.returncode == 130
+    assert b"seeds in" in out
+    seed = int(shrinking.split()[1].rstrip(b":"))
+    (path,) = (tmp_path / "out").iterdir()
+    assert load_scenario(path).name == f"seed-{seed}"
+    assert fly_case({"extends": str(path)}, seed).violations
 
 
 def test_regressions_are_scenarios_that_run_accepts() -> None:

@@ -156,18 +156,20 @@ def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[Sim
     first, flown = result.violations[0], result
     judges_docking = _NOT_DOCKED in first.text
 
-    def fails(case: Case) -> bool:
+    def violation_s(case: Case) -> float | None:
         nonlocal flown
         # Without its command to approach, no chaser docks.
         if judges_docking and _approaches(case) != _approaches(result.case):
-            return False
+            return None
         try:
             flown = fly_case(case, result.seed)
         except ScenarioError:  # a simplification that leaves the scenario inconsistent
-            return False
-        return any(_without_numbers(v) == _without_numbers(first) for v in flown.violations)
+            return None
+        same = (v.time_s for v in flown.violations if _without_numbers(v) == _without_numbers(first))
+        return next(same, None)
 
-    for _ in shrink(result.case, fails, first.time_s, attempts):
+    duration_s = load_scenario(find_scenario(result.case["extends"])).duration_s
+    for _ in shrink(result.case, violation_s, first.time_s, duration_s, attempts):
         yield flown
 
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from .swarm import Case
 
-Fails = Callable[[Case], bool]
+Judge = Callable[[Case], float | None]
 _LISTS = (
     ("fault",),
     ("timeline",),
@@ -23,45 +23,48 @@ _LISTS = (
     ("simulation", "slow"),
     ("simulation", "clock"),
 )
+_OPTIONAL = {
+    ("fault",): ("peer",),
+    ("thruster_failure",): ("reported",),
+    ("simulation", "clock"): ("offset_s", "drift"),
+}
+"""Keys that rows of the lists may leave out."""
 _SECTIONS = ("truth", "simulation", "controller")
 
 
-def shrink(case: Case, fails: Fails, violated_s: float, attempts: int = 200) -> Iterator[Case]:
-    """Yield simpler and simpler cases for which ``fails`` holds, as it does for ``case``.
+def shrink(
+    case: Case, violation_s: Judge, violated_s: float, duration_s: float, attempts: int = 200
+) -> Iterator[Case]:
+    """Yield simpler and simpler cases with the violation of ``case``, which is at ``violated_s`` of ``duration_s``.
 
-    ``violated_s``: mission time of the violation; what comes later is cut first. ``fails`` is called ``attempts`` times at
+    ``violation_s`` returns the mission time of the violation in a case, None without it; it is called ``attempts`` times at
     most.
     """
-    left = attempts
 
-    def still(candidate: Case) -> bool:
-        nonlocal left
-        left -= 1
-        return left >= 0 and fails(candidate)
+    def shorter(case: Case) -> Iterator[Case]:
+        return _shorter(case, violated_s, duration_s)
 
-    steps = (_without_items, _without_keys, _shorter_faults, _rounder)
-    first = (lambda c: _shorter(c, violated_s), _without_halves)
-    for simplify in (*first, *steps):
-        case = yield from _fixed_point(case, simplify, still)
-    before = None
+    left, before = attempts, None
     while before != case and left > 0:
         before = case
-        for simplify in steps:
-            case = yield from _fixed_point(case, simplify, still)
-
-
-def _fixed_point(
-    case: Case, simplify: Callable[[Case], Iterator[Case]], still: Fails
-) -> Generator[Case, None, Case]:
-    """Apply simplifications one after the other until none of them fails any more; yield and return the cases."""
-    while True:
-        for candidate in simplify(case):
-            if candidate != case and still(candidate):
-                case = candidate
-                yield case
-                break
-        else:
-            return case
+        for simplify in (
+            shorter,
+            _without_halves,
+            _without_items,
+            _without_keys,
+            _earlier,
+            _shorter_faults,
+            _rounder,
+        ):
+            candidates = simplify(case)
+            while (candidate := next(candidates, None)) is not None and left > 0:
+                if candidate == case:
+                    continue
+                left -= 1
+                if (time_s := violation_s(candidate)) is not None:
+                    case, violated_s = candidate, time_s
+                    yield case
+                    candidates = simplify(case)
 
 
 def _changed(case: Case, path: tuple[Any, ...], value: Any) -> Case:
@@ -86,11 +89,11 @@ def _at(case: Case, path: tuple[str, ...]) -> Any:
     return value
 
 
-def _shorter(case: Case, violated_s: float) -> Iterator[Case]:
+def _shorter(case: Case, violated_s: float, duration_s: float) -> Iterator[Case]:
     """Yield the case cut soon after the violation; whether chasers dock is not judged in it."""
     for extra_s in (0.5, 2.0):
         end_s = math.ceil(2.0 * (violated_s + extra_s)) / 2.0
-        if end_s < case.get("duration_s", math.inf):
+        if end_s < case.get("duration_s", duration_s):
             shorter = {**copy.deepcopy(case), "duration_s": end_s}
             shorter["success"] = {**case.get("success", {}), "docked": [], "latched": []}
             for path in (("fault",), ("timeline",), ("thruster_failure",)):
@@ -118,7 +121,7 @@ def _without_items(case: Case) -> Iterator[Case]:
 
 
 def _without_keys(case: Case) -> Iterator[Case]:
-    """Yield the case without whole sections, then without single keys of them, and lock-step if it is not."""
+    """Yield the case without whole sections, then without single keys of them and of rows, and with seed 0."""
     for section in _SECTIONS:
         if section in case:
             yield {k: v for k, v in copy.deepcopy(case).items() if k != section}
@@ -128,17 +131,30 @@ def _without_keys(case: Case) -> Iterator[Case]:
     for kind, values in case.get("truth", {}).items():
         for key in values:
             yield _changed(case, ("truth", kind, key), None)
+    for path, optional in _OPTIONAL.items():
+        for k, row in enumerate(_at(case, path)):
+            for key in optional:
+                if key in row:
+                    yield _changed(case, (*path, k, key), None)
     if case.get("seed", 0):
         yield {**case, "seed": 0}
+
+
+def _earlier(case: Case) -> Iterator[Case]:
+    """Yield the case with one row at half the time."""
+    for path in _LISTS:
+        for k, row in enumerate(_at(case, path)):
+            if (half_s := round(row.get("at_s", 0.0) / 2.0, 2)) >= 0.1:
+                yield _changed(case, (*path, k, "at_s"), half_s)
 
 
 def _shorter_faults(case: Case) -> Iterator[Case]:
     for path in _LISTS:
         for k, row in enumerate(_at(case, path)):
-            for key in ("duration_s", "copies", "delay_s"):
+            for key in ("duration_s", "copies", "delay_s", "offset_s"):
                 if key in row:
                     shorter = round(row[key] / 2.0, 2) if isinstance(row[key], float) else row[key] // 2
-                    if shorter >= 0.1:
+                    if abs(shorter) >= 0.1:
                         yield _changed(case, (*path, k, key), shorter)
             if row.get("share", 1.0) < 1.0:
                 yield _changed(case, (*path, k, "share"), 1.0)
@@ -154,7 +170,7 @@ def _rounder(case: Case) -> Iterator[Case]:
             for key, value in row.items():
                 if isinstance(value, float):
                     for digits in (0, 1):
-                        if (rounded := round(value, digits)) != value and rounded > 0.0:
+                        if (rounded := round(value, digits)) != value and rounded:
                             yield _changed(case, (*path, k, key), rounded)
                 elif isinstance(value, list) and value and isinstance(value[0], float):
                     yield _changed(case, (*path, k, key), [round(x, 1) for x in value])

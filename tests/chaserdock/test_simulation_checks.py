@@ -719,21 +719,19 @@ def test_shrinking_leaves_what_the_failure_needs(scenario: Scenario) -> None:
     original = copy.deepcopy(case)
     calls = 0
 
-    def fails(c: Case) -> bool:
+    def violation_s(c: Case) -> float | None:
         nonlocal calls
         calls += 1
         drops = [f for f in c["fault"] if f["kind"] == "drop" and f["process"] == "chaser/2"]
         long = any(f["duration_s"] >= 0.9 and f["at_s"] < c.get("duration_s", 25.0) for f in drops)
-        return long and c.get("simulation", {}).get("loss", 0.0) > 0.0
+        return drops[-1]["at_s"] + 1.86 if long and c.get("simulation", {}).get("loss", 0.0) > 0.0 else None
 
-    *_, small = shrink(case, fails, violated_s=9.2)
+    *_, small = shrink(case, violation_s, violated_s=9.2, duration_s=25.0)
     assert case == original
-    assert fails(small)
-    assert small["duration_s"] == 10.0
+    assert violation_s(small) is not None
+    assert small["duration_s"] == 2.5
     assert small["simulation"] == {"loss": 0.01}
-    assert small["fault"] == [{**culprit, "at_s": 7.0, "duration_s": 0.9, "share": 1.0}] or (
-        small["fault"][0]["duration_s"] < 2.0 and small["fault"][0]["share"] == 1.0
-    )
+    assert small["fault"] == [{**culprit, "at_s": 0.1, "duration_s": 1.0, "share": 1.0}]
     assert "truth" not in small
     assert small["seed"] == 0
     assert calls < 120
@@ -742,14 +740,41 @@ def test_shrinking_leaves_what_the_failure_needs(scenario: Scenario) -> None:
 def test_shrinking_stops_after_its_attempts(scenario: Scenario) -> None:
     calls = 0
 
-    def fails(_: Case) -> bool:
+    def violation_s(_: Case) -> None:
         nonlocal calls
         calls += 1
-        return False
 
     case = draw_case("fault-drill", 5, scenario)
-    assert list(shrink(case, fails, 3.0, attempts=7)) == []
+    assert list(shrink(case, violation_s, 3.0, 25.0, attempts=7)) == []
     assert calls <= 7
+
+
+def test_shrinking_never_lengthens_a_flight() -> None:
+    (simpler, *_) = shrink({"extends": "single", "seed": 5}, lambda _: 1.0, 1.0, duration_s=1.0)
+    assert simpler == {"extends": "single", "seed": 0}
+
+
+def test_shrinking_simplifies_errors_of_clocks() -> None:
+    jump = {
+        "kind": "clock_jump",
+        "at_s": 18.37,
+        "duration_s": 7.91,
+        "process": "controller",
+        "offset_s": -73.218,
+    }
+    clock = {"process": "world", "offset_s": -523.4, "drift": -0.0123}
+    case: Case = {"extends": "fault-drill", "fault": [jump], "simulation": {"clock": [clock]}}
+
+    def violation_s(c: Case) -> float | None:
+        late = any(f["offset_s"] < -1.0 for f in c.get("fault", ()))
+        behind = any(k.get("offset_s", 0.0) < -100.0 for k in c.get("simulation", {}).get("clock", ()))
+        return 20.0 if late and behind else None
+
+    *_, small = shrink(case, violation_s, 20.0, 25.0)
+    assert small["fault"] == [
+        {"kind": "clock_jump", "at_s": 0.1, "duration_s": 0.1, "process": "controller", "offset_s": -1.1}
+    ]
+    assert small["simulation"] == {"clock": [{"process": "world", "offset_s": -131.0}]}
 
 
 def a_result(case: Case, *violations: Violation) -> SimulationResult:

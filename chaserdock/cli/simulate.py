@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import time
@@ -60,6 +61,7 @@ def simulate(
     """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if all of them hold."""
     from chaserdock.simulation.campaign import Swarm, UnflownSeed, consistency, fly_seeds, inconsistency
 
+    _check_writable(out)
     if seeds is None:
         raise typer.Exit(_fly_one(scenario, out, mode))
     begin_s = time.monotonic()
@@ -96,6 +98,13 @@ def simulate(
         print(f"chaserdock: {reason}", file=sys.stderr)
         failed += 1
     raise typer.Exit(STOPPED if stopped else FAILED if failed else DONE)
+
+
+def _check_writable(out: Path) -> None:
+    """Exit with status 2 unless ``out`` is a folder that can be written, or can be made."""
+    nearest = next(path for path in (out, *out.absolute().parents) if os.access(path, os.F_OK))
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
+        raise fail(f"--out {out}: {nearest} is not a folder that can be written")
 
 
 def _shrink(result: SimulationResult, out: Path) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import time
@@ -10,10 +11,12 @@ from pathlib import Path
 
 import psutil
 import pytest
+import typer
 from chaserdock_protocol.messages import Tick
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, chaserdock, finished
 
+from chaserdock.cli.simulate import simulate
 from chaserdock.simulation.campaign import Swarm, fly_seed, shrink_result, write_case
 from chaserdock.simulation.invariants import Invariants
 from chaserdock.simulation.swarm import draw_case, fly_case
@@ -48,6 +51,22 @@ def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Pat
     assert status == 0, text
     assert "2 seeds in" in text
     assert not out.exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--seeds", "1:2")], ids=["one", "seeds"])
+@pytest.mark.parametrize("out", ["good.toml", "good.toml/below"])
+def test_out_must_be_a_folder_that_can_be_written(out: str, options: tuple[str, ...], good: Path) -> None:
+    status, text = finished("simulate", str(good), *options, "--out", str(good.parent / out))
+    assert status == 2
+    (line,) = text.splitlines()
+    assert line.endswith(f"{out}: {good} is not a folder that can be written")
+
+
+def test_out_must_be_writable(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.access", lambda path, mode: mode == os.F_OK)
+    with pytest.raises(typer.Exit) as exit_:
+        simulate(str(good), out=good.parent / "out")
+    assert exit_.value.exit_code == 2
 
 
 def test_a_seed_that_cannot_be_flown_does_not_end_the_others(good: Path) -> None:

@@ -38,7 +38,7 @@ def simulate(
             help="fly random faults drawn from these seeds; without: as the scenario states",
         ),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, max=256, help="processes to fly on")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="processes to fly seeds on")] = 1,
     mode: Annotated[
         ModeOption | None, typer.Option(help="fly all seeds in this mode; drawn by default")
     ] = None,
@@ -63,6 +63,9 @@ def simulate(
 
     _check_writable(out)
     if seeds is None:
+        given = {"--jobs": jobs > 1, "--images": images, "--no-shrink": not shrinking, "--stop": stop}
+        if unused := [option for option, is_given in given.items() if is_given]:
+            raise fail(f"{', '.join(unused)}: only with --seeds")
         raise typer.Exit(_fly_one(scenario, out, mode))
     begin_s = time.monotonic()
     results: list[SimulationResult] = []

@@ -69,6 +69,13 @@ def test_out_must_be_writable(good: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert exit_.value.exit_code == 2
 
 
+def test_options_of_seeds_need_seeds(good: Path) -> None:
+    options = ("--jobs", "2", "--images", "--stop", "--no-shrink")
+    status, text = finished("simulate", str(good), *options)
+    assert status == 2
+    assert text == "chaserdock: --jobs, --images, --no-shrink, --stop: only with --seeds\n"
+
+
 def test_a_seed_that_cannot_be_flown_does_not_end_the_others(good: Path) -> None:
     """A goto beside the only distance that the limits allow is refused."""
     text = good.read_text() + "limits = {min_distance_target_m = 1.0, max_reference_distance_m = 1.0}\n"

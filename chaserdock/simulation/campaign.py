@@ -192,7 +192,7 @@ def _without_numbers(violation: Violation) -> tuple[str, str, str]:
 def write_case(result: SimulationResult, folder: Path) -> Path:
     """Write a case that fails as a scenario file, with what it violates in its first lines; return its path."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"seed-{result.seed}.toml"
+    path = folder / f"{Path(result.case['extends']).stem}-seed-{result.seed}.toml"
     lines = [f"# {violation}" for violation in result.violations]
     path.write_text("\n".join([*lines, toml_document(result.case)]), encoding="utf-8")
     return path

@@ -171,6 +171,13 @@ def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest
         assert result.sim_time_s == pytest.approx(end_s)
 
 
+def test_cases_of_two_scenarios_have_files_of_their_own(good: Path, bad: Path, tmp_path: Path) -> None:
+    results = [fly_seed(Swarm(str(path)), 2) for path in (good, bad)]
+    paths = [write_case(result, tmp_path / "out") for result in results]
+    assert [path.name for path in paths] == ["good-seed-2.toml", "bad-seed-2.toml"]
+    assert [load_scenario(path).success.docked for path in paths] == [(), (0,)]
+
+
 def test_ctrl_c_ends_flights_on_several_processes_at_once() -> None:
     """The parent alone receives the signal; a flight of ``detumble`` takes minutes."""
     arguments = ("simulate", "detumble", "--seeds", "1:20", "--jobs", "2")

@@ -87,7 +87,8 @@ def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Sim
     os.environ.update(SINGLE_THREADED)  # read by the numerical libraries of the new processes when they start
     workers: list[_Worker] = []
     try:
-        workers += [_Worker(swarm) for _ in range(jobs)]
+        for _ in range(jobs):
+            workers.append(_Worker(swarm))
         yield from _fly_on(workers, iter(seeds))
     finally:
         for worker in workers:
@@ -95,15 +96,30 @@ def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Sim
 
 
 class _Worker:
-    """A process that flies one seed after the other. ``turn``: the place of its seed in the order of all."""
+    """A process that flies one seed after the other. ``turn``: the place of its ``seed`` in the order of all."""
 
     def __init__(self, swarm: Swarm) -> None:
+        self.swarm, self.seed, self.turn = swarm, 0, 0
+        self._start()
+
+    def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self.turn = 0
         self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(swarm, theirs), daemon=True)
+        self._process = context.Process(target=_work, args=(self.swarm, theirs), daemon=True)
         self._process.start()
         theirs.close()
+
+    def answer(self) -> SimulationResult | UnflownSeed | ChaserdockError:
+        """Return what the process has sent; start another one if it has died."""
+        try:
+            return self.connection.recv()
+        except (EOFError, OSError):
+            self._process.join(1.0)
+            self.end()
+            status = self._process.exitcode
+            self._start()
+            why = " (killed, as when memory is short)" if status == -signal.SIGKILL else ""
+            return UnflownSeed(self.seed, f"its process ended with status {status}{why}")
 
     def end(self) -> None:
         """End the process at once."""
@@ -132,8 +148,9 @@ def _fly_on(workers: Sequence[_Worker], seeds: Iterator[int]) -> Iterator[Simula
 
     def assign(worker: _Worker) -> None:
         for seed in itertools.islice(seeds, 1):
-            worker.turn = next(turns)
-            worker.connection.send(seed)
+            worker.seed, worker.turn = seed, next(turns)
+            with contextlib.suppress(OSError):  # of a process that has died, which its answer shows
+                worker.connection.send(seed)
             flying[worker.connection] = worker
 
     for worker in workers:
@@ -141,7 +158,7 @@ def _fly_on(workers: Sequence[_Worker], seeds: Iterator[int]) -> Iterator[Simula
     while flying:
         for connection in multiprocessing.connection.wait(list(flying)):
             worker = flying.pop(cast(Connection, connection))
-            answer = worker.connection.recv()
+            answer = worker.answer()
             if isinstance(answer, ChaserdockError):
                 raise answer
             flown[worker.turn] = answer

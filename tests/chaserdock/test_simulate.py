@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, chaserdock, finished
 
 from chaserdock.cli.simulate import simulate
-from chaserdock.simulation.campaign import Swarm, fly_seed, shrink_result, write_case
+from chaserdock.simulation.campaign import Swarm, UnflownSeed, fly_seed, fly_seeds, shrink_result, write_case
 from chaserdock.simulation.invariants import Invariants
 from chaserdock.simulation.swarm import draw_case, fly_case
 
@@ -176,6 +177,17 @@ def test_cases_of_two_scenarios_have_files_of_their_own(good: Path, bad: Path, t
     paths = [write_case(result, tmp_path / "out") for result in results]
     assert [path.name for path in paths] == ["good-seed-2.toml", "bad-seed-2.toml"]
     assert [load_scenario(path).success.docked for path in paths] == [(), (0,)]
+
+
+def test_a_killed_process_costs_one_seed(good: Path) -> None:
+    flights = fly_seeds(Swarm(str(good)), range(1, 7), jobs=2)
+    results = [next(flights)]
+    os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+    results += flights
+    assert [result.seed for result in results] == [1, 2, 3, 4, 5, 6]
+    (lost,) = (result for result in results if isinstance(result, UnflownSeed))
+    assert lost.reason == "its process ended with status -9 (killed, as when memory is short)"
+    assert multiprocessing.active_children() == []
 
 
 def test_ctrl_c_ends_flights_on_several_processes_at_once() -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import Figures, make_parser, run_parts
 
-from chaserdock.simulation.campaign import Swarm, fly_seeds
+from chaserdock.simulation.campaign import Swarm, fly_seed
 from chaserdock.simulation.mission import simulate
 
 SCENARIO = "fault-drill"
@@ -46,7 +46,8 @@ def nominal(flights: int) -> Figures:
 def swarm(seeds: int) -> Figures:
     """Fly random seeds."""
     begin_s, outcomes, simulated_s = time.process_time(), Counter(), 0.0
-    for result in fly_seeds(Swarm(SCENARIO), range(1, seeds + 1)):
+    for seed in range(1, seeds + 1):
+        result = fly_seed(Swarm(SCENARIO), seed)
         outcomes[result.outcome] += 1
         simulated_s += result.sim_time_s
     elapsed_s = time.process_time() - begin_s

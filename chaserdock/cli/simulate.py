@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import time
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from chaserdock.exit_codes import DONE, FAILED
+from chaserdock.exit_codes import DONE, FAILED, STOPPED
 
 from .options import ModeOption, ScenarioArg, fail
 
@@ -37,7 +38,7 @@ def simulate(
             help="fly random faults drawn from these seeds; without: as the scenario states",
         ),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, max=256, help="processes to fly on")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="processes to fly seeds on")] = 1,
     mode: Annotated[
         ModeOption | None, typer.Option(help="fly all seeds in this mode; drawn by default")
     ] = None,
@@ -58,46 +59,69 @@ def simulate(
     ] = Path("simulations"),
 ) -> None:
     """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if all of them hold."""
-    from chaserdock.simulation.campaign import (
-        Swarm,
-        consistency,
-        fly_seeds,
-        inconsistency,
-        shrink_result,
-        write_case,
-    )
-    from chaserdock.simulation.swarm import fly_case
+    from chaserdock.simulation.campaign import Swarm, UnflownSeed, consistency, fly_seeds, inconsistency
 
+    _check_writable(out)
     if seeds is None:
+        given = {"--jobs": jobs > 1, "--images": images, "--no-shrink": not shrinking, "--stop": stop}
+        if unused := [option for option, is_given in given.items() if is_given]:
+            raise fail(f"{', '.join(unused)}: only with --seeds")
         raise typer.Exit(_fly_one(scenario, out, mode))
     begin_s = time.monotonic()
     results: list[SimulationResult] = []
     outcomes: Counter[str] = Counter()
     swarm = Swarm(scenario, images, None if mode is None else mode.value, to_violation=stop)
-    for result in fly_seeds(swarm, _seed_range(seeds), jobs):
-        results.append(result)
-        outcomes[result.outcome] += 1
-        if not result.violations:
-            continue
-        for violation in result.violations:
-            print(f"seed {result.seed}: {violation}", flush=True)
-        if shrinking:
-            case = shrink_result(result)
-            path = write_case(case, fly_case(case, result.seed), out)
-            print(f"seed {result.seed}: shrunk to {path}:\n\n{path.read_text()}", flush=True)
-        if stop:
-            break
+    stopped = False
+    try:
+        for result in fly_seeds(swarm, _seed_range(seeds), jobs):
+            if isinstance(result, UnflownSeed):
+                outcomes["not flown"] += 1
+                print(f"seed {result.seed}: not flown: {result.reason}", flush=True)
+                continue
+            results.append(result)
+            outcomes[result.outcome] += 1
+            if not result.violations:
+                continue
+            for violation in result.violations:
+                print(f"seed {result.seed}: {violation}", flush=True)
+            if shrinking:
+                _shrink(result, out)
+            if stop:
+                break
+    except KeyboardInterrupt:
+        stopped = True
     elapsed_s = time.monotonic() - begin_s
-    failed = sum(bool(r.violations) for r in results)
-    counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common())
+    failed = sum(bool(r.violations) for r in results) + outcomes["not flown"]
+    counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common()) or "none flown"
     mean, flights = consistency(results)
     print(
-        f"{len(results)} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 over {flights} flights"
+        f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 over {flights} flights"
     )
     if reason := inconsistency(results):
         print(f"chaserdock: {reason}", file=sys.stderr)
         failed += 1
-    raise typer.Exit(FAILED if failed else DONE)
+    raise typer.Exit(STOPPED if stopped else FAILED if failed else DONE)
+
+
+def _check_writable(out: Path) -> None:
+    """Exit with status 2 unless ``out`` is a folder that can be written, or can be made."""
+    nearest = next(path for path in (out, *out.absolute().parents) if os.access(path, os.F_OK))
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
+        raise fail(f"--out {out}: {nearest} is not a folder that can be written")
+
+
+def _shrink(result: SimulationResult, out: Path) -> None:
+    """Reduce a case that fails; write and print the simplest one, on Ctrl-C that so far."""
+    from chaserdock.simulation.campaign import shrink_result, write_case
+
+    simplest = result
+    try:
+        print(f"seed {result.seed}: shrinking; Ctrl-C ends it", flush=True)
+        for simpler in shrink_result(result):
+            simplest = simpler
+    finally:
+        path = write_case(simplest, out)
+        print(f"seed {result.seed}: shrunk to {path}:\n\n{path.read_text()}", flush=True)
 
 
 def _fly_one(scenario: str, out: Path, mode: Any) -> int:

@@ -3,27 +3,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-import multiprocessing
+import multiprocessing.connection
 import os
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+import re
+import signal
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.process import SINGLE_THREADED
-from chaserdock_protocol.scenario import ScenarioError, load_scenario
+from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.toml_text import toml_document
 
+from .invariants import Violation
 from .shrinking import shrink
 from .swarm import Case, SimulationResult, draw_case, fly_case
 
 NEES_LIMITS = (1.5, 12.0)
 """Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights without lying sensors."""
 LEAST_NEES_FLIGHTS = 20
+_NOT_DOCKED = "ends in phase "
+"""Begin of the text on a chaser that should have docked, or should be safe."""
 
 
 @dataclass(frozen=True)
@@ -36,53 +44,174 @@ class Swarm:
     to_violation: bool = False
 
 
+@dataclass(frozen=True)
+class UnflownSeed:
+    """A seed that could not be flown, and why."""
+
+    seed: int
+    reason: str
+
+
+def _load(swarm: Swarm) -> tuple[str, Scenario]:
+    """Return the scenario and what cases extend it by. Raises ScenarioError if no seed can fly it."""
+    path = find_scenario(swarm.scenario)
+    scenario = load_scenario(path)
+    if not (swarm.images or scenario.target_model().markers):
+        raise ScenarioError(f"{path}: the target has no markers to draw measurements of; use --images")
+    return (str(path.resolve()) if path == Path(swarm.scenario) else path.stem), scenario
+
+
 def fly_seed(swarm: Swarm, seed: int) -> SimulationResult:
     """Draw and fly the case of a seed. Raises ScenarioError."""
-    path = find_scenario(swarm.scenario)
-    name = str(path.resolve()) if path == Path(swarm.scenario) else path.stem
-    case = draw_case(name, seed, load_scenario(path), images=swarm.images, mode=swarm.mode)
+    name, scenario = _load(swarm)
+    case = draw_case(name, seed, scenario, images=swarm.images, mode=swarm.mode)
     return fly_case(case, seed, to_violation=swarm.to_violation)
 
 
-def _fly(job: tuple[Swarm, int]) -> SimulationResult:
-    return fly_seed(*job)
+def _fly(swarm: Swarm, seed: int) -> SimulationResult | UnflownSeed:
+    try:
+        return fly_seed(swarm, seed)
+    except ScenarioError as error:
+        return UnflownSeed(seed, str(error))
 
 
-def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[SimulationResult]:
-    """Yield the results of the seeds, in their order."""
+def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[SimulationResult | UnflownSeed]:
+    """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can be flown.
+
+    With several ``jobs``, these processes end at once when the generator does.
+    """
+    _load(swarm)
     if jobs == 1:
-        yield from map(_fly, ((swarm, seed) for seed in seeds))
+        yield from (_fly(swarm, seed) for seed in seeds)
         return
     os.environ.update(SINGLE_THREADED)  # read by the numerical libraries of the new processes when they start
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        remaining, running = iter(seeds), []
-        for seed in itertools.islice(remaining, 2 * jobs):
-            running.append(pool.submit(_fly, (swarm, seed)))
-        while running:
-            yield running.pop(0).result()
-            running += [pool.submit(_fly, (swarm, seed)) for seed in itertools.islice(remaining, 1)]
+    workers: list[_Worker] = []
+    try:
+        for _ in range(jobs):
+            workers.append(_Worker(swarm))
+        yield from _fly_on(workers, iter(seeds))
+    finally:
+        for worker in workers:
+            worker.end()
 
 
-def shrink_result(result: SimulationResult, attempts: int = 200) -> Case:
-    """Return the simplest case found that violates the first violated invariant of a result."""
-    first = result.violations[0]
+class _Worker:
+    """A process that flies one seed after the other. ``turn``: the place of its ``seed`` in the order of all."""
 
-    def fails(case: Case) -> bool:
+    def __init__(self, swarm: Swarm) -> None:
+        self.swarm, self.seed, self.turn = swarm, 0, 0
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(self.swarm, theirs), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def answer(self) -> SimulationResult | UnflownSeed | ChaserdockError:
+        """Return what the process has sent; start another one if it has died."""
         try:
-            return any(v.invariant == first.invariant for v in fly_case(case, result.seed).violations)
+            return self.connection.recv()
+        except (EOFError, OSError):
+            self._process.join(1.0)
+            self.end()
+            status = self._process.exitcode
+            self._start()
+            why = " (killed, as when memory is short)" if status == -signal.SIGKILL else ""
+            return UnflownSeed(self.seed, f"its process ended with status {status}{why}")
+
+    def end(self) -> None:
+        """End the process at once."""
+        self._process.terminate()
+        self._process.join()
+        self.connection.close()
+
+
+def _work(swarm: Swarm, connection: Connection) -> None:
+    """Fly the seeds that arrive until the connection closes, and send back results, or errors that concern all seeds."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent ends this one
+    with contextlib.suppress(EOFError):
+        while True:
+            seed = connection.recv()
+            try:
+                connection.send(_fly(swarm, seed))
+            except ChaserdockError as error:
+                connection.send(error)
+
+
+def _fly_on(workers: Sequence[_Worker], seeds: Iterator[int]) -> Iterator[SimulationResult | UnflownSeed]:
+    """Yield the results of the seeds in their order; each worker that is free flies the next one."""
+    flying: dict[Connection, _Worker] = {}
+    flown: dict[int, SimulationResult | UnflownSeed] = {}
+    turns, turn = itertools.count(), 0
+
+    def assign(worker: _Worker) -> None:
+        for seed in itertools.islice(seeds, 1):
+            worker.seed, worker.turn = seed, next(turns)
+            with contextlib.suppress(OSError):  # of a process that has died, which its answer shows
+                worker.connection.send(seed)
+            flying[worker.connection] = worker
+
+    for worker in workers:
+        assign(worker)
+    while flying:
+        for connection in multiprocessing.connection.wait(list(flying)):
+            worker = flying.pop(cast(Connection, connection))
+            answer = worker.answer()
+            if isinstance(answer, ChaserdockError):
+                raise answer
+            flown[worker.turn] = answer
+            assign(worker)
+        while turn in flown:
+            yield flown.pop(turn)
+            turn += 1
+
+
+def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
+    """Yield flights of simpler and simpler cases with the first violation of a result, in other numbers."""
+    first, flown = result.violations[0], result
+    judges_docking = _NOT_DOCKED in first.text
+
+    def violation_s(case: Case) -> float | None:
+        nonlocal flown
+        # Without its command to approach, no chaser docks.
+        if judges_docking and _approaches(case) != _approaches(result.case):
+            return None
+        try:
+            flown = fly_case(case, result.seed)
         except ScenarioError:  # a simplification that leaves the scenario inconsistent
-            return False
+            return None
+        same = (v.time_s for v in flown.violations if _without_numbers(v) == _without_numbers(first))
+        return next(same, None)
 
-    return shrink(result.case, fails, first.time_s, attempts)
+    duration_s = load_scenario(find_scenario(result.case["extends"])).duration_s
+    for _ in shrink(result.case, violation_s, first.time_s, duration_s, attempts):
+        yield flown
 
 
-def write_case(case: Case, result: SimulationResult, folder: Path) -> Path:
+def _approaches(case: Case) -> int:
+    """Return the number of commands to approach."""
+    return sum(entry["command"] == "approach" for entry in case.get("timeline", ()))
+
+
+def _without_numbers(violation: Violation) -> tuple[str, str, str]:
+    """Return what violations of one defect share: invariant, subject and the words of the text.
+
+    Of a chaser that has not docked, the phase and the reason may differ.
+    """
+    subject, _, text = violation.text.partition(": ")
+    if text.startswith(_NOT_DOCKED):
+        text = _NOT_DOCKED
+    return violation.invariant, subject, re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "", text)
+
+
+def write_case(result: SimulationResult, folder: Path) -> Path:
     """Write a case that fails as a scenario file, with what it violates in its first lines; return its path."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"seed-{result.seed}.toml"
+    path = folder / f"{Path(result.case['extends']).stem}-seed-{result.seed}.toml"
     lines = [f"# {violation}" for violation in result.violations]
-    path.write_text("\n".join([*lines, toml_document(case)]), encoding="utf-8")
+    path.write_text("\n".join([*lines, toml_document(result.case)]), encoding="utf-8")
     return path
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reduce a failing case: fewest faults, shortest duration, simplest values that still violate the same invariant.
+"""Reduce a failing case: fewest faults, shortest duration, simplest values with the same violation.
 
 Greedy delta debugging (A. Zeller, R. Hildebrandt, 2002): each pass proposes simpler cases, coarse ones first, and keeps one
 whenever it still fails, until a whole pass changes nothing.
@@ -14,7 +14,7 @@ from typing import Any
 
 from .swarm import Case
 
-Fails = Callable[[Case], bool]
+Judge = Callable[[Case], float | None]
 _LISTS = (
     ("fault",),
     ("timeline",),
@@ -23,49 +23,48 @@ _LISTS = (
     ("simulation", "slow"),
     ("simulation", "clock"),
 )
+_OPTIONAL = {
+    ("fault",): ("peer",),
+    ("thruster_failure",): ("reported",),
+    ("simulation", "clock"): ("offset_s", "drift"),
+}
+"""Keys that rows of the lists may leave out."""
 _SECTIONS = ("truth", "simulation", "controller")
 
 
-def shrink(case: Case, fails: Fails, violated_s: float, attempts: int = 200) -> Case:
-    """Return the simplest case found for which ``fails`` holds, as it does for ``case``.
+def shrink(
+    case: Case, violation_s: Judge, violated_s: float, duration_s: float, attempts: int = 200
+) -> Iterator[Case]:
+    """Yield simpler and simpler cases with the violation of ``case``, which is at ``violated_s`` of ``duration_s``.
 
-    ``violated_s``: mission time of the violation; what comes later is cut first. ``fails`` is called ``attempts`` times at
+    ``violation_s`` returns the mission time of the violation in a case, None without it; it is called ``attempts`` times at
     most.
     """
-    left = attempts
 
-    def still(candidate: Case) -> bool:
-        nonlocal left
-        left -= 1
-        return left >= 0 and fails(candidate)
+    def shorter(case: Case) -> Iterator[Case]:
+        return _shorter(case, violated_s, duration_s)
 
-    for simplify in (
-        lambda c: _shorter(c, violated_s),
-        _without_halves,
-        _without_items,
-        _without_keys,
-        _shorter_faults,
-        _rounder,
-    ):
-        case = _fixed_point(case, simplify, still)
-    before = None
+    left, before = attempts, None
     while before != case and left > 0:
         before = case
-        for simplify in (_without_items, _without_keys, _shorter_faults, _rounder):
-            case = _fixed_point(case, simplify, still)
-    return case
-
-
-def _fixed_point(case: Case, simplify: Callable[[Case], Iterator[Case]], still: Fails) -> Case:
-    """Apply simplifications one after the other until none of them fails any more."""
-    changed = True
-    while changed:
-        changed = False
-        for candidate in simplify(case):
-            if candidate != case and still(candidate):
-                case, changed = candidate, True
-                break
-    return case
+        for simplify in (
+            shorter,
+            _without_halves,
+            _without_items,
+            _without_keys,
+            _earlier,
+            _shorter_faults,
+            _rounder,
+        ):
+            candidates = simplify(case)
+            while (candidate := next(candidates, None)) is not None and left > 0:
+                if candidate == case:
+                    continue
+                left -= 1
+                if (time_s := violation_s(candidate)) is not None:
+                    case, violated_s = candidate, time_s
+                    yield case
+                    candidates = simplify(case)
 
 
 def _changed(case: Case, path: tuple[Any, ...], value: Any) -> Case:
@@ -90,12 +89,13 @@ def _at(case: Case, path: tuple[str, ...]) -> Any:
     return value
 
 
-def _shorter(case: Case, violated_s: float) -> Iterator[Case]:
-    """Yield the case cut soon after the violation."""
+def _shorter(case: Case, violated_s: float, duration_s: float) -> Iterator[Case]:
+    """Yield the case cut soon after the violation; whether chasers dock is not judged in it."""
     for extra_s in (0.5, 2.0):
         end_s = math.ceil(2.0 * (violated_s + extra_s)) / 2.0
-        if end_s < case.get("duration_s", math.inf):
+        if end_s < case.get("duration_s", duration_s):
             shorter = {**copy.deepcopy(case), "duration_s": end_s}
+            shorter["success"] = {**case.get("success", {}), "docked": [], "latched": []}
             for path in (("fault",), ("timeline",), ("thruster_failure",)):
                 kept = [row for row in _at(case, path) if row["at_s"] < end_s]
                 if path[0] in case:
@@ -121,7 +121,7 @@ def _without_items(case: Case) -> Iterator[Case]:
 
 
 def _without_keys(case: Case) -> Iterator[Case]:
-    """Yield the case without whole sections, then without single keys of them, and lock-step if it is not."""
+    """Yield the case without whole sections, then without single keys of them and of rows, and with seed 0."""
     for section in _SECTIONS:
         if section in case:
             yield {k: v for k, v in copy.deepcopy(case).items() if k != section}
@@ -131,17 +131,30 @@ def _without_keys(case: Case) -> Iterator[Case]:
     for kind, values in case.get("truth", {}).items():
         for key in values:
             yield _changed(case, ("truth", kind, key), None)
+    for path, optional in _OPTIONAL.items():
+        for k, row in enumerate(_at(case, path)):
+            for key in optional:
+                if key in row:
+                    yield _changed(case, (*path, k, key), None)
     if case.get("seed", 0):
         yield {**case, "seed": 0}
+
+
+def _earlier(case: Case) -> Iterator[Case]:
+    """Yield the case with one row at half the time."""
+    for path in _LISTS:
+        for k, row in enumerate(_at(case, path)):
+            if (half_s := round(row.get("at_s", 0.0) / 2.0, 2)) >= 0.1:
+                yield _changed(case, (*path, k, "at_s"), half_s)
 
 
 def _shorter_faults(case: Case) -> Iterator[Case]:
     for path in _LISTS:
         for k, row in enumerate(_at(case, path)):
-            for key in ("duration_s", "copies", "delay_s"):
+            for key in ("duration_s", "copies", "delay_s", "offset_s"):
                 if key in row:
                     shorter = round(row[key] / 2.0, 2) if isinstance(row[key], float) else row[key] // 2
-                    if shorter >= 0.1:
+                    if abs(shorter) >= 0.1:
                         yield _changed(case, (*path, k, key), shorter)
             if row.get("share", 1.0) < 1.0:
                 yield _changed(case, (*path, k, "share"), 1.0)
@@ -157,7 +170,7 @@ def _rounder(case: Case) -> Iterator[Case]:
             for key, value in row.items():
                 if isinstance(value, float):
                     for digits in (0, 1):
-                        if (rounded := round(value, digits)) != value and rounded > 0.0:
+                        if (rounded := round(value, digits)) != value and rounded:
                             yield _changed(case, (*path, k, key), rounded)
                 elif isinstance(value, list) and value and isinstance(value[0], float):
                     yield _changed(case, (*path, k, key), [round(x, 1) for x in value])

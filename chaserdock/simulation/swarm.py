@@ -20,7 +20,7 @@ from typing import Any, get_args
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.recording.scan import LOG_NAME
-from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.scenario.faults import LATCH_FAULTS, FaultKind
 from chaserdock_protocol.transport import RawSample
 from chaserdock_world.lockstep.tick_barrier import RECORDER_WINDOW_TICKS
@@ -295,7 +295,11 @@ def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, An
         entry = {"at_s": round(draw.uniform(1.0, 0.9 * scenario.duration_s), 2), "command": command}
         entry["chasers"] = [chaser]
         if command == "goto":
-            entry["offset_m"] = [round(1.3 * x, 3) for x in scenario.chasers[chaser].position_m]
+            position_m = scenario.chasers[chaser].position_m
+            # The farthest reference less 0.1 %, for what rounding adds.
+            farthest_m = 0.999 * scenario.limits.max_reference_distance_m
+            share = min(1.3, farthest_m / (math.hypot(*position_m) or 1.0))
+            entry["offset_m"] = [round(share * x, 3) for x in position_m]
         timeline.append(entry)
     return sorted(timeline, key=lambda e: e["at_s"])
 
@@ -312,7 +316,11 @@ def fly_case(
         path = (folder or scratch) / "scenario.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(toml_document(case), encoding="utf-8")
-        checks, fingerprint = Invariants(load_scenario(path)), 0
+        try:
+            checks, fingerprint = Invariants(load_scenario(path)), 0
+        except ScenarioError as error:
+            # The text is not to name a file that is deleted now.
+            raise ScenarioError(str(error).replace(f"{scratch / path.name}: ", "")) from None
         published: Counter[str] = Counter()
 
         def tap(sender: str, raw: RawSample) -> None:
@@ -329,8 +337,7 @@ def fly_case(
             return to_violation and bool(checks.violations)
 
         flight = simulate(path, path.parent / "run", tap=tap, over=over)
-        lies = _LIES & {f["kind"] for f in case.get("fault", [])}
-        honest = not (lies or "truth" in case or "thruster_failure" in case)
+        honest = _is_honest(checks.scenario)
         if not over():
             checks.check_end(flight.crashes, flight.stalled)
             _check_recording(checks, flight, published)
@@ -347,6 +354,12 @@ def fly_case(
         honest=honest,
         sim_time_s=checks.time_s,
     )
+
+
+def _is_honest(scenario: Scenario) -> bool:
+    """Return whether no sensor lies and the plant is as stated."""
+    lies = _LIES & {fault.kind for fault in scenario.fault}
+    return not (lies or scenario.thruster_failure or "truth" in scenario.model_fields_set)
 
 
 def _check_consistency(checks: Invariants) -> None:

@@ -35,7 +35,7 @@ def without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     "command",
-    [("world", "single"), ("simulate", "single", "--images"), ("run", "single", "--out", "never-made")],
+    [("world", "single"), ("simulate", "single"), ("run", "single", "--out", "never-made")],
 )
 def test_world_without_pybullet_names_its_platforms_and_mujoco(command: tuple[str, ...]) -> None:
     done = without("pybullet", *command)
@@ -58,7 +58,9 @@ engine = "mujoco"
 """
 
 
-@pytest.mark.parametrize("options", [(), ("--images",)], ids=["statistical", "images"])
+@pytest.mark.parametrize(
+    "options", [("--seeds", "1"), ("--seeds", "1", "--images")], ids=["statistical", "images"]
+)
 def test_a_mission_on_mujoco_needs_no_pybullet(tmp_path: Path, options: tuple[str, ...]) -> None:
     scenario = tmp_path / "elsewhere.toml"
     scenario.write_text(MUJOCO, encoding="utf-8")

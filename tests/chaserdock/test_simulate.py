@@ -3,16 +3,24 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+import subprocess
+import time
 from pathlib import Path
 
+import psutil
 import pytest
+import typer
 from chaserdock_protocol.messages import Tick
 from chaserdock_protocol.scenario import load_scenario
-from harness import ROOT, finished
+from harness import ROOT, chaserdock, finished
 
-from chaserdock.simulation.campaign import Swarm, fly_seed, shrink_result, write_case
+from chaserdock.cli.simulate import simulate
+from chaserdock.simulation.campaign import Swarm, UnflownSeed, fly_seed, fly_seeds, shrink_result, write_case
 from chaserdock.simulation.invariants import Invariants
-from chaserdock.simulation.swarm import fly_case
+from chaserdock.simulation.swarm import draw_case, fly_case
 
 SHORT = """
 extends = "single"
@@ -46,6 +54,57 @@ def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Pat
     assert not out.exists()
 
 
+@pytest.mark.parametrize("options", [(), ("--seeds", "1:2")], ids=["one", "seeds"])
+@pytest.mark.parametrize("out", ["good.toml", "good.toml/below"])
+def test_out_must_be_a_folder_that_can_be_written(out: str, options: tuple[str, ...], good: Path) -> None:
+    status, text = finished("simulate", str(good), *options, "--out", str(good.parent / out))
+    assert status == 2
+    (line,) = text.splitlines()
+    assert line.endswith(f"{out}: {good} is not a folder that can be written")
+
+
+def test_out_must_be_writable(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.access", lambda path, mode: mode == os.F_OK)
+    with pytest.raises(typer.Exit) as exit_:
+        simulate(str(good), out=good.parent / "out")
+    assert exit_.value.exit_code == 2
+
+
+def test_options_of_seeds_need_seeds(good: Path) -> None:
+    options = ("--jobs", "2", "--images", "--stop", "--no-shrink")
+    status, text = finished("simulate", str(good), *options)
+    assert status == 2
+    assert text == "chaserdock: --jobs, --images, --no-shrink, --stop: only with --seeds\n"
+
+
+def test_a_seed_that_cannot_be_flown_does_not_end_the_others(good: Path) -> None:
+    """A goto beside the only distance that the limits allow is refused."""
+    text = good.read_text() + "limits = {min_distance_target_m = 1.0, max_reference_distance_m = 1.0}\n"
+    good.write_text(text)
+    base = load_scenario(good)
+    cases = [draw_case("good", s, base) for s in range(60)]
+    wrong = next(
+        s
+        for s in range(59)
+        if "goto" in {e["command"] for e in cases[s].get("timeline", ())} and "timeline" not in cases[s + 1]
+    )
+    status, text = finished("simulate", str(good), "--seeds", f"{wrong}:{wrong + 1}")
+    assert status == 1
+    assert f"seed {wrong}: not flown: (scenario): timeline." in text
+    assert "scenario.toml" not in text
+    assert "\n2 seeds in" in text
+    assert "1 not flown" in text
+
+
+def test_targets_without_markers_need_images() -> None:
+    status, text = finished("simulate", "markerless-docking", "--seeds", "1:3")
+    assert status == 2
+    (line,) = text.splitlines()
+    assert line.endswith(
+        "markerless-docking.toml: the target has no markers to draw measurements of; use --images"
+    )
+
+
 def test_a_flight_without_seeds_keeps_its_log_once(good: Path, tmp_path: Path) -> None:
     arguments = ("simulate", str(good), "--out", str(tmp_path / "out"))
     status, text = finished(*arguments)
@@ -64,8 +123,9 @@ def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_pat
     assert status == 1
     assert "\n1 seeds in" in text
     assert fly_seed(Swarm(str(bad)), seed).fingerprint == result.fingerprint
-    case = shrink_result(result, attempts=60)
-    path = write_case(case, fly_case(case, seed), tmp_path / "out")
+    *_, simplest = shrink_result(result, attempts=60)
+    path = write_case(simplest, tmp_path / "out")
+    case = simplest.case
     assert not case["fault"]
     assert case.keys() <= {"extends", "name", "seed", "perception", "fault", "duration_s"}
     assert path.read_text().startswith(
@@ -73,6 +133,29 @@ def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_pat
     )
     assert load_scenario(path).duration_s == 1.0
     assert [v.invariant for v in fly_case({"extends": str(path)}, seed).violations] == ["liveness"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "honest"),
+    [
+        ("", True),
+        (
+            '[[fault]]\nkind = "odometry_lie"\nat_s = 0.5\nduration_s = 1.0\nprocess = "chaser/0"\noffset_m = [1.0, 0.0, 0.0]\n',
+            False,
+        ),
+        ("[truth.chaser]\nforce_N = 0.005\n", False),
+    ],
+    ids=["nothing", "lie", "truth"],
+)
+def test_a_case_is_as_honest_as_the_scenario_that_it_extends(keys: str, honest: bool, good: Path) -> None:
+    good.write_text(good.read_text() + keys)
+    assert fly_case({"extends": str(good), "duration_s": 0.3}, 0).honest == honest
+
+
+def test_a_case_inherits_thruster_failures() -> None:
+    statistical = {"name": "statistical"}
+    case = {"extends": "thruster-failure", "duration_s": 0.3, "perception": statistical}
+    assert not fly_case(case, 0).honest
 
 
 def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,6 +170,56 @@ def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest
         result = fly_case({"extends": str(good)}, 0, to_violation=to_violation)
         assert [v.text for v in result.violations] == ["test: third tick"]
         assert result.sim_time_s == pytest.approx(end_s)
+
+
+def test_cases_of_two_scenarios_have_files_of_their_own(good: Path, bad: Path, tmp_path: Path) -> None:
+    results = [fly_seed(Swarm(str(path)), 2) for path in (good, bad)]
+    paths = [write_case(result, tmp_path / "out") for result in results]
+    assert [path.name for path in paths] == ["good-seed-2.toml", "bad-seed-2.toml"]
+    assert [load_scenario(path).success.docked for path in paths] == [(), (0,)]
+
+
+def test_a_killed_process_costs_one_seed(good: Path) -> None:
+    flights = fly_seeds(Swarm(str(good)), range(1, 7), jobs=2)
+    results = [next(flights)]
+    os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+    results += flights
+    assert [result.seed for result in results] == [1, 2, 3, 4, 5, 6]
+    (lost,) = (result for result in results if isinstance(result, UnflownSeed))
+    assert lost.reason == "its process ended with status -9 (killed, as when memory is short)"
+    assert multiprocessing.active_children() == []
+
+
+def test_ctrl_c_ends_flights_on_several_processes_at_once() -> None:
+    """The parent alone receives the signal; a flight of ``detumble`` takes minutes."""
+    arguments = ("simulate", "detumble", "--seeds", "1:20", "--jobs", "2")
+    process = chaserdock(*arguments, stdout=subprocess.PIPE)
+    try:
+        while len(psutil.Process(process.pid).children()) < 2:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=30.0)
+    finally:
+        for left in (*psutil.Process(process.pid).children(), process) if process.poll() is None else ():
+            left.kill()
+    assert process.returncode == 130
+    assert out.startswith(b"0 seeds in")
+
+
+def test_ctrl_c_while_shrinking_writes_the_simplest_case_so_far(bad: Path, tmp_path: Path) -> None:
+    arguments = ("simulate", str(bad), "--seeds", "2:5", "--out", str(tmp_path / "out"))
+    process = chaserdock(*arguments, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    lines = iter(process.stdout.readline, b"")
+    shrinking = next(line for line in lines if line.endswith(b": shrinking; Ctrl-C ends it\n"))
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=30.0)
+    assert process.returncode == 130
+    assert b"seeds in" in out
+    seed = int(shrinking.split()[1].rstrip(b":"))
+    (path,) = (tmp_path / "out").iterdir()
+    assert load_scenario(path).name == f"seed-{seed}"
+    assert fly_case({"extends": str(path)}, seed).violations
 
 
 def test_regressions_are_scenarios_that_run_accepts() -> None:

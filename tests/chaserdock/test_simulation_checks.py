@@ -41,7 +41,7 @@ from harness import ROOT
 from message_samples import BY_TYPE
 from pydantic import ValidationError
 
-from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
+from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency, shrink_result
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
 from chaserdock.simulation.network import EPOCH_NS
@@ -107,6 +107,15 @@ def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario,
     assert kinds == set(KINDS)
     assert modes == {"lockstep", "realtime"}
     assert sections >= {"truth", "timeline", "partition", "slow", "clock", "loss", "duplicate", "reorder"}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
+def test_seeds_draw_valid_variants_of_every_shipped_scenario(path: Path, tmp_path: Path) -> None:
+    base = load_scenario(path)
+    for seed in range(15):
+        case = draw_case(path.stem, seed, base, images=not base.target_model().markers)
+        (tmp_path / "case.toml").write_text(toml_document(case))
+        load_scenario(tmp_path / "case.toml")
 
 
 def test_seeds_draw_faults_of_latches_where_there_are_ports(tmp_path: Path) -> None:
@@ -712,21 +721,19 @@ def test_shrinking_leaves_what_the_failure_needs(scenario: Scenario) -> None:
     original = copy.deepcopy(case)
     calls = 0
 
-    def fails(c: Case) -> bool:
+    def violation_s(c: Case) -> float | None:
         nonlocal calls
         calls += 1
         drops = [f for f in c["fault"] if f["kind"] == "drop" and f["process"] == "chaser/2"]
         long = any(f["duration_s"] >= 0.9 and f["at_s"] < c.get("duration_s", 25.0) for f in drops)
-        return long and c.get("simulation", {}).get("loss", 0.0) > 0.0
+        return drops[-1]["at_s"] + 1.86 if long and c.get("simulation", {}).get("loss", 0.0) > 0.0 else None
 
-    small = shrink(case, fails, violated_s=9.2)
+    *_, small = shrink(case, violation_s, violated_s=9.2, duration_s=25.0)
     assert case == original
-    assert fails(small)
-    assert small["duration_s"] == 10.0
+    assert violation_s(small) is not None
+    assert small["duration_s"] == 2.5
     assert small["simulation"] == {"loss": 0.01}
-    assert small["fault"] == [{**culprit, "at_s": 7.0, "duration_s": 0.9, "share": 1.0}] or (
-        small["fault"][0]["duration_s"] < 2.0 and small["fault"][0]["share"] == 1.0
-    )
+    assert small["fault"] == [{**culprit, "at_s": 0.1, "duration_s": 1.0, "share": 1.0}]
     assert "truth" not in small
     assert small["seed"] == 0
     assert calls < 120
@@ -735,14 +742,110 @@ def test_shrinking_leaves_what_the_failure_needs(scenario: Scenario) -> None:
 def test_shrinking_stops_after_its_attempts(scenario: Scenario) -> None:
     calls = 0
 
-    def fails(_: Case) -> bool:
+    def violation_s(_: Case) -> None:
         nonlocal calls
         calls += 1
-        return False
 
     case = draw_case("fault-drill", 5, scenario)
-    assert shrink(case, fails, 3.0, attempts=7) == case
+    assert list(shrink(case, violation_s, 3.0, 25.0, attempts=7)) == []
     assert calls <= 7
+
+
+def test_shrinking_never_lengthens_a_flight() -> None:
+    (simpler, *_) = shrink({"extends": "single", "seed": 5}, lambda _: 1.0, 1.0, duration_s=1.0)
+    assert simpler == {"extends": "single", "seed": 0}
+
+
+def test_shrinking_simplifies_errors_of_clocks() -> None:
+    jump = {
+        "kind": "clock_jump",
+        "at_s": 18.37,
+        "duration_s": 7.91,
+        "process": "controller",
+        "offset_s": -73.218,
+    }
+    clock = {"process": "world", "offset_s": -523.4, "drift": -0.0123}
+    case: Case = {"extends": "fault-drill", "fault": [jump], "simulation": {"clock": [clock]}}
+
+    def violation_s(c: Case) -> float | None:
+        late = any(f["offset_s"] < -1.0 for f in c.get("fault", ()))
+        behind = any(k.get("offset_s", 0.0) < -100.0 for k in c.get("simulation", {}).get("clock", ()))
+        return 20.0 if late and behind else None
+
+    *_, small = shrink(case, violation_s, 20.0, 25.0)
+    assert small["fault"] == [
+        {"kind": "clock_jump", "at_s": 0.1, "duration_s": 0.1, "process": "controller", "offset_s": -1.1}
+    ]
+    assert small["simulation"] == {"clock": [{"process": "world", "offset_s": -131.0}]}
+
+
+def a_result(case: Case, *violations: Violation) -> SimulationResult:
+    return SimulationResult(1, case, violations, "", "", (), True, 1.0)
+
+
+def shrunk(result: SimulationResult) -> Case:
+    *_, simplest = shrink_result(result)
+    return simplest.case
+
+
+STALL = Violation("liveness", 13.2, "world: has not ended")
+NOT_DOCKED = Violation("liveness", 25.0, "chaser/0: ends in phase hold without a named reason")
+FLOOD = {
+    "kind": "flood",
+    "at_s": 5.0,
+    "duration_s": 12.0,
+    "process": "world",
+    "topic": "odometry",
+    "copies": 200,
+}
+
+
+def test_shrinking_keeps_the_violation_not_only_its_invariant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight that is cut before its chasers can dock violates liveness, too."""
+
+    def flown(case: Case, seed: int) -> SimulationResult:
+        wanted = case.get("success", {}).get("docked", [0])
+        cut = [NOT_DOCKED] if wanted and case.get("duration_s", 25.0) < 20.0 else []
+        return a_result(case, *([STALL] if case["fault"] else cut))
+
+    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    case: Case = {"extends": "fault-drill", "fault": [FLOOD]}
+    small = shrunk(a_result(case, STALL))
+    assert [fault["kind"] for fault in small["fault"]] == ["flood"]
+    assert small["duration_s"] == 14.0
+    assert flown({**small, "fault": []}, 1).violations == ()
+
+
+def test_shrinking_keeps_the_commands_to_approach_of_a_chaser_that_does_not_dock(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def flown(case: Case, seed: int) -> SimulationResult:
+        commands = [entry["command"] for entry in case["timeline"]]
+        docks = "approach" in commands and not case["fault"]
+        return a_result(case, *([] if docks else [NOT_DOCKED]))
+
+    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    timeline = [
+        {"at_s": 5.0, "command": "approach", "chasers": [0]},
+        {"at_s": 9.0, "command": "hold", "chasers": [1]},
+    ]
+    case: Case = {"extends": "fault-drill", "fault": [FLOOD], "timeline": timeline}
+    small = shrunk(a_result(case, NOT_DOCKED))
+    assert [entry["command"] for entry in small["timeline"]] == ["approach"]
+    assert len(small["fault"]) == 1
+
+
+def test_shrinking_takes_violations_that_differ_in_numbers_only_as_equal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def flown(case: Case, seed: int) -> SimulationResult:
+        chaser = 2 if case["seed"] else 1
+        return a_result(case, Violation("no contact", 1.0, f"chaser/{chaser}: {len(case['fault'])}e-05 m"))
+
+    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    case: Case = {"extends": "fault-drill", "fault": [FLOOD], "seed": 3}
+    small = shrunk(flown(case, 1))
+    assert (small["fault"], small["seed"]) == ([], 3)
 
 
 def test_violations_print_as_one_line() -> None:

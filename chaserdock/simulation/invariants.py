@@ -112,7 +112,8 @@ class Violation:
 class Invariants:
     """Checks the messages of one flight as they are published; each violation is noted once per subject.
 
-    ``reasons``: warnings and errors in the log, the last at ``reason_s``. ``nees``: normalized squared errors of the estimated
+    ``reasons``: warnings and errors in the log, the last at ``reason_s``. ``dead``: processes that were lost, and chasers that no
+    command has reached, until these have flown commands for ``STOPPING_S``. ``nees``: normalized squared errors of the estimated
     pose of the target, one a second (6 on average if consistent).
     """
 
@@ -125,6 +126,8 @@ class Invariants:
     end: MissionEnd | None = None
     phases: dict[int, str] = field(default_factory=dict)
     dead: set[str] = field(default_factory=set)
+    _lost: set[str] = field(default_factory=set)
+    _returned_s: dict[str, float] = field(default_factory=dict)
     _seen: set[tuple[str, str]] = field(default_factory=set)
     _tick: int = -1
     _opened: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=200))
@@ -216,6 +219,7 @@ class Invariants:
     def _on_tick(self, tick: Tick) -> None:
         if tick.revision:
             self._repeated.add(tick.tick)
+        self._lost.difference_update(f"chaser/{i}" for i in tick.chasers)
         if tick.tick > self._tick:
             self._opened.append((self._now_s, tick.tick))
             self._tick = tick.tick
@@ -469,7 +473,20 @@ class Invariants:
         spans += [(w.at_s, w.at_s + w.duration_s) for w in (*s.partition, *s.slow)]
         return max([0.0, *(min(end_s, now_s) for at_s, end_s in spans if at_s <= now_s)])
 
+    def _note_return(self, command: ActuatorCommand) -> None:
+        """Judge a chaser again that has flown commands for ``STOPPING_S``, while no fault kept them from its actuators."""
+        name, now_s = f"chaser/{command.chaser}", self.time_s
+        if command.source != "command" or name in self._lost:
+            self._returned_s.pop(name, None)
+            return
+        since_s = max(self._returned_s.setdefault(name, now_s), self._disturbed_until_s(name, now_s))
+        if now_s - since_s > STOPPING_S:
+            self.dead.remove(name)
+            del self._returned_s[name]
+
     def _on_command(self, command: ActuatorCommand) -> None:
+        if f"chaser/{command.chaser}" in self.dead:
+            self._note_return(command)
         if command.source != "command":
             self._check_following(command)
             return
@@ -626,6 +643,9 @@ class Invariants:
         if event.process == "world" and event.what in ("process lost", "actuators stopped"):
             lost = event.detail.partition(":")[0]
             self.dead.add(lost)
+            self._returned_s.pop(lost, None)
+            if event.what == "process lost":
+                self._lost.add(lost)
             if not self._may_lose():
                 self.violate("no loss without a cause", lost, event.what)
 

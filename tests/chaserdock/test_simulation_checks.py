@@ -199,17 +199,19 @@ class Log:
         )
         self.checks.observe(sender, raw)
 
-    def tick(self, tick: int, revision: int = 0) -> None:
-        time_ns = tick * 100_000_000
-        sample = msgspec.structs.replace(BY_TYPE[Tick], tick=tick, sim_time_ns=time_ns, revision=revision)
-        self.publish(topics.TICK, sample)
+    def tick(self, tick: int, revision: int = 0, chasers: tuple[int, ...] = (0, 1, 2, 3)) -> None:
+        at: dict[str, Any] = {"tick": tick, "sim_time_ns": tick * 100_000_000, "revision": revision}
+        self.publish(topics.TICK, msgspec.structs.replace(BY_TYPE[Tick], chasers=chasers, **at))
 
     def bodies(self, tick: int, *bodies: BodyTruth, contacts: tuple[tuple[str, str], ...] = ()) -> None:
         for body in bodies:
             stamped = msgspec.structs.replace(body, tick=tick, sim_time_ns=tick * 100_000_000)
             self.publish(topics.TRUTH_BODY, stamped, body.body)
-        self.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=contacts, saturated=()))
+        self.touch(tick, *contacts)
         self.tick(tick)
+
+    def touch(self, tick: int, *contacts: tuple[str, str]) -> None:
+        self.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=contacts, saturated=()))
 
     def flies(self, chaser: int, tick: int, term: int = 1, source: str = "command") -> None:
         command = msgspec.structs.replace(ACTUATORS, chaser=chaser, tick=tick, term=term, source=source)
@@ -254,6 +256,21 @@ def test_keep_out_zones_surround_target_and_chasers(log: Log) -> None:
     assert log.found == []
     log.bodies(3, body("target", 0.0), body("chaser/0", 0.32), body("chaser/1", 0.64))
     assert log.found == ["keep-out zone", "keep-out zone"]
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_chaser_that_flies_commands_again_is_judged_again(killed: Scenario, lost: bool) -> None:
+    """From 3 s of flown commands on, and of a process that was lost, only if it takes part again."""
+    log = Log(killed)
+    log.tick(5)
+    log.event(*(("process lost", "chaser/1") if lost else ("actuators stopped", "chaser/1: no command")))
+    for tick in range(6, 100):
+        log.tick(tick, chasers=(0, 2, 3) if lost and tick < 50 else (0, 1, 2, 3))
+        log.flies(1, tick, source="command" if tick >= 20 else "hold")
+        log.touch(tick, ("chaser/1", "target"))
+        if log.found:
+            break
+    assert [v.time_s for v in log.checks.violations] == [8.1 if lost else 5.1]
 
 
 def test_momentum_changes_by_impulses_only(log: Log) -> None:

@@ -138,6 +138,7 @@ class Invariants:
     _flown: dict[int, ActuatorCommand] = field(default_factory=dict)
     _commanders: dict[int, str] = field(default_factory=dict)
     _repeated: set[int] = field(default_factory=set)
+    _term_ticks: dict[int, tuple[int, int]] = field(default_factory=dict)
     _touching: set[str] = field(default_factory=set)
     _begin: dict[str, float] = field(default_factory=dict)
     _commanded: dict[int, int] = field(default_factory=dict)
@@ -506,6 +507,21 @@ class Invariants:
         if other != sender and command.tick not in self._repeated:
             text = f"flies a command of {sender} for tick {command.tick}, in which {other} commands"
             self.violate("one commander", name, text)
+        self._check_succession(command)
+
+    def _check_succession(self, command: ActuatorCommand) -> None:
+        """Check that no command of a lower term is flown for a later tick than one of a higher term of the other controller.
+
+        A repeated tick may have both. A chaser that was lost may fly its commands late, but for their own ticks.
+        """
+        term, tick = command.term, command.tick
+        first, last = self._term_ticks.get(term, (tick, tick))
+        self._term_ticks[term] = min(first, tick), max(last, tick)
+        for other, (from_tick, until_tick) in self._term_ticks.items():
+            superseded = (other > term and from_tick < tick) or (other < term and tick < until_tick)
+            if superseded and commander_of(other) != commander_of(term):
+                text = f"flies term {term} for tick {tick}; term {other} is flown from tick {from_tick} to {until_tick}"
+                self.violate("one commander", f"chaser/{command.chaser}", text)
 
     def _clock_s(self, process: str, sent_ns: int) -> float:
         """Return the virtual time (s) at which a process has stamped a message with its own clock."""

@@ -535,7 +535,7 @@ def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
     assert log.found == []
     log.flies(1, 10)
     assert log.found == ["no stale command"]
-    log.flies(0, 21, term=2)
+    log.flies(0, 21, term=3)
     log.flies(0, 22, term=1)
     assert log.found[1:] == ["no superseded command"]
 
@@ -567,6 +567,23 @@ def test_chasers_fly_different_commanders_only_in_a_tick_that_is_repeated(log: L
     log.flies(1, 22, term=5)
     log.flies(0, 22, term=4)
     assert log.found == ["one commander"]
+
+
+def test_controllers_do_not_command_in_turn(log: Log, scenario: Scenario) -> None:
+    """A command that is flown late, and one of a repeated tick, may be of the former commander."""
+    log.tick(21)
+    log.tick(21, revision=1)
+    for chaser, tick, term in ((0, 20, 1), (1, 21, 2), (2, 20, 1), (3, 21, 1)):
+        log.flies(chaser, tick, term)
+    assert log.found == []
+    log.tick(22)
+    log.flies(3, 22, term=1)
+    assert log.found == ["one commander"]
+    other = Log(scenario)
+    other.tick(22)
+    other.flies(3, 22, term=1)
+    other.flies(1, 21, term=2)
+    assert other.found == ["one commander"]
 
 
 def test_invalid_messages_are_noticed(log: Log) -> None:

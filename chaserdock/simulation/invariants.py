@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_controller.guidance.trajectories import PEAK_SPEED
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -163,6 +164,9 @@ class Invariants:
         self._now_s = 0.0
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
+        }
+        self._cones = {
+            f"chaser/{p.chaser}": cone_of(self.scenario, p.chaser) for p in self.scenario.docking.ports
         }
         self._liars = {f.process for f in self.scenario.fault if f.kind == "lying_sensor"}
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -424,9 +428,16 @@ class Invariants:
         for name, at in chasers.items():
             if target is None or name in self._touching:
                 continue
-            distance_m = _distance(at, np.array(target.position_m))
-            if distance_m < self._nearest_m[name] - KEEP_OUT_SLACK_M:
+            offset = rotations.rotate_inverse(target.q_wxyz, at - target.position_m)
+            distance_m = float(np.linalg.norm(offset))
+            if distance_m < self._nearest_allowed_m(name, offset) - KEEP_OUT_SLACK_M:
                 self.violate("keep-out zone", name, f"{distance_m:.3f} m from the target")
+
+    def _nearest_allowed_m(self, name: str, offset_m: Array) -> float:
+        """Return the smallest allowed distance from the target of a chaser at an offset (3,), TRF: smaller in its corridor."""
+        cone = self._cones.get(name)
+        in_corridor = cone is not None and cone.room_m(offset_m) > -KEEP_OUT_SLACK_M
+        return self._nearest_m[name] if in_corridor else self.scenario.limits.min_distance_target_m
 
     # -- commands ------------------------------------------------------------------------------------------------
 

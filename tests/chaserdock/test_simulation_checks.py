@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
+import numpy as np
 import pytest
+from chaserdock_models import rotations
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
@@ -271,6 +273,26 @@ def test_a_chaser_that_flies_commands_again_is_judged_again(killed: Scenario, lo
         if log.found:
             break
     assert [v.time_s for v in log.checks.violations] == [8.1 if lost else 5.1]
+
+
+@pytest.mark.parametrize(
+    ("along_m", "aside_m", "found"),
+    [(0.6, 0.0, []), (0.6, 0.3, ["keep-out zone"]), (-0.6, 0.0, ["keep-out zone"])],
+)
+def test_a_chaser_comes_nearer_in_the_corridor_of_its_port_only(
+    along_m: float, aside_m: float, found: list[str]
+) -> None:
+    capture = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+    log, axis = Log(capture), np.array(capture.docking.ports[0].axis)
+    aside = np.cross(axis, (0.0, 0.6, 0.8))
+    q = rotations.exp(np.array((0.0, 0.0, 0.5)))
+    at = rotations.rotate(q, along_m * axis + aside_m * aside / np.linalg.norm(aside))
+    log.bodies(
+        1,
+        body("target", 0.0, q_wxyz=tuple(q.tolist())),
+        msgspec.structs.replace(body("chaser/0", 0.0), position_m=tuple(at.tolist())),
+    )
+    assert log.found == found
 
 
 def test_momentum_changes_by_impulses_only(log: Log) -> None:

@@ -21,7 +21,7 @@ from typing import Any, get_args
 from chaserdock_protocol import topics
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.scenario.faults import LATCH_FAULTS, FaultKind
+from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, LATCH_FAULTS, FaultKind, role_of
 from chaserdock_protocol.transport import RawSample
 from chaserdock_world.lockstep.tick_barrier import RECORDER_WINDOW_TICKS
 from mcap.exceptions import McapError
@@ -334,7 +334,7 @@ def fly_case(
         if not over():
             checks.check_end(flight.crashes, flight.stalled)
             _check_recording(checks, flight, published)
-            _check_queues(checks, flight, published.total())
+            check_queues(checks, flight, published.total())
             if honest:
                 _check_consistency(checks)
     return SimulationResult(
@@ -406,14 +406,25 @@ def queue_limit(reader: str, published: int, ticks: int) -> int:
     return max(QUEUE_LIMIT, behind)
 
 
-def _check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
-    """Check that queues stay short unless a flood or a slow or frozen reader fills them."""
-    s = checks.scenario
-    if s.simulation.slow or s.simulation.partition or any(f.kind in ("flood", "freeze") for f in s.fault):
-        return
+def _falls_behind(reader: str, s: Scenario) -> bool:
+    """Return whether the network or a fault fills the queue of a process."""
+    return (
+        any(w.process == reader for w in s.simulation.slow)
+        or any(reader in p.processes for p in s.simulation.partition)
+        or any(f.kind == "freeze" and f.process == reader for f in s.fault)
+        or any(
+            f.kind == "flood" and topics.may_read(role_of(reader), FAULTY_TOPICS[str(f.topic)])
+            for f in s.fault
+        )
+    )
+
+
+def check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
+    """Check that queues stay short, except those of readers that are slow, frozen, cut off or flooded."""
     for name, items in flight.traffic.queues.items():
         reader = name.split()[0]
-        if items.most > queue_limit(reader, published, checks.ticks):
+        limit = queue_limit(reader, published, checks.ticks)
+        if items.most > limit and not _falls_behind(reader, checks.scenario):
             checks.violate("bounded queues", reader, f"{items.most} messages waited")
 
 
@@ -421,4 +432,4 @@ LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
 """Largest mean normalized squared error (6 if consistent) of at least so many estimates of one flight without lying sensors."""
 _LIES = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
 QUEUE_LIMIT = 400
-"""Most messages that may wait for a reader which is neither slow nor flooded; see ``queue_limit``."""
+"""Most messages that may wait for a reader which is not slow, frozen, cut off or flooded; see ``queue_limit``."""

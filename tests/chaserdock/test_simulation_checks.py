@@ -9,7 +9,8 @@ import random
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, get_args
+from types import SimpleNamespace
+from typing import Any, cast, get_args
 
 import msgspec
 import numpy as np
@@ -46,13 +47,15 @@ from pydantic import ValidationError
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
-from chaserdock.simulation.network import EPOCH_NS
+from chaserdock.simulation.mission import SimulatedFlight
+from chaserdock.simulation.network import EPOCH_NS, Traffic
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import (
     KINDS,
     LATCH_KINDS,
     Case,
     SimulationResult,
+    check_queues,
     draw_case,
     draw_fault,
     queue_limit,
@@ -63,6 +66,7 @@ DRILL = ROOT / "scenarios" / "fault-drill.toml"
 WEAK: dict[str, Any] = {"force_N": (0.25, -1.5, 1.0), "torque_N_m": (0.01, 0.0, -0.02)}
 WRENCH: Any = msgspec.structs.replace(BY_TYPE[WrenchCommand], expires_ns=1_300_000_000, **WEAK)
 ACTUATORS: Any = msgspec.structs.replace(BY_TYPE[ActuatorCommand], pulses=(), isolated=(), **WEAK)
+WHILE = {"at_s": 1.0, "duration_s": 0.5}
 EYE3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -87,6 +91,41 @@ def test_recorder_may_be_the_window_of_ticks_behind() -> None:
     """Four chasers with ports and thrusters publish 54 messages a tick, 476 of which waited in `detumble`."""
     assert 476 < queue_limit("recorder", 1619, 30) < 600
     assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
+
+
+@pytest.mark.parametrize(
+    ("keys", "readers"),
+    [
+        ({}, {"world", "controller", "chaser/0", "chaser/1", "recorder"}),
+        (
+            {"fault": [{"kind": "freeze", "process": "chaser/1", **WHILE}]},
+            {"world", "controller", "chaser/0", "recorder"},
+        ),
+        (
+            {"fault": [{"kind": "flood", "process": "chaser/0", "topic": "sighting", "copies": 5, **WHILE}]},
+            {"world", "chaser/0", "chaser/1"},
+        ),
+        (
+            {"simulation": {"slow": [{"process": "recorder", "each_s": 0.01, **WHILE}]}},
+            {"world", "controller", "chaser/0", "chaser/1"},
+        ),
+        (
+            {"simulation": {"partition": [{"processes": ["chaser/0"], **WHILE}]}},
+            {"world", "controller", "chaser/1", "recorder"},
+        ),
+    ],
+)
+def test_queues_grow_for_a_reader_that_falls_behind_only(
+    keys: dict[str, Any], readers: set[str], tmp_path: Path
+) -> None:
+    log = Log(variant(tmp_path, **keys))
+    log.tick(249)
+    names = ("world", "controller", "chaser/0", "chaser/1", "recorder")
+    traffic = Traffic(
+        queues={f"{name} {k}": cast(Any, SimpleNamespace(most=1000)) for k, name in enumerate(names)}
+    )
+    check_queues(log.checks, SimulatedFlight(tmp_path, {}, {}, (), "", 25.0, traffic), 5000)
+    assert {v.text.split(":")[0] for v in log.checks.violations} == readers
 
 
 # -- cases ------------------------------------------------------------------------------------------------------

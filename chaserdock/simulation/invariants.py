@@ -137,6 +137,7 @@ class Invariants:
     _states: dict[str, BodyTruth] = field(default_factory=dict)
     _drawn: dict[str, Any] = field(default_factory=dict)
     _flown: dict[int, ActuatorCommand] = field(default_factory=dict)
+    _sources: dict[int, str] = field(default_factory=dict)
     _commanders: dict[int, str] = field(default_factory=dict)
     _repeated: set[int] = field(default_factory=set)
     _term_ticks: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -497,6 +498,7 @@ class Invariants:
             del self._returned_s[name]
 
     def _on_command(self, command: ActuatorCommand) -> None:
+        self._sources[command.chaser] = command.source
         if f"chaser/{command.chaser}" in self.dead:
             self._note_return(command)
         if command.source != "command":
@@ -732,6 +734,11 @@ class Invariants:
             phase, name = self.phases.get(chaser, ""), f"chaser/{chaser}"
             if phase in ATTACHED and chaser not in self._latched and name not in self.dead:
                 self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
+            error_m = self._docking_error_m(chaser)
+            if phase == "docked" and not self._falls_back(chaser) and error_m > self._docked_within_m():
+                self.violate(
+                    "liveness", name, f"is in phase docked, but {error_m:.3f} m from its docking place"
+                )
             named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
             if phase not in DOCKED and not self._disturbed():
                 self.violate(
@@ -743,6 +750,25 @@ class Invariants:
             if phase in DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue
             self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+
+    def _falls_back(self, chaser: int) -> bool:
+        """Return whether no command reaches a chaser: it is lost, stopped, or controls itself."""
+        return f"chaser/{chaser}" in self.dead or self._sources.get(chaser, "command") != "command"
+
+    def _docking_error_m(self, chaser: int) -> float:
+        """Return the true distance of a chaser without a port from the place where it docks; 0 if the truth is not known."""
+        target, own = self._states.get("target"), self._states.get(f"chaser/{chaser}")
+        if target is None or own is None:
+            return 0.0
+        nominal_m = self.scenario.chasers[chaser].position_m
+        place = np.array(nominal_m) * (self.scenario.approach.dock_distance_m / math.hypot(*nominal_m))
+        offset = rotations.rotate_inverse(target.q_wxyz, np.subtract(own.position_m, target.position_m))
+        return _distance(offset, place)
+
+    def _docked_within_m(self) -> float:
+        """Return the largest true distance of a docked chaser from its place: that of the scenario and errors of the estimate."""
+        drift_m = self.scenario.navigation.errors().position_drift_m
+        return self.scenario.approach.docked_position_m + ACCURACY_M + 4.0 * drift_m
 
     def _disturbed(self) -> bool:
         """Return whether anything may keep the chasers from docking: faults, the network, commands, or another plant."""

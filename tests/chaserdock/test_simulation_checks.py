@@ -719,6 +719,24 @@ def test_a_complete_mission_lasts_as_long_as_the_scenario(log: Log) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("x_m", "source", "found"),
+    [
+        (-0.41, "command", []),
+        (-0.43, "command", ["liveness"]),
+        (-0.43, "hold", []),
+        (0.4, "command", ["liveness"]),
+    ],
+)
+def test_a_docked_chaser_is_at_its_docking_place(log: Log, x_m: float, source: str, found: list[str]) -> None:
+    """Within 2 cm, unless it falls back."""
+    at_end(log, "docked")
+    log.bodies(249, body("target", 0.0), body("chaser/0", x_m))
+    log.flies(0, 249, source=source)
+    ended(log).checks.check_end({}, ())
+    assert log.found == found
+
+
 def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -> None:
     at_end(log, "docked")
     ended(log).checks.check_end({}, ())

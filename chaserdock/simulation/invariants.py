@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -113,9 +114,9 @@ class Violation:
 class Invariants:
     """Checks the messages of one flight as they are published; each violation is noted once per subject.
 
-    ``reasons``: warnings and errors in the log, the last at ``reason_s``. ``dead``: processes that were lost, and chasers that no
-    command has reached, until these have flown commands for ``STOPPING_S``. ``nees``: normalized squared errors of the estimated
-    pose of the target, one a second (6 on average if consistent).
+    ``reasons``: warnings and errors in the log. ``reason_s``: time of the last one that concerns a chaser. ``dead``: processes
+    that were lost, and chasers that no command has reached, until these have flown commands for ``STOPPING_S``. ``nees``:
+    normalized squared errors of the estimated pose of the target, one a second (6 on average if consistent).
     """
 
     scenario: Scenario
@@ -123,7 +124,7 @@ class Invariants:
     nees: list[float] = field(default_factory=list)
     relative_nees: list[float] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
-    reason_s: float = 0.0
+    reason_s: dict[int, float] = field(default_factory=dict)
     end: MissionEnd | None = None
     phases: dict[int, str] = field(default_factory=dict)
     dead: set[str] = field(default_factory=set)
@@ -196,6 +197,13 @@ class Invariants:
     def ticks(self) -> int:
         """Number of ticks flown so far."""
         return 1 + max(self._tick, self._state_tick)
+
+    @property
+    def to_dock(self) -> list[int]:
+        """Chasers that are to dock or to latch, and are commanded to approach before the end."""
+        s, success = self.scenario, self.scenario.success
+        rows = [e for e in s.timeline if e.command == "approach" and e.at_s < s.duration_s]
+        return sorted({i for e in rows for i in e.chasers} & {*success.docked, *success.latched})
 
     def violate(self, invariant: str, subject: str, text: str) -> None:
         """Note a violation, unless one of the same invariant and subject is noted already."""
@@ -668,7 +676,7 @@ class Invariants:
         chosen = "(from " in event.what and ": " in event.what.partition("(from ")[2]
         if (event.level != "info" and not event.what.startswith("fault ")) or chosen:
             self.reasons.append(f"{event.process}: {event.what} {event.detail}".strip())
-            self.reason_s = self.time_s
+            self.reason_s |= dict.fromkeys(self._concerned(event), self.time_s)
         if event.process == "world" and event.what in ("process lost", "actuators stopped"):
             lost = event.detail.partition(":")[0]
             self.dead.add(lost)
@@ -677,6 +685,16 @@ class Invariants:
                 self._lost.add(lost)
             if not self._may_lose():
                 self.violate("no loss without a cause", lost, event.what)
+
+    def _concerned(self, event: Event) -> set[int]:
+        """Return the chasers that an event may keep from docking: the one that publishes it, or those that world or
+        controllers name; all if they name none."""
+        if event.process.startswith("chaser/"):
+            return {int(event.process.partition("/")[2])}
+        named = {int(i) for i in re.findall(r"chaser[ /](\d+)", f"{event.what} {event.detail}")}
+        if event.process == "recorder" or event.detail == "recorder":
+            return set()
+        return named or set(range(len(self.scenario.chasers)))
 
     def _latch_may_open(self, i: int) -> bool:
         """Return whether a fault or a limited strength explains that a closed latch opens."""
@@ -698,19 +716,6 @@ class Invariants:
     def _on_end(self, end: MissionEnd) -> None:
         self.end = end
 
-    def _settling_s(self, chaser: int) -> float:
-        """Return how long a chaser may take after the last disturbance: for an approach from rest, or another attempt."""
-        d, approach = self.scenario.docking, self.scenario.approach
-        if d.port_of(chaser) is None:
-            way_m = math.hypot(*self.scenario.chasers[chaser].position_m) - approach.dock_distance_m
-            moving_s = PEAK_SPEED * max(0.0, way_m) / approach.max_speed_m_s
-            return max(SETTLING_S, STOPPING_S + moving_s + approach.docked_time_s)
-        out_s = d.entry_m / approach.max_speed_m_s
-        in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (
-            d.final_m + d.overdrive_m
-        ) / d.contact_speed_m_s
-        return SETTLING_S + out_s + in_s + d.settle_s + 2.0 * d.pull_s
-
     def check_end(self, crashes: dict[str, str], stalled: tuple[str, ...]) -> None:
         """Check what must hold when a flight is over: it ended, all processes did, and each mission is docked or safe."""
         for name, trace in crashes.items():
@@ -729,8 +734,7 @@ class Invariants:
         if self.end.complete and self.end.tick != self.scenario.ticks:
             text = f"complete after {self.end.tick} of {self.scenario.ticks} ticks"
             self.violate("liveness", "world", text)
-        success, commanded = self.scenario.success, {e.command for e in self.scenario.timeline}
-        for chaser in (*success.docked, *success.latched):
+        for chaser in self.to_dock:
             phase, name = self.phases.get(chaser, ""), f"chaser/{chaser}"
             if phase in ATTACHED and chaser not in self._latched and name not in self.dead:
                 self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
@@ -739,17 +743,29 @@ class Invariants:
                 self.violate(
                     "liveness", name, f"is in phase docked, but {error_m:.3f} m from its docking place"
                 )
-            named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
             if phase not in DOCKED and not self._disturbed():
                 self.violate(
                     "liveness", name, f"ends in phase {phase or 'none'}, although nothing disturbed it"
                 )
-            commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
-            allowed_s = self._settling_s(chaser)
-            disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < allowed_s
-            if phase in DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
-                continue
-            self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+            if not self.state_at_end(chaser):
+                self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+
+    def state_at_end(self, chaser: int) -> str:
+        """Return how a chaser that is to dock ends: ``docked``, ``safe``, ``unfinished``, or empty if it is none of these.
+
+        Safe: no command reaches it, or it keeps its distance and a warning or command names why. Unfinished: the time after
+        the last warning or command was too short for an approach.
+        """
+        phase = self.phases.get(chaser, "")
+        commands = [e for e in self.scenario.timeline if chaser in e.chasers]
+        named = chaser in self.reason_s or any(e.command in _NAMED_IN for e in commands)
+        if phase in DOCKED and not self._falls_back(chaser):
+            return "docked"
+        if f"chaser/{chaser}" in self.dead or (named and (phase in SAFE_PHASES or self._falls_back(chaser))):
+            return "safe"
+        last_s = max(self.reason_s.get(chaser, 0.0), *(e.at_s for e in commands), 0.0)
+        in_time = self.time_s - last_s < settling_s(self.scenario, chaser)
+        return "unfinished" if in_time and phase not in SAFE_PHASES else ""
 
     def _falls_back(self, chaser: int) -> bool:
         """Return whether no command reaches a chaser: it is lost, stopped, or controls itself."""
@@ -777,6 +793,18 @@ class Invariants:
         commands = {e.command for e in s.timeline} - {"approach"}
         plant = s.thruster_failure or "truth" in s.model_fields_set
         return bool(s.fault or commands or plant or any(network.values()))
+
+
+def settling_s(s: Scenario, chaser: int) -> float:
+    """Return how long a chaser may take after the last disturbance: for an approach from rest, or another attempt."""
+    d, approach = s.docking, s.approach
+    if d.port_of(chaser) is None:
+        way_m = math.hypot(*s.chasers[chaser].position_m) - approach.dock_distance_m
+        moving_s = PEAK_SPEED * max(0.0, way_m) / approach.max_speed_m_s
+        return max(SETTLING_S, STOPPING_S + moving_s + approach.docked_time_s)
+    out_s = d.entry_m / approach.max_speed_m_s
+    in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (d.final_m + d.overdrive_m) / d.contact_speed_m_s
+    return SETTLING_S + out_s + in_s + d.settle_s + 2.0 * d.pull_s
 
 
 def _concerns(fault: Fault, name: str) -> bool:

@@ -58,6 +58,7 @@ from chaserdock.simulation.swarm import (
     check_queues,
     draw_case,
     draw_fault,
+    outcome_of,
     queue_limit,
 )
 from chaserdock.toml_text import toml_document
@@ -148,6 +149,16 @@ def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario,
     assert kinds == set(KINDS)
     assert modes == {"lockstep", "realtime"}
     assert sections >= {"truth", "timeline", "partition", "slow", "clock", "loss", "duplicate", "reorder"}
+
+
+def test_one_seed_in_four_has_the_time_to_dock_after_its_last_disturbance(scenario: Scenario) -> None:
+    ends_s = {seed: draw_case("fault-drill", seed, scenario).get("duration_s", 25.0) for seed in range(40)}
+    assert {seed for seed, end_s in ends_s.items() if end_s > 25.0} == set(range(0, 40, 4))
+    for seed in range(0, 40, 4):
+        case = draw_case("fault-drill", seed, scenario)
+        rows = [*case["fault"], *case.get("timeline", []), *case["simulation"].get("partition", [])]
+        last_s = max([5.0, *(row["at_s"] + row.get("duration_s", 0.0) for row in rows)])
+        assert last_s + 30.0 < ends_s[seed] < 80.0
 
 
 def test_seeds_draw_faults_of_latches_where_there_are_ports(tmp_path: Path) -> None:
@@ -748,23 +759,85 @@ def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -
     with_reason = Log(killed)
     at_end(with_reason, "hold")
     with_reason.event("no command", "for 2 s", "chaser/0")
+    with_reason.event("no command", "for 2 s", "chaser/3")
     ended(with_reason).checks.check_end({}, ())
     assert with_reason.found == []
 
 
 @pytest.mark.parametrize(
-    ("what", "violations"),
+    ("process", "level", "what", "without"),
     [
-        ("chaser 0: hold (from approach: no chaser has seen the target for 3 s)", 0),
-        ("chaser 0: hold (from wait)", 2),
+        ("controller", "info", "chaser 0: hold (from approach: no chaser has seen the target for 3 s)", [3]),
+        ("controller", "info", "chaser 0: hold (from wait)", [0, 3]),
+        ("controller", "warning", "chaser 3: odometry jumped by 2 mm", [0]),
+        ("controller", "error", "solver error", []),
+        ("world", "warning", "hand-over", []),
+        ("chaser/3", "warning", "no command", [0]),
+        ("chaser/1", "warning", "no command", [0, 3]),
+        ("recorder", "warning", "slow disk", [0, 3]),
     ],
 )
-def test_guidance_names_the_reason_of_a_phase(what: str, violations: int, killed: Scenario) -> None:
+def test_a_reason_counts_for_the_chasers_that_it_concerns(
+    process: str, level: str, what: str, without: list[int], killed: Scenario
+) -> None:
+    """A phase that guidance chose names its reason as information."""
     log = Log(killed)
     at_end(log, "hold")
-    log.event(what, "", "controller", "info")
+    log.event(what, "", process, level)
     ended(log).checks.check_end({}, ())
-    assert log.found == ["liveness"] * violations
+    assert [v.text for v in log.checks.violations] == [
+        f"chaser/{i}: ends in phase hold without a named reason" for i in without
+    ]
+
+
+@pytest.mark.parametrize(
+    ("end_tick", "state", "found"), [(305, "unfinished", []), (307, "", ["liveness"] * 2)]
+)
+def test_a_mission_has_the_time_of_an_approach_after_a_reason(
+    end_tick: int, state: str, found: list[str], killed: Scenario
+) -> None:
+    """That is 20.6 s in fault-drill."""
+    log = Log(killed)
+    at_end(log, "approach")
+    log.tick(100)
+    log.event("process lost", "controller")
+    log.tick(end_tick)
+    ended(log).checks.check_end({}, ())
+    assert log.checks.state_at_end(0) == state
+    assert log.found == found
+
+
+def test_a_chaser_that_falls_back_is_safe(killed: Scenario) -> None:
+    """It states no phase: the last one is that of a controller that is gone."""
+    log = Log(killed)
+    at_end(log, "approach")
+    log.tick(10)
+    for chaser, source in ((0, "hold"), (3, "command")):
+        log.event("no command", "for 2 s", f"chaser/{chaser}")
+        log.tick(400)
+        log.flies(chaser, 400, source=source)
+    ended(log).checks.check_end({}, ())
+    assert [log.checks.state_at_end(i) for i in (0, 3)] == ["safe", "unfinished"]
+    assert outcome_of(log.checks) == "unfinished"
+    at_end(log, "docked")
+    assert outcome_of(log.checks) == "safe"
+    log.flies(0, 401)
+    assert outcome_of(log.checks) == "docked"
+
+
+def test_a_chaser_that_is_not_commanded_to_approach_may_hold(tmp_path: Path) -> None:
+    approach = {"command": "approach", "at_s": 5.0}
+    log = Log(
+        variant(tmp_path, timeline=[{**approach, "chasers": [0]}, {**approach, "at_s": 25.0, "chasers": [3]}])
+    )
+    at_end(log, "hold")
+    ended(log).checks.check_end({}, ())
+    assert {v.text.partition(":")[0] for v in log.checks.violations} == {"chaser/0"}
+    none = Log(variant(tmp_path, timeline=[]))
+    at_end(none, "hold")
+    ended(none).checks.check_end({}, ())
+    assert none.found == []
+    assert outcome_of(none.checks) == "safe"
 
 
 def test_an_undisturbed_mission_docks(log: Log) -> None:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_controller.guidance.trajectories import PEAK_SPEED
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -112,8 +114,9 @@ class Violation:
 class Invariants:
     """Checks the messages of one flight as they are published; each violation is noted once per subject.
 
-    ``reasons``: warnings and errors in the log, the last at ``reason_s``. ``nees``: normalized squared errors of the estimated
-    pose of the target, one a second (6 on average if consistent).
+    ``reasons``: warnings and errors in the log. ``reason_s``: time of the last one that concerns a chaser. ``dead``: processes
+    that were lost, and chasers that no command has reached, until these have flown commands for ``STOPPING_S``. ``nees``:
+    normalized squared errors of the estimated pose of the target, one a second (6 on average if consistent).
     """
 
     scenario: Scenario
@@ -121,10 +124,12 @@ class Invariants:
     nees: list[float] = field(default_factory=list)
     relative_nees: list[float] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
-    reason_s: float = 0.0
+    reason_s: dict[int, float] = field(default_factory=dict)
     end: MissionEnd | None = None
     phases: dict[int, str] = field(default_factory=dict)
     dead: set[str] = field(default_factory=set)
+    _lost: set[str] = field(default_factory=set)
+    _returned_s: dict[str, float] = field(default_factory=dict)
     _seen: set[tuple[str, str]] = field(default_factory=set)
     _tick: int = -1
     _opened: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=200))
@@ -133,9 +138,11 @@ class Invariants:
     _states: dict[str, BodyTruth] = field(default_factory=dict)
     _drawn: dict[str, Any] = field(default_factory=dict)
     _flown: dict[int, ActuatorCommand] = field(default_factory=dict)
+    _sources: dict[int, str] = field(default_factory=dict)
     _commanders: dict[int, str] = field(default_factory=dict)
     _controllers: dict[str, str] = field(default_factory=dict)
     _controller_lost: set[int] = field(default_factory=set)
+    _term_ticks: dict[int, tuple[int, int]] = field(default_factory=dict)
     _touching: set[str] = field(default_factory=set)
     _begin: dict[str, float] = field(default_factory=dict)
     _commanded: dict[int, int] = field(default_factory=dict)
@@ -160,6 +167,9 @@ class Invariants:
         self._now_s = 0.0
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
+        }
+        self._cones = {
+            f"chaser/{p.chaser}": cone_of(self.scenario, p.chaser) for p in self.scenario.docking.ports
         }
         self._liars = {f.process for f in self.scenario.fault if f.kind == "lying_sensor"}
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -189,6 +199,13 @@ class Invariants:
         """Number of ticks flown so far."""
         return 1 + max(self._tick, self._state_tick)
 
+    @property
+    def to_dock(self) -> list[int]:
+        """Chasers that are to dock or to latch, and are commanded to approach before the end."""
+        s, success = self.scenario, self.scenario.success
+        rows = [e for e in s.timeline if e.command == "approach" and e.at_s < s.duration_s]
+        return sorted({i for e in rows for i in e.chasers} & {*success.docked, *success.latched})
+
     def violate(self, invariant: str, subject: str, text: str) -> None:
         """Note a violation, unless one of the same invariant and subject is noted already."""
         if (invariant, subject) not in self._seen:
@@ -217,6 +234,7 @@ class Invariants:
     def _on_tick(self, tick: Tick) -> None:
         if tick.tick == self._tick and len(tick.controllers) < len(self._controllers):
             self._controller_lost.add(tick.tick)
+        self._lost.difference_update(f"chaser/{i}" for i in tick.chasers)
         if tick.tick > self._tick:
             self._controllers = tick.controllers
             self._opened.append((self._now_s, tick.tick))
@@ -421,9 +439,16 @@ class Invariants:
         for name, at in chasers.items():
             if target is None or name in self._touching:
                 continue
-            distance_m = _distance(at, np.array(target.position_m))
-            if distance_m < self._nearest_m[name] - KEEP_OUT_SLACK_M:
+            offset = rotations.rotate_inverse(target.q_wxyz, at - target.position_m)
+            distance_m = float(np.linalg.norm(offset))
+            if distance_m < self._nearest_allowed_m(name, offset) - KEEP_OUT_SLACK_M:
                 self.violate("keep-out zone", name, f"{distance_m:.3f} m from the target")
+
+    def _nearest_allowed_m(self, name: str, offset_m: Array) -> float:
+        """Return the smallest allowed distance from the target of a chaser at an offset (3,), TRF: smaller in its corridor."""
+        cone = self._cones.get(name)
+        in_corridor = cone is not None and cone.room_m(offset_m) > -KEEP_OUT_SLACK_M
+        return self._nearest_m[name] if in_corridor else self.scenario.limits.min_distance_target_m
 
     # -- commands ------------------------------------------------------------------------------------------------
 
@@ -471,7 +496,21 @@ class Invariants:
         spans += [(w.at_s, w.at_s + w.duration_s) for w in (*s.partition, *s.slow)]
         return max([0.0, *(min(end_s, now_s) for at_s, end_s in spans if at_s <= now_s)])
 
+    def _note_return(self, command: ActuatorCommand) -> None:
+        """Judge a chaser again that has flown commands for ``STOPPING_S``, while no fault kept them from its actuators."""
+        name, now_s = f"chaser/{command.chaser}", self.time_s
+        if command.source != "command" or name in self._lost:
+            self._returned_s.pop(name, None)
+            return
+        since_s = max(self._returned_s.setdefault(name, now_s), self._disturbed_until_s(name, now_s))
+        if now_s - since_s > STOPPING_S:
+            self.dead.remove(name)
+            del self._returned_s[name]
+
     def _on_command(self, command: ActuatorCommand) -> None:
+        self._sources[command.chaser] = command.source
+        if f"chaser/{command.chaser}" in self.dead:
+            self._note_return(command)
         if command.source != "command":
             self._check_following(command)
             return
@@ -491,6 +530,21 @@ class Invariants:
         if other != sender and command.tick not in self._controller_lost:
             text = f"flies a command of {sender} for tick {command.tick}, in which {other} commands"
             self.violate("one commander", name, text)
+        self._check_succession(command)
+
+    def _check_succession(self, command: ActuatorCommand) -> None:
+        """Check that no command of a lower term is flown for a later tick than one of a higher term of the other controller.
+
+        A repeated tick may have both. A chaser that was lost may fly its commands late, but for their own ticks.
+        """
+        term, tick = command.term, command.tick
+        first, last = self._term_ticks.get(term, (tick, tick))
+        self._term_ticks[term] = min(first, tick), max(last, tick)
+        for other, (from_tick, until_tick) in self._term_ticks.items():
+            superseded = (other > term and from_tick < tick) or (other < term and tick < until_tick)
+            if superseded and commander_of(other) != commander_of(term):
+                text = f"flies term {term} for tick {tick}; term {other} is flown from tick {from_tick} to {until_tick}"
+                self.violate("one commander", f"chaser/{command.chaser}", text)
 
     def _clock_s(self, process: str, sent_ns: int) -> float:
         """Return the virtual time (s) at which a process has stamped a message with its own clock."""
@@ -624,12 +678,25 @@ class Invariants:
         chosen = "(from " in event.what and ": " in event.what.partition("(from ")[2]
         if (event.level != "info" and not event.what.startswith("fault ")) or chosen:
             self.reasons.append(f"{event.process}: {event.what} {event.detail}".strip())
-            self.reason_s = self.time_s
+            self.reason_s |= dict.fromkeys(self._concerned(event), self.time_s)
         if event.process == "world" and event.what in ("process lost", "actuators stopped"):
             lost = event.detail.partition(":")[0]
             self.dead.add(lost)
+            self._returned_s.pop(lost, None)
+            if event.what == "process lost":
+                self._lost.add(lost)
             if not self._may_lose():
                 self.violate("no loss without a cause", lost, event.what)
+
+    def _concerned(self, event: Event) -> set[int]:
+        """Return the chasers that an event may keep from docking: the one that publishes it, or those that world or
+        controllers name; all if they name none."""
+        if event.process.startswith("chaser/"):
+            return {int(event.process.partition("/")[2])}
+        named = {int(i) for i in re.findall(r"chaser[ /](\d+)", f"{event.what} {event.detail}")}
+        if event.process == "recorder" or event.detail == "recorder":
+            return set()
+        return named or set(range(len(self.scenario.chasers)))
 
     def _latch_may_open(self, i: int) -> bool:
         """Return whether a fault or a limited strength explains that a closed latch opens."""
@@ -651,19 +718,6 @@ class Invariants:
     def _on_end(self, end: MissionEnd) -> None:
         self.end = end
 
-    def _settling_s(self, chaser: int) -> float:
-        """Return how long a chaser may take after the last disturbance: for an approach from rest, or another attempt."""
-        d, approach = self.scenario.docking, self.scenario.approach
-        if d.port_of(chaser) is None:
-            way_m = math.hypot(*self.scenario.chasers[chaser].position_m) - approach.dock_distance_m
-            moving_s = PEAK_SPEED * max(0.0, way_m) / approach.max_speed_m_s
-            return max(SETTLING_S, STOPPING_S + moving_s + approach.docked_time_s)
-        out_s = d.entry_m / approach.max_speed_m_s
-        in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (
-            d.final_m + d.overdrive_m
-        ) / d.contact_speed_m_s
-        return SETTLING_S + out_s + in_s + d.settle_s + 2.0 * d.pull_s
-
     def check_end(self, crashes: dict[str, str], stalled: tuple[str, ...]) -> None:
         """Check what must hold when a flight is over: it ended, all processes did, and each mission is docked or safe."""
         for name, trace in crashes.items():
@@ -682,22 +736,57 @@ class Invariants:
         if self.end.complete and self.end.tick != self.scenario.ticks:
             text = f"complete after {self.end.tick} of {self.scenario.ticks} ticks"
             self.violate("liveness", "world", text)
-        success, commanded = self.scenario.success, {e.command for e in self.scenario.timeline}
-        for chaser in (*success.docked, *success.latched):
+        for chaser in self.to_dock:
             phase, name = self.phases.get(chaser, ""), f"chaser/{chaser}"
             if phase in ATTACHED and chaser not in self._latched and name not in self.dead:
                 self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
-            named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
+            error_m = self._docking_error_m(chaser)
+            if phase == "docked" and not self._falls_back(chaser) and error_m > self._docked_within_m():
+                self.violate(
+                    "liveness", name, f"is in phase docked, but {error_m:.3f} m from its docking place"
+                )
             if phase not in DOCKED and not self._disturbed():
                 self.violate(
                     "liveness", name, f"ends in phase {phase or 'none'}, although nothing disturbed it"
                 )
-            commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
-            allowed_s = self._settling_s(chaser)
-            disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < allowed_s
-            if phase in DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
-                continue
-            self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+            if not self.state_at_end(chaser):
+                self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+
+    def state_at_end(self, chaser: int) -> str:
+        """Return how a chaser that is to dock ends: ``docked``, ``safe``, ``unfinished``, or empty if it is none of these.
+
+        Safe: no command reaches it, or it keeps its distance and a warning or command names why. Unfinished: the time after
+        the last warning or command was too short for an approach.
+        """
+        phase = self.phases.get(chaser, "")
+        commands = [e for e in self.scenario.timeline if chaser in e.chasers]
+        named = chaser in self.reason_s or any(e.command in _NAMED_IN for e in commands)
+        if phase in DOCKED and not self._falls_back(chaser):
+            return "docked"
+        if f"chaser/{chaser}" in self.dead or (named and (phase in SAFE_PHASES or self._falls_back(chaser))):
+            return "safe"
+        last_s = max(self.reason_s.get(chaser, 0.0), *(e.at_s for e in commands), 0.0)
+        in_time = self.time_s - last_s < settling_s(self.scenario, chaser)
+        return "unfinished" if in_time and phase not in SAFE_PHASES else ""
+
+    def _falls_back(self, chaser: int) -> bool:
+        """Return whether no command reaches a chaser: it is lost, stopped, or controls itself."""
+        return f"chaser/{chaser}" in self.dead or self._sources.get(chaser, "command") != "command"
+
+    def _docking_error_m(self, chaser: int) -> float:
+        """Return the true distance of a chaser without a port from the place where it docks; 0 if the truth is not known."""
+        target, own = self._states.get("target"), self._states.get(f"chaser/{chaser}")
+        if target is None or own is None:
+            return 0.0
+        nominal_m = self.scenario.chasers[chaser].position_m
+        place = np.array(nominal_m) * (self.scenario.approach.dock_distance_m / math.hypot(*nominal_m))
+        offset = rotations.rotate_inverse(target.q_wxyz, np.subtract(own.position_m, target.position_m))
+        return _distance(offset, place)
+
+    def _docked_within_m(self) -> float:
+        """Return the largest true distance of a docked chaser from its place: that of the scenario and errors of the estimate."""
+        drift_m = self.scenario.navigation.errors().position_drift_m
+        return self.scenario.approach.docked_position_m + ACCURACY_M + 4.0 * drift_m
 
     def _disturbed(self) -> bool:
         """Return whether anything may keep the chasers from docking: faults, the network, commands, or another plant."""
@@ -706,6 +795,18 @@ class Invariants:
         commands = {e.command for e in s.timeline} - {"approach"}
         plant = s.thruster_failure or "truth" in s.model_fields_set
         return bool(s.fault or commands or plant or any(network.values()))
+
+
+def settling_s(s: Scenario, chaser: int) -> float:
+    """Return how long a chaser may take after the last disturbance: for an approach from rest, or another attempt."""
+    d, approach = s.docking, s.approach
+    if d.port_of(chaser) is None:
+        way_m = math.hypot(*s.chasers[chaser].position_m) - approach.dock_distance_m
+        moving_s = PEAK_SPEED * max(0.0, way_m) / approach.max_speed_m_s
+        return max(SETTLING_S, STOPPING_S + moving_s + approach.docked_time_s)
+    out_s = d.entry_m / approach.max_speed_m_s
+    in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (d.final_m + d.overdrive_m) / d.contact_speed_m_s
+    return SETTLING_S + out_s + in_s + d.settle_s + 2.0 * d.pull_s
 
 
 def _concerns(fault: Fault, name: str) -> bool:

@@ -9,10 +9,13 @@ import random
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, get_args
+from types import SimpleNamespace
+from typing import Any, cast, get_args
 
 import msgspec
+import numpy as np
 import pytest
+from chaserdock_models import rotations
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
@@ -44,15 +47,18 @@ from pydantic import ValidationError
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency, shrink_result
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
-from chaserdock.simulation.network import EPOCH_NS
+from chaserdock.simulation.mission import SimulatedFlight
+from chaserdock.simulation.network import EPOCH_NS, Traffic
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import (
     KINDS,
     LATCH_KINDS,
     Case,
     SimulationResult,
+    check_queues,
     draw_case,
     draw_fault,
+    outcome_of,
     queue_limit,
 )
 from chaserdock.toml_text import toml_document
@@ -61,6 +67,7 @@ DRILL = ROOT / "scenarios" / "fault-drill.toml"
 WEAK: dict[str, Any] = {"force_N": (0.25, -1.5, 1.0), "torque_N_m": (0.01, 0.0, -0.02)}
 WRENCH: Any = msgspec.structs.replace(BY_TYPE[WrenchCommand], expires_ns=1_300_000_000, **WEAK)
 ACTUATORS: Any = msgspec.structs.replace(BY_TYPE[ActuatorCommand], pulses=(), isolated=(), **WEAK)
+WHILE = {"at_s": 1.0, "duration_s": 0.5}
 EYE3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -85,6 +92,41 @@ def test_recorder_may_be_the_window_of_ticks_behind() -> None:
     """Four chasers with ports and thrusters publish 54 messages a tick, 476 of which waited in `detumble`."""
     assert 476 < queue_limit("recorder", 1619, 30) < 600
     assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
+
+
+@pytest.mark.parametrize(
+    ("keys", "readers"),
+    [
+        ({}, {"world", "controller", "chaser/0", "chaser/1", "recorder"}),
+        (
+            {"fault": [{"kind": "freeze", "process": "chaser/1", **WHILE}]},
+            {"world", "controller", "chaser/0", "recorder"},
+        ),
+        (
+            {"fault": [{"kind": "flood", "process": "chaser/0", "topic": "sighting", "copies": 5, **WHILE}]},
+            {"world", "chaser/0", "chaser/1"},
+        ),
+        (
+            {"simulation": {"slow": [{"process": "recorder", "each_s": 0.01, **WHILE}]}},
+            {"world", "controller", "chaser/0", "chaser/1"},
+        ),
+        (
+            {"simulation": {"partition": [{"processes": ["chaser/0"], **WHILE}]}},
+            {"world", "controller", "chaser/1", "recorder"},
+        ),
+    ],
+)
+def test_queues_grow_for_a_reader_that_falls_behind_only(
+    keys: dict[str, Any], readers: set[str], tmp_path: Path
+) -> None:
+    log = Log(variant(tmp_path, **keys))
+    log.tick(249)
+    names = ("world", "controller", "chaser/0", "chaser/1", "recorder")
+    traffic = Traffic(
+        queues={f"{name} {k}": cast(Any, SimpleNamespace(most=1000)) for k, name in enumerate(names)}
+    )
+    check_queues(log.checks, SimulatedFlight(tmp_path, {}, {}, (), "", 25.0, traffic), 5000)
+    assert {v.text.split(":")[0] for v in log.checks.violations} == readers
 
 
 # -- cases ------------------------------------------------------------------------------------------------------
@@ -116,6 +158,16 @@ def test_seeds_draw_valid_variants_of_every_shipped_scenario(path: Path, tmp_pat
         case = draw_case(path.stem, seed, base, images=not base.target_model().markers)
         (tmp_path / "case.toml").write_text(toml_document(case))
         load_scenario(tmp_path / "case.toml")
+
+
+def test_one_seed_in_four_has_the_time_to_dock_after_its_last_disturbance(scenario: Scenario) -> None:
+    ends_s = {seed: draw_case("fault-drill", seed, scenario).get("duration_s", 25.0) for seed in range(40)}
+    assert {seed for seed, end_s in ends_s.items() if end_s > 25.0} == set(range(0, 40, 4))
+    for seed in range(0, 40, 4):
+        case = draw_case("fault-drill", seed, scenario)
+        rows = [*case["fault"], *case.get("timeline", []), *case["simulation"].get("partition", [])]
+        last_s = max([5.0, *(row["at_s"] + row.get("duration_s", 0.0) for row in rows)])
+        assert last_s + 30.0 < ends_s[seed] < 80.0
 
 
 def test_seeds_draw_faults_of_latches_where_there_are_ports(tmp_path: Path) -> None:
@@ -208,17 +260,19 @@ class Log:
         )
         self.checks.observe(sender, raw)
 
-    def tick(self, tick: int, **changes: Any) -> None:
-        time_ns = tick * 100_000_000
-        sample = msgspec.structs.replace(BY_TYPE[Tick], tick=tick, sim_time_ns=time_ns, **changes)
-        self.publish(topics.TICK, sample)
+    def tick(self, tick: int, chasers: tuple[int, ...] = (0, 1, 2, 3), **changes: Any) -> None:
+        at: dict[str, Any] = {"tick": tick, "sim_time_ns": tick * 100_000_000, **changes}
+        self.publish(topics.TICK, msgspec.structs.replace(BY_TYPE[Tick], chasers=chasers, **at))
 
     def bodies(self, tick: int, *bodies: BodyTruth, contacts: tuple[tuple[str, str], ...] = ()) -> None:
         for body in bodies:
             stamped = msgspec.structs.replace(body, tick=tick, sim_time_ns=tick * 100_000_000)
             self.publish(topics.TRUTH_BODY, stamped, body.body)
-        self.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=contacts, saturated=()))
+        self.touch(tick, *contacts)
         self.tick(tick)
+
+    def touch(self, tick: int, *contacts: tuple[str, str]) -> None:
+        self.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=contacts, saturated=()))
 
     def flies(self, chaser: int, tick: int, term: int = 1, source: str = "command") -> None:
         command = msgspec.structs.replace(ACTUATORS, chaser=chaser, tick=tick, term=term, source=source)
@@ -263,6 +317,41 @@ def test_keep_out_zones_surround_target_and_chasers(log: Log) -> None:
     assert log.found == []
     log.bodies(3, body("target", 0.0), body("chaser/0", 0.32), body("chaser/1", 0.64))
     assert log.found == ["keep-out zone", "keep-out zone"]
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_chaser_that_flies_commands_again_is_judged_again(killed: Scenario, lost: bool) -> None:
+    """From 3 s of flown commands on, and of a process that was lost, only if it takes part again."""
+    log = Log(killed)
+    log.tick(5)
+    log.event(*(("process lost", "chaser/1") if lost else ("actuators stopped", "chaser/1: no command")))
+    for tick in range(6, 100):
+        log.tick(tick, chasers=(0, 2, 3) if lost and tick < 50 else (0, 1, 2, 3))
+        log.flies(1, tick, source="command" if tick >= 20 else "hold")
+        log.touch(tick, ("chaser/1", "target"))
+        if log.found:
+            break
+    assert [v.time_s for v in log.checks.violations] == [8.1 if lost else 5.1]
+
+
+@pytest.mark.parametrize(
+    ("along_m", "aside_m", "found"),
+    [(0.6, 0.0, []), (0.6, 0.3, ["keep-out zone"]), (-0.6, 0.0, ["keep-out zone"])],
+)
+def test_a_chaser_comes_nearer_in_the_corridor_of_its_port_only(
+    along_m: float, aside_m: float, found: list[str]
+) -> None:
+    capture = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+    log, axis = Log(capture), np.array(capture.docking.ports[0].axis)
+    aside = np.cross(axis, (0.0, 0.6, 0.8))
+    q = rotations.exp(np.array((0.0, 0.0, 0.5)))
+    at = rotations.rotate(q, along_m * axis + aside_m * aside / np.linalg.norm(aside))
+    log.bodies(
+        1,
+        body("target", 0.0, q_wxyz=tuple(q.tolist())),
+        msgspec.structs.replace(body("chaser/0", 0.0), position_m=tuple(at.tolist())),
+    )
+    assert log.found == found
 
 
 def test_momentum_changes_by_impulses_only(log: Log) -> None:
@@ -527,7 +616,7 @@ def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
     assert log.found == []
     log.flies(1, 10)
     assert log.found == ["no stale command"]
-    log.flies(0, 21, term=2)
+    log.flies(0, 21, term=3)
     log.flies(0, 22, term=1)
     assert log.found[1:] == ["no superseded command"]
 
@@ -561,6 +650,23 @@ def test_chasers_fly_different_commanders_only_in_a_tick_in_which_a_controller_i
     log.tick(22, revision=1, chasers=(0,), controllers={"controller": "c", "standby": "s"})
     log.flies(0, 22, term=4)
     assert log.found == ["one commander"]
+
+
+def test_controllers_do_not_command_in_turn(log: Log, scenario: Scenario) -> None:
+    """A command that is flown late, and one of a tick in which a controller is lost, may be of the former commander."""
+    log.tick(21, controllers={"controller": "c", "standby": "s"})
+    log.tick(21, revision=1, controllers={"standby": "s"})
+    for chaser, tick, term in ((0, 20, 1), (1, 21, 2), (2, 20, 1), (3, 21, 1)):
+        log.flies(chaser, tick, term)
+    assert log.found == []
+    log.tick(22)
+    log.flies(3, 22, term=1)
+    assert log.found == ["one commander"]
+    other = Log(scenario)
+    other.tick(22)
+    other.flies(3, 22, term=1)
+    other.flies(1, 21, term=2)
+    assert other.found == ["one commander"]
 
 
 def test_invalid_messages_are_noticed(log: Log) -> None:
@@ -635,6 +741,24 @@ def test_a_complete_mission_lasts_as_long_as_the_scenario(log: Log) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("x_m", "source", "found"),
+    [
+        (-0.41, "command", []),
+        (-0.43, "command", ["liveness"]),
+        (-0.43, "hold", []),
+        (0.4, "command", ["liveness"]),
+    ],
+)
+def test_a_docked_chaser_is_at_its_docking_place(log: Log, x_m: float, source: str, found: list[str]) -> None:
+    """Within 2 cm, unless it falls back."""
+    at_end(log, "docked")
+    log.bodies(249, body("target", 0.0), body("chaser/0", x_m))
+    log.flies(0, 249, source=source)
+    ended(log).checks.check_end({}, ())
+    assert log.found == found
+
+
 def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -> None:
     at_end(log, "docked")
     ended(log).checks.check_end({}, ())
@@ -646,23 +770,85 @@ def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -
     with_reason = Log(killed)
     at_end(with_reason, "hold")
     with_reason.event("no command", "for 2 s", "chaser/0")
+    with_reason.event("no command", "for 2 s", "chaser/3")
     ended(with_reason).checks.check_end({}, ())
     assert with_reason.found == []
 
 
 @pytest.mark.parametrize(
-    ("what", "violations"),
+    ("process", "level", "what", "without"),
     [
-        ("chaser 0: hold (from approach: no chaser has seen the target for 3 s)", 0),
-        ("chaser 0: hold (from wait)", 2),
+        ("controller", "info", "chaser 0: hold (from approach: no chaser has seen the target for 3 s)", [3]),
+        ("controller", "info", "chaser 0: hold (from wait)", [0, 3]),
+        ("controller", "warning", "chaser 3: odometry jumped by 2 mm", [0]),
+        ("controller", "error", "solver error", []),
+        ("world", "warning", "hand-over", []),
+        ("chaser/3", "warning", "no command", [0]),
+        ("chaser/1", "warning", "no command", [0, 3]),
+        ("recorder", "warning", "slow disk", [0, 3]),
     ],
 )
-def test_guidance_names_the_reason_of_a_phase(what: str, violations: int, killed: Scenario) -> None:
+def test_a_reason_counts_for_the_chasers_that_it_concerns(
+    process: str, level: str, what: str, without: list[int], killed: Scenario
+) -> None:
+    """A phase that guidance chose names its reason as information."""
     log = Log(killed)
     at_end(log, "hold")
-    log.event(what, "", "controller", "info")
+    log.event(what, "", process, level)
     ended(log).checks.check_end({}, ())
-    assert log.found == ["liveness"] * violations
+    assert [v.text for v in log.checks.violations] == [
+        f"chaser/{i}: ends in phase hold without a named reason" for i in without
+    ]
+
+
+@pytest.mark.parametrize(
+    ("end_tick", "state", "found"), [(305, "unfinished", []), (307, "", ["liveness"] * 2)]
+)
+def test_a_mission_has_the_time_of_an_approach_after_a_reason(
+    end_tick: int, state: str, found: list[str], killed: Scenario
+) -> None:
+    """That is 20.6 s in fault-drill."""
+    log = Log(killed)
+    at_end(log, "approach")
+    log.tick(100)
+    log.event("process lost", "controller")
+    log.tick(end_tick)
+    ended(log).checks.check_end({}, ())
+    assert log.checks.state_at_end(0) == state
+    assert log.found == found
+
+
+def test_a_chaser_that_falls_back_is_safe(killed: Scenario) -> None:
+    """It states no phase: the last one is that of a controller that is gone."""
+    log = Log(killed)
+    at_end(log, "approach")
+    log.tick(10)
+    for chaser, source in ((0, "hold"), (3, "command")):
+        log.event("no command", "for 2 s", f"chaser/{chaser}")
+        log.tick(400)
+        log.flies(chaser, 400, source=source)
+    ended(log).checks.check_end({}, ())
+    assert [log.checks.state_at_end(i) for i in (0, 3)] == ["safe", "unfinished"]
+    assert outcome_of(log.checks) == "unfinished"
+    at_end(log, "docked")
+    assert outcome_of(log.checks) == "safe"
+    log.flies(0, 401)
+    assert outcome_of(log.checks) == "docked"
+
+
+def test_a_chaser_that_is_not_commanded_to_approach_may_hold(tmp_path: Path) -> None:
+    approach = {"command": "approach", "at_s": 5.0}
+    log = Log(
+        variant(tmp_path, timeline=[{**approach, "chasers": [0]}, {**approach, "at_s": 25.0, "chasers": [3]}])
+    )
+    at_end(log, "hold")
+    ended(log).checks.check_end({}, ())
+    assert {v.text.partition(":")[0] for v in log.checks.violations} == {"chaser/0"}
+    none = Log(variant(tmp_path, timeline=[]))
+    at_end(none, "hold")
+    ended(none).checks.check_end({}, ())
+    assert none.found == []
+    assert outcome_of(none.checks) == "safe"
 
 
 def test_an_undisturbed_mission_docks(log: Log) -> None:

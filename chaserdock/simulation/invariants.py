@@ -141,6 +141,7 @@ class Invariants:
     _sources: dict[int, str] = field(default_factory=dict)
     _commanders: dict[int, str] = field(default_factory=dict)
     _controllers: dict[str, str] = field(default_factory=dict)
+    _listed: dict[str, str] = field(default_factory=dict)
     _controller_lost: set[int] = field(default_factory=set)
     _term_ticks: dict[int, tuple[int, int]] = field(default_factory=dict)
     _touching: set[str] = field(default_factory=set)
@@ -234,6 +235,7 @@ class Invariants:
     def _on_tick(self, tick: Tick) -> None:
         if tick.tick == self._tick and len(tick.controllers) < len(self._controllers):
             self._controller_lost.add(tick.tick)
+        self._listed = tick.controllers
         self._lost.difference_update(f"chaser/{i}" for i in tick.chasers)
         if tick.tick > self._tick:
             self._controllers = tick.controllers
@@ -525,6 +527,9 @@ class Invariants:
         if before is not None and command.term < before.term:
             self.violate("no superseded command", name, f"flies term {command.term} after {before.term}")
         sender = commander_of(command.term)
+        former = sender if before is None else commander_of(before.term)
+        if former != sender and former in self._listed and not self._may_lose():
+            self.violate("no loss without a cause", former, f"{sender} commands {name} in its place")
         other = self._commanders.setdefault(command.tick, sender)
         # If the commander is lost in a tick, chasers may have executed its command before.
         if other != sender and command.tick not in self._controller_lost:
@@ -569,10 +574,10 @@ class Invariants:
         commander = self._commanders.get(self._tick - 1)
         if sighting.status == "seen" and sighting.tick > self._sighted.get(sighting.chaser, -1):
             self._sighted[sighting.chaser] = sighting.tick
-            self._damaged += self._damaged_share(name) if commander == "controller" else 0.0
+            self._damaged += self._damaged_share(name, commander) if commander else 0.0
 
-    def _damaged_share(self, chaser: str) -> float:
-        """Return the share of a chaser's sightings that a fault damages now for the controller, and that it receives in time."""
+    def _damaged_share(self, chaser: str, commander: str) -> float:
+        """Return the share of a chaser's sightings that a fault damages now for the commander, and that it receives in time."""
         active = [
             f for f in self.scenario.fault if f.at_s <= self.time_s < f.at_s + (f.duration_s or math.inf)
         ]
@@ -580,7 +585,7 @@ class Invariants:
             _concerns(f, chaser) for f in active if f.kind not in _BESIDE_DAMAGE
         ):
             return 0.0
-        shares = (f.share or 1.0 for f in active if _damages_sightings(f) and f.peer in (None, chaser))
+        shares = (f.share or 1.0 for f in active if _damages_sightings(f, commander) and f.peer in (None, chaser))
         return max(shares, default=0.0)
 
     def _check_accuracy(self, estimate: TargetEstimate, truth: BodyTruth) -> None:
@@ -814,9 +819,9 @@ def _concerns(fault: Fault, name: str) -> bool:
     return fault.kind not in _HARMLESS and fault.process in (name, "world", "controller", "standby")
 
 
-def _damages_sightings(fault: Fault) -> bool:
-    """Return whether a fault damages sightings that the controller receives."""
-    return (fault.kind, fault.process, fault.topic) == ("corrupt", "controller", "sighting")
+def _damages_sightings(fault: Fault, controller: str) -> bool:
+    """Return whether a fault damages sightings that a controller receives."""
+    return (fault.kind, fault.process, fault.topic) == ("corrupt", controller, "sighting")
 
 
 def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth) -> float:

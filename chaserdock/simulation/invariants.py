@@ -585,7 +585,9 @@ class Invariants:
             _concerns(f, chaser) for f in active if f.kind not in _BESIDE_DAMAGE
         ):
             return 0.0
-        shares = (f.share or 1.0 for f in active if _damages_sightings(f, commander) and f.peer in (None, chaser))
+        shares = (
+            f.share or 1.0 for f in active if _damages_sightings(f, commander) and f.peer in (None, chaser)
+        )
         return max(shares, default=0.0)
 
     def _check_accuracy(self, estimate: TargetEstimate, truth: BodyTruth) -> None:

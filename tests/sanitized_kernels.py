@@ -4,18 +4,11 @@
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from pathlib import Path
 
-from chaserdock_agents.chaser.perception import native as perception
-from chaserdock_controller.estimation.joint import native as joint
-from chaserdock_controller.nmpc import native as nmpc
-from chaserdock_models import native as models
 from chaserdock_models.native.build import LIBRARY_NAME, NATIVE_FOLDERS
-from chaserdock_world.rendering import native as rendering
-from source_tree import ROOT
-
-LIBRARIES = (models.LIBRARY, perception.LIBRARY, rendering.LIBRARY, nmpc.LIBRARY, joint.LIBRARY)
 
 for number, folder in enumerate(NATIVE_FOLDERS):
-    (library,) = (one for one in LIBRARIES if one.path.parent == ROOT / folder)
-    library.path = Path(os.environ["SANITIZED_KERNELS"]) / str(number) / LIBRARY_NAME
+    module = import_module(folder.partition("/")[2].replace("/", "."))
+    module.LIBRARY.path = Path(os.environ["SANITIZED_KERNELS"]) / str(number) / LIBRARY_NAME

@@ -91,11 +91,11 @@ def fuzz(program: Path, target: str, inputs: int, seed: int, first: int = 0) -> 
     return completed.stderr or (f"status {completed.returncode}" if completed.returncode else "")
 
 
-def _compile_library(folder: str, to: Path) -> None:
+def _compile_library(folder: str, to: Path, optimize: str) -> None:
     """Compile the kernels of ``folder`` with sanitizers, beside a copy of their sources, as `KernelLibrary` expects."""
     shutil.copytree(ROOT / folder, to, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     x86_64 = platform.machine().lower() in ("x86_64", "amd64")
-    shared = ("-O1", "-fPIC", f"-I{to}", f"-I{build.HERE}", f'-DSOURCE_DIGEST="{build.source_digest(to)}"')
+    shared = (optimize, "-fPIC", f"-I{to}", f"-I{build.HERE}", f'-DSOURCE_DIGEST="{build.source_digest(to)}"')
     objects = []
     for level, _ in build.X86_64 if x86_64 else build.OTHER:
         objects.append(str(to / f"v{level}.o"))
@@ -104,13 +104,13 @@ def _compile_library(folder: str, to: Path) -> None:
     _compile(*shared, "-shared", str(build.HERE / "dispatch.c"), *objects, "-o", str(to / build.LIBRARY_NAME))
 
 
-def run_tests(*arguments: str) -> subprocess.CompletedProcess[str]:
+def run_tests(*arguments: str, optimize: str = "-O1") -> subprocess.CompletedProcess[str]:
     """Run Python tests of all kernels in a process in which the kernels have sanitizers; ``arguments`` for pytest."""
     find = ["gcc", "-print-file-name=libasan.so"]
     runtime = subprocess.run(find, check=True, capture_output=True, text=True).stdout.strip()
     with tempfile.TemporaryDirectory() as folder:
         for number, kernels in enumerate(build.NATIVE_FOLDERS):
-            _compile_library(kernels, Path(folder) / str(number))
+            _compile_library(kernels, Path(folder) / str(number), optimize)
         paths = [str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]
         environment = os.environ | _ENVIRONMENT
         environment |= {"LD_PRELOAD": runtime, "PYTHONPATH": os.pathsep.join(filter(None, paths))}

@@ -222,10 +222,12 @@ class RecordedFlight:
     ``estimates`` holds the fused estimate as ``target``; ``estimate_known`` (K,): whether the target was tracked or
     predicted. ``relative``: of the chasers whose pose the estimator publishes, while the target is known. ``identified``:
     None without identification. ``expected_commands``: number of actuator commands that all ticks expected.
+    ``blas``: linear algebra library of each process, empty where older logs do not state it.
     """
 
     scenario: Scenario
     run: dict[str, str]
+    blas: dict[str, str]
     truth: Tracks
     absolute_impulse_N_s: dict[str, float]
     thruster_impulse_N_s: dict[str, float]
@@ -497,6 +499,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
     return RecordedFlight(
         scenario=scenario,
         run=run,
+        blas={name: h.blas for name, h in c.health.items()} | {"recorder": run.get("blas", "")},
         truth=Tracks(dict(c.bodies)),
         absolute_impulse_N_s=dict(c.impulse),
         thruster_impulse_N_s=dict(c.thruster_impulse),

@@ -33,11 +33,11 @@ class Deviation(msgspec.Struct):
 class RunComparison(msgspec.Struct):
     """``summary``: keys whose values differ, both values. ``deviations``: by track; ``target estimate`` is the fused one.
 
-    ``blas``: the linear algebra library of each flight (recording.provenance.blas_in_use), empty in older logs.
+    ``blas``: processes whose linear algebra libraries (recording.provenance.blas_in_use) are known and differ, both libraries.
     """
 
     digests: tuple[str, str]
-    blas: tuple[str, str]
+    blas: dict[str, tuple[str, str]]
     first_difference: str | None
     summary: dict[str, tuple[Any, Any]]
     deviations: dict[str, Deviation]
@@ -65,12 +65,17 @@ def compare(first: Path, second: Path, tolerance: float = 0.0) -> RunComparison:
     topics = _messages(first, second, tolerance)
     return RunComparison(
         digests=(flights[0].digest, flights[1].digest),
-        blas=(flights[0].run.get("blas", ""), flights[1].run.get("blas", "")),
+        blas=_different_blas(*(f.blas for f in flights)),
         first_difference=first_difference(topics),
         summary={k: (a.get(k), b.get(k)) for k in {**a, **b} if a.get(k) != b.get(k)},
         deviations=_deviations(*flights),
         topics=topics,
     )
+
+
+def _different_blas(one: dict[str, str], other: dict[str, str]) -> dict[str, tuple[str, str]]:
+    both = {name: (one[name], other[name]) for name in sorted(one.keys() & other.keys())}
+    return {name: pair for name, pair in both.items() if all(pair) and pair[0] != pair[1]}
 
 
 def _messages(first: LogSource, second: LogSource, tolerance: float) -> list[TopicDifference]:
@@ -101,10 +106,10 @@ def _deviations(a: RecordedFlight, b: RecordedFlight) -> dict[str, Deviation]:
 
 def comparison_lines(result: RunComparison) -> list[str]:
     """Format the comparison as lines of text."""
-    one, other = result.blas
-    lines = []
-    if one and other and one != other:
-        lines = [f"different BLAS, whose results differ in the last bits: {one}; {other}"]
+    lines = [
+        f"different BLAS of {name}, whose results differ in the last bits: {one}; {other}"
+        for name, (one, other) in result.blas.items()
+    ]
     if result.equal:
         return [*lines, f"equal flights, digest {result.digests[0]}"]
     lines += ["summary (first, second, second / first):"]

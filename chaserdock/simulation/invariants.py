@@ -141,7 +141,6 @@ class Invariants:
     _sources: dict[int, str] = field(default_factory=dict)
     _commanders: dict[int, str] = field(default_factory=dict)
     _controllers: dict[str, str] = field(default_factory=dict)
-    _listed: dict[str, str] = field(default_factory=dict)
     _controller_lost: set[int] = field(default_factory=set)
     _term_ticks: dict[int, tuple[int, int]] = field(default_factory=dict)
     _touching: set[str] = field(default_factory=set)
@@ -235,7 +234,6 @@ class Invariants:
     def _on_tick(self, tick: Tick) -> None:
         if tick.tick == self._tick and len(tick.controllers) < len(self._controllers):
             self._controller_lost.add(tick.tick)
-        self._listed = tick.controllers
         self._lost.difference_update(f"chaser/{i}" for i in tick.chasers)
         if tick.tick > self._tick:
             self._controllers = tick.controllers
@@ -493,8 +491,12 @@ class Invariants:
 
     def _disturbed_until_s(self, name: str, now_s: float) -> float:
         """Return until when faults or the network have kept commands from a chaser, at most ``now_s``; 0 if never."""
+        return self._lasted_until_s([f for f in self.scenario.fault if _concerns(f, name)], now_s)
+
+    def _lasted_until_s(self, faults: Sequence[Fault], now_s: float) -> float:
+        """Return until when one of the faults, a partition or a slow reader has lasted, at most ``now_s``; 0 if none."""
         s = self.scenario.simulation
-        spans = [(f.at_s, f.at_s + (f.duration_s or 0.0)) for f in self.scenario.fault if _concerns(f, name)]
+        spans = [(f.at_s, f.at_s + (f.duration_s or 0.0)) for f in faults]
         spans += [(w.at_s, w.at_s + w.duration_s) for w in (*s.partition, *s.slow)]
         return max([0.0, *(min(end_s, now_s) for at_s, end_s in spans if at_s <= now_s)])
 
@@ -508,6 +510,12 @@ class Invariants:
         if now_s - since_s > STOPPING_S:
             self.dead.remove(name)
             del self._returned_s[name]
+
+    def _may_hand_over(self) -> bool:
+        """Return whether the network, or a fault within the last `FOLLOWING_S`, explains that the other controller commands."""
+        faults = [f for f in self.scenario.fault if f.kind not in _HARMLESS]
+        until_s = self._lasted_until_s(faults, self.time_s)
+        return self._may_be_late() or (until_s > 0.0 and self.time_s - until_s <= FOLLOWING_S)
 
     def _on_command(self, command: ActuatorCommand) -> None:
         self._sources[command.chaser] = command.source
@@ -527,14 +535,12 @@ class Invariants:
         if before is not None and command.term < before.term:
             self.violate("no superseded command", name, f"flies term {command.term} after {before.term}")
         sender = commander_of(command.term)
-        former = sender if before is None else commander_of(before.term)
-        if former != sender and former in self._listed and not self._may_lose():
-            self.violate("no loss without a cause", former, f"{sender} commands {name} in its place")
         other = self._commanders.setdefault(command.tick, sender)
         # If the commander is lost in a tick, chasers may have executed its command before.
         if other != sender and command.tick not in self._controller_lost:
             text = f"flies a command of {sender} for tick {command.tick}, in which {other} commands"
             self.violate("one commander", name, text)
+        self._check_hand_over(command)
         self._check_succession(command)
 
     def _check_succession(self, command: ActuatorCommand) -> None:
@@ -550,6 +556,15 @@ class Invariants:
             if superseded and commander_of(other) != commander_of(term):
                 text = f"flies term {term} for tick {tick}; term {other} is flown from tick {from_tick} to {until_tick}"
                 self.violate("one commander", f"chaser/{command.chaser}", text)
+
+    def _check_hand_over(self, command: ActuatorCommand) -> None:
+        """Check that the network or a fault explains that a later tick is commanded by the other controller."""
+        before = max(self._term_ticks, default=command.term)
+        newer = command.term > before and command.tick > self._term_ticks[before][1]
+        handed_over = newer and commander_of(command.term) != commander_of(before)
+        if handed_over and not self._may_hand_over():
+            text = f"flies term {command.term} after term {before}, but nothing disturbed its controller"
+            self.violate("no hand-over without a cause", f"chaser/{command.chaser}", text)
 
     def _clock_s(self, process: str, sent_ns: int) -> float:
         """Return the virtual time (s) at which a process has stamped a message with its own clock."""
@@ -714,13 +729,16 @@ class Invariants:
     def _may_lose(self) -> bool:
         """Return whether a fault or the network explains that a process is lost."""
         s = self.scenario.simulation
-        lossy = s.mode == "realtime" and (s.loss or s.reorder)
-        # A tick's messages cross the network three times; if that takes longer than half a tick, leases may run out.
+        begun = any(f.at_s <= self.time_s for f in self.scenario.fault)
+        return bool(self._may_be_late() or s.slow or s.partition or begun)
+
+    def _may_be_late(self) -> bool:
+        """Return whether the network loses messages, or delays them so that leases may run out."""
+        s = self.scenario.simulation
+        # A tick's messages cross the network three times, which may take longer than half a tick.
         late_s = 3.0 * s.latency_s + LATE_JITTERS * s.jitter_s
-        slow = s.mode == "realtime" and late_s > 0.5 / self.scenario.time.rate_hz
-        return bool(lossy or slow or s.slow or s.partition) or any(
-            f.at_s <= self.time_s for f in self.scenario.fault
-        )
+        late = s.loss or s.reorder or late_s > 0.5 / self.scenario.time.rate_hz
+        return s.mode == "realtime" and bool(late)
 
     def _on_end(self, end: MissionEnd) -> None:
         self.end = end

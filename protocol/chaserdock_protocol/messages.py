@@ -613,13 +613,17 @@ class Event(Message, frozen=True, kw_only=True):
 
 
 class Health(Message, frozen=True, kw_only=True):
-    """Message counters of a process: rejected (by reason), lost (gaps in ``seq``), discarded as stale."""
+    """Message counters of a process: rejected (by reason), lost (gaps in ``seq``), discarded as stale.
+
+    ``blas``: the linear algebra library in use, whose kernels differ in the last bits; empty if not known.
+    """
 
     process: Text
     rejected: Counts
     lost: Count
     stale: Count
     wall_busy_s: float = 0.0
+    blas: Text = ""
 
 
 class RecorderAck(Message, frozen=True, kw_only=True):

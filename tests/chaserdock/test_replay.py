@@ -19,6 +19,7 @@ from chaserdock_controller.estimation.joint.estimator import JointInputs
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.recording.log import LogWriter, Record, read_log, read_scenario
+from chaserdock_protocol.recording.provenance import blas_in_use
 from chaserdock_protocol.recording.scan import stored_messages
 from chaserdock_protocol.recording.schema_migrations import UPGRADES, current_key, decode_logged
 from chaserdock_protocol.replay_node import order_by_tick
@@ -26,6 +27,7 @@ from chaserdock_protocol.transport import ReceivedMessage
 from harness import finished
 from message_samples import BY_TYPE
 
+from chaserdock.analysis.flight import load_flight
 from chaserdock.replay.compare import compare, comparison_lines
 from chaserdock.replay.difference import Comparison, difference_lines, field_differences, first_difference
 from chaserdock.replay.run import replay
@@ -319,12 +321,32 @@ def test_compare_reports_different_blas_kernels(tmp_path: Path) -> None:
     one, other = (rewritten(GOLDEN, tmp_path / name, blas=name) for name in ("a Haswell", "a SkylakeX"))
     found = compare(one, other)
     assert comparison_lines(found) == [
-        "different BLAS, whose results differ in the last bits: a Haswell; a SkylakeX",
+        "different BLAS of recorder, whose results differ in the last bits: a Haswell; a SkylakeX",
         f"equal flights, digest {found.digests[0]}",
     ]
     assert len(comparison_lines(compare(one, one))) == 1
     unstated = rewritten(GOLDEN, tmp_path / "unstated", blas="")  # as older logs
     assert len(comparison_lines(compare(one, unstated))) == 1
+
+
+def test_every_process_states_its_blas(short_flight: Path) -> None:
+    processes = ("world", "controller", "chaser/0", "chaser/1", "recorder")
+    assert load_flight(short_flight).blas == dict.fromkeys(processes, blas_in_use())
+
+
+def test_compare_names_the_process_whose_blas_differs(tmp_path: Path) -> None:
+    def flown_with(blas: str) -> Any:
+        def change(record: Record) -> Any:
+            own = record.key == "controller/health"
+            return msgspec.structs.replace(record.message, blas=blas) if own else record.message
+
+        return change
+
+    names = ("a Haswell", "a SkylakeX")
+    one, other = (rewritten(GOLDEN, tmp_path / name, flown_with(name), blas="a Haswell") for name in names)
+    assert comparison_lines(compare(one, other))[:-1] == [
+        "different BLAS of controller, whose results differ in the last bits: a Haswell; a SkylakeX"
+    ]
 
 
 def test_compare_reports_deviations_of_bodies(tmp_path: Path) -> None:

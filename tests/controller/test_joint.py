@@ -44,6 +44,8 @@ from scipy.stats import chi2
 
 SCENARIO = scenario()
 STEP = 1e-6
+LATCHED = (((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.5)), (0.3, -0.2, 0.1))
+"""Inertia ratios and centre of mass (m) of target and chaser."""
 
 
 def random_state(seed: int, chasers: int = 2) -> JointState:
@@ -218,8 +220,9 @@ def test_disturbances_are_estimated() -> None:
         assert np.linalg.norm(error[:3]) < 0.004
 
 
-def test_late_sightings_give_the_same_state() -> None:
-    """Sightings that arrive up to half a second late, in any order, change nothing in the end."""
+@pytest.mark.parametrize("latched_at", [None, 20])
+def test_late_sightings_give_the_same_state(latched_at: int | None) -> None:
+    """Sightings that arrive up to half a second late, in any order, change nothing in the end, also from before a latch."""
     rng = np.random.default_rng(5)
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 5)
     prompt, late = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
@@ -232,6 +235,9 @@ def test_late_sightings_give_the_same_state() -> None:
         held = [(at, s) for at, s in held if at > k and k < 39]
         rng.shuffle(due)
         late.update(replace(inputs, sightings=tuple(due)))
+        if k == latched_at:
+            for estimator in (prompt, late):
+                estimator.change_body(*LATCHED)
         flight.step()
     assert late.late_dropped == 0
     assert prompt.state is not None

@@ -28,6 +28,7 @@ from chaserdock_protocol.messages import (
     ScenarioRequest,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
+from chaserdock_protocol.recording.provenance import blas_in_use
 from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 
@@ -249,7 +250,7 @@ class Heartbeat:
 
 
 def create_health(node: Node, tick: int, time_ns: int) -> Health:
-    """Return the health message of a node's traffic counters."""
+    """Return the health message of a node: its traffic counters, and the BLAS of its process."""
     return Health(
         tick=tick,
         sim_time_ns=time_ns,
@@ -257,4 +258,5 @@ def create_health(node: Node, tick: int, time_ns: int) -> Health:
         rejected=dict(node.counts.rejected),
         lost=min(sum(node.counts.lost.values()), MAX_COUNT),
         stale=node.counts.stale,
+        blas=blas_in_use(),
     )

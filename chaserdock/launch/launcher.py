@@ -31,6 +31,7 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, Tls, TransportError
+from chaserdock_protocol.transport.session import find_world, ignore_foreign_publishers
 from chaserdock_world.requirements import require_packages
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
@@ -372,8 +373,13 @@ def watch(
     measured_s = 0.0
     silence = StallTimer(time.monotonic)
     end: MissionEnd | None = None
+    world: str | None = None
     while end is None:
-        received = hub.receive(0.1)
+        if world is None and (world := find_world(hub)) is not None:
+            ignore_foreign_publishers(hub, world, reporter.report_foreign)
+        if world is None:
+            time.sleep(0.1)  # messages wait: whether they are the world's is not known
+        received = None if world is None else hub.receive(0.1)
         if not reporter.flying or (received is not None and received.topic is topics.TICK):
             silence.reset()
         if received is not None:

@@ -72,7 +72,9 @@ class Child:
     output: Path
 
     def last_line(self) -> str:
-        """Return the last line of its output."""
+        """Return the last line of its output, or the signal that ended it."""
+        if (status := self.process.poll()) is not None and status < 0:
+            return f"{self.name}: killed (signal {-status})"
         lines = self.output.read_text(errors="replace").strip().splitlines()
         return lines[-1].removeprefix("chaserdock: ") if lines else f"{self.name}: exited without output"
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -35,17 +36,31 @@ _ENVIRONMENT = {
     "ASAN_OPTIONS": "abort_on_error=1:detect_leaks=0:quarantine_size_mb=8",
     "UBSAN_OPTIONS": "abort_on_error=1:print_stacktrace=1",
 }
-# Python tests that call all kernels. casadi loads its solvers with RTLD_DEEPBIND, which AddressSanitizer refuses.
+# Python tests that together call all kernels. casadi loads its solvers with RTLD_DEEPBIND, which AddressSanitizer refuses.
 _TESTS = (
     "tests/architecture/test_native.py",
+    "tests/agents/test_model_perception.py::test_search_for_the_sun_behind_a_target_is_spread_over_images",
     "tests/agents/test_perception.py",
     "tests/agents/test_views.py",
     "tests/controller/test_dynamics.py",
+    "tests/controller/test_identification.py::test_the_transition_is_the_derivative_of_the_prediction",
+    "tests/controller/test_joint.py",
     "tests/controller/test_nmpc_qp.py",
+    "tests/missions/test_statistical.py::test_measurements_depend_on_seed_chaser_and_number_only",
+    "tests/world/test_mesh_renderer.py",
+    "tests/world/test_physics.py",
     "tests/world/test_pixels.py",
     "tests/world/test_render.py",
-    "-knot ipopt",
+    "-mnot slow",
+    "-knot ipopt and not mujoco",
+    "--all-kernels",
 )
+
+
+def kernels_in(folder: str) -> set[str]:
+    """Return the names of the kernels in one of the folders ``NATIVE_FOLDERS``."""
+    sources = "".join(path.read_text() for path in (ROOT / folder).glob("*.c"))
+    return set(re.findall(r"^EXPORT \w+ NAME\((\w+)\)", sources, re.MULTILINE))
 
 
 @cache

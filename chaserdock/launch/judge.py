@@ -15,7 +15,7 @@ from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Link, Node
-from chaserdock_protocol.transport.session import join, request_scenario
+from chaserdock_protocol.transport.session import ignore_foreign_publishers, join, request_scenario
 
 from chaserdock.exit_codes import STOPPED
 
@@ -53,6 +53,7 @@ def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_
         # Keys differ between the parties of a mission on several hosts: each has its own folder.
         address = MissionAddress(namespace=link.namespace, endpoint=",".join(link.connect))
         reporter.report(start_line(scenario, mission.mode, folder, address))
+        ignore_foreign_publishers(node, mission.source, reporter.report_foreign)
         try:
             failure = _watch(node, reporter, stop, world_timeout_s)
         finally:

@@ -31,6 +31,7 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, Tls, TransportError
+from chaserdock_protocol.transport.session import find_world, ignore_foreign_publishers
 from chaserdock_world.requirements import require_packages
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
@@ -71,7 +72,9 @@ class Child:
     output: Path
 
     def last_line(self) -> str:
-        """Return the last line of its output."""
+        """Return the last line of its output, or the signal that ended it."""
+        if (status := self.process.poll()) is not None and status < 0:
+            return f"{self.name}: killed (signal {-status})"
         lines = self.output.read_text(errors="replace").strip().splitlines()
         return lines[-1].removeprefix("chaserdock: ") if lines else f"{self.name}: exited without output"
 
@@ -372,8 +375,13 @@ def watch(
     measured_s = 0.0
     silence = StallTimer(time.monotonic)
     end: MissionEnd | None = None
+    world: str | None = None
     while end is None:
-        received = hub.receive(0.1)
+        if world is None and (world := find_world(hub)) is not None:
+            ignore_foreign_publishers(hub, world, reporter.report_foreign)
+        if world is None:
+            time.sleep(0.1)  # messages wait: whether they are the world's is not known
+        received = None if world is None else hub.receive(0.1)
         if not reporter.flying or (received is not None and received.topic is topics.TICK):
             silence.reset()
         if received is not None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from enum import StrEnum
 
 from chaserdock_protocol import topics
+from chaserdock_protocol.messages import Message
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.transport import Node
 from rich.console import Console, Group
@@ -133,6 +134,19 @@ class ProgressReporter:
                     sim_time_s=time_s, process=process, level="warning", what="has exited", detail=text
                 )
             )
+
+    def report_foreign(self, detail: str, newest: Message | None) -> None:
+        """Report a session that publishes on the world's keys; see `ignore_foreign_publishers`."""
+        time_s = self.state.time_ns / 1e9
+        self.report(
+            EventNotice(
+                sim_time_s=time_s,
+                process="operator",
+                level="warning",
+                what="foreign publisher",
+                detail=detail,
+            )
+        )
 
     def close(self) -> None:
         """Show the last progress and restore the terminal."""

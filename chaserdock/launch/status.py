@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Event, MissionEnd, Presence, Reference, TargetEstimate, Tick
+from chaserdock_protocol.process import print_status
 from chaserdock_protocol.transport import Link, Node
+from chaserdock_protocol.transport.session import find_world, ignore_foreign_publishers
 from rich.table import Table
 
 
@@ -107,6 +109,10 @@ def observe(link: Link, seconds: float) -> MissionStatus:
         ):
             node.subscribe(topic)
         node.watch_liveliness(changed)
+        if world := find_world(node):
+            ignore_foreign_publishers(
+                node, world, lambda detail, _: print_status("status", f"foreign publisher: {detail}")
+            )
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             received = node.receive(0.05)

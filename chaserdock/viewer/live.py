@@ -25,6 +25,7 @@ from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.transport import Link, Node, NoRouterError, ReceivedMessage
 from chaserdock_protocol.transport.network import unique_id
+from chaserdock_protocol.transport.session import ignore_foreign_publishers
 
 from .address import DEFAULT_HOST, page_token, url_of
 from .history import History, reply_text
@@ -226,6 +227,11 @@ class _MissionView:
     def _connect(self) -> None:
         self._alive.clear()
         self._node = self._open_node()
+        ignore_foreign_publishers(
+            self._node,
+            self._mission.source,
+            lambda detail, _: print_status("viewer", f"foreign publisher: {detail}"),
+        )
         self._feed = _Feed.of(self._node, len(self._state.chasers), self._truth)
         self._node.watch_liveliness(self._on_liveliness)
 

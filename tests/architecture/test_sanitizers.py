@@ -23,8 +23,7 @@ WORKSPACES = {"qp_workspace", "tick_workspace", "predict_workspace", "innovate_w
 
 @pytest.mark.parametrize("folder", NATIVE_FOLDERS)
 def test_every_kernel_has_a_fuzz_target(folder: str) -> None:
-    sources = "".join(path.read_text() for path in (ROOT / folder).glob("*.c") if path.name != "dispatch.c")
-    kernels = set(re.findall(r"^EXPORT \w+ NAME\((\w+)\)", sources, re.MULTILINE))
+    kernels = sanitizers.kernels_in(folder)
     program = (ROOT / "tests" / "native" / f"{sanitizers.PROGRAMS[folder]}.c").read_text()
     assert kernels
     assert set(re.findall(r'\{"(\w+)", \1\}', program)) == kernels - WORKSPACES
@@ -40,6 +39,13 @@ def test_kernels_stand_any_floating_point_input(folder: str, tmp_path: Path) -> 
         for kernel in sanitizers.targets(program)
         if (found := sanitizers.fuzz(program, kernel, INPUTS, 1))
     ] == []
+
+
+@needs_gcc
+@pytest.mark.slow(minutes=1.5)
+def test_python_tests_call_all_kernels_under_sanitizers() -> None:
+    run = sanitizers.run_tests()
+    assert run.returncode == 0, f"{run.stdout[-3000:]}\n{run.stderr[-3000:]}"
 
 
 @needs_gcc

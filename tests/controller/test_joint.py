@@ -18,9 +18,10 @@ from chaserdock_controller.estimation.joint.measurements import (
     predict_sighting,
 )
 from chaserdock_controller.estimation.joint.parameters import GATE_CHI_SQUARE_3, SightingNoise
-from chaserdock_controller.estimation.joint.prediction import predict
+from chaserdock_controller.estimation.joint.prediction import disturbance, predict
 from chaserdock_controller.estimation.joint.state import (
     ATTITUDE_DRIFT,
+    CENTRE,
     CHASER,
     TARGET,
     VIEW,
@@ -218,6 +219,19 @@ def test_disturbances_are_estimated() -> None:
         own = estimator.state.covariance[block(i), block(i)]
         assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(own)[12:18]))
         assert np.linalg.norm(error[:3]) < 0.004
+
+
+def test_disturbance_moves_a_body_as_its_shifted_centre_of_mass_does() -> None:
+    state, p = random_state(4), parameters(SCENARIO, navigation("lab"))
+    commanded = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.03])
+    wrench, centre_m, omega = commanded + state.extra[0, :6], state.of(0, CENTRE), state.omegas_rad_s[0]
+    torque = wrench[3:] - np.cross(centre_m, wrench[:3])
+    inertia = np.diag(p.inertia)
+    alpha = np.linalg.solve(inertia, torque - np.cross(omega, inertia @ omega))
+    lag_m_s2 = np.cross(alpha, centre_m) + np.cross(omega, np.cross(omega, centre_m))
+    expected = np.concatenate([wrench[:3] - p.body.mass_kg * lag_m_s2, torque])
+    assert np.linalg.norm(expected - wrench) > 1e-3
+    np.testing.assert_allclose(commanded + disturbance(state, 0, commanded, p), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("latched_at", [None, 20])

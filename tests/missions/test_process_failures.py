@@ -200,6 +200,7 @@ def test_flight_continues_after_process_is_killed(
     result = summary(tmp_path / "run")
     name = "/".join(victim)
     assert any(f"process lost {name}" in e["what"] for e in result["events"])
+    assert result["failures"][0] == f"{name}: killed (signal 9)"
     assert result["sim_time_s"] == duration_s
     assert result["collisions"] == 0
     flight = load_flight(tmp_path / "run" / "mission.mcap")

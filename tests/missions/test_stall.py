@@ -4,20 +4,29 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 from chaserdock_protocol import codec, topics
-from chaserdock_protocol.messages import MissionEnd, Tick, encoding_of
+from chaserdock_protocol.messages import JoinRequest, MissionEnd, Tick, encoding_of
 from chaserdock_protocol.recording.log import read_log
-from chaserdock_protocol.transport import Link
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from chaserdock_protocol.transport.zenoh_network import zenoh_config
+from chaserdock_world.lockstep.membership import Membership
 from chaserdock_world.process import World
 from harness import ROOT, SHORT, ByHand, sets, wait_for_log
 
+from chaserdock.launch.json_events import EventNotice, JsonLine
+from chaserdock.launch.launcher import Fleet, never, open_hub, watch
+from chaserdock.launch.progress import ProgressReporter, Show
+from chaserdock.launch.status import observe
 from chaserdock.simulation.mission import SimulatedFlight, simulate
 from chaserdock.simulation.network import SimulatedHost
 
@@ -116,23 +125,105 @@ def test_processes_notice_that_the_world_hangs(tmp_path: Path, monkeypatch: pyte
     assert set(flight.statuses.values()) == {1}
 
 
-@pytest.mark.slow
-def test_foreign_ticks_are_ignored_and_their_publisher_is_named(tmp_path: Path) -> None:
-    by_hand = ByHand.at_free_port("foreign")
-    log = tmp_path / "mission.mcap"
+@contextmanager
+def world_and_intruder(endpoint: str) -> Iterator[tuple[Node, Node]]:
+    """Open a node that replies as the world does, and another one that may publish on the world's keys."""
+    world, intruder = (Node("world", "world", Link("forged", (endpoint,))) for _ in range(2))
     try:
-        changes = (*SHORT, "duration_s=10.0", "perception.name='statistical'")
+        mission = Membership(1, "forged", "lockstep", "{}", source=world.source)
+        world.declare_queryable(
+            topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(mission.admit(request))
+        )
+        world.declare_liveliness()
+        yield world, intruder
+    finally:
+        world.close()
+        intruder.close()
+
+
+def until(condition: Callable[[], Any], act: Callable[[], None] = lambda: None) -> None:
+    """Wait until a condition holds, and call ``act`` ten times a second meanwhile."""
+    deadline = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < deadline
+        act()
+        time.sleep(0.1)
+
+
+FORGED = MissionEnd(reason="forged end", complete=False)
+
+
+def test_run_ignores_a_forged_end_and_names_its_publisher() -> None:
+    hub, endpoint = open_hub("forged", 600_000)
+    lines: list[JsonLine] = []
+    reporter = ProgressReporter(load_scenario(ROOT / "scenarios" / "single.toml"), Show.json, lines.append)
+    with world_and_intruder(endpoint) as (world, intruder), ThreadPoolExecutor(1) as thread:
+        try:
+            failure = thread.submit(watch, Fleet(), hub, reporter, never, 60.0)
+            until(lambda: failure.done() or lines, lambda: intruder.publish(topics.END, FORGED))
+            assert not failure.done()
+            end = MissionEnd(reason="duration flown", complete=True)
+            until(failure.done, lambda: world.publish(topics.END, end))
+            assert failure.result() is None
+        finally:
+            world.publish(topics.END, MissionEnd(reason="the test ends", complete=True))
+    hub.close()
+    notices = [(line.what, line.detail) for line in lines if isinstance(line, EventNotice)]
+    text = f"session {intruder.source} publishes on world/end, which is the world's (session {world.source}); ignored"
+    assert notices == [("foreign publisher", text)]
+
+
+def test_status_ignores_a_forged_end(capsys: pytest.CaptureFixture[str]) -> None:
+    hub, endpoint = open_hub("forged", 600_000)
+    with world_and_intruder(endpoint) as (_, intruder), ThreadPoolExecutor(1) as thread:
+        seen = thread.submit(observe, Link("forged", (endpoint,)), 3.0)
+        until(seen.done, lambda: intruder.publish(topics.END, FORGED))
+    hub.close()
+    assert seen.result().alive == {"world"}
+    assert seen.result().ended is None
+    assert (
+        f"status: foreign publisher: session {intruder.source} publishes on world/end"
+        in capsys.readouterr().err
+    )
+
+
+def test_ring_buffer_gives_no_messages_of_foreign_publishers() -> None:
+    hub, endpoint = open_hub("forged", 600_000)
+    looker, foreign = Node("viewer", "viewer", Link("forged", (endpoint,))), []
+    with world_and_intruder(endpoint) as (world, intruder):
+        looker.expect_world(world.source, lambda key, source, _: foreign.append((key, source)))
+        take, ticks = looker.subscribe_newest(topics.TICK, 4), list[int]()
+
+        def publish() -> None:
+            intruder.publish(topics.TICK, Tick(tick=5000, images=False, chasers=()))
+            world.publish(topics.TICK, Tick(tick=1, images=False, chasers=()))
+            ticks.extend(received.message.tick for received in take())
+
+        until(lambda: foreign and ticks, publish)
+    looker.close()
+    hub.close()
+    assert set(ticks) == {1}
+    assert foreign == [("world/tick", intruder.source)]
+
+
+@pytest.mark.slow
+def test_foreign_messages_are_ignored_and_their_publisher_is_named(tmp_path: Path) -> None:
+    by_hand = ByHand.at_free_port("foreign")
+    try:
+        changes = (*SHORT, "duration_s=60.0", "perception.name='statistical'")
         by_hand.start("world", "world", "two-chaser-tracking", *sets(*changes), "--stall-s", "20")
-        by_hand.start("recorder", "record", "--out", str(tmp_path))
+        by_hand.start("recorder", "record", "--by-run", "--out", str(tmp_path))
+        by_hand.start("judge", "judge", str(tmp_path), "--timeout", "60")
         by_hand.start("controller", "controller")
+        until(lambda: list(tmp_path.glob("*/mission.mcap")))
+        (log,) = tmp_path.glob("*/mission.mcap")
         for i in range(2):
             by_hand.start(f"chaser/{i}", "chaser", str(i))
         wait_for_log(log, 100_000)
         link = Link(by_hand.namespace, (by_hand.endpoint,))
         with zenoh.open(zenoh_config(link)) as session:
             intruder = str(session.zid())
-            time.sleep(1.0)
-            for k in range(20):
+            for k in range(30):
                 tick = Tick(
                     tick=5000 + k,
                     sim_time_ns=10**12,
@@ -141,12 +232,15 @@ def test_foreign_ticks_are_ignored_and_their_publisher_is_named(tmp_path: Path) 
                     controllers={"controller": "c"},
                 )
                 session.put(topics.TICK.key_of(), codec.encode(tick), encoding=encoding_of(Tick))
-            time.sleep(1.0)
-        for name in ("world", "controller", "recorder", "chaser/0", "chaser/1"):
+                time.sleep(0.1)
+            session.put(topics.END.key_of(), codec.encode(FORGED), encoding=encoding_of(MissionEnd))
+            time.sleep(0.5)
+        for name in ("world", "controller", "recorder", "chaser/0", "chaser/1", "judge"):
             status, output = by_hand.output_of(name)
             assert status == 0, f"{name}: {output}"
             if name != "world":
-                assert f"foreign publisher: session {intruder} publishes on world/tick" in output
+                own = "operator: foreign publisher " if name == "judge" else f"{name}: foreign publisher: "
+                assert f"{own}session {intruder} publishes on world/tick" in output
     finally:
         by_hand.end()
     records = list(read_log(log))

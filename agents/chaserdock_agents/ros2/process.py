@@ -15,7 +15,7 @@ from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node
-from chaserdock_protocol.transport.session import join
+from chaserdock_protocol.transport.session import ignore_foreign_publishers, join
 
 from . import wrench_control
 from .conversion import Converter, InvalidImage, topic_types
@@ -74,9 +74,8 @@ class Bridge:
     def __init__(self, node: Node, ros: RosNode, mission: JoinReply) -> None:
         scenario: FlightScenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
         self._node, chasers = node, len(scenario.chasers)
-        node.expect_world(
-            mission.source,
-            lambda key, source, _: print_status(NAME, f"session {source} publishes on {key}; ignored"),
+        ignore_foreign_publishers(
+            node, mission.source, lambda detail, _: print_status(NAME, f"foreign publisher: {detail}")
         )
         self._converter = Converter(scenario)
         self._invalid: Counter[str] = Counter()

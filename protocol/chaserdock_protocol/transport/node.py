@@ -103,7 +103,7 @@ class Node:
         self._world_source, self._on_foreign = source, on_foreign
 
     def _is_foreign(self, raw: RawSample) -> bool:
-        """Count a message on the world's keys that is not the world's. Runs on the network's thread."""
+        """Count a message on the world's keys that is not the world's. Runs on the network's or the reader's thread."""
         if raw.source == self._world_source or not self._world_source:
             return False
         if not raw.key.startswith(topics.WORLD_BRANCHES):
@@ -205,6 +205,7 @@ class Node:
                 received = self._decode(topic, found[1], raw) if found and found[0] is topic else None
                 if received is not None:
                     out.append(received)
+            self._report_foreign()
             return out
 
         return drain
@@ -233,8 +234,7 @@ class Node:
 
         Counts invalid messages in ``counts.rejected`` by topic and reason, and gaps in ``seq`` in ``counts.lost``.
         """
-        if self._foreign:
-            self._on_foreign(*self._foreign.popleft(), self._newest)
+        self._report_foreign()
         if self._ready:
             return self._ready.popleft()
         if timeout_s == 0 and self._inbox.empty():
@@ -248,6 +248,10 @@ class Node:
                 key = next(iter(self._latest))
                 item = self._latest.pop(key)
         return self._filter(*item)
+
+    def _report_foreign(self) -> None:
+        if self._foreign:
+            self._on_foreign(*self._foreign.popleft(), self._newest)
 
     def _filter(
         self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float
@@ -275,6 +279,8 @@ class Node:
     def _decode(
         self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float = 0.0
     ) -> ReceivedMessage | None:
+        if self._is_foreign(raw):  # arrived through a ring buffer, or before `expect_world`
+            return None
         try:
             message: Any = self._connection.decode(topic.kind, raw)
             if place is not None and str(getattr(message, "chaser", place)) != place:

@@ -114,12 +114,34 @@ def run_member(
             node.close()
 
 
-def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
-    """Make a node ignore messages on the world's keys that are not the world's, and name their publisher in a warning."""
+def find_world(node: Node) -> str | None:
+    """Return the identity of the world's session without joining its mission, or None without a world."""
+    # The name of the world is always refused, and so reserves no name of another process.
+    request = JoinRequest(process="world", instance=node.host.unique_id())
+    reply = node.query(topics.JOIN_KEY, request, JoinReply, 0.5)
+    return None if reply is None else reply.source
 
-    def warn(key: str, source: str, newest: Message | None) -> None:
+
+def ignore_foreign_publishers(
+    node: Node, world_source: str, warn: Callable[[str, Message | None], None]
+) -> None:
+    """Make a node ignore messages on the world's keys that are not the world's.
+
+    ``warn(detail, newest)`` runs on the reader's thread for each session that publishes such messages; ``detail`` names it.
+    ``newest``: the last valid message.
+    """
+
+    def on_foreign(key: str, source: str, newest: Message | None) -> None:
         who = "a session without time stamps" if source == node.source else f"session {source}"
-        detail = f"{who} publishes on {key}, which is the world's (session {world_source}); ignored"
+        warn(f"{who} publishes on {key}, which is the world's (session {world_source}); ignored", newest)
+
+    node.expect_world(world_source, on_foreign)
+
+
+def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
+    """Make a node ignore messages on the world's keys that are not the world's, and publish a warning about each session."""
+
+    def warn(detail: str, newest: Message | None) -> None:
         print_status(node.name, f"foreign publisher: {detail}")
         stamp = (-1, 0) if newest is None else (newest.tick, newest.sim_time_ns)
         warning = Event(
@@ -132,7 +154,7 @@ def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
         )
         node.publish(topics.EVENT, warning, node.name)
 
-    node.expect_world(world_source, warn)
+    ignore_foreign_publishers(node, world_source, warn)
 
 
 def required_peers(process: str, present: set[str]) -> set[str]:

@@ -55,7 +55,7 @@ class Membership:
         """Admit a process and return the mission, or refuse it with a reason."""
         reason = self._refusal(request)
         if reason:
-            return JoinReply(accepted=False, reason=reason)
+            return JoinReply(accepted=False, reason=reason, source=self.source)
         with self._lock:
             self._admitted[request.process] = request.instance
             self._admitted_s[request.process] = self.now_s()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from enum import StrEnum
 from pathlib import Path
+from functools import cache
 from typing import Annotated
 
 import typer
@@ -130,10 +131,11 @@ def play(
 
     from chaserdock.logs.player import play as publish
 
-    stop = StopSignal(watch_parent=False)
-    count = publish(_source(log), link.link("world", timeout), speed, timeout, stopped=stop)
+    # Made at its first use, when the session is open: until then Ctrl-C ends the wait for a router.
+    signal = cache(lambda: StopSignal(watch_parent=False))
+    count = publish(_source(log), link.link("world", timeout), speed, timeout, stopped=lambda: signal()())
     print(f"{count} messages sent")
-    raise typer.Exit(STOPPED if stop() else DONE)
+    raise typer.Exit(STOPPED if signal()() else DONE)
 
 
 for member in (info, recover, export, tracks, play):

@@ -47,10 +47,10 @@ def main(options: ProcessOptions) -> int:
         return wrench_control.main(options)
     node: Node | None = None
     ros: RosNode | None = None
-    stop = options.stop_signal()
     try:
         ros = open_ros(options.ros, ROS_NODE)
         node = Node(NAME, "bridge", options.link)
+        stop = options.stop_signal()  # until here Ctrl-C ends the wait for a router
         mission = join(node, node.host.unique_id(), stop, options.patience_s)
         if mission is None:
             return 1

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import zenoh
 
 from chaserdock_protocol import codec
+from chaserdock_protocol.process import print_status
 
 from .config import QUEUE_OPTIONS, Link, NoRouterError, Tls, TransportError, is_unreachable, open_error
 from .network import Connection, Host, Machine, Query, RawSample, Reply, T, Undo
@@ -109,17 +110,17 @@ class ZenohNetwork:
         config = zenoh_config(self._link)
         try:
             if config.get_json("mode") == '"client"' and config.get_json("connect/timeout_ms") == "-1":
-                return _ZenohConnection(self._open_client(config)), Machine()
+                return _ZenohConnection(self._open_client(config, name)), Machine()
             return _ZenohConnection(zenoh.open(config)), Machine()
         except zenoh.ZError as error:
             kind = NoRouterError if is_unreachable(error) else TransportError
             raise kind(open_error(error, self._link)) from None
 
-    def _open_client(self, config: zenoh.Config) -> zenoh.Session:
+    def _open_client(self, config: zenoh.Config, name: str) -> zenoh.Session:
         """Open a client session by attempts of limited duration. Raises ZError after the link's time.
 
         Zenoh waits in native code, and Python handles signals such as Ctrl-C only between the attempts. Each is longer
-        than the one before, so that a slow TLS handshake succeeds, too.
+        than the one before, so that a slow TLS handshake succeeds, too. The first that fails is printed.
         """
         limit_s = self._link.connect_timeout_s
         end_s = math.inf if limit_s is None else time.monotonic() + limit_s
@@ -132,6 +133,8 @@ class ZenohNetwork:
             except zenoh.ZError as error:
                 if left_s <= attempt_s or not is_unreachable(error):
                     raise
+                if attempt_s == _FIRST_ATTEMPT_S:
+                    print_status(name, f"{open_error(error, self._link)}; waiting")
             attempt_s = min(2.0 * attempt_s, _LONGEST_ATTEMPT_S)
 
 

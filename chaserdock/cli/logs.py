@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 from enum import StrEnum
-from pathlib import Path
 from functools import cache
+from pathlib import Path
 from typing import Annotated
 
 import typer

@@ -7,6 +7,7 @@ import json
 import math
 import signal
 import socket
+import subprocess
 import time
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from harness import (
     descendants,
     find_child,
     finished,
+    free_port,
     run,
     sets,
     summary,
@@ -39,6 +41,7 @@ from chaserdock.launch import launcher
 TWO = "two-chaser-tracking"
 FLYING_BYTES = 300_000
 LONG = (*SHORT, "duration_s=60.0")
+GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 
 
 def test_existing_log_is_not_overwritten(tmp_path: Path) -> None:
@@ -58,6 +61,27 @@ def test_world_reports_port_in_use() -> None:
     assert status == 2
     assert "port is in use" in output
     assert endpoint in output
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("log", "play", str(GOLDEN), "-m", "client"),
+        ("ros2", "-m", "client"),
+        ("world", "single", "-m", "client"),
+    ],
+)
+def test_interrupt_ends_the_wait_for_a_router(arguments: tuple[str, ...]) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    process = chaserdock(*arguments, "-e", endpoint, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        assert process.stdout is not None
+        assert any(b"Waiting for it" in line for line in process.stdout)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 130
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def test_chaser_and_operator_time_out_without_peers() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
@@ -15,7 +16,6 @@ from typing import Any, Literal
 import zenoh
 
 from chaserdock_protocol import codec
-from chaserdock_protocol.process import print_status
 
 from .config import QUEUE_OPTIONS, Link, NoRouterError, Tls, TransportError, is_unreachable, open_error
 from .network import Connection, Host, Machine, Query, RawSample, Reply, T, Undo
@@ -134,7 +134,11 @@ class ZenohNetwork:
                 if left_s <= attempt_s or not is_unreachable(error):
                     raise
                 if attempt_s == _FIRST_ATTEMPT_S:
-                    print_status(name, f"{open_error(error, self._link)}; waiting")
+                    print(
+                        f"{name}: {open_error(error, self._link)} Waiting for it.",
+                        file=sys.stderr,
+                        flush=True,
+                    )
             attempt_s = min(2.0 * attempt_s, _LONGEST_ATTEMPT_S)
 
 

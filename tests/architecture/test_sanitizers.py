@@ -71,9 +71,3 @@ def test_planted_faults_are_found(
     assert finding in found
     number = int(re.findall(rf"aborted: {kernel}, input (\d+), seed 1", found)[-1])
     assert finding in sanitizers.fuzz(program, kernel, 1, 1, first=number)  # the stated input alone
-
-
-@needs_gcc
-def test_python_tests_run_with_all_kernels_under_sanitizers() -> None:
-    run = sanitizers.run_tests("tests/world/test_physics.py", "-k", "bullets_steps_in_c", optimize="-O0")
-    assert run.returncode == 0, run.stdout + run.stderr

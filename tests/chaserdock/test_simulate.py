@@ -40,9 +40,10 @@ def good(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def bad(tmp_path: Path) -> Path:
-    """A mission that is to dock without any command, which violates liveness."""
+    """A mission that is to dock on a command after its last tick, which violates liveness."""
     path = tmp_path / "bad.toml"
-    path.write_text(SHORT.replace("DOCKED", "0"))
+    approach = '[{at_s = 0.99, command = "approach", chasers = [0]}]'
+    path.write_text(SHORT.replace("timeline = []", f"timeline = {approach}").replace("DOCKED", "0"))
     return path
 
 

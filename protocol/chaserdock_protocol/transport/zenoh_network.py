@@ -120,7 +120,8 @@ class ZenohNetwork:
         """Open a client session by attempts of limited duration. Raises ZError after the link's time.
 
         Zenoh waits in native code, and Python handles signals such as Ctrl-C only between the attempts. Each is longer
-        than the one before, so that a slow TLS handshake succeeds, too. The first that fails is printed.
+        than the one before, so that a slow TLS handshake succeeds, too. Prints once that it waits, unless that is
+        soon over.
         """
         limit_s = self._link.connect_timeout_s
         end_s = math.inf if limit_s is None else time.monotonic() + limit_s
@@ -133,7 +134,7 @@ class ZenohNetwork:
             except zenoh.ZError as error:
                 if left_s <= attempt_s or not is_unreachable(error):
                     raise
-                if attempt_s == _FIRST_ATTEMPT_S:
+                if attempt_s == _FIRST_ATTEMPT_S and (limit_s is None or limit_s > _LONGEST_ATTEMPT_S):
                     print(
                         f"{name}: {open_error(error, self._link)} Waiting for it.",
                         file=sys.stderr,

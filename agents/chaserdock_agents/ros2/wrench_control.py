@@ -35,7 +35,7 @@ WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
 _LIFETIME_NS = 500_000_000
 _RECEIVE_S = 0.1
 _PATIENCE_TICKS = 0.5
-"""Share of a tick's period after which chasers without a wrench are told that none has come."""
+"""Share of a tick's period after which chasers without a wrench get a message without command."""
 
 
 class ControlError(ChaserdockError):

@@ -14,7 +14,6 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.fault_injection import create_fault_layer
 from chaserdock_protocol.messages import (
-    JoinReply,
     JoinRequest,
     MissionEnd,
     ScenarioReply,
@@ -26,7 +25,7 @@ from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenari
 from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node, TransportError
-from chaserdock_protocol.transport.session import Heartbeat
+from chaserdock_protocol.transport.session import Heartbeat, ask_as_world
 
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
@@ -80,8 +79,7 @@ def load_world_scenario(options: ProcessOptions) -> Scenario:
 
 def refuse_second_world(node: Node) -> None:
     """Raise TransportError if a world is already running in this namespace."""
-    request = JoinRequest(process="world", instance=node.host.unique_id())
-    reply = node.query(topics.JOIN_KEY, request, JoinReply, timeout_s=0.5)
+    reply = ask_as_world(node)
     if reply is not None:
         raise TransportError(reply.reason)
 

@@ -114,11 +114,15 @@ def run_member(
             node.close()
 
 
+def ask_as_world(node: Node) -> JoinReply | None:
+    """Return how the world of this namespace refuses a second one, or None without a world. Reserves no name."""
+    request = JoinRequest(process="world", instance=node.host.unique_id())
+    return node.query(topics.JOIN_KEY, request, JoinReply, 0.5)
+
+
 def find_world(node: Node) -> str | None:
     """Return the identity of the world's session without joining its mission, or None without a world."""
-    # The name of the world is always refused, and so reserves no name of another process.
-    request = JoinRequest(process="world", instance=node.host.unique_id())
-    reply = node.query(topics.JOIN_KEY, request, JoinReply, 0.5)
+    reply = ask_as_world(node)
     return None if reply is None else reply.source
 
 

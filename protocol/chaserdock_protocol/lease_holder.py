@@ -117,14 +117,16 @@ class LeaseHolder:
     def claim(self, tick: Tick) -> bool:
         """Return whether this controller commands a tick; ``term`` is then the number to command with.
 
-        It is no smaller than any that a chaser has stated, so that the newest commander always has the highest.
+        A new grant raises it above all that chasers have stated up to that tick, so that the newest commander has the highest.
+        Otherwise it stays: the other controller may hold a higher term in a minority, or in later ticks that a controller that
+        was frozen knows before it has finished its own.
         """
         found = self.commander_of(tick)
         if found is None or (found.name, found.instance) != (self.name, self.instance):
             return False
-        newest = max(lease.term for lease in self.leases.values())
-        if max(newest, found.term) > self.term:
-            self.term = next_term(max(newest, found.term) - 1, self.name)
+        if found.term > self.term:
+            stated = [lease.term for lease in self.leases.values() if lease.tick <= tick.tick]
+            self.term = next_term(max([found.term, *stated]) - 1, self.name)
         return True
 
     def _is_commanded_since(self, since: int, tick: Tick) -> bool:

@@ -92,6 +92,22 @@ def test_commander_takes_the_highest_term_of_all() -> None:
     assert holder.term == 8
 
 
+def test_commander_keeps_its_term_while_the_other_has_only_a_minority_or_later_ticks() -> None:
+    """A controller that was frozen finishes its tick after the other has read the leases of the next."""
+    holder = standby(*(lease(i, 5) for i in (0, 1, 2)))
+    assert holder.claim(tick(5))
+    assert holder.term == 2
+    holder.add(lease(0, 6, "controller", term=3))
+    assert holder.claim(tick(6))
+    assert holder.term == 2
+
+
+def test_new_commander_takes_no_account_of_leases_of_later_ticks() -> None:
+    holder = standby(lease(0, 5), lease(1, 5), lease(2, 7, "controller", term=7))
+    assert holder.claim(tick(5))
+    assert holder.term == 2
+
+
 def test_minority_waits_then_gives_its_lease_back_and_counts_it_no_more() -> None:
     holder = standby()
     for number in range(5, 5 + PATIENCE_TICKS):
@@ -207,9 +223,9 @@ class IgnoresYield(lease_grantor.LeaseGrantor):
 @pytest.mark.parametrize(
     ("wrong", "seed", "words"),
     [
-        (GrantsWhileALeaseRuns, 1, "command it"),
-        (IgnoresInstance, 95, "holds its lease"),
-        (IgnoresTerm, 5, "states"),
+        (GrantsWhileALeaseRuns, 0, "command it"),
+        (IgnoresInstance, 173, "command it"),
+        (IgnoresTerm, 3, "states"),
         (IgnoresYield, 6, "after the last loss"),
     ],
 )

@@ -7,6 +7,7 @@ import os
 import re
 import secrets
 import socket
+from collections.abc import Sequence
 from hmac import compare_digest
 from urllib.parse import urlsplit
 
@@ -67,10 +68,17 @@ def path_below_token(path: str, token: str) -> str | None:
     return rest if rest.startswith("/") else f"/{rest}"
 
 
-def is_own_origin(origin: str | None, requested_host: str, host: str) -> bool:
-    """Return whether a web socket is opened by the viewer's page (``Origin`` equals ``Host``) or by a program (no
-    ``Origin``). On a loopback address ``Host`` must be a loopback name, which prevents DNS rebinding."""
-    name = urlsplit(f"//{requested_host}").hostname
-    if host in _LOOPBACK and name not in _LOOPBACK:
+def is_own_origin(origins: Sequence[str], requested_hosts: Sequence[str], host: str) -> bool:
+    """Return whether a web socket is opened by the viewer's page (``Origin`` equals ``Host``) or by a program (no ``Origin``).
+
+    ``origins``, ``requested_hosts``: values of these headers, of which a request states at most one and exactly one. On a
+    loopback address ``Host`` must be a loopback name, which prevents DNS rebinding.
+    """
+    if len(origins) > 1 or len(requested_hosts) != 1:
         return False
-    return origin is None or urlsplit(origin).netloc == requested_host
+    try:
+        name = urlsplit(f"//{requested_hosts[0]}").hostname
+        own = all(urlsplit(origin).netloc == requested_hosts[0] for origin in origins)
+    except ValueError:  # malformed
+        return False
+    return own and (host not in _LOOPBACK or name in _LOOPBACK)

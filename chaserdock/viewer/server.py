@@ -87,9 +87,9 @@ def request_check(respond: _RequestHandler, host: str, token: str) -> _RequestHa
         path = path_below_token(request.path, token)
         response = respond(connection, dataclasses.replace(request, path=path or request.path))
         if response is None:
-            origin, requested_host = request.headers.get("Origin"), request.headers.get("Host", "")
-            if not is_own_origin(origin, requested_host, host):
-                logging.getLogger(__name__).warning("rejected a page of origin %s", origin)
+            origins = request.headers.get_all("Origin")
+            if not is_own_origin(origins, request.headers.get_all("Host"), host):
+                logging.getLogger(__name__).warning("rejected a page of origin %s", ", ".join(origins))
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "origin not allowed\n")
         if path is None and (response is None or request.path.partition("?")[0] == "/"):
             return connection.respond(

@@ -353,23 +353,29 @@ def test_corridor_covers_the_allowed_region() -> None:
 
 
 @pytest.mark.parametrize(
-    ("origin", "requested_host", "host", "allowed"),
+    ("origins", "requested_hosts", "host", "allowed"),
     [
-        ("http://127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1", True),
-        ("http://localhost:8080", "localhost:8080", "127.0.0.1", True),
-        (None, "127.0.0.1:8080", "127.0.0.1", True),
-        ("https://evil.example", "127.0.0.1:8080", "127.0.0.1", False),
-        ("http://127.0.0.1:9999", "127.0.0.1:8080", "127.0.0.1", False),
-        ("http://evil.example:8080", "evil.example:8080", "127.0.0.1", False),
-        ("null", "127.0.0.1:8080", "127.0.0.1", False),
-        ("http://lab-7:8080", "lab-7:8080", "0.0.0.0", True),
-        ("https://evil.example", "lab-7:8080", "0.0.0.0", False),
+        (["http://127.0.0.1:8080"], ["127.0.0.1:8080"], "127.0.0.1", True),
+        (["http://localhost:8080"], ["localhost:8080"], "127.0.0.1", True),
+        (["http://[::1]:8080"], ["[::1]:8080"], "::1", True),
+        ([], ["127.0.0.1:8080"], "127.0.0.1", True),
+        (["https://evil.example"], ["127.0.0.1:8080"], "127.0.0.1", False),
+        (["http://127.0.0.1:9999"], ["127.0.0.1:8080"], "127.0.0.1", False),
+        (["http://evil.example:8080"], ["evil.example:8080"], "127.0.0.1", False),
+        (["null"], ["127.0.0.1:8080"], "127.0.0.1", False),
+        (["http://lab-7:8080"], ["lab-7:8080"], "0.0.0.0", True),
+        (["https://evil.example"], ["lab-7:8080"], "0.0.0.0", False),
+        (["http://lab-7:8080", "https://evil.example"], ["lab-7:8080"], "0.0.0.0", False),
+        (["http://lab-7:8080"], ["lab-7:8080", "evil.example"], "0.0.0.0", False),
+        ([], [], "0.0.0.0", False),
+        ([], ["[::1"], "127.0.0.1", False),
+        (["http://[::1"], ["lab-7:8080"], "0.0.0.0", False),
     ],
 )
 def test_only_our_own_page_may_connect(
-    origin: str | None, requested_host: str, host: str, allowed: bool
+    origins: list[str], requested_hosts: list[str], host: str, allowed: bool
 ) -> None:
-    assert is_own_origin(origin, requested_host, host) is allowed
+    assert is_own_origin(origins, requested_hosts, host) is allowed
 
 
 def address(server: viser.ViserServer) -> str:
@@ -430,6 +436,8 @@ def test_rejected_web_socket_executes_no_buffered_message() -> None:
             ("foreign page", f"/{TOKEN}", foreign),
             ("program without token", "/", own),
             ("program with another token", f"/{TOKEN[::-1]}", own),
+            ("two origins", f"/{TOKEN}", f"{own}\r\nOrigin: {foreign}"),
+            ("malformed origin", f"/{TOKEN}", "http://[::1"),
         ):
             with sent_clicks(server, path, origin, button(name)) as status:
                 assert status == b"HTTP/1.1 403 Forbidden\r\n", name

@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 import pytest
+from chaserdock_protocol import topics
 from chaserdock_protocol.messages import JoinRequest, Presence
 from chaserdock_protocol.scenario.simulation import SimulationSection
 from chaserdock_protocol.transport import Link, Node
+from chaserdock_protocol.transport.network import RawSample
 from chaserdock_protocol.transport.session import Heartbeat
 from chaserdock_world.lockstep.membership import Membership
 
@@ -231,13 +234,32 @@ def test_heartbeat_ends_with_its_node() -> None:
 
 
 @pytest.fixture
-def heartbeat() -> Heartbeat:
+def node() -> Node:
+    """That of a controller."""
+    network = SimulatedNetwork(Scheduler(0), SimulationSection(), 0, True)
+    return Node("controller", "controller", Link(network=network))
+
+
+@pytest.fixture
+def heartbeat(node: Node) -> Heartbeat:
     """That of a controller in the mission of the world whose session is ``w``."""
-    node = Node(
-        "controller", "controller", Link(network=SimulatedNetwork(Scheduler(0), SimulationSection(), 0, True))
-    )
     node.expect_world("w", lambda key, source, newest: None)
     return Heartbeat(node, "controller-1")
+
+
+def test_identity_forged_for_each_message_is_reported_a_few_times_only(
+    node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    callbacks: list[Callable[[RawSample], None]] = []
+    reported: list[str] = []
+    monkeypatch.setattr(node._connection, "subscribe", lambda _, arrived: callbacks.append(arrived))
+    node.expect_world("w", lambda key, source, newest: reported.append(source))
+    node.subscribe(topics.TICK)
+    for i in range(1000):
+        callbacks[0](RawSample(topics.TICK.key, "", b"", 0, f"forged-{i}"))
+        assert node.receive(0) is None
+    assert reported == [f"forged-{i}" for i in range(16)]
+    assert node.counts.rejected[f"{topics.TICK.key}:foreign publisher"] == 1000
 
 
 def presence(instance: str, world: str = "w") -> Presence:

@@ -36,6 +36,8 @@ class TrafficCounters:
     stale: int = 0
 
 
+_MOST_REPORTED = 16
+"""Sessions of foreign publishers that are reported; whoever forges an identity per message fills no log."""
 _Arrival = tuple[Topic, str | None, RawSample, float]
 """Topic, place and sample of a message, and the time (s) when it arrived."""
 
@@ -97,8 +99,8 @@ class Node:
     def expect_world(self, source: str, on_foreign: Callable[[str, str, Message | None], None]) -> None:
         """Ignore messages on the world's keys that another session than ``source`` publishes; empty: accept all.
 
-        ``on_foreign(key, source, newest)`` runs on the reader's thread for the first of each session; ``newest``: the
-        last valid message.
+        ``on_foreign(key, source, newest)`` runs on the reader's thread for the first of each session, up to a number of
+        sessions; ``newest``: the last valid message.
         """
         self._world_source, self._on_foreign = source, on_foreign
 
@@ -109,7 +111,7 @@ class Node:
         if not raw.key.startswith(topics.WORLD_BRANCHES):
             return False
         self.counts.rejected[f"{raw.key}:foreign publisher"] += 1
-        if raw.source not in self._foreign_sources:
+        if raw.source not in self._foreign_sources and len(self._foreign_sources) < _MOST_REPORTED:
             self._foreign_sources.add(raw.source)
             self._foreign.append((raw.key, raw.source))
         return True

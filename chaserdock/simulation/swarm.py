@@ -426,13 +426,14 @@ def _check_recording(checks: Invariants, flight: SimulatedFlight, published: Cou
             )
 
 
-def queue_limit(reader: str, published: int, ticks: int) -> int:
+def queue_limit(reader: str, published: int, ticks: int, missed_ticks: float = 0.0) -> int:
     """Return how many messages may wait for a process in a flight with so many messages and ticks.
 
-    The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the mean.
+    The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the mean. ``missed_ticks``: the
+    most ticks that a world opens at once, after it was frozen.
     """
-    behind = math.ceil((RECORDER_WINDOW_TICKS + 2) * published / max(1, ticks)) if reader == "recorder" else 0
-    return max(QUEUE_LIMIT, behind)
+    behind = missed_ticks + (RECORDER_WINDOW_TICKS + 2 if reader == "recorder" else 0)
+    return max(QUEUE_LIMIT, math.ceil(behind * published / max(1, ticks)))
 
 
 def _falls_behind(reader: str, s: Scenario) -> bool:
@@ -450,10 +451,13 @@ def _falls_behind(reader: str, s: Scenario) -> bool:
 
 def check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
     """Check that queues stay short, except those of readers that are slow, frozen, cut off or flooded."""
+    s = checks.scenario
+    frozen_s = [f.duration_s or 0.0 for f in s.fault if f.kind == "freeze" and f.process == "world"]
+    missed_ticks = sum(frozen_s) * s.time.rate_hz if s.simulation.mode == "realtime" else 0.0
     for name, items in flight.traffic.queues.items():
         reader = name.split()[0]
-        limit = queue_limit(reader, published, checks.ticks)
-        if items.most > limit and not _falls_behind(reader, checks.scenario):
+        limit = queue_limit(reader, published, checks.ticks, missed_ticks)
+        if items.most > limit and not _falls_behind(reader, s):
             checks.violate("bounded queues", reader, f"{items.most} messages waited")
 
 

@@ -94,6 +94,13 @@ def test_recorder_may_be_the_window_of_ticks_behind() -> None:
     assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
 
 
+def test_messages_of_ticks_that_a_frozen_world_opens_at_once_may_wait() -> None:
+    """Seed 357 of `fault-drill`: 459 messages of 30 ticks waited for the recorder."""
+    assert 459 < queue_limit("recorder", 3000, 250, missed_ticks=30) < 600
+    assert queue_limit("controller", 3000, 250, missed_ticks=30) == 400
+    assert queue_limit("controller", 30_000, 250, missed_ticks=30) == 3600
+
+
 @pytest.mark.parametrize(
     ("keys", "readers"),
     [

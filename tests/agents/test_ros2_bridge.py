@@ -29,11 +29,12 @@ from chaserdock_protocol.messages import (
     OperatorCommand,
     Tick,
 )
-from chaserdock_protocol.process import ProcessOptions, RosLink
+from chaserdock_protocol.process import ProcessOptions, RosLink, StopSignal
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.scenario.flight import flight_scenario_json
 from chaserdock_protocol.transport import Link, Node
+from chaserdock_protocol.transport.config import ReceivedMessage
 from harness import ROOT, free_port
 from message_samples import BY_TYPE
 from msgspec.structs import replace
@@ -410,6 +411,21 @@ def test_chasers_without_a_wrench_keep_their_leases_while_one_is_valid(
     for number in range(5 * period, 8 * period):
         flight.fly(number, ())
     assert [grantor.holder for grantor in flight.grantors] == ["standby"] * 3
+
+
+def test_replaced_process_ends_with_status_1_without_a_farewell(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = ControlledFlight(monkeypatch)
+    tick = Tick(tick=1, images=False, chasers=(0, 1, 2), controllers={"controller": "another"})
+    received = iter(
+        [
+            ReceivedMessage(topics.TICK, None, tick, 0),
+            ReceivedMessage(topics.END, None, BY_TYPE[MissionEnd], 0),
+        ]
+    )
+    monkeypatch.setattr(flight.node, "receive", lambda _: next(received), raising=False)
+    monkeypatch.setattr(SilentHeartbeat, "is_replaced", lambda _, listed: listed != "c")
+    monkeypatch.setattr(SilentHeartbeat, "world_is_gone", lambda _: False, raising=False)
+    assert flight.control.run(StopSignal(watch_parent=False, signals=False)) == 1
 
 
 def test_lock_step_mission_is_refused(mission: Mission, capsys: pytest.CaptureFixture[str]) -> None:

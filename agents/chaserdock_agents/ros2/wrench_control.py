@@ -104,7 +104,7 @@ class WrenchControl:
         self._leases = LeaseHolder(NAME, instance)
         self._commanded: dict[int, int] = {}
         self._expires_ns, self._deadline_s = 0, math.inf
-        self._leads = False
+        self._leads = self._replaced = False
         self._refused: Counter[str] = Counter()
         for i in range(len(scenario.chasers)):
             node.advertise(topics.WRENCH, i)
@@ -116,7 +116,7 @@ class WrenchControl:
     def run(self, stop: StopSignal) -> int:
         """Command until the mission ends; return the exit status."""
         ended = False
-        while not (ended or stop() or self._heartbeat.world_is_gone()):
+        while not (ended or self._replaced or stop() or self._heartbeat.world_is_gone()):
             received = self._node.receive(
                 max(0.0, min(_RECEIVE_S, self._deadline_s - self._node.host.now_s()))
             )
@@ -126,7 +126,8 @@ class WrenchControl:
                 if self._node.host.now_s() >= self._deadline_s:
                     self._complete_tick()
         tick = self._tick
-        self._heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)
+        if not self._replaced:
+            self._heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)
         for reason, number in self._refused.items():
             print_status(NAME, f"{number} wrenches not commanded: {reason}")
         return 0 if ended else 1
@@ -135,6 +136,9 @@ class WrenchControl:
         """Take a message of the mission; return whether it ends it."""
         match message:
             case Tick() as tick:
+                self._replaced |= self._heartbeat.is_replaced(tick.controllers.get(NAME))
+                if self._replaced:
+                    return False
                 self._heartbeat.in_flight.set()
                 self._tick = tick
                 self._leases.add_tick(tick)

@@ -4,9 +4,9 @@
  *     PROGRAM                              lists the targets
  *     PROGRAM TARGET FIRST COUNT SEED      runs a target on inputs FIRST .. FIRST + COUNT - 1
  *
- * An input depends on target, seed and number only. What a sanitizer finds, a failed CHECK and an input that takes more than 10 s
- * abort; the last line on stderr then names target, input and seed. Arrays have their exact size, so that every access
- * beyond them is found.
+ * An input depends on target, seed and number only. What a sanitizer finds, a failed CHECK and an input that takes more than
+ * 10 s of processor time abort; the last line on stderr then names target, input and seed. Arrays have their exact size, so
+ * that every access beyond them is found.
  */
 #ifndef CHASERDOCK_FUZZ_H
 #define CHASERDOCK_FUZZ_H
@@ -16,6 +16,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/time.h>
 #include <unistd.h>
 #include "base.h"
 
@@ -136,7 +137,7 @@ static double *copy_of(const double *a, int64_t count) {
 
 static void report_input(int number) {
     char line[200];
-    int length = snprintf(line, sizeof line, "%s: %s, input %llu, seed %llu\n", number == SIGALRM ? "no end after 10 s" : "aborted",
+    int length = snprintf(line, sizeof line, "%s: %s, input %llu, seed %llu\n", number == SIGPROF ? "no end after 10 s of processor time" : "aborted",
                           target_name, (unsigned long long)input_number, (unsigned long long)input_seed);
     if (length > 0 && write(2, line, (size_t)length) < 0) _exit(2);
     _exit(1);
@@ -154,7 +155,9 @@ static int run_targets(const Target *targets, int count, int argc, char **argv) 
     target_name = chosen->name;
     input_seed = strtoull(argv[4], NULL, 10);
     signal(SIGABRT, report_input);
-    signal(SIGALRM, report_input);
+    signal(SIGPROF, report_input);
+    // Processor time: a process may be stopped, or wait for a core.
+    const struct itimerval limit = {.it_value = {.tv_sec = 10}};
     const uint64_t first = strtoull(argv[2], NULL, 10), end = first + strtoull(argv[3], NULL, 10);
     for (input_number = first; input_number < end; input_number++) {
         static const double shares[] = {0.0, 0.0, 0.003, 0.03, 0.3, 1.0};
@@ -162,11 +165,10 @@ static int run_targets(const Target *targets, int count, int argc, char **argv) 
         random_state = random_bits();
         special_share = shares[whole(0, COUNT_OF(shares) - 1)];
         special_drawn = 0;
-        alarm(10);
+        setitimer(ITIMER_PROF, &limit, NULL);
         chosen->run();
         while (block_count) free(blocks[--block_count]);
     }
-    alarm(0);
     return 0;
 }
 

@@ -117,9 +117,9 @@ class LeaseHolder:
     def claim(self, tick: Tick) -> bool:
         """Return whether this controller commands a tick; ``term`` is then the number to command with.
 
-        A new grant raises it above all that chasers have stated up to that tick, so that the newest commander has the highest.
-        Otherwise it stays: the other controller may hold a higher term in a minority, or in later ticks that a controller that
-        was frozen knows before it has finished its own.
+        With a new grant it is no smaller than any that chasers have stated up to that tick, so that the newest commander has the
+        highest. Otherwise it stays: the other controller may hold a higher term in a minority, or in later ticks, whose leases a
+        controller that was frozen may have read before it finishes its own.
         """
         found = self.commander_of(tick)
         if found is None or (found.name, found.instance) != (self.name, self.instance):

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_controller.guidance.trajectories import PEAK_SPEED
+from chaserdock_controller.ingest.lost_chasers import MOST_M as LOST_MARGIN_M
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import relative_acceleration, relative_torque
@@ -64,6 +65,8 @@ TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 SETTLING_S, STOPPING_S = 15.0, 3.0
 """Time (s) after the last warning or command until a chaser has docked or is safe, at least the time that an approach takes;
 and until a chaser that is in motion has stopped."""
+DRIFT_ERROR_M = 0.1
+"""Largest error (m) of the position to which a lost chaser is extrapolated."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate", "inspect")
 ATTACHED = frozenset({"latched", "verified", "identify", "detumble", "stack_hold"})
 DOCKED = ATTACHED | {"docked"}
@@ -781,7 +784,7 @@ class Invariants:
         """Return how a chaser that is to dock ends: ``docked``, ``safe``, ``unfinished``, or empty if it is none of these.
 
         Safe: no command reaches it, or it keeps its distance and a warning or command names why. Unfinished: the time after
-        the last warning or command was too short for an approach.
+        the last warning or command was too short for an approach, or a lost chaser is in the way.
         """
         phase = self.phases.get(chaser, "")
         commands = [e for e in self.scenario.timeline if chaser in e.chasers]
@@ -792,21 +795,34 @@ class Invariants:
             return "safe"
         last_s = max(self.reason_s.get(chaser, 0.0), *(e.at_s for e in commands), 0.0)
         in_time = self.time_s - last_s < settling_s(self.scenario, chaser)
-        return "unfinished" if in_time and phase not in SAFE_PHASES else ""
+        return "unfinished" if (in_time or self._is_blocked(chaser)) and phase not in SAFE_PHASES else ""
 
     def _falls_back(self, chaser: int) -> bool:
         """Return whether no command reaches a chaser: it is lost, stopped, or controls itself."""
         return f"chaser/{chaser}" in self.dead or self._sources.get(chaser, "command") != "command"
 
+    def _docking_place(self, chaser: int) -> Array | None:
+        """Return the true place (WRF, m) where a chaser without a port docks; None if the truth is not known."""
+        target = self._states.get("target")
+        if target is None:
+            return None
+        nominal_m = np.array(self.scenario.chasers[chaser].position_m)
+        offset_m = nominal_m * (self.scenario.approach.dock_distance_m / math.hypot(*nominal_m))
+        return target.position_m + rotations.rotate(np.array(target.q_wxyz), offset_m)
+
     def _docking_error_m(self, chaser: int) -> float:
         """Return the true distance of a chaser without a port from the place where it docks; 0 if the truth is not known."""
-        target, own = self._states.get("target"), self._states.get(f"chaser/{chaser}")
-        if target is None or own is None:
-            return 0.0
-        nominal_m = self.scenario.chasers[chaser].position_m
-        place = np.array(nominal_m) * (self.scenario.approach.dock_distance_m / math.hypot(*nominal_m))
-        offset = rotations.rotate_inverse(target.q_wxyz, np.subtract(own.position_m, target.position_m))
-        return _distance(offset, place)
+        place, own = self._docking_place(chaser), self._states.get(f"chaser/{chaser}")
+        return 0.0 if place is None or own is None else math.dist(place, own.position_m)
+
+    def _is_blocked(self, chaser: int) -> bool:
+        """Return whether a lost chaser drifts so close to the docking place, or to a chaser with a port, that others avoid it."""
+        own = self._states.get(f"chaser/{chaser}")
+        port = self.scenario.docking.port_of(chaser)
+        place = self._docking_place(chaser) if port is None or own is None else own.position_m
+        near_m = self.scenario.limits.min_distance_chasers_m + LOST_MARGIN_M + DRIFT_ERROR_M
+        lost = [state for name, state in self._states.items() if name in self._lost]
+        return place is not None and any(math.dist(place, state.position_m) < near_m for state in lost)
 
     def _docked_within_m(self) -> float:
         """Return the largest true distance of a docked chaser from its place: that of the scenario and errors of the estimate."""

@@ -852,6 +852,21 @@ def test_a_mission_has_the_time_of_an_approach_after_a_reason(
     assert log.found == found
 
 
+@pytest.mark.parametrize(
+    ("x_m", "back", "state"), [(-1.0, False, "unfinished"), (-1.3, False, ""), (-1.0, True, "")]
+)
+def test_a_lost_chaser_in_the_way_keeps_others_from_docking(
+    x_m: float, back: bool, state: str, killed: Scenario
+) -> None:
+    """Seeds 984 and 1296 of `fault-drill`: it drifted within the distance that the others keep from it."""
+    log = Log(killed)
+    at_end(log, "approach")
+    log.bodies(1, body("target", 0.0), body("chaser/0", -0.8), body("chaser/2", x_m))
+    log.event("process lost", "chaser/2")
+    log.tick(400, (0, 1, 2, 3) if back else (0, 1, 3))
+    assert log.checks.state_at_end(0) == state
+
+
 def test_a_chaser_that_falls_back_is_safe(killed: Scenario) -> None:
     """It states no phase: the last one is that of a controller that is gone."""
     log = Log(killed)

@@ -430,7 +430,7 @@ def queue_limit(reader: str, published: int, ticks: int, missed_ticks: float = 0
     """Return how many messages may wait for a process in a flight with so many messages and ticks.
 
     The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the mean. ``missed_ticks``: the
-    most ticks that a world opens at once, after it was frozen.
+    most ticks that a process opens or answers at once, after it was frozen or slow.
     """
     behind = missed_ticks + (RECORDER_WINDOW_TICKS + 2 if reader == "recorder" else 0)
     return max(QUEUE_LIMIT, math.ceil(behind * published / max(1, ticks)))
@@ -452,8 +452,9 @@ def _falls_behind(reader: str, s: Scenario) -> bool:
 def check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
     """Check that queues stay short, except those of readers that are slow, frozen, cut off or flooded."""
     s = checks.scenario
-    frozen_s = [f.duration_s or 0.0 for f in s.fault if f.kind == "freeze" and f.process == "world"]
-    missed_ticks = sum(frozen_s) * s.time.rate_hz if s.simulation.mode == "realtime" else 0.0
+    behind_s = [f.duration_s or 0.0 for f in s.fault if f.kind == "freeze"]
+    behind_s += [slow.duration_s for slow in s.simulation.slow]
+    missed_ticks = sum(behind_s) * s.time.rate_hz if s.simulation.mode == "realtime" else 0.0
     for name, items in flight.traffic.queues.items():
         reader = name.split()[0]
         limit = queue_limit(reader, published, checks.ticks, missed_ticks)

@@ -94,8 +94,8 @@ def test_recorder_may_be_the_window_of_ticks_behind() -> None:
     assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
 
 
-def test_messages_of_ticks_that_a_frozen_world_opens_at_once_may_wait() -> None:
-    """Seed 357 of `fault-drill`: 459 messages of 30 ticks waited for the recorder."""
+def test_messages_of_ticks_that_are_opened_or_answered_at_once_may_wait() -> None:
+    """Seed 357 of `fault-drill`: 459 messages of 30 ticks of a world that had been frozen waited for the recorder."""
     assert 459 < queue_limit("recorder", 3000, 250, missed_ticks=30) < 600
     assert queue_limit("controller", 3000, 250, missed_ticks=30) == 400
     assert queue_limit("controller", 30_000, 250, missed_ticks=30) == 3600
@@ -134,6 +134,28 @@ def test_queues_grow_for_a_reader_that_falls_behind_only(
     )
     check_queues(log.checks, SimulatedFlight(tmp_path, {}, {}, (), "", 25.0, traffic), 5000)
     assert {v.text.split(":")[0] for v in log.checks.violations} == readers
+
+
+@pytest.mark.parametrize(
+    ("keys", "found"),
+    [
+        ({}, ["bounded queues"]),
+        ({"simulation": {"slow": [{"process": "controller", "each_s": 0.02, **WHILE}]}}, ["bounded queues"]),
+        ({"simulation": {"slow": [{"process": "controller", "each_s": 0.02, "at_s": 7.9, "duration_s": 5.1}]}}, []),
+        ({"fault": [{"kind": "freeze", "process": "world", "at_s": 1.0, "duration_s": 3.0}]}, []),
+    ],
+    ids=["nothing", "short", "slow", "frozen"],
+)  # fmt: skip
+def test_queue_of_the_recorder_grows_while_a_process_catches_up(
+    keys: dict[str, Any], found: list[str], tmp_path: Path
+) -> None:
+    """Seed 1745 of `fault-drill`: the controller answered the ticks of 5 s at once."""
+    simulation = {"mode": "realtime"} | keys.get("simulation", {})
+    log = Log(variant(tmp_path, **keys | {"simulation": simulation}))
+    log.tick(249)
+    traffic = Traffic(queues={"recorder 0": cast(Any, SimpleNamespace(most=469))})
+    check_queues(log.checks, SimulatedFlight(tmp_path, {}, {}, (), "", 25.0, traffic), 5000)
+    assert log.found == found
 
 
 # -- cases ------------------------------------------------------------------------------------------------------

@@ -430,7 +430,7 @@ def queue_limit(reader: str, published: int, ticks: int, missed_ticks: float = 0
     """Return how many messages may wait for a process in a flight with so many messages and ticks.
 
     The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the mean. ``missed_ticks``: the
-    most ticks that a process opens or answers at once, after it was frozen or slow.
+    most ticks that a process opens or replies to at once, after it was frozen or slow.
     """
     behind = missed_ticks + (RECORDER_WINDOW_TICKS + 2 if reader == "recorder" else 0)
     return max(QUEUE_LIMIT, math.ceil(behind * published / max(1, ticks)))

@@ -94,7 +94,7 @@ def test_recorder_may_be_the_window_of_ticks_behind() -> None:
     assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
 
 
-def test_messages_of_ticks_that_are_opened_or_answered_at_once_may_wait() -> None:
+def test_messages_of_ticks_that_are_opened_at_once_may_wait() -> None:
     """Seed 357 of `fault-drill`: 459 messages of 30 ticks of a world that had been frozen waited for the recorder."""
     assert 459 < queue_limit("recorder", 3000, 250, missed_ticks=30) < 600
     assert queue_limit("controller", 3000, 250, missed_ticks=30) == 400
@@ -149,7 +149,7 @@ def test_queues_grow_for_a_reader_that_falls_behind_only(
 def test_queue_of_the_recorder_grows_while_a_process_catches_up(
     keys: dict[str, Any], found: list[str], tmp_path: Path
 ) -> None:
-    """Seed 1745 of `fault-drill`: the controller answered the ticks of 5 s at once."""
+    """Seed 1745 of `fault-drill`: the controller replied to the ticks of 5 s at once."""
     simulation = {"mode": "realtime"} | keys.get("simulation", {})
     log = Log(variant(tmp_path, **keys | {"simulation": simulation}))
     log.tick(249)

@@ -185,15 +185,13 @@ class Ledger:
             time_ns = turn.exposure_ns
         if topic not in _OWN_TIME and message.sim_time_ns != time_ns:
             self.report(key, "wrong sim_time_ns", f"{message.sim_time_ns}, not {time_ns}")
-        if isinstance(message, WrenchCommand | ActuatorCommand):
-            effective_ns = timing.effective_ns(message.tick)
-            if message.effective_time_ns != effective_ns:
-                self.report(
-                    key, "wrong effective_time_ns", f"{message.effective_time_ns}, not {effective_ns}"
-                )
+        due_ns = timing.effective_ns(message.tick)
+        if isinstance(message, WrenchCommand | ActuatorCommand) and message.effective_time_ns != due_ns:
+            self.report(key, "wrong effective_time_ns", f"{message.effective_time_ns}, not {due_ns}")
         if isinstance(message, WrenchCommand):
             self._check_authority(key, message, turn)
-            reason = refusal(message, message.chaser, self.scenario.chaser, message.tick - 1, time_ns)
+            body, before = self.scenario.chaser, message.tick - 1
+            reason = refusal(message, message.chaser, body, before, time_ns, due_ns)
             if reason is not None:
                 self.report(key, "a command that the chaser rejects", reason)
 

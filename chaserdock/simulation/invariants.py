@@ -158,6 +158,8 @@ class Invariants:
     _seen_s: dict[int, float] = field(default_factory=dict)
     _damaged: float = 0.0
     _sighted: dict[int, int] = field(default_factory=dict)
+    _without_pulse_N_s: dict[int, Array] = field(default_factory=dict)
+    _suspected: dict[int, set[int]] = field(default_factory=dict)
     _unexplained: dict[int, Array] = field(default_factory=dict)
     _given_N_s: dict[int, float] = field(default_factory=dict)
     _tumble_N_m_s: tuple[float, float] | None = None
@@ -520,8 +522,23 @@ class Invariants:
         until_s = self._lasted_until_s(faults, self.time_s)
         return self._may_be_late() or (until_s > 0.0 and self.time_s - until_s <= FOLLOWING_S)
 
+    def _check_pulses(self, command: ActuatorCommand) -> None:
+        """Check that thrusters open before the force commanded since the last pulse gives more than all in one period."""
+        body, i = self.scenario.chaser, command.chaser
+        carried = body.actuation == "thrusters" and body.modulation.carry_over
+        if command.pulses or command.isolated or not carried:
+            self._without_pulse_N_s.pop(i, None)
+            return
+        impulse_N_s = np.array(command.force_N) / self.scenario.time.rate_hz
+        total_N_s = self._without_pulse_N_s[i] = self._without_pulse_N_s.get(i, 0.0) + impulse_N_s
+        waiting_N_s = float(np.linalg.norm(total_N_s))
+        if waiting_N_s > sum(t.thrust_N for t in body.thrusters) / body.modulation.carrier_hz:
+            text = f"opens no thruster, although {waiting_N_s:.2g} N s are commanded"
+            self.violate("commands are flown", f"chaser/{i}", text)
+
     def _on_command(self, command: ActuatorCommand) -> None:
         self._sources[command.chaser] = command.source
+        self._check_pulses(command)
         if f"chaser/{command.chaser}" in self.dead:
             self._note_return(command)
         if command.source != "command":
@@ -624,12 +641,13 @@ class Invariants:
         """Compare the impulse that a chaser expects of its thrusters with the true one, summed since the last fault."""
         i, name = report.chaser, f"chaser/{report.chaser}"
         body, now_s = self._states.get(name), report.tick / self.scenario.time.rate_hz
-        if (
-            body is None
-            or body.tick != report.tick
-            or name in self._touching
-            or self._device_disturbed(now_s)
-        ):
+        disturbed = self._device_disturbed(now_s)
+        suspected = {j for j, state in enumerate(report.thrusters) if state != "healthy"}
+        if not disturbed and suspected - self._suspected.get(i, set()):
+            self.violate("thrusters as expected", name, f"takes {sorted(suspected)} for failed, but none is")
+        self._suspected[i] = suspected
+        # Lost commands look like failed thrusters, and a chaser that suspects one expects less of it from then on.
+        if body is None or body.tick != report.tick or name in self._touching or disturbed or suspected:
             self._unexplained.pop(i, None)
             return
         true = [*body.impulse_N_s, *np.divide(body.angular_impulse_N_m_s, _ARM_M)]

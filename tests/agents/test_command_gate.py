@@ -31,7 +31,7 @@ COMMAND = WrenchCommand(
 
 
 def why_not(last_tick: int = 4, now_ns: int = 300_000_000, **changes: Any) -> str | None:
-    return refusal(msgspec.structs.replace(COMMAND, **changes), 1, BODY, last_tick, now_ns)
+    return refusal(msgspec.structs.replace(COMMAND, **changes), 1, BODY, last_tick, now_ns, 333_000_000)
 
 
 def test_a_good_command_is_flown_as_it_is() -> None:
@@ -39,6 +39,7 @@ def test_a_good_command_is_flown_as_it_is() -> None:
     assert why_not(now_ns=799_999_999) is None
     assert why_not(last_tick=-1) is None
     assert why_not(force_N=(2.0 * 1.009, 0.0, 0.0)) is None  # rounding at the limit
+    assert why_not(effective_time_ns=833_000_000) is None  # a clock that is ahead by a command's lifetime
     flown = passed_on(COMMAND)
     assert flown.source == "command"
     for field in ("tick", "sim_time_ns", "chaser", "effective_time_ns", "force_N", "torque_N_m"):
@@ -53,6 +54,10 @@ def test_a_good_command_is_flown_as_it_is() -> None:
         ({"last_tick": 9}, "for tick 5, but a command for tick 9"),
         ({"now_ns": 800_000_000}, "expired at 0.800 s, now 0.800 s"),
         ({"now_ns": 900_000_000}, "expired at 0.800 s, now 0.900 s"),
+        (
+            {"effective_time_ns": 833_000_001},
+            "takes effect at 0.833 s, commands for tick 5 do at 0.333 s",
+        ),
         ({"force_N": (0.0, -2.03, 0.0)}, "force of 2.03 N exceeds the body's 2 N"),
         ({"force_N": (0.0, 0.0, 1e9)}, "force of 1e+09 N exceeds"),
         ({"torque_N_m": (0.0, 0.0, -0.0506)}, "torque of 0.0506 N m exceeds the body's 0.05 N m"),
@@ -112,7 +117,7 @@ def test_commanded_thrusts_must_fit_the_thrusters() -> None:
 
     def why(thrusts_N: tuple[float, ...], of: Body = body) -> str | None:
         command = msgspec.structs.replace(base, thrusts_N=thrusts_N)
-        return refusal(command, 1, of, 4, 300_000_000)
+        return refusal(command, 1, of, 4, 300_000_000, 333_000_000)
 
     assert why((1.5,) * 12) is None
     assert why((1.5,) * 11) == "thrusts of 11 thrusters, but the body has 12"

@@ -581,6 +581,29 @@ def test_thrusters_give_what_the_chaser_expects() -> None:
         assert log.found == ([] if tick < 10 else ["thrusters as expected"]), tick
 
 
+def test_a_healthy_thruster_is_not_suspected(tmp_path: Path) -> None:
+    """Unless a fault was recent: lost commands look like failed thrusters."""
+    fault = {"kind": "drop", "process": "world", "topic": "actuators", "at_s": 0.1, "duration_s": 0.5}
+    weak: Any = msgspec.structs.replace(BY_TYPE[ThrusterReport], thrusters=("healthy", "weak"))
+    for faults, found in (([], ["thrusters as expected"]), ([fault], [])):
+        log = Log(variant(tmp_path, fault=faults))
+        for tick in (9, 90):
+            log.publish(topics.THRUSTERS, msgspec.structs.replace(weak, tick=tick), 0)
+        assert [name for name in log.found if name != "valid messages"] == found
+
+
+@pytest.mark.parametrize(("every", "found"), [(10, []), (100, ["commands are flown"])])
+def test_commanded_force_opens_thrusters(every: int, found: list[str]) -> None:
+    """Twelve thrusters of 1.5 N give 1.8 N s in a carrier period; 1.5 N for 30 ticks of 15 Hz are 3 N s."""
+    log = Log(load_scenario(ROOT / "scenarios" / "docking-contact.toml"))
+    push: Any = msgspec.structs.replace(ACTUATORS, chaser=0, force_N=(1.5, 0.0, 0.0), torque_N_m=(0.0,) * 3)
+    pulse = ThrusterPulse(thruster=0, open_ns=0, close_ns=100_000_000)
+    for tick in range(30):
+        pulses = () if tick % every else (pulse,)
+        log.checks._check_pulses(msgspec.structs.replace(push, tick=tick, pulses=pulses))
+    assert log.found == found
+
+
 @pytest.mark.parametrize(("phase", "found"), [("verified", ["latch holds"]), ("retreat", [])])
 def test_a_latch_opens_for_a_retreat_only(log: Log, phase: str, found: list[str]) -> None:
     for tick, latched in ((1, (0,)), (2, ())):

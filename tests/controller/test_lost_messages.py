@@ -139,6 +139,23 @@ def test_chaser_without_command_actuates_once_per_tick(
     assert any(t is topics.EVENT for t, _ in published)
 
 
+@pytest.mark.parametrize(("ahead_s", "source"), [(0.3, "command"), (-0.3, "command"), (36.0, "hold")])
+def test_wrong_clock_of_a_controller_delays_no_command(
+    chaser: ChaserProcess, scenario: Scenario, ahead_s: float, source: str
+) -> None:
+    """Commands act at the time of their tick; the thrusters of a chaser that took 36 s for it did not open until then."""
+    sent = wrench(scenario, 1)
+    ahead_ns = round(ahead_s * 1e9)
+    stamps = ("sim_time_ns", "effective_time_ns", "expires_ns")
+    sent = msgspec.structs.replace(sent, **{name: getattr(sent, name) + ahead_ns for name in stamps})
+    published = deliver(chaser, topics.TICK, None, tick_of(scenario, 1, (0,)))
+    published += deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
+    published += deliver(chaser, topics.WRENCH, 0, sent)
+    effective_ns = scenario.timing.effective_ns(1)
+    found = [(m.source, m.effective_time_ns) for t, m in published if t is topics.ACTUATORS]
+    assert found == [(source, effective_ns)]
+
+
 def test_older_tick_changes_no_lease(chaser: ChaserProcess, scenario: Scenario) -> None:
     deliver(chaser, topics.TICK, None, tick_of(scenario, 9, (0,)))
     repeated = msgspec.structs.replace(tick_of(scenario, 9, (0,)), revision=1)

@@ -114,8 +114,9 @@ def test_chaser_executes_the_command(scenario: Scenario, records: dict[type, lis
     executed = {(r.message.chaser, r.message.tick): r.message for r in records[ActuatorCommand]}
     for record in records[WrenchCommand]:
         command: WrenchCommand = record.message
-        why_not = refusal(command, command.chaser, scenario.chaser, command.tick - 1, command.sim_time_ns)
-        assert why_not is None
+        due_ns = scenario.timing.effective_ns(command.tick)
+        body, before = scenario.chaser, command.tick - 1
+        assert refusal(command, command.chaser, body, before, command.sim_time_ns, due_ns) is None
         expected: ActuatorCommand = executed[command.chaser, command.tick]
         assert passed_on(command) == ActuatorCommand(
             **{name: getattr(expected, name) for name in expected.__struct_fields__ if name != "seq"}

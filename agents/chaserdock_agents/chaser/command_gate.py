@@ -16,10 +16,13 @@ from chaserdock_protocol.scenario.bodies import Body
 from .local_damping import LocalDamping
 
 
-def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now_ns: int) -> str | None:
+def refusal(
+    command: WrenchCommand, chaser: int, body: Body, last_tick: int, now_ns: int, due_ns: int
+) -> str | None:
     """Return why a wrench command must not be executed, or None.
 
-    ``last_tick``: the newest tick whose command was executed; ``now_ns``: the newest simulated time known.
+    ``last_tick``: the newest tick whose command was executed; ``now_ns``: the newest simulated time known; ``due_ns``: when
+    commands of its tick take effect.
     """
     if command.chaser != chaser:
         return f"addressed to chaser {command.chaser}"
@@ -27,6 +30,10 @@ def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now
         return f"for tick {command.tick}, but a command for tick {last_tick} was already executed"
     if command.expires_ns <= now_ns:
         return f"expired at {command.expires_ns / 1e9:.3f} s, now {now_ns / 1e9:.3f} s"
+    # Of a clock that is ahead; one that is behind makes commands expire.
+    if command.effective_time_ns - due_ns > command.expires_ns - command.sim_time_ns:
+        due = f"commands for tick {command.tick} do at {due_ns / 1e9:.3f} s"
+        return f"takes effect at {command.effective_time_ns / 1e9:.3f} s, {due}"
     if command.thrusts_N:
         return _thrusts_refusal(command.thrusts_N, body)
     # The margin covers rounding.

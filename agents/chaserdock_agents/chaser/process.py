@@ -338,10 +338,12 @@ class ChaserProcess:
         if command.tick == self.executed_tick and command.term > self._term:
             self._renew_lease(command)
             return  # repeated by a controller that became commander within the tick
-        reason = refusal(command, self.number, self.scenario.chaser, self.executed_tick, now_ns)
+        due_ns = self.scenario.timing.effective_ns(command.tick)
+        reason = refusal(command, self.number, self.scenario.chaser, self.executed_tick, now_ns, due_ns)
         if reason is None:
             self._renew_lease(command)
-            self._execute(command)
+            # Ticks are the clock that all share: that of the controller may be wrong.
+            self._execute(msgspec.structs.replace(command, effective_time_ns=due_ns))
             return
         self.node.counts.stale += 1
         self._refused += 1

@@ -499,6 +499,17 @@ def test_a_retreat_leads_to_the_nominal_place_when_it_has_turned(log: Log) -> No
     assert log.found == ["retreat leads away"]
 
 
+def test_a_retreat_leads_to_the_entry_of_the_corridor_for_another_attempt() -> None:
+    """Seed 502 of `abort`: from 1.07 m, past the nominal place at 1 m, to the entry at 0.9 m."""
+    log = Log(load_scenario(ROOT / "scenarios" / "docking-contact.toml"))
+    sample: Any = msgspec.structs.replace(BY_TYPE[Reference], chaser=0, phase="retreat")
+    for found, places_m in (([], (-1.07, -1.0, -0.9)), (["retreat leads away"], (-0.86,))):
+        for k, x_m in enumerate(places_m):
+            at = {"phase_time_s": 6.0 + k, "offset_m": (x_m, 0.0, -0.05)}
+            log.publish(topics.REFERENCE, msgspec.structs.replace(sample, **at), 0)
+        assert log.found == found
+
+
 def test_commands_are_the_inputs_of_their_plans(log: Log) -> None:
     inputs = (*WRENCH.force_N, *WRENCH.torque_N_m, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     sample: Any = BY_TYPE[Plan]

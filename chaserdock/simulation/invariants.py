@@ -154,7 +154,7 @@ class Invariants:
     _latched: set[int] = field(default_factory=set)
     _probing: set[str] = field(default_factory=set)
     _retreats_from_m: dict[int, float] = field(default_factory=dict)
-    _homing_m: dict[int, Array] = field(default_factory=dict)
+    _homing_m: dict[int, tuple[str, Array]] = field(default_factory=dict)
     _planned: dict[int, Plan] = field(default_factory=dict)
     _seen_s: dict[int, float] = field(default_factory=dict)
     _damaged: float = 0.0
@@ -170,7 +170,7 @@ class Invariants:
             self.scenario.controller.command_lifetime_s * self.scenario.time.rate_hz
         )
         self._orbit = None if self.scenario.orbit is None else TargetOrbit(self.scenario.orbit)
-        self._now_s = 0.0
+        self._now_s, self._sender = 0.0, ""
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
         }
@@ -230,7 +230,7 @@ class Invariants:
             return
         for text in defects_of(message, self.scenario):
             self.violate("valid messages", raw.key, text)
-        self._now_s = self._clock_s(sender, raw.sent_ns)
+        self._now_s, self._sender = self._clock_s(sender, raw.sent_ns), sender
         handle = self._handlers.get(type(message))
         if handle is not None:
             handle(message)
@@ -251,7 +251,7 @@ class Invariants:
         self._state_tick = world.tick
         for a, b in world.contacts:
             # A chaser that no command reaches drifts; its contacts are not counted.
-            if not {a, b} & self.dead:
+            if not {a, b} & self.dead and not ("target" in (a, b) and self._is_misled()):
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
         for i in self._latched - set(world.latched):
             if self.phases.get(i) in ATTACHED and not self._latch_may_open(i):
@@ -441,13 +441,23 @@ class Invariants:
         for (a, at), (b, bt) in itertools.combinations(chasers.items(), 2):
             if (distance_m := _distance(at, bt)) < limit_m:
                 self.violate("keep-out zone", f"{a} and {b}", f"{distance_m:.3f} m apart")
+        if target is None or self._is_misled():
+            return
         for name, at in chasers.items():
-            if target is None or name in self._touching:
+            if name in self._touching:
                 continue
             offset = rotations.rotate_inverse(target.q_wxyz, at - target.position_m)
             distance_m = float(np.linalg.norm(offset))
             if distance_m < self._nearest_allowed_m(name, offset) - KEEP_OUT_SLACK_M:
                 self.violate("keep-out zone", name, f"{distance_m:.3f} m from the target")
+
+    def _is_misled(self) -> bool:
+        """Return whether the sensors of half of the chasers lie, or lied until recently: who is honest cannot be known then."""
+        lies = [f for f in self.scenario.fault if f.kind == "lying_sensor"]
+        recent = [
+            f.process for f in lies if f.at_s <= self.time_s <= f.at_s + (f.duration_s or 0.0) + SETTLING_S
+        ]
+        return 2 * len(set(recent)) >= len(self.scenario.chasers)
 
     def _nearest_allowed_m(self, name: str, offset_m: Array) -> float:
         """Return the smallest allowed distance from the target of a chaser at an offset (3,), TRF: smaller in its corridor."""
@@ -711,13 +721,18 @@ class Invariants:
             )
 
     def _check_homing(self, i: int, reference: Reference) -> None:
-        """Check that a retreat leads to the chaser's nominal place or, for another attempt, to the entry of its corridor."""
+        """Check that a retreat leads to the chaser's nominal place or, for another attempt, to the entry of its corridor.
+
+        Controllers begin it by their own estimates: after a hand-over it may be less far.
+        """
         port, goals_m = self.scenario.docking.port_of(i), [np.array(self.scenario.chasers[i].position_m)]
         if port is not None:
             reach_m, entry_m = self.scenario.chaser.probe_reach_m, self.scenario.docking.entry_m
             goals_m.append(centre_offset(port, reach_m, entry_m))
         left_m = np.linalg.norm(np.array(goals_m) - reference.offset_m, axis=1)
-        least_m = self._homing_m[i] = np.minimum(left_m, self._homing_m.get(i, left_m))
+        sender, least_m = self._homing_m.get(i, (self._sender, left_m))
+        least_m = np.minimum(left_m, least_m) if sender == self._sender else left_m
+        self._homing_m[i] = self._sender, least_m
         if np.all(left_m > least_m + HOMING_SLACK_M):
             text = f"its reference is {left_m[0]:.2f} m from its nominal place, after {least_m[0]:.2f} m"
             self.violate("retreat leads away", f"chaser/{i}", text)

@@ -163,6 +163,8 @@ class FaultLayer:
                 self._held.setdefault(key, []).append((message.tick + late, False, message))
                 return [*out, *lost]
             if fault.kind == "reorder":
+                if overtaken := self._release_overtaken(key):
+                    return [*out, message, *overtaken]
                 self._held.setdefault(key, []).append((message.tick + 1, True, message))
                 return [*out, *lost]
             if fault.kind == "corrupt":

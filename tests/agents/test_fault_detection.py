@@ -228,6 +228,15 @@ def test_a_bump_or_a_pull_is_no_thruster(seed: int) -> None:
         assert case.step(asked, asked + pushed) is None
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_commands_that_reach_no_valve_are_no_failure(seed: int) -> None:
+    """Seed 192 of `docking-contact`: of twelve healthy thrusters three were isolated within two seconds."""
+    case = Case("tetra12", seed, odometry_noise=True)
+    for tick in range(120):
+        asked = case.random()
+        assert case.step(asked, asked if tick < 30 or tick > 90 else np.zeros(12)) is None
+
+
 def test_only_suspects_are_blamed() -> None:
     case = Case("tetra12", 1)
     suspects = np.arange(12) != 5

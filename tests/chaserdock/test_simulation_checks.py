@@ -348,6 +348,21 @@ def test_keep_out_zones_surround_target_and_chasers(log: Log) -> None:
     assert log.found == ["keep-out zone", "keep-out zone"]
 
 
+@pytest.mark.parametrize(("liars", "found"), [(1, ["no contact", "keep-out zone"]), (2, [])])
+def test_distances_are_not_judged_while_half_of_the_sensors_lie(
+    liars: int, found: list[str], tmp_path: Path
+) -> None:
+    lies = [
+        {"kind": "lying_sensor", "process": f"chaser/{i}", "offset_m": [0.2, 0.0, 0.0], **WHILE}
+        for i in range(liars)
+    ]
+    log = Log(variant(tmp_path, fault=lies))
+    log.bodies(12, body("target", 0.0), body("chaser/2", 0.2), contacts=(("chaser/3", "target"),))
+    assert log.found == found
+    log.bodies(200, body("target", 0.0), body("chaser/2", 0.2))
+    assert log.found == (found or ["keep-out zone"])
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_chaser_that_flies_commands_again_is_judged_again(killed: Scenario, lost: bool) -> None:
     """From 3 s of flown commands on, and of a process that was lost, only if it takes part again."""

@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.estimation.types import RelativePose, TargetState
+from chaserdock_controller.guidance.horizon import ReferenceBuilder
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario, senses
@@ -324,6 +327,24 @@ def test_corridor_replaces_the_keep_out_only_for_the_chaser_in_it() -> None:
     pilot.fly_to("verified")
     assert pilot.guidance.min_distance_target_m(0) == 0.0
     assert pilot.guidance.min_distance_target_m(1) == limit
+
+
+@pytest.mark.parametrize(("phase", "pushed"), [("final", False), ("hold", True)])
+def test_uncertainty_pushes_no_chaser_out_of_its_corridor(phase: str, pushed: bool) -> None:
+    """Released from its port, with an uncertain pose, a chaser was planned around a larger keep-out, and left sideways."""
+    pilot = Pilot()
+    if phase != "hold":
+        pilot.ask("approach")
+    pilot.fly_to(phase)
+    still, q = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    target = TargetState(0, still, still, q, still, np.eye(12) * 1e-8, "predicting", 0, ())
+    builder = ReferenceBuilder(pilot.scenario, pilot.guidance)
+    limit_m = pilot.guidance.min_distance_target_m(0)
+    for sigma_m, margin_m in ((0.001, 0.003), (0.03, 0.09)):
+        place = RelativePose(0, np.array([-limit_m - 0.02, 0.0, 0.0]), q, np.eye(6) * sigma_m**2)
+        body = TargetBody(40.0, np.eye(3), still)
+        kept_m = builder.horizon((0,), target, body, frozenset(), [place]).min_distance_target_m[0]
+        assert kept_m == pytest.approx(limit_m + (margin_m if pushed else min(margin_m, 0.02)))
 
 
 def test_when_the_target_is_lost_an_approach_is_broken_off_and_a_latch_is_not() -> None:

@@ -98,6 +98,12 @@ def test_reorder_lets_one_overtake() -> None:
     assert heard(on, topics.SIGHTING, Sighting, range(9, 13)) == [9, -10, 11, 10, 12]
 
 
+def test_reorder_of_all_messages_swaps_pairs() -> None:
+    """Each held until its successor arrives, which is held as well, none would arrive before the end of the fault."""
+    on = layer("controller", fault(kind="reorder", process="controller", topic="sighting", duration_s=0.5))
+    assert heard(on, topics.SIGHTING, Sighting, range(9, 15)) == [9, -10, 11, 10, -12, 13, 12, -14]
+
+
 def test_duplicate() -> None:
     on = layer("chaser/0", fault(kind="duplicate", process="chaser/0", topic="image", duration_s=0.2))
     assert heard(on, topics.IMAGE, Image, range(9, 13)) == [9, 10, 10, 11, 11, 12]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, length
 from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_models.shape_distance import box_table, moved
 from chaserdock_protocol.scenario import FlightScenario
@@ -95,9 +95,15 @@ class ReferenceBuilder:
                 middles.alpha_rad_s2,
                 middles.acceleration_m_s2,
             )
-        known = {r.chaser: r.covariance for r in relative}
-        margins = self._margins_m([known.get(i, start.covariance) for i in chasers])
-        distances = np.array([self._machine.min_distance_target_m(i) for i in chasers]) + margins
+        known = {r.chaser: r for r in relative}
+        margins = self._margins_m([known[i].covariance if i in known else start.covariance for i in chasers])
+        distances = np.array([self._machine.min_distance_target_m(i) for i in chasers])
+        # A chaser between target and corridor is not to be pushed aside because it is uncertain where it is.
+        room = [
+            length(known[i].position_m) - d if i in known and self._machine.in_corridor(i) else np.inf
+            for i, d in zip(chasers, distances.tolist(), strict=True)
+        ]
+        distances = distances + np.minimum(margins, np.maximum(room, 0.0))
         boxes = clearance = None
         if self._boxes is not None:
             boxes = moved(self._boxes, nodes.positions_m, nodes.q_wxyz)

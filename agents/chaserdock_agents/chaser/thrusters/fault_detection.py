@@ -4,7 +4,8 @@
 Two hypotheses are tested for every thruster, each with its signature: stuck on (constant full thrust: the residual is the
 part that was not commanded) and weak or stuck off (the residual is the negative of a share of what was commanded). A
 hypothesis is accepted if the residuals are much more likely under it than without a fault (likelihood ratio), are consistent
-with it (chi-square), and no other thruster explains them nearly as well. Single faults only. No I/O.
+with it (chi-square), and neither another thruster nor a loss of whole commands, which no thruster gave, explains them nearly as
+well. Single faults only. No I/O.
 
 Mass properties and thrusts that differ from the model cause residuals too, the same ones at every tick. All likelihoods are
 those after integration over these constant differences with their prior, so that only what they cannot explain counts.
@@ -97,7 +98,10 @@ class ThrusterFaultDetector:
 
     def __init__(self, matrix: Array, full_N: Array, min_pulse_N_s: Array, differences: int) -> None:
         self._matrix, self._full_N, self._min_pulse_N_s = matrix, full_N, min_pulse_N_s
-        self._evidence = _Evidence(len(full_N), differences)
+        self._on_evidence = _Evidence(len(full_N), differences)
+        self._off_evidence = _Evidence(
+            len(full_N) + 1, differences
+        )  # the last hypothesis: whole commands are lost
         self._on: deque[Array] = deque(maxlen=max(_ON_WINDOWS))
         self._off: list[deque[Array]] = []
         self.information = np.zeros(len(full_N))
@@ -127,17 +131,19 @@ class ThrusterFaultDetector:
         white, columns = whiten @ residual, whiten @ self._matrix
         constant = whiten @ mismatch
         extra = self._full_N * time_s - commanded_N_s
-        self._on.append(self._evidence.of_tick(white, columns * extra, constant))
+        self._on.append(self._on_evidence.of_tick(white, columns * extra, constant))
         fired = suspects & (commanded_N_s > 0.5 * self._min_pulse_N_s)
         self.information = np.where(fired, commanded_N_s**2 * (columns**2).sum(axis=0), 0.0)
-        lost = self._evidence.of_tick(white, -columns * commanded_N_s, constant)
+        signatures = -columns * commanded_N_s
+        signatures = np.column_stack([signatures, signatures.sum(axis=1)])
+        lost = self._off_evidence.of_tick(white, signatures, constant)
         for thruster in np.flatnonzero(fired):
             self._off[thruster].append(lost)
         return self._detect_stuck_on(suspects) or self._detect_loss(np.flatnonzero(fired).tolist(), suspects)
 
     def _detect_stuck_on(self, suspects: Flags) -> ThrusterFault | None:
         for length, total in _totals(self._on, _ON_WINDOWS):
-            energy, along, squared = self._evidence.marginal(total)
+            energy, along, squared = self._on_evidence.marginal(total)
             gain = np.where(suspects, along - squared / 2.0, -math.inf)
             best = int(np.argmax(gain))
             if _is_distinct(gain, best) and is_consistent(
@@ -147,13 +153,14 @@ class ThrusterFaultDetector:
         return None
 
     def _detect_loss(self, fired: list[int], suspects: Flags) -> ThrusterFault | None:
+        possible = np.append(suspects, True)
         for thruster in fired:
             for length, total in _totals(self._off[thruster], _OFF_WINDOWS):
-                energy, along, squared = self._evidence.marginal(total)
+                energy, along, squared = self._off_evidence.marginal(total)
                 loss = np.where(
                     squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0
                 )
-                gain = np.where(suspects, loss * along - loss**2 * squared / 2.0, -math.inf)
+                gain = np.where(possible, loss * along - loss**2 * squared / 2.0, -math.inf)
                 known = squared[thruster] * _LOSS_SIGMA**2 >= 1.0
                 if not known or loss[thruster] < _WEAK_LOSS or int(np.argmax(gain)) != thruster:
                     continue

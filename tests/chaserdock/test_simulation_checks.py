@@ -608,13 +608,11 @@ def test_thrusters_give_what_the_chaser_expects() -> None:
 
 
 def test_a_healthy_thruster_is_not_suspected(tmp_path: Path) -> None:
-    """Unless a fault was recent: lost commands look like failed thrusters."""
-    fault = {"kind": "drop", "process": "world", "topic": "actuators", "at_s": 0.1, "duration_s": 0.5}
+    """Except where pulses may be late: the chaser cannot know what they lose."""
     weak: Any = msgspec.structs.replace(BY_TYPE[ThrusterReport], thrusters=("healthy", "weak"))
-    for faults, found in (([], ["thrusters as expected"]), ([fault], [])):
-        log = Log(variant(tmp_path, fault=faults))
-        for tick in (9, 90):
-            log.publish(topics.THRUSTERS, msgspec.structs.replace(weak, tick=tick), 0)
+    for jitter_s, found in ((0.001, ["thrusters as expected"]), (0.01, [])):
+        log = Log(variant(tmp_path, simulation={"mode": "realtime", "jitter_s": jitter_s}))
+        log.publish(topics.THRUSTERS, weak, 0)
         assert [name for name in log.found if name != "valid messages"] == found
 
 

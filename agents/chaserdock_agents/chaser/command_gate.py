@@ -30,7 +30,7 @@ def refusal(
         return f"for tick {command.tick}, but a command for tick {last_tick} was already executed"
     if command.expires_ns <= now_ns:
         return f"expired at {command.expires_ns / 1e9:.3f} s, now {now_ns / 1e9:.3f} s"
-    # Of a clock that is ahead; one that is behind makes commands expire.
+    # The controller's clock is ahead; commands of one that is behind have expired.
     if command.effective_time_ns - due_ns > command.expires_ns - command.sim_time_ns:
         due = f"commands for tick {command.tick} do at {due_ns / 1e9:.3f} s"
         return f"takes effect at {command.effective_time_ns / 1e9:.3f} s, {due}"

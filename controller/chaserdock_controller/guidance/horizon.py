@@ -98,7 +98,7 @@ class ReferenceBuilder:
         known = {r.chaser: r for r in relative}
         margins = self._margins_m([known[i].covariance if i in known else start.covariance for i in chasers])
         distances = np.array([self._machine.min_distance_target_m(i) for i in chasers])
-        # A chaser between target and corridor is not to be pushed aside because it is uncertain where it is.
+        # An uncertain pose pushes no chaser out of the corridor of its port, where no other place is safe.
         room = [
             length(known[i].position_m) - d if i in known and self._machine.in_corridor(i) else np.inf
             for i, d in zip(chasers, distances.tolist(), strict=True)

@@ -99,9 +99,8 @@ class ThrusterFaultDetector:
     def __init__(self, matrix: Array, full_N: Array, min_pulse_N_s: Array, differences: int) -> None:
         self._matrix, self._full_N, self._min_pulse_N_s = matrix, full_N, min_pulse_N_s
         self._on_evidence = _Evidence(len(full_N), differences)
-        self._off_evidence = _Evidence(
-            len(full_N) + 1, differences
-        )  # the last hypothesis: whole commands are lost
+        # The last hypothesis: whole commands are lost.
+        self._off_evidence = _Evidence(len(full_N) + 1, differences)
         self._on: deque[Array] = deque(maxlen=max(_ON_WINDOWS))
         self._off: list[deque[Array]] = []
         self.information = np.zeros(len(full_N))

@@ -66,6 +66,8 @@ TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 SETTLING_S, STOPPING_S = 15.0, 3.0
 """Time (s) after the last warning or command until a chaser has docked or is safe, at least the time that an approach takes;
 and until a chaser that is in motion has stopped."""
+BRAKING_S = 20.0
+"""Longest time (s) in which a chaser without a controller comes to rest."""
 DRIFT_ERROR_M = 0.1
 """Largest error (m) of the position to which a lost chaser is extrapolated."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate", "inspect")
@@ -159,7 +161,8 @@ class Invariants:
     _seen_s: dict[int, float] = field(default_factory=dict)
     _damaged: float = 0.0
     _sighted: dict[int, int] = field(default_factory=dict)
-    _without_pulse_N_s: dict[int, Array] = field(default_factory=dict)
+    _braking_s: dict[int, float] = field(default_factory=dict)
+    _without_pulse_N_s: dict[int, tuple[int, Array]] = field(default_factory=dict)
     _unexplained: dict[int, Array] = field(default_factory=dict)
     _given_N_s: dict[int, float] = field(default_factory=dict)
     _tumble_N_m_s: tuple[float, float] | None = None
@@ -459,10 +462,13 @@ class Invariants:
         return 2 * len(set(recent)) >= len(self.scenario.chasers)
 
     def _nearest_allowed_m(self, name: str, offset_m: Array) -> float:
-        """Return the smallest allowed distance from the target of a chaser at an offset (3,), TRF: smaller in its corridor."""
+        """Return the smallest allowed distance from the target of a chaser at an offset (3,), TRF: smaller in its corridor, and for
+        one that controls itself, which the corridor of a rotating target leaves behind."""
         cone = self._cones.get(name)
         in_corridor = cone is not None and cone.room_m(offset_m) > -KEEP_OUT_SLACK_M
-        return self._nearest_m[name] if in_corridor else self.scenario.limits.min_distance_target_m
+        if in_corridor or (cone is not None and self._falls_back(int(name.partition("/")[2]))):
+            return self._nearest_m[name]
+        return self.scenario.limits.min_distance_target_m
 
     # -- commands ------------------------------------------------------------------------------------------------
 
@@ -531,6 +537,15 @@ class Invariants:
         until_s = self._lasted_until_s(faults, self.time_s)
         return self._may_be_late() or (until_s > 0.0 and self.time_s - until_s <= FOLLOWING_S)
 
+    def _check_braking(self, command: ActuatorCommand) -> None:
+        """Check that a chaser without a controller comes to rest; a latched one, or one without odometry, pushes not at all."""
+        i, name = command.chaser, f"chaser/{command.chaser}"
+        pushes = any((*command.force_N, *command.torque_N_m)) and i not in self._latched
+        if command.source != "brake" or not pushes or name in self.dead or self.scenario.thruster_failure:
+            self._braking_s.pop(i, None)
+        elif (lasting_s := self.time_s - self._braking_s.setdefault(i, self.time_s)) > BRAKING_S:
+            self.violate("liveness", name, f"brakes for {lasting_s:.0f} s and does not come to rest")
+
     def _check_pulses(self, command: ActuatorCommand) -> None:
         """Check that thrusters open before the force commanded since the last pulse gives more than all in one period."""
         body, i = self.scenario.chaser, command.chaser
@@ -538,8 +553,11 @@ class Invariants:
         if command.pulses or command.isolated or not carried:
             self._without_pulse_N_s.pop(i, None)
             return
-        impulse_N_s = np.array(command.force_N) / self.scenario.time.rate_hz
-        total_N_s = self._without_pulse_N_s[i] = self._without_pulse_N_s.get(i, 0.0) + impulse_N_s
+        counted, total_N_s = self._without_pulse_N_s.get(i, (-1, np.zeros(3)))
+        if command.tick == counted:
+            return  # a copy, or the second command of a tick
+        total_N_s = total_N_s + np.array(command.force_N) / self.scenario.time.rate_hz
+        self._without_pulse_N_s[i] = command.tick, total_N_s
         waiting_N_s = float(np.linalg.norm(total_N_s))
         if waiting_N_s > sum(t.thrust_N for t in body.thrusters) / body.modulation.carrier_hz:
             text = f"opens no thruster, although {waiting_N_s:.2g} N s are commanded"
@@ -548,6 +566,7 @@ class Invariants:
     def _on_command(self, command: ActuatorCommand) -> None:
         self._sources[command.chaser] = command.source
         self._check_pulses(command)
+        self._check_braking(command)
         if f"chaser/{command.chaser}" in self.dead:
             self._note_return(command)
         if command.source != "command":

@@ -15,6 +15,7 @@ from chaserdock_agents.chaser.fallback import (
     LastCommand,
     clearance_m,
     extrapolate_target,
+    fallback_limits,
     fallback_wrench,
     interpolate_plan,
     is_at_rest,
@@ -88,13 +89,13 @@ def fly_fallback(
     scenario: Scenario, last: LastCommand, x: Array, seconds: float
 ) -> tuple[list[FallbackState], Array]:
     """Simulate a rigid body in fallback; return its fallback state of each step and its states (K, 13)."""
-    body, min_distance_m = scenario.chaser, clearance_m(scenario, 0)
+    body, limits = scenario.chaser, fallback_limits(scenario, 0)
     history: list[FallbackState] = []
     states, state = [x], None
     for k in range(round(seconds / STEP_S)):
         odometry = moving(x, k * STEP_S)
         effective_ns = odometry.sim_time_ns
-        state = next_state(state, odometry, effective_ns, last, min_distance_m)
+        state = next_state(state, odometry, effective_ns, last, limits)
         u = fallback_wrench(state, odometry, effective_ns, last, body)
         assert np.all(np.abs(u[:3]) <= body.force_max_N * (1 + 1e-9))
         assert np.all(np.abs(u[3:]) <= body.torque_max_N_m * (1 + 1e-9))
@@ -165,13 +166,24 @@ def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
     assert modes_of(history) == ["brake", "hold"]
     assert history[-1].distance_m is None
     assert "the target is unknown" in history[-1].text()
-    assert is_at_rest(moving(x[-1], 60.0), np.zeros(3))
+    assert is_at_rest(moving(x[-1], 60.0), np.zeros(3), fallback_limits(scenario, 0))
+
+
+def test_chaser_with_thrusters_is_at_rest_within_its_shortest_pulses() -> None:
+    """Seed 285 of `docking-contact`: pulses keep the rate between 0.3 and 1.1 deg/s, and it braked for ever, within the keep-out."""
+    limits = fallback_limits(load_scenario(ROOT / "scenarios" / "docking-contact.toml"), 0)
+    assert limits.rest_m_s == pytest.approx(0.004)
+    assert np.degrees(limits.rest_rad_s) == pytest.approx(1.5, abs=0.01)
+    slow = start(velocity_m_s=(0.002, 0.0, 0.0), omega_rad_s=(0.0, 0.019, 0.0))
+    assert next_state(FallbackState("brake"), moving(slow, 0.0), 0, LastCommand(), limits).mode == "hold"
 
 
 def test_fallback_modes_do_not_return(scenario: Scenario) -> None:
     fast = moving(start(velocity_m_s=(0.1, 0.0, 0.0)), 0.0)
     for before in (FallbackState("brake"), FallbackState("hold", np.zeros(3))):
-        again = next_state(before, fast, 0, LastCommand(straight(0.1), target()), 0.5)
+        again = next_state(
+            before, fast, 0, LastCommand(straight(0.1), target()), fallback_limits(scenario, 0)
+        )
         assert again.mode == before.mode
 
 

@@ -616,6 +616,14 @@ def test_a_healthy_thruster_is_not_suspected(tmp_path: Path) -> None:
         assert [name for name in log.found if name != "valid messages"] == found
 
 
+@pytest.mark.parametrize(("pause", "found"), [(1000, ["liveness"]), (150, [])])
+def test_a_chaser_without_a_controller_comes_to_rest(log: Log, pause: int, found: list[str]) -> None:
+    for tick in range(250):
+        log.tick(tick)
+        log.flies(0, tick, source="hold" if tick == pause else "brake")
+    assert [name for name in log.found if name != "commands are flown"] == found
+
+
 @pytest.mark.parametrize(("every", "found"), [(10, []), (100, ["commands are flown"])])
 def test_commanded_force_opens_thrusters(every: int, found: list[str]) -> None:
     """Twelve thrusters of 1.5 N give 1.8 N s in a carrier period; 1.5 N for 30 ticks of 15 Hz are 3 N s."""
@@ -624,7 +632,8 @@ def test_commanded_force_opens_thrusters(every: int, found: list[str]) -> None:
     pulse = ThrusterPulse(thruster=0, open_ns=0, close_ns=100_000_000)
     for tick in range(30):
         pulses = () if tick % every else (pulse,)
-        log.checks._check_pulses(msgspec.structs.replace(push, tick=tick, pulses=pulses))
+        for _ in range(3):  # copies of a flood count once
+            log.checks._check_pulses(msgspec.structs.replace(push, tick=tick, pulses=pulses))
     assert log.found == found
 
 

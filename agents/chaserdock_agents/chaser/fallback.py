@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from chaserdock_models import rotations
@@ -19,14 +19,18 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_models.setpoint_tracking import Setpoint, track_setpoint
+from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.bodies import Body
+from chaserdock_protocol.scenario.thrusters import thrusts_max
 
 FallbackMode = Literal["plan", "brake", "hold"]
 
 REST_M_S, REST_RAD_S = 0.004, math.radians(0.3)
 """A chaser below these rates, relative to the target's velocity and in WRF, is at rest."""
+REST_PULSES = 2.0
+"""A chaser with thrusters is at rest below the rates that so many shortest pulses of its strongest thruster change."""
 CLEARANCE_MARGIN_M = 0.05
 """Distance of the hold position beyond the entry of the corridor."""
 _KNOWN = ("tracking", "predicting")
@@ -38,6 +42,14 @@ class LastCommand:
 
     plan: Plan | None = None
     target: TargetEstimate | None = None
+
+
+class FallbackLimits(NamedTuple):
+    """Least distance of the hold position from the target (m); speed (m/s) and rate (rad/s) below which a chaser is at rest."""
+
+    clearance_m: float
+    rest_m_s: float
+    rest_rad_s: float
 
 
 @dataclass(frozen=True)
@@ -106,6 +118,18 @@ def clearance_m(scenario: FlightScenario, chaser: int) -> float:
     return max(scenario.limits.min_distance_target_m, entry_m) + CLEARANCE_MARGIN_M
 
 
+def fallback_limits(scenario: FlightScenario, chaser: int) -> FallbackLimits:
+    """Return the limits of a chaser's fallback. Thrusters hold rates only within a few of their shortest pulses."""
+    body, rest_m_s, rest_rad_s = scenario.chaser, REST_M_S, REST_RAD_S
+    if body.actuation == "thrusters":
+        shortest_N_s = thrusts_max(body.thrusters) * [t.min_on_s for t in body.thrusters]
+        impulses = REST_PULSES * wrench_matrix(body.thrusters) * shortest_N_s
+        rates = np.linalg.norm(impulses[3:] / np.array(body.inertia)[:, None], axis=0)
+        rest_m_s = max(rest_m_s, float(np.linalg.norm(impulses[:3], axis=0).max()) / body.mass_kg)
+        rest_rad_s = max(rest_rad_s, float(rates.max()))
+    return FallbackLimits(clearance_m(scenario, chaser), rest_m_s, rest_rad_s)
+
+
 def target_velocity(target: TargetEstimate | None) -> Array:
     """Return the velocity (3,) of the target's origin, WRF; zero if the target was not known."""
     if target is None or target.status not in _KNOWN:
@@ -113,10 +137,10 @@ def target_velocity(target: TargetEstimate | None) -> Array:
     return np.asarray(target.velocity_m_s)
 
 
-def is_at_rest(odometry: Odometry, velocity_m_s: Array) -> bool:
+def is_at_rest(odometry: Odometry, velocity_m_s: Array, limits: FallbackLimits) -> bool:
     """Return whether a chaser moves with ``velocity_m_s`` (3,), WRF, and does not rotate."""
-    relative = np.asarray(odometry.velocity_m_s) - velocity_m_s
-    return math.hypot(*relative) < REST_M_S and math.hypot(*odometry.omega_rad_s) < REST_RAD_S
+    speed_m_s = math.hypot(*(np.asarray(odometry.velocity_m_s) - velocity_m_s))
+    return speed_m_s < limits.rest_m_s and math.hypot(*odometry.omega_rad_s) < limits.rest_rad_s
 
 
 def next_state(
@@ -124,17 +148,17 @@ def next_state(
     odometry: Odometry,
     effective_ns: int,
     last: LastCommand,
-    min_distance_m: float,
+    limits: FallbackLimits,
 ) -> FallbackState:
     """Return the fallback state that follows ``state`` (None: the fallback starts). Modes only advance.
 
-    ``effective_ns``: when the actuator command of this tick takes effect. ``min_distance_m``: minimum distance of the hold
-    position from the target; a chaser that is farther away keeps its distance.
+    ``effective_ns``: when the actuator command of this tick takes effect. A chaser that is farther away than
+    ``limits.clearance_m`` keeps its distance.
     """
     mode = None if state is None else state.mode
     if mode in (None, "plan") and interpolate_plan(last.plan, effective_ns) is not None:
         return FallbackState("plan")
-    if mode != "hold" and not is_at_rest(odometry, target_velocity(last.target)):
+    if mode != "hold" and not is_at_rest(odometry, target_velocity(last.target), limits):
         return FallbackState("brake")
     if state is not None and state.mode == "hold":
         return state
@@ -142,7 +166,7 @@ def next_state(
     if target is None or not np.any(position - target):
         return FallbackState("hold", position)
     distance_m = float(np.linalg.norm(position - target))
-    return FallbackState("hold", (position - target) / distance_m, max(distance_m, min_distance_m))
+    return FallbackState("hold", (position - target) / distance_m, max(distance_m, limits.clearance_m))
 
 
 def hold_setpoint(state: FallbackState, odometry: Odometry, last: LastCommand) -> Setpoint:

@@ -44,7 +44,7 @@ from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 
 from .command_gate import autonomous_command, brake_command, damping_command, passed_on, refusal
-from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, next_state
+from .fallback import FallbackState, LastCommand, fallback_limits, fallback_wrench, next_state
 from .lease_grantor import LeaseGrantor
 from .local_damping import LocalDamping
 from .perception import make_perception
@@ -109,7 +109,7 @@ class ChaserProcess:
         self._last = LastCommand()
         self._last_tick = -1
         self._fallback: FallbackState | None = None
-        self._clearance_m = clearance_m(self.scenario, self.number)
+        self._fallback_limits = fallback_limits(self.scenario, self.number)
         self._thrusters_tick = self._uncommanded_tick = -1
         self._odometry_ns, self._odometry_arrived_s = 0, 0.0
         self._odometry_tick = self._docking_tick = -1
@@ -468,7 +468,7 @@ class ChaserProcess:
         if latched or stale:
             return brake_command(odometry, body, effective_ns, latched=True), None
         before = self._fallback
-        state = next_state(before, odometry, effective_ns, self._last, self._clearance_m)
+        state = next_state(before, odometry, effective_ns, self._last, self._fallback_limits)
         self._fallback = state
         if before is None or before.mode != state.mode:
             what = f"fallback: {state.mode}"

@@ -179,6 +179,7 @@ class Invariants:
         self._cones = {
             f"chaser/{p.chaser}": cone_of(self.scenario, p.chaser) for p in self.scenario.docking.ports
         }
+        self._retreats_to_m = [_retreat_goals(self.scenario, i) for i in range(len(self.scenario.chasers))]
         self._liars = {f.process for f in self.scenario.fault if f.kind == "lying_sensor"}
         self._handlers: dict[type, Callable[[Any], None]] = {
             Tick: self._on_tick,
@@ -745,11 +746,7 @@ class Invariants:
 
         Controllers begin it by their own estimates: after a hand-over it may be less far.
         """
-        port, goals_m = self.scenario.docking.port_of(i), [np.array(self.scenario.chasers[i].position_m)]
-        if port is not None:
-            reach_m, entry_m = self.scenario.chaser.probe_reach_m, self.scenario.docking.entry_m
-            goals_m.append(centre_offset(port, reach_m, entry_m))
-        left_m = np.linalg.norm(np.array(goals_m) - reference.offset_m, axis=1)
+        left_m = np.linalg.norm(self._retreats_to_m[i] - reference.offset_m, axis=1)
         sender, least_m = self._homing_m.get(i, (self._sender, left_m))
         least_m = np.minimum(left_m, least_m) if sender == self._sender else left_m
         self._homing_m[i] = self._sender, least_m
@@ -907,6 +904,14 @@ def settling_s(s: Scenario, chaser: int) -> float:
     out_s = d.entry_m / approach.max_speed_m_s
     in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (d.final_m + d.overdrive_m) / d.contact_speed_m_s
     return SETTLING_S + out_s + in_s + d.settle_s + 2.0 * d.pull_s
+
+
+def _retreat_goals(s: Scenario, chaser: int) -> Array:
+    """Return the places (1 or 2, 3), TRF, to which a retreat may lead: the nominal one, and the entry of the corridor to a port."""
+    port, goals_m = s.docking.port_of(chaser), [np.array(s.chasers[chaser].position_m)]
+    if port is not None:
+        goals_m.append(centre_offset(port, s.chaser.probe_reach_m, s.docking.entry_m))
+    return np.array(goals_m)
 
 
 def _concerns(fault: Fault, name: str) -> bool:

@@ -399,7 +399,7 @@ class ChaserProcess:
         self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
 
     def inform_perception(self, command: WrenchCommand) -> None:
-        """Pass on what a command tells about the target: its geometry, and where it is expected in the next image."""
+        """Pass on what a command states about the target: its geometry, and where it is expected in the next image."""
         self._expected = command.expected
         if (refused := apply_geometry(self.perception, command.geometry)) is not None:
             self._publish_warning("geometry refused", refused, command.tick, command.sim_time_ns)

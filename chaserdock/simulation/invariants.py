@@ -67,7 +67,7 @@ SETTLING_S, STOPPING_S = 15.0, 3.0
 """Time (s) after the last warning or command until a chaser has docked or is safe, at least the time that an approach takes;
 and until a chaser that is in motion has stopped."""
 BRAKING_S = 20.0
-"""Longest time (s) in which a chaser without a controller comes to rest."""
+"""Longest time (s) in which a chaser without a controller brakes."""
 DRIFT_ERROR_M = 0.1
 """Largest error (m) of the position to which a lost chaser is extrapolated."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate", "inspect")
@@ -539,13 +539,13 @@ class Invariants:
         return self._may_be_late() or (until_s > 0.0 and self.time_s - until_s <= FOLLOWING_S)
 
     def _check_braking(self, command: ActuatorCommand) -> None:
-        """Check that a chaser without a controller comes to rest; a latched one, or one without odometry, pushes not at all."""
+        """Check that a chaser without a controller ends braking; a latched one, or one without odometry, pushes not at all."""
         i, name = command.chaser, f"chaser/{command.chaser}"
         pushes = any((*command.force_N, *command.torque_N_m)) and i not in self._latched
         if command.source != "brake" or not pushes or name in self.dead or self.scenario.thruster_failure:
             self._braking_s.pop(i, None)
         elif (lasting_s := self.time_s - self._braking_s.setdefault(i, self.time_s)) > BRAKING_S:
-            self.violate("liveness", name, f"brakes for {lasting_s:.0f} s and does not come to rest")
+            self.violate("liveness", name, f"brakes for {lasting_s:.0f} s")
 
     def _check_pulses(self, command: ActuatorCommand) -> None:
         """Check that thrusters open before the force commanded since the last pulse gives more than all in one period."""

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.fallback import (
+    BRAKE_LIMIT_S,
     CLEARANCE_MARGIN_M,
     FallbackState,
     LastCommand,
@@ -86,9 +87,12 @@ def target(
 
 
 def fly_fallback(
-    scenario: Scenario, last: LastCommand, x: Array, seconds: float
+    scenario: Scenario, last: LastCommand, x: Array, seconds: float, disturbance: Any = (0.0,) * 6
 ) -> tuple[list[FallbackState], Array]:
-    """Simulate a rigid body in fallback; return its fallback state of each step and its states (K, 13)."""
+    """Simulate a rigid body in fallback; return its fallback state of each step and its states (K, 13).
+
+    ``disturbance``: constant force and torque (6,), body axes, that the chaser does not know.
+    """
     body, limits = scenario.chaser, fallback_limits(scenario, 0)
     history: list[FallbackState] = []
     states, state = [x], None
@@ -99,6 +103,7 @@ def fly_fallback(
         u = fallback_wrench(state, odometry, effective_ns, last, body)
         assert np.all(np.abs(u[:3]) <= body.force_max_N * (1 + 1e-9))
         assert np.all(np.abs(u[3:]) <= body.torque_max_N_m * (1 + 1e-9))
+        u = u + np.asarray(disturbance)
         v = x[3:6] + rotations.rotate(x[6:10], u[:3]) / body.mass_kg * STEP_S
         omega = x[10:] + u[3:] / np.asarray(body.inertia) * STEP_S
         x = np.concatenate([x[:3] + v * STEP_S, v, rotations.integrate(x[6:10], omega, STEP_S), omega])
@@ -167,6 +172,15 @@ def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
     assert history[-1].distance_m is None
     assert "the target is unknown" in history[-1].text()
     assert is_at_rest(moving(x[-1], 60.0), np.zeros(3), fallback_limits(scenario, 0))
+
+
+def test_braking_ends_where_a_disturbance_keeps_the_chaser_from_rest(scenario: Scenario) -> None:
+    """Seed 3065 of `fault-drill`: under 0.5 mN m chasers kept rotating at 0.5 deg/s, and braked for ever."""
+    near, torque = start((-0.45, 0.0, 0.0), omega_rad_s=(0.0, 0.05, 0.0)), (0.0, 0.0, 0.0, 0.0, 0.0005, 0.0)
+    history, x = fly_fallback(scenario, LastCommand(None, target()), near, 60.0, torque)
+    assert modes_of(history) == ["brake", "hold"]
+    assert [a.mode for a in history].count("brake") == BRAKE_LIMIT_S / STEP_S
+    assert np.linalg.norm(x[-1, :3]) == pytest.approx(clearance_m(scenario, 0), abs=0.01)
 
 
 def test_chaser_with_thrusters_is_at_rest_within_its_shortest_pulses() -> None:

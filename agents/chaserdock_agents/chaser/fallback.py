@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.braking import brake_wrench
+from chaserdock_models.braking import BRAKE_TIME_S, brake_wrench
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_models.setpoint_tracking import Setpoint, track_setpoint
 from chaserdock_models.wrench_set import wrench_matrix
@@ -29,6 +29,8 @@ FallbackMode = Literal["plan", "brake", "hold"]
 
 REST_M_S, REST_RAD_S = 0.004, math.radians(0.3)
 """A chaser below these rates, relative to the target's velocity and in WRF, is at rest."""
+BRAKE_LIMIT_S = 5 * BRAKE_TIME_S
+"""Longest time of ``brake``: a constant disturbance, which the braking law only balances, may keep a chaser from rest."""
 REST_PULSES = 2.0
 """A chaser with thrusters is at rest below the rates that so many shortest pulses of its strongest thruster change."""
 CLEARANCE_MARGIN_M = 0.05
@@ -54,7 +56,7 @@ class FallbackLimits(NamedTuple):
 
 @dataclass(frozen=True)
 class FallbackState:
-    """Mode of a chaser without commands.
+    """Mode of a chaser without commands. For ``brake``: when it began, ``since_ns``.
 
     For ``hold``: ``outward_w`` (3,), unit vector from the target to the chaser, and ``distance_m`` between them; without a
     known target the position itself (3,) and None.
@@ -63,6 +65,7 @@ class FallbackState:
     mode: FallbackMode
     outward_w: Array | None = None
     distance_m: float | None = None
+    since_ns: int = 0
 
     def text(self) -> str:
         """Return the detail of the event."""
@@ -152,16 +155,19 @@ def next_state(
 ) -> FallbackState:
     """Return the fallback state that follows ``state`` (None: the fallback starts). Modes only advance.
 
-    ``effective_ns``: when the actuator command of this tick takes effect. A chaser that is farther away than
-    ``limits.clearance_m`` keeps its distance.
+    ``effective_ns``: when the actuator command of this tick takes effect. Braking ends at rest, or after ``BRAKE_LIMIT_S``. A
+    chaser that is farther away than ``limits.clearance_m`` keeps its distance.
     """
     mode = None if state is None else state.mode
     if mode in (None, "plan") and interpolate_plan(last.plan, effective_ns) is not None:
         return FallbackState("plan")
-    if mode != "hold" and not is_at_rest(odometry, target_velocity(last.target), limits):
-        return FallbackState("brake")
     if state is not None and state.mode == "hold":
         return state
+    since_ns = state.since_ns if state is not None and state.mode == "brake" else effective_ns
+    if (effective_ns - since_ns) / 1e9 < BRAKE_LIMIT_S and not is_at_rest(
+        odometry, target_velocity(last.target), limits
+    ):
+        return FallbackState("brake", since_ns=since_ns)
     position, target = np.asarray(odometry.position_m), extrapolate_target(last.target, odometry.sim_time_ns)
     if target is None or not np.any(position - target):
         return FallbackState("hold", position)

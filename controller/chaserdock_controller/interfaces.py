@@ -167,7 +167,7 @@ class TargetEstimation:
     ``relative``: poses of the chasers relative to the target, if estimated with covariance.
     ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
     target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are. ``shape``: errors of
-    the known geometry, once they are estimated.
+    the known geometry, once they are estimated. ``doubtful``: chasers whose odometry may be wrong.
     """
 
     target: TargetState
@@ -184,6 +184,7 @@ class TargetEstimation:
     events: tuple[LogEntry, ...]
     stack: IdentifiedStack | None = None
     shape: EstimatedShape | None = None
+    doubtful: frozenset[int] = frozenset()
 
     @property
     def known(self) -> bool:

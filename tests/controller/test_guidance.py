@@ -342,7 +342,7 @@ def test_approach_holds_while_the_target_is_out_of_sight_and_continues() -> None
         ("hold", ""),
         ("approach", ""),
         ("hold", "no chaser has seen the target for 3 s"),
-        ("approach", "the target is in sight again"),
+        ("approach", "its sightings can be used again"),
     ]
     assert events[2][0] == pytest.approx(8.0, abs=0.11)
     assert events[3][0] == pytest.approx(15.0, abs=0.11)
@@ -350,6 +350,22 @@ def test_approach_holds_while_the_target_is_out_of_sight_and_continues() -> None
 
 def test_a_moment_without_sight_changes_nothing() -> None:
     assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 7.9)] == ["hold", "approach"]
+
+
+def test_approach_holds_while_the_odometry_is_doubtful_and_continues() -> None:
+    guidance, events = PhaseMachine(scenario()), []
+    guidance.target_acquired(0.0)
+    for k in range(100):
+        guidance.update_visibility(0.1 * k, True, {0} if 20 <= k < 40 else set())
+        if k == 1:
+            for i in (0, 1):
+                assert guidance.command(operator("approach", i), 0.1).accepted
+        events += [(k, *change) for change in drain(guidance)]
+    reason = "its sightings have contradicted its odometry since that was received"
+    assert [(k, i, what, why.partition(": ")[2]) for k, i, what, why in events if k >= 20] == [
+        (20, 0, "hold", reason),
+        (40, 0, "approach", "its sightings can be used again"),
+    ]
 
 
 def test_commanded_chaser_does_not_resume_its_approach() -> None:

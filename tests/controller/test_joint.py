@@ -23,6 +23,7 @@ from chaserdock_controller.estimation.joint.state import (
     ATTITUDE_DRIFT,
     CENTRE,
     CHASER,
+    SIGHTING_CHANNEL,
     TARGET,
     VIEW,
     JointState,
@@ -357,10 +358,29 @@ def test_chaser_that_contradicts_all_measurements_is_started_again() -> None:
     estimator.drain_events()
     fly(estimator, flight, 2.0, moved)
     texts = [e.text for e in estimator.drain_events()]
-    restart = "chaser 1: no measurement fitted for 1 s; started again from its odometry"
+    restart = "chaser 1: no measurement of its pose fitted for 1 s; started again from its odometry"
     assert texts.count(restart) == 1
     np.testing.assert_allclose(estimator.state.positions_m[1], stated[-1].position_m, atol=0.01)
     assert (estimator.state.rejections[1, 1:] < 5).all()
+
+
+def test_chaser_whose_sightings_and_pose_contradict_the_estimate_is_started_again() -> None:
+    """When odometry that was wrong from the start becomes right, the rates fit all the time, but support no pose."""
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 3, 7)
+    estimator = estimator_for(flight.errors, 3)
+
+    def displaced(inputs: JointInputs) -> JointInputs:
+        o = inputs.odometry[1]
+        elsewhere = msgspec.structs.replace(o, position_m=vector(np.add(o.position_m, [0.0, 0.0, 0.17])))
+        return replace(inputs, odometry={**inputs.odometry, 1: elsewhere})
+
+    fly(estimator, flight, 5.0, displaced)
+    assert estimator.state is not None
+    assert estimator.state.rejections[1, SIGHTING_CHANNEL] > 0
+    fly(estimator, flight, 2.0)
+    honest = flight.inputs().odometry[1]
+    np.testing.assert_allclose(estimator.state.positions_m[1], honest.position_m, atol=0.01)
+    assert not estimator.state.rejections[1].any()
 
 
 @pytest.mark.parametrize(("ticks", "follows"), [(1, False), (2, True)])

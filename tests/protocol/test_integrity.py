@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
-from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
+from chaserdock_controller.ingest.sensor_consistency import AGREES_S, DISAGREES_S, SensorConsistency
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
@@ -99,6 +99,31 @@ def test_agreement() -> None:
 def test_chaser_without_sightings_does_not_disagree() -> None:
     agreement = SensorConsistency()
     assert [agreement.update(t / 10, (), ()) for t in range(50)] == [[]] * 50
+
+
+def test_odometry_is_doubtful_until_sightings_agree_since_it_was_lost() -> None:
+    """Sightings of chaser 1 disagree from 2 to 3 s and from 5 to 6 s; its odometry is lost until 1 s, and from 4 to 5 s."""
+    agreement, doubtful_at = SensorConsistency(), []
+    for tick in range(160):
+        now_s = tick / 16  # exact
+        rejected = {1} if 2.0 <= now_s < 3.0 or 5.0 <= now_s < 6.0 else set()
+        lost = {1} if now_s < 1.0 or 4.0 <= now_s < 5.0 else set()
+        agreement.update(now_s, {0, 1} - rejected - lost, rejected, lost)
+        doubtful_at += [now_s] if agreement.doubtful else []
+    # From 2 to 3 s, after a second of agreement, a camera fault is likelier: a jump of the odometry would have been noticed.
+    assert doubtful_at[0] == pytest.approx(5.0 + DISAGREES_S, abs=1 / 16)
+    assert doubtful_at[-1] == pytest.approx(6.0 + AGREES_S, abs=1 / 16)
+    assert len(doubtful_at) == (doubtful_at[-1] - doubtful_at[0]) * 16 + 1
+
+
+def test_jump_of_doubtful_odometry_is_accepted() -> None:
+    watch = OdometryValidation(SCENARIO)
+    for tick in range(20):
+        assert watch.update(lying(flown(tick), (0.2, 0.0, 0.0), 0.1), doubtful=tick > 10)[1] == []
+    odometry, events = watch.update(flown(20), doubtful=True)
+    assert odometry == flown(20)
+    assert [level for level, _ in events] == ["warning"]
+    assert watch.update(flown(21)) == (flown(21), [])
 
 
 @pytest.mark.parametrize("gap", [1, 2, 5])

@@ -85,7 +85,7 @@ class EstimationStage:
         visible_to = frozenset(s.chaser for s in o.sightings if s.solutions)
         events: list[LogEntry] = [(e.level, e.text) for e in estimator.drain_events()]
         accepted, rejected = sorted(visible_to - set(target.rejected)), sorted(target.rejected)
-        events += self.consistency.update(o.time_s, accepted, rejected)
+        events += self.consistency.update(o.time_s, accepted, rejected, o.lost)
         return TargetEstimation(
             target=target,
             at_effect=estimator.estimate_at(o.effective_ns) if known else None,
@@ -95,6 +95,7 @@ class EstimationStage:
             motion_covariances=self._motion_covariances(own) if known else {},
             relative=estimator.relative_poses() if isinstance(estimator, JointEstimator) else (),
             visible_to=visible_to,
+            doubtful=self.consistency.doubtful,
             cameras=camera_calibrations(estimator, self._camera),
             latched=self.composite.latched,
             body=self.composite.moving,

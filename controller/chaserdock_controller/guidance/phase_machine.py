@@ -7,7 +7,7 @@ Phases and transitions: ``phases``. Every phase change looks up its target in th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -115,20 +115,23 @@ class PhaseMachine:
         for i in range(len(self.chasers)):
             self._stop_or_back_out(i, Trigger.TARGET_LOST, now_s, "the target is lost")
 
-    def update_visibility(self, now_s: float, visible: bool) -> None:
-        """Interrupt approaches to a target that no chaser has seen for a while, and resume them afterwards."""
+    def update_visibility(self, now_s: float, visible: bool, doubtful: Collection[int] = frozenset()) -> None:
+        """Interrupt approaches to a target that no chaser has seen for a while, and those of chasers whose odometry is
+        ``doubtful``; resume them afterwards."""
         self._seen_s = now_s if visible or self._seen_s is None else self._seen_s
         unseen_s = now_s - self._seen_s
         for i in range(len(self.chasers)):
-            if unseen_s >= _SIGHT_LOSS_S:
+            if unseen_s >= _SIGHT_LOSS_S or i in doubtful:
                 reason = f"no chaser has seen the target for {_SIGHT_LOSS_S:g} s"
+                if i in doubtful:
+                    reason = "its sightings have contradicted its odometry since that was received"
                 if self._stop_or_back_out(i, Trigger.SIGHT_LOST, now_s, reason) is Phase.HOLD:
                     self._interrupted.add(i)
             elif i in self._interrupted and unseen_s == 0.0 and self._permits(i, Trigger.SIGHT_REGAINED):
                 move = move_to(
                     self._in_trf(i, now_s), self.dock_offset(i), now_s, self._scenario.approach.max_speed_m_s
                 )
-                self._transition(i, Trigger.SIGHT_REGAINED, now_s, move, "the target is in sight again")
+                self._transition(i, Trigger.SIGHT_REGAINED, now_s, move, "its sightings can be used again")
             if self.chasers[i].phase is not Phase.HOLD:
                 self._interrupted.discard(i)
 

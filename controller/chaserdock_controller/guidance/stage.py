@@ -113,7 +113,7 @@ class GuidanceStage:
                 self.machine.target_lost(now_s)
             self.machine.target_unknown(now_s)
             return
-        self.machine.update_visibility(now_s, visible=target.status == "tracking")
+        self.machine.update_visibility(now_s, target.status == "tracking", estimation.doubtful)
         self.machine.target_acquired(now_s)
         if is_settled(target):
             for i, odometry in estimation.own.items():

@@ -2,7 +2,8 @@
 """Validation of odometry: states that no rigid body can have, and jumps that a chaser cannot have made. No I/O.
 
 A chaser whose odometry jumps would fly to the wrong place, through the target if that lies between. A jump is
-therefore removed and the state before it continued; a jump back removes the correction.
+therefore removed and the state before it continued; a jump back removes the correction. Where sightings contradict the
+state before the jump and have never confirmed it, the jump may lead back to the truth, and is accepted.
 """
 
 from __future__ import annotations
@@ -98,8 +99,9 @@ class OdometryValidation:
         self._alpha_rad_s2 = math.sqrt(3.0) * body.torque_max_N_m / min(body.inertia)
         self._known: dict[int, Known] = {}
 
-    def update(self, odometry: Odometry) -> tuple[Odometry, list[tuple[Level, str]]]:
-        """Return a chaser's next odometry without jumps, and the events to log."""
+    def update(self, odometry: Odometry, doubtful: bool = False) -> tuple[Odometry, list[tuple[Level, str]]]:
+        """Return a chaser's next odometry without jumps, and the events to log. ``doubtful``: what was received before it may
+        be wrong."""
         i, known = odometry.chaser, self._known.get(odometry.chaser)
         gap_s = 0.0 if known is None else (odometry.sim_time_ns - known.last.sim_time_ns) / 1e9
         if known is None or not 0.0 < gap_s <= LONGEST_S:
@@ -114,11 +116,15 @@ class OdometryValidation:
             self._known[i] = Known(odometry)
             return odometry, [("info", f"chaser {i}: odometry jumped back; correction removed")]
         jump_m, jump_rad = _distance(corrected, expected)
+        jump = f"jumped by {jump_m * 1e3:.0f} mm, {math.degrees(jump_rad):.1f} deg"
+        if doubtful:
+            self._known[i] = Known(odometry)
+            text = f"chaser {i}: odometry {jump}; accepted, as its sightings contradicted it before"
+            return odometry, [("warning", text)]
         offset = np.subtract(odometry.position_m, expected.position_m)
         rotation = rotations.multiply(rotations.conjugate(expected.q_wxyz), odometry.q_wxyz)
         self._known[i] = Known(_remove(odometry, offset, rotation), offset, rotation)
-        jump = f"{jump_m * 1e3:.0f} mm, {math.degrees(jump_rad):.1f} deg"
-        text = f"chaser {i}: odometry jumped by {jump}, more than the chaser can have moved; jump removed"
+        text = f"chaser {i}: odometry {jump}, more than the chaser can have moved; jump removed"
         return self._known[i].last, [("warning", text)]
 
     def _is_plausible(self, odometry: Odometry, expected: Odometry, gap_s: float) -> bool:

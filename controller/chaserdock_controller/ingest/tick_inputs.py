@@ -43,11 +43,12 @@ class TickInputCollector:
         self._has_port = [scenario.docking.port_of(i) is not None for i in range(len(scenario.chasers))]
         self._extrapolation_ns = scenario.controller.command_lifetime_s * 1e9
 
-    def add_odometry(self, odometry: Odometry) -> list[LogEntry] | None:
-        """Add an odometry and return the events to log; None if one of that chaser as new is known."""
+    def add_odometry(self, odometry: Odometry, doubtful: bool = False) -> list[LogEntry] | None:
+        """Add an odometry and return the events to log; None if one of that chaser as new is known. ``doubtful``: what was
+        received before it may be wrong."""
         if _is_overtaken(odometry, self._odometry.get(odometry.chaser)):
             return None
-        self._odometry[odometry.chaser], events = self.odometry_validation.update(odometry)
+        self._odometry[odometry.chaser], events = self.odometry_validation.update(odometry, doubtful)
         return events
 
     def add_docking(self, docking: DockingStatus) -> bool:

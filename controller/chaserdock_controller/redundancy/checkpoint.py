@@ -145,6 +145,8 @@ class ShapeState(Struct, forbid_unknown_fields=True):
 
 class ConsistencyState(Struct, forbid_unknown_fields=True):
     inconsistent: set[int]
+    confirmed: set[int]
+    _lost_s: dict[int, float]
     _since_s: dict[int, tuple[bool, float]]
 
 

@@ -3,7 +3,8 @@
 
 A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
 until it has fitted as often: a jump or a constant error then changes nothing. A chaser of which no measurement was used for
-``restart_after_s`` is started again from its odometry: an estimate that contradicts all measurements cannot recover otherwise.
+``restart_after_s``, or none of its pose while sightings contradict it, is started again from its odometry: an estimate that
+contradicts all measurements cannot recover otherwise.
 A velocity or rate that does not fit in two ticks in a row, by no more than the thrusters can cause within a tick, is followed.
 Noise that exceeds the gate in a single tick, which happens in about every flight, must not pass for a force. A sighting by shape
 that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can cause, is followed as well, unless
@@ -65,6 +66,7 @@ from .state import (
     packed,
 )
 
+_POSE = (CHANNELS.index("position"), CHANNELS.index("attitude"))
 _RATES = (CHANNELS.index("velocity"), CHANNELS.index("rate"))
 _SIGHTING, _ODOMETRY = frozenset({SIGHTING_CHANNEL}), frozenset(range(1, len(CHANNELS)))
 _TICK_S = 0.1
@@ -304,7 +306,7 @@ def update(
             continue
         sighting = sightings.get(i) if state.target_known else None
         fits = _update_chaser(running, i, odometry.get(i), sighting, new_views, mounting, p)
-        if any(fits.values()):
+        if _is_supported(fits, bool(running.rejections[i, SIGHTING_CHANNEL])):
             measured[i] = state.time_ns
         if sighting is not None and sighting.solutions:
             (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
@@ -314,6 +316,12 @@ def update(
     report = UpdateReport(tuple(accepted), tuple(rejected))
     finished = running.finished(state.updates + bool(accepted), markers)
     return replace(finished, measured_ns=measured), report
+
+
+def _is_supported(fits: Mapping[int, bool], contradicted: bool) -> bool:
+    """Return whether measurements support a chaser's estimate: those of rates do not while its sightings are ``contradicted``."""
+    pose = fits.get(SIGHTING_CHANNEL, False) or all(fits.get(k, False) for k in _POSE)
+    return pose or (not contradicted and any(fits.values()))
 
 
 def _update_chaser(

@@ -19,7 +19,7 @@ from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_controller.guidance.trajectories import PEAK_SPEED
 from chaserdock_controller.ingest.lost_chasers import MOST_M as LOST_MARGIN_M
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, length
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_models.relative_motion import relative_acceleration, relative_torque
 from chaserdock_protocol import topics
@@ -173,6 +173,7 @@ class Invariants:
         )
         self._orbit = None if self.scenario.orbit is None else TargetOrbit(self.scenario.orbit)
         self._now_s, self._sender = 0.0, ""
+        self._truth = self.scenario.truth.mismatch("chaser")
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
         }
@@ -318,8 +319,8 @@ class Invariants:
         gained_m_s = _distance(np.array(before.velocity_m_s), np.array(after.velocity_m_s))
         drawn = self._drawn.get(after.body)
         pushed_m_s = after.absolute_impulse_N_s / drawn.mass_kg if drawn is not None else 0.0
-        off_m = 0.0 if drawn is None else float(np.linalg.norm(drawn.centre_of_mass_m))
-        turned_rad = float(np.linalg.norm(after.omega_rad_s) + np.linalg.norm(before.omega_rad_s)) * dt_s
+        off_m = 0.0 if drawn is None else math.hypot(*drawn.centre_of_mass_m)
+        turned_rad = (math.hypot(*after.omega_rad_s) + math.hypot(*before.omega_rad_s)) * dt_s
         allowed_m = _DISPLACEMENT_FLOOR_M + (gained_m_s + pushed_m_s) * dt_s + off_m * turned_rad
         if error_m > allowed_m:
             text = f"moved {error_m:.2e} m more than its velocity explains, {allowed_m:.2e} allowed"
@@ -330,19 +331,17 @@ class Invariants:
         drawn = self._drawn.get(after.body)
         if self.scenario.plume is not None and len(self.scenario.chasers) > 1:
             return  # plumes of the others push it
-        if drawn is None or np.any(
-            drawn.centre_of_mass_m
-        ):  # the body's origin is not its centre of mass then
+        if drawn is None or any(drawn.centre_of_mass_m):  # the body's origin is not its centre of mass then
             return
-        truth, dt_s = self.scenario.truth.mismatch("chaser"), 1.0 / self.scenario.time.rate_hz
+        truth, dt_s = self._truth, 1.0 / self.scenario.time.rate_hz
         impulse = np.array(after.impulse_N_s) + np.array(drawn.force_N) * dt_s
         halfway = rotations.integrate(np.array(before.q_wxyz), np.array(before.omega_rad_s), 0.5 * dt_s)
         linear, turning = self._orbital_impulse(before, drawn)
         gained = drawn.mass_kg * (np.array(after.velocity_m_s) - np.array(before.velocity_m_s)) - linear
-        error = float(np.linalg.norm(gained - rotations.rotate(halfway, impulse)))
-        turned = float(np.linalg.norm(after.omega_rad_s)) * dt_s
+        error = length(gained - rotations.rotate(halfway, impulse))
+        turned = math.hypot(*after.omega_rad_s) * dt_s
         allowed = _IMPULSE_FLOOR_N_S + (_IMPULSE_SHARE + turned) * (
-            after.absolute_impulse_N_s + float(np.linalg.norm(drawn.force_N)) * dt_s
+            after.absolute_impulse_N_s + math.hypot(*drawn.force_N) * dt_s
         )
         if error > allowed + 5.0 * truth.force_noise_N * dt_s:
             self.violate("momentum", after.body, f"{error:.2e} N s without a cause, {allowed:.2e} allowed")
@@ -350,7 +349,7 @@ class Invariants:
         angular = np.array(after.angular_impulse_N_m_s) + np.array(drawn.torque_N_m) * dt_s
         spun = rotations.rotate(after.q_wxyz, inertia @ after.omega_rad_s)
         spun = spun - rotations.rotate(before.q_wxyz, inertia @ before.omega_rad_s) - turning
-        error = float(np.linalg.norm(spun - rotations.rotate(halfway, angular)))
+        error = length(spun - rotations.rotate(halfway, angular))
         allowed = _ANGULAR_FLOOR_N_M_S + (_IMPULSE_SHARE + turned) * (
             float(np.abs(angular).sum()) + _ARM_M * after.absolute_impulse_N_s
         )
@@ -389,14 +388,14 @@ class Invariants:
         omega, velocity = np.array(body.omega_rad_s), np.array(body.velocity_m_s)
         inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
         conserved = {"rotational energy": 0.5 * float(omega @ inertia @ omega)}
-        if not np.any(drawn.centre_of_mass_m):
-            conserved["speed"] = float(np.linalg.norm(velocity))
+        if not any(drawn.centre_of_mass_m):
+            conserved["speed"] = length(velocity)
         if self.scenario.target.motion == "torque_free":
             momentum = rotations.rotate(np.array(body.q_wxyz), inertia @ omega)
             conserved |= {
                 f"angular momentum {axis}": float(x) for axis, x in zip("xyz", momentum, strict=True)
             }
-        scale = float(np.linalg.norm(inertia @ omega))
+        scale = length(inertia @ omega)
         for name, value in conserved.items():
             begin = self._begin.setdefault(name, value)
             size = max(abs(begin), scale if name.startswith("angular") else abs(begin), 1e-9)
@@ -429,8 +428,8 @@ class Invariants:
         inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
         spun = [rotations.rotate(s.q_wxyz, inertia @ s.omega_rad_s) for s in (before, body)]
         _, given = self._orbital_impulse(before, drawn)
-        error = float(np.linalg.norm(spun[1] - spun[0] - given))
-        allowed = _SPUN_SHARE * float(np.linalg.norm(spun[1])) + 1e-12
+        error = length(spun[1] - spun[0] - given)
+        allowed = _SPUN_SHARE * length(spun[1]) + 1e-12
         if error > allowed:
             text = f"target: {error:.2e} N m s without a cause, {allowed:.2e} allowed"
             self.violate("energy and momentum", "target", text)
@@ -450,7 +449,7 @@ class Invariants:
             if name in self._touching:
                 continue
             offset = rotations.rotate_inverse(target.q_wxyz, at - target.position_m)
-            distance_m = float(np.linalg.norm(offset))
+            distance_m = length(offset)
             if distance_m < self._nearest_allowed_m(name, offset) - KEEP_OUT_SLACK_M:
                 self.violate("keep-out zone", name, f"{distance_m:.3f} m from the target")
 
@@ -491,11 +490,11 @@ class Invariants:
     def _check_plan(self, plan: Plan, command: WrenchCommand) -> None:
         """Check that a command is the input of its plan at the time from which it acts."""
         stage = int((command.effective_time_ns - plan.sim_time_ns) / 1e9 / plan.step_s + 1e-9)
-        planned = np.reshape(plan.inputs, (-1, 6))
-        if not 0 <= stage < len(planned):
+        if not 0 <= stage < len(plan.inputs) // 6:
             return
+        planned = plan.inputs[6 * stage : 6 * stage + 6]
         limits = self.scenario.chaser.wrench_max
-        error = np.abs(np.array([*command.force_N, *command.torque_N_m]) - planned[stage]) / limits
+        error = np.abs(np.array([*command.force_N, *command.torque_N_m]) - planned) / limits
         if float(error.max()) > _PLAN_SHARE:
             text = f"differs from its plan by {error.max():.2e} of the limits"
             self.violate("plan is flown", f"chaser/{command.chaser}", text)
@@ -559,7 +558,7 @@ class Invariants:
             return  # a copy, or the second command of a tick
         total_N_s = total_N_s + np.array(command.force_N) / self.scenario.time.rate_hz
         self._without_pulse_N_s[i] = command.tick, total_N_s
-        waiting_N_s = float(np.linalg.norm(total_N_s))
+        waiting_N_s = length(total_N_s)
         if waiting_N_s > sum(t.thrust_N for t in body.thrusters) / body.modulation.carrier_hz:
             text = f"opens no thruster, although {waiting_N_s:.2g} N s are commanded"
             self.violate("commands are flown", f"chaser/{i}", text)
@@ -699,7 +698,7 @@ class Invariants:
 
     def _thruster_error_N_s(self, name: str, given_N_s: float) -> float:
         """Return by how much the impulse that thrusters have given may differ from the expected one."""
-        truth, drawn = self.scenario.truth.mismatch("chaser"), self._drawn.get(name)
+        truth, drawn = self._truth, self._drawn.get(name)
         late_s = truth.delay_s + 3.0 * truth.delay_jitter_s
         late_s += 0.0 if drawn is None else abs(drawn.clock_offset_s)
         # A thruster's force acts on position and, by its arm, on attitude.

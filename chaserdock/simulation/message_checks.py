@@ -41,14 +41,16 @@ def covariance_defect(values: Sequence[float]) -> str:
     size = math.isqrt(len(values))
     if size == 3 and _is_covariance_3(*values):
         return ""
-    matrix = np.reshape(np.asarray(values), (size, size))
-    scale = float(np.abs(matrix).max())
-    asymmetry = float(np.abs(matrix - matrix.T).max())
-    if asymmetry > _SYMMETRY * scale:
-        return f"covariance is not symmetric: {asymmetry:.2e} of {scale:.2e}"
+    matrix, scale = np.array(values).reshape(size, size), max(map(abs, values))
+    if not (matrix == matrix.T).all():
+        asymmetry = float(np.abs(matrix - matrix.T).max())
+        if asymmetry > _SYMMETRY * scale:
+            return f"covariance is not symmetric: {asymmetry:.2e} of {scale:.2e}"
+    shifted = matrix.copy()
+    shifted.reshape(-1)[:: size + 1] += _SYMMETRY * scale
     try:
         # Exists unless an eigenvalue is below -_SYMMETRY * scale, and is faster than the eigenvalues.
-        np.linalg.cholesky(matrix + _SYMMETRY * scale * np.eye(size))
+        np.linalg.cholesky(shifted)
         return ""
     except np.linalg.LinAlgError:
         least = float(np.linalg.eigvalsh(matrix)[0])
@@ -122,16 +124,16 @@ def _plan(plan: Plan, scenario: Scenario) -> Iterator[str]:
     if lengths != (3 * (stages + 1), 4 * (stages + 1), 6 * stages):
         yield f"plan of {stages} stages with {lengths} numbers"
         return
-    yield from _within_limits(np.reshape(plan.inputs, (stages, 6)), scenario)
+    yield from _within_limits(plan.inputs, scenario)
 
 
-def _within_limits(wrenches: Any, scenario: Scenario, single: bool = False) -> Iterator[str]:
-    """Check wrenches (..., 6). ``single``: thrusters may be commanded one by one, up to all in the same direction."""
+def _within_limits(wrenches: Sequence[float], scenario: Scenario, single: bool = False) -> Iterator[str]:
+    """Check wrenches, six numbers each. ``single``: thrusters may be commanded one by one, up to all in the same direction."""
     limits, thrusters = scenario.chaser.wrench_max, scenario.chaser.thrusters
     if single:
         limits = np.maximum(limits, np.abs(wrench_matrix(thrusters)) @ thrusts_max(thrusters))
-    share = float(np.max(np.abs(wrenches) / limits, initial=0.0))
-    if share > _LIMIT_SHARE:
+    shares = np.abs(np.array(wrenches).reshape(-1, 6)) / limits
+    if len(shares) and (share := float(shares.max())) > _LIMIT_SHARE:
         yield f"wrench of {share:.3f} of the body's limits"
 
 

@@ -54,9 +54,12 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
 def _by_rows(kernel: str, a: Array, b: Array) -> Array:
     """Return a kernel's result (..., n) for operands (..., m) and (..., n), which it repeats along leading axes."""
     lead_a, lead_b = a.shape[:-1], b.shape[:-1]
-    lead = lead_a
-    if lead_b and lead_a != lead_b:
-        lead = np.broadcast_shapes(lead_a, lead_b) if lead_a else lead_b
+    if not lead_b or lead_a[-len(lead_b) :] == lead_b:
+        lead = lead_a
+    elif not lead_a or lead_b[-len(lead_a) :] == lead_a:
+        lead = lead_b
+    else:
+        lead = np.broadcast_shapes(lead_a, lead_b)
     out = np.empty((*lead, b.shape[-1]))
     a, b = _repeatable(a, lead), _repeatable(b, lead)
     function(kernel)(

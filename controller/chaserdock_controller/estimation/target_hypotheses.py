@@ -118,8 +118,8 @@ def apply_shocks(state: StateT, shocks: Sequence[Shock]) -> StateT:
 
 def is_lost(covariance: Array, p: MekfParameters) -> bool:
     """Test whether a pose with this covariance (12+, 12+) is too uncertain to use."""
-    variances = covariance.diagonal()
-    if variances[0:3].sum() <= p.lost_position_m**2 and variances[6:9].sum() <= p.lost_attitude_rad**2:
+    v = covariance.diagonal().tolist()
+    if v[0] + v[1] + v[2] <= p.lost_position_m**2 and v[6] + v[7] + v[8] <= p.lost_attitude_rad**2:
         return False  # no eigenvalue exceeds the trace
     position_m, attitude_rad = (_largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 6))
     return position_m > p.lost_position_m or attitude_rad > p.lost_attitude_rad

@@ -57,8 +57,8 @@ class SearchProgress(Struct, frozen=True):
 
 def is_settled(target: TargetState) -> bool:
     """Return whether the target's rates are known well enough to fly relative to it."""
-    sums = [float(target.covariance.diagonal()[i : i + 3].sum()) for i in (3, 9)]
-    if sums[0] < _SETTLED_M_S**2 and sums[1] < _SETTLED_RAD_S**2:
+    v = target.covariance.diagonal().tolist()
+    if v[3] + v[4] + v[5] < _SETTLED_M_S**2 and v[9] + v[10] + v[11] < _SETTLED_RAD_S**2:
         return True  # no eigenvalue is larger than the trace
     largest = [float(np.linalg.eigvalsh(target.covariance[i : i + 3, i : i + 3])[-1]) for i in (3, 9)]
     return largest[0] < _SETTLED_M_S**2 and largest[1] < _SETTLED_RAD_S**2

@@ -43,9 +43,17 @@ class Part(Struct, frozen=True, eq=False, dict=True):
         """Return the end position, repeated (count, 3)."""
         end = self._rests.get(count)
         if end is None:
-            powers = np.vander(np.full(count, self.duration_s), 6, increasing=True)
-            end = self._rests[count] = powers @ self.coefficients
+            end = self._rests[count] = _powers(np.full(count, self.duration_s)) @ self.coefficients
         return end
+
+
+def _powers(times_s: Array) -> Array:
+    """Return the powers 0 to 5 (K, 6) of times (K,), as ``numpy.vander`` does in twice the time."""
+    powers = np.empty((len(times_s), 6))
+    powers[:, 0] = 1.0
+    powers[:, 1:] = times_s[:, None]
+    np.multiply.accumulate(powers[:, 1:], axis=1, out=powers[:, 1:])
+    return powers
 
 
 @lru_cache(maxsize=8)
@@ -86,7 +94,7 @@ class Move(Struct, frozen=True, eq=False, tag=True):
                 continue
             inside = ((t >= 0.0) & (t <= part.duration_s))[:, None]
             c = part.coefficients
-            powers = np.vander(np.clip(t, 0.0, part.duration_s), 6, increasing=True)
+            powers = _powers(np.minimum(np.maximum(t, 0.0), part.duration_s))
             position += powers @ c
             velocity += np.where(inside, powers[:, :5] @ (c[1:] * _FIRST), 0.0)
             acceleration += np.where(inside, powers[:, :4] @ (c[2:] * _SECOND), 0.0)

@@ -9,7 +9,7 @@ state before the jump and have never confirmed it, the jump may lead back to the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import msgspec
@@ -74,16 +74,10 @@ def _is_covariance(elements: tuple[float, ...]) -> bool:
 
 @dataclass
 class Known:
-    """The last corrected odometry of a chaser, and the correction: offset (3,) in WRF, rotation (4,) in CRF."""
+    """The last corrected odometry of a chaser, and the correction, if any: offset (3,) in WRF, rotation (4,) in CRF."""
 
     last: Odometry
-    offset_m: Array = field(default_factory=lambda: np.zeros(3))
-    rotation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-
-    @property
-    def corrected(self) -> bool:
-        """Return whether there is a correction."""
-        return bool(np.any(self.offset_m)) or bool(self.rotation[0] != 1.0)
+    correction: tuple[Array, Array] | None = None
 
 
 class OdometryValidation:
@@ -108,11 +102,11 @@ class OdometryValidation:
             self._known[i] = Known(odometry)
             return odometry, []
         expected = extrapolate(known.last, odometry.tick, odometry.sim_time_ns)
-        corrected = _remove(odometry, known.offset_m, known.rotation)
+        corrected = odometry if known.correction is None else _remove(odometry, *known.correction)
         if self._is_plausible(corrected, expected, gap_s):
             known.last = corrected
             return corrected, []
-        if known.corrected and self._is_plausible(odometry, expected, gap_s):
+        if known.correction is not None and self._is_plausible(odometry, expected, gap_s):
             self._known[i] = Known(odometry)
             return odometry, [("info", f"chaser {i}: odometry jumped back; correction removed")]
         jump_m, jump_rad = _distance(corrected, expected)
@@ -123,7 +117,7 @@ class OdometryValidation:
             return odometry, [("warning", text)]
         offset = np.subtract(odometry.position_m, expected.position_m)
         rotation = rotations.multiply(rotations.conjugate(expected.q_wxyz), odometry.q_wxyz)
-        self._known[i] = Known(_remove(odometry, offset, rotation), offset, rotation)
+        self._known[i] = Known(_remove(odometry, offset, rotation), (offset, rotation))
         text = f"chaser {i}: odometry {jump}, more than the chaser can have moved; jump removed"
         return self._known[i].last, [("warning", text)]
 
@@ -144,9 +138,7 @@ def _distance(a: Odometry, b: Odometry) -> tuple[float, float]:
 
 
 def _remove(odometry: Odometry, offset_m: Array, rotation: Array) -> Odometry:
-    """Return odometry less an offset (WRF) and a rotation (4,) (CRF); the same object when there is neither."""
-    if not offset_m.any() and rotation[0] == 1.0:
-        return odometry
+    """Return odometry less an offset (WRF) and a rotation (4,) (CRF)."""
     q = rotations.multiply(odometry.q_wxyz, rotations.conjugate(rotation))
     return msgspec.structs.replace(
         odometry,

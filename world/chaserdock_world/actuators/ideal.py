@@ -91,7 +91,7 @@ class IdealActuators:
         """See ``Actuators.command``."""
         limit = self.body.wrench_max
         wrench = np.array([*command.force_N, *command.torque_N_m])
-        self.saturated |= bool(np.any(np.abs(wrench) > limit * (1 + 1e-6)))
+        self.saturated |= bool((np.abs(wrench) > limit * (1 + 1e-6)).any())
         self.late += effective_step < now_step
         # A restarted chaser counts ``seq`` from zero again; the order of arrival decides, and arrays are never compared.
         self._received += 1

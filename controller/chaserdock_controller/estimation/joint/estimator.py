@@ -406,9 +406,13 @@ def _report_odometry(
     """Report channels of odometry that are dropped, used again, or noisier than they state."""
     s = now.hypotheses[0]
     dropped, overconfident = set(now.dropped), set(now.overconfident)
-    for i in np.flatnonzero(s.alive).tolist():
-        for k, name in enumerate(CHANNELS[1:]):
-            key, count, mean = (i, name), int(s.rejections[i, k + 1]), float(s.nis[i, k])
+    for i, (alive, rejections, nis) in enumerate(
+        zip(s.alive.tolist(), s.rejections.tolist(), s.nis.tolist(), strict=True)
+    ):
+        if not alive:
+            continue
+        for name, count, mean in zip(CHANNELS[1:], rejections[1:], nis, strict=True):
+            key = (i, name)
             if count >= p.rejections_to_drop and key not in dropped:
                 dropped.add(key)
                 text = f"chaser {i}: odometry {name} contradicts the estimate; not used"

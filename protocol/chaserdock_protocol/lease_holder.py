@@ -36,7 +36,8 @@ class LeaseHolder:
     """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this controller.
 
     ``_renewed``: tick in which a chaser has last stated a longer lease of the same holder, and so has executed a command.
-    ``_first``: the first revisions of the last ticks.
+    ``_first``: the first revisions of the last ticks. ``_claimed``, ``_ceded``: newest ticks that this controller, and another one,
+    was found to command.
     """
 
     name: str
@@ -47,6 +48,8 @@ class LeaseHolder:
     _lost: dict[int, int] = field(default_factory=dict)
     _given_back: dict[int, int] = field(default_factory=dict)
     _idle_since: dict[int, int] = field(default_factory=dict)
+    _claimed: int = -1
+    _ceded: int = -1
     _first: deque[Tick] = field(default_factory=lambda: deque(maxlen=_MOST_KNOWN))
 
     def add_tick(self, tick: Tick) -> None:
@@ -117,16 +120,22 @@ class LeaseHolder:
     def claim(self, tick: Tick) -> bool:
         """Return whether this controller commands a tick; ``term`` is then the number to command with.
 
-        With a new grant it is no smaller than any that chasers have stated up to that tick, so that the newest commander has the
-        highest. Otherwise it stays: the other controller may hold a higher term in a minority, or in later ticks, whose leases a
-        controller that was frozen may have read before it finishes its own.
+        With a new grant, or after the other has commanded, it is no smaller than any that chasers have stated up to that tick, so
+        that the newest commander has the highest. Otherwise it stays: the other controller may hold a higher term in a minority, or
+        in later ticks, whose leases a controller that was frozen may have read before it finishes its own.
         """
         found = self.commander_of(tick)
-        if found is None or (found.name, found.instance) != (self.name, self.instance):
+        if found is None:
             return False
-        if found.term > self.term:
+        if (found.name, found.instance) != (self.name, self.instance):
+            self._ceded = max(self._ceded, tick.tick)
+            return False
+        # Chasers that were cut off may hold older grants than those with which the other has commanded meanwhile.
+        regained = self._claimed < self._ceded < tick.tick
+        self._claimed = max(self._claimed, tick.tick)
+        if found.term > self.term or regained:
             stated = [lease.term for lease in self.leases.values() if lease.tick <= tick.tick]
-            self.term = next_term(max([found.term, *stated]) - 1, self.name)
+            self.term = next_term(max([self.term, found.term, *stated]) - 1, self.name)
         return True
 
     def _is_commanded_since(self, since: int, tick: Tick) -> bool:

@@ -102,6 +102,20 @@ def test_commander_keeps_its_term_while_the_other_has_only_a_minority_or_later_t
     assert holder.term == 2
 
 
+def test_commander_that_returns_by_older_grants_takes_a_new_term() -> None:
+    """Seed 4136 of `fault-drill`: of chasers 1 and 2, 1 granted term 3 to the controller; then 0, cut off until then, was back with
+    its grant to the standby, and made a majority with 3."""
+    holder = standby(*(lease(i, 5, until_tick=20) for i in (0, 1, 2, 3)))
+    assert holder.claim(tick(5, (0, 1, 2, 3)))
+    holder.add(lease(1, 6, "controller", term=3, until_tick=20))
+    assert not holder.claim(tick(6, (1, 2)))
+    assert holder.claim(tick(7, (0, 1, 2, 3)))
+    assert holder.term == 4
+    holder.add(lease(1, 8, "controller", term=5, until_tick=20))
+    assert holder.claim(tick(8, (0, 1, 2, 3)))
+    assert holder.term == 4
+
+
 def test_new_commander_takes_no_account_of_leases_of_later_ticks() -> None:
     holder = standby(lease(0, 5), lease(1, 5), lease(2, 7, "controller", term=7))
     assert holder.claim(tick(5))

@@ -141,4 +141,6 @@ def feed_forward(
     omega_body = rotate_inverse(q_off, omega)
     torque = cross(omega_body, omega_body @ inertia.T) + rotate_inverse(q_off, alpha) @ inertia.T
     force = mass_kg * rotate_inverse(q_off, acceleration)
-    return np.concatenate([force, np.broadcast_to(torque, force.shape)], axis=-1)
+    wrench = np.empty((*force.shape[:-1], 6))
+    wrench[..., :3], wrench[..., 3:] = force, torque
+    return wrench

@@ -160,6 +160,6 @@ def warm_start(
     start = problem.u_ref.copy()
     known = [row for row, name in enumerate(names) if name in plans]
     if known:
-        start[known] = shift_inputs(np.stack([plans[names[row]] for row in known]), shift_s, dt_s)
+        start[known] = shift_inputs(np.array([plans[names[row]] for row in known]), shift_s, dt_s)
     limits = problem.input_max[:, None, :]
     return np.minimum(np.maximum(start, -limits), limits)

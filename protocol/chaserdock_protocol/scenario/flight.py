@@ -7,6 +7,7 @@ of ``FlightScenario``; any other one is a field of ``Scenario`` (mission.py).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 from chaserdock_models.camera import Camera
@@ -38,6 +39,11 @@ from .schema import (
     Time,
     TimelineEntry,
 )
+
+
+@lru_cache(maxsize=64)
+def _timing(physics_hz: int, rate_hz: int, image_hz: int, latency_steps: int) -> Timing:
+    return Timing(physics_hz=physics_hz, rate_hz=rate_hz, image_hz=image_hz, latency_steps=latency_steps)
 
 
 class FlightScenario(Section):
@@ -80,12 +86,8 @@ class FlightScenario(Section):
 
     @property
     def timing(self) -> Timing:
-        return Timing(
-            physics_hz=self.time.physics_hz,
-            rate_hz=self.time.rate_hz,
-            image_hz=self.time.image_hz,
-            latency_steps=round(self.time.latency_s * self.time.physics_hz),
-        )
+        time = self.time
+        return _timing(time.physics_hz, time.rate_hz, time.image_hz, round(time.latency_s * time.physics_hz))
 
     def camera_model(self) -> Camera:
         """Return the camera as calibrated."""

@@ -11,10 +11,11 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_protocol.messages import Odometry, Sighting
 from msgspec.structs import replace
 from threadpoolctl import ThreadpoolController
@@ -67,6 +68,7 @@ from .state import (
 )
 from .update import SightedPose, UpdateReport, sighted_pose, start_chaser, start_target, update
 
+_IDENTITY_3 = np.eye(3)
 FAR_LOST_SHARE = 2e-3
 """Largest standard deviation of the position of a target beyond 100 m, as a share of its distance."""
 _BLAS = ThreadpoolController()
@@ -233,10 +235,9 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
 def lost_limits(state: JointState, target: MekfParameters) -> MekfParameters:
     """Return the parameters with the standard deviation of the target's position beyond which it is lost: of a far target at least
     `FAR_LOST_SHARE` of its distance from the nearest chaser, as the error of a camera's mounting grows with the distance."""
-    if not state.alive.any():
-        return target
-    away = state.positions_m[state.alive] - state.position_m
-    limit_m = FAR_LOST_SHARE * math.sqrt(float(np.einsum("ij,ij->i", away, away).min()))
+    at = state.position_m.tolist()
+    places = zip(state.positions_m.tolist(), state.alive.tolist(), strict=True)
+    limit_m = FAR_LOST_SHARE * min((math.dist(place, at) for place, alive in places if alive), default=0.0)
     return (
         target if limit_m <= target.lost_position_m else dataclasses.replace(target, lost_position_m=limit_m)
     )
@@ -429,18 +430,25 @@ def _report_odometry(
     return replace(now, dropped=frozenset(dropped), overconfident=frozenset(overconfident))
 
 
+@lru_cache(maxsize=64)
+def _pose_rows(chasers: tuple[int, ...]) -> IntArray:
+    """Return the rows (n, 12) of a covariance with the poses of the target and of each chaser."""
+    ids = np.array(chasers, dtype=np.int64)
+    poses = np.broadcast_to(POSE, (len(ids), 6))
+    return np.concatenate([poses, TARGET + CHASER * ids[:, None] + POSE], axis=1)
+
+
 def relative_poses(s: JointState, chasers: Sequence[int]) -> list[RelativePose]:
     """Return the poses of chasers in TRF with their covariances (6, 6): position in TRF, rotation in CRF."""
-    ids = np.array(chasers, dtype=np.int64)
-    rt, n = so3.to_matrix(s.q_wxyz), len(ids)
-    c = np.array([so3.matrix_components(*q) for q in s.attitudes_wxyz[ids].tolist()]).reshape(n, 3, 3)
+    rows = _pose_rows(tuple(chasers))
+    rt, n = so3.to_matrix(s.q_wxyz), len(rows)
+    c = np.array([so3.matrix_components(*s.attitudes_wxyz[i].tolist()) for i in chasers]).reshape(n, 3, 3)
     places = [rt.T @ (s.positions_m[i] - s.position_m) for i in chasers]
     j = np.zeros((n, 6, 12))
-    j[:, 0:3, 0:3], j[:, 0:3, 6:9], j[:, 3:6, 9:12] = -rt.T, rt.T, np.eye(3)
+    j[:, 0:3, 0:3], j[:, 0:3, 6:9], j[:, 3:6, 9:12] = -rt.T, rt.T, _IDENTITY_3
     j[:, 3:6, 3:6] = -(c.transpose(0, 2, 1) @ rt)
     for row, place in enumerate(places):
         j[row, 0:3, 3:6] = so3.skew(place)
-    rows = np.concatenate([np.broadcast_to(POSE, (n, 6)), TARGET + CHASER * ids[:, None] + POSE], axis=1)
     covariances = j @ s.covariance[rows[:, :, None], rows[:, None, :]] @ j.transpose(0, 2, 1)
     return [
         RelativePose(i, place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)

@@ -659,6 +659,8 @@ class Invariants:
             return
         if self.scenario.chaser.actuation == "thrusters" and self._may_be_late():
             return  # what late pulses lose is unknown to the chasers
+        if self._is_pushed():
+            return
         if sum(self.time_s - seen_s <= SEEN_S for seen_s in self._seen_s.values()) < 2:
             return
         error_m = _distance(np.array(estimate.position_m), np.array(truth.position_m))
@@ -666,6 +668,13 @@ class Invariants:
         if error_m > allowed_m:
             text = f"estimated {error_m:.3f} m from its position, {allowed_m:g} allowed"
             self.violate("accurate estimate", "target", text)
+
+    def _is_pushed(self) -> bool:
+        """Return whether a thruster of a latched chaser may be stuck on without a report: detection pauses while latched."""
+        return any(
+            f.kind == "stuck_on" and not f.reported and f.at_s <= self.time_s and f.chaser in self._latched
+            for f in self.scenario.thruster_failure
+        )
 
     def _on_thrusters(self, report: ThrusterReport) -> None:
         """Compare the impulse that a chaser expects of its thrusters with the true one, summed since the last fault."""

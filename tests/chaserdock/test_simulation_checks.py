@@ -38,6 +38,8 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, Fault, FaultKind, role_of
+from chaserdock_protocol.scenario.thrusters import ThrusterFailure
+from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import RawSample
 from harness import ROOT
@@ -559,6 +561,25 @@ def test_a_lying_sensor_does_not_mislead_the_estimate_of_two_others(tmp_path: Pa
             )
             log.publish(topics.TARGET, estimate)
     assert [log.found for log in logs] == [["accurate estimate"], []]
+
+
+@pytest.mark.parametrize(("reported", "latched"), [(False, True), (True, True), (False, False)])
+def test_estimate_is_not_judged_while_a_thruster_pushes_the_target_unknown_to_all(
+    reported: bool, latched: bool
+) -> None:
+    s = load_scenario(find_scenario("four-chaser-capture"))
+    failure = ThrusterFailure(chaser=0, thruster=3, at_s=0.5, kind="stuck_on", reported=reported)
+    log, sample = Log(s.model_copy(update={"thruster_failure": (failure,)})), BY_TYPE[TargetEstimate]
+    held = WorldTruth(tick=15, contacts=(), saturated=(), latched=(0,) if latched else ())
+    stamps: Any = {"tick": 15, "sim_time_ns": 1_000_000_000}
+    log.publish(topics.TRUTH_BODY, msgspec.structs.replace(body("target", 0.0), **stamps), "target")
+    log.publish(topics.TRUTH_WORLD, held)
+    for chaser in range(3):
+        sighting: Any = msgspec.structs.replace(BY_TYPE[Sighting], chaser=chaser)
+        log.publish(topics.SIGHTING, sighting, chaser)
+    estimate: Any = msgspec.structs.replace(sample, position_m=(0.015, 0.0, 0.0), **stamps)
+    log.publish(topics.TARGET, estimate)
+    assert log.found == ([] if latched and not reported else ["accurate estimate"])
 
 
 @pytest.mark.parametrize(

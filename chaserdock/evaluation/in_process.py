@@ -193,7 +193,7 @@ class InProcessMission:
         return odometry_of(self._odometry_sensor, chaser, states[f"chaser/{chaser}"], self.tick, time_ns)
 
     def _validated(self, odometry: Odometry) -> Odometry:
-        doubtful = odometry.chaser in self.controller.estimation.consistency.doubtful
+        doubtful = odometry.chaser in self.controller.doubtful
         validated, events = self._validation.update(odometry, doubtful)
         self.events += [(odometry.sim_time_ns / 1e9, level, text) for level, text in events]
         return validated

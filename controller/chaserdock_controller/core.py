@@ -58,6 +58,11 @@ class ControllerCore:
         return target_message(observation, self.estimation.run(observation))
 
     @property
+    def doubtful(self) -> frozenset[int]:
+        """Return the chasers whose odometry may be wrong, after the last tick."""
+        return self.estimation.consistency.doubtful
+
+    @property
     def estimator(self) -> Estimator | JointEstimator:
         """Return the target estimator."""
         return self.estimation.estimator

@@ -211,7 +211,7 @@ class ControllerProcess:
         late = self._open_tick()
         if late is not None and odometry.tick > late.tick:
             self._process(late)  # while its own odometry is still the newest
-        doubtful = odometry.chaser in self.core.estimation.consistency.doubtful
+        doubtful = odometry.chaser in self.core.doubtful
         events = self.inputs.add_odometry(odometry, doubtful)
         self.node.counts.stale += events is None
         for level, text in events or ():

@@ -32,6 +32,11 @@ class _EstimationOnly:
         self._core.output.history.forget_before(inputs.time_ns)
         return TickOutputs(target=target)
 
+    @property
+    def doubtful(self) -> frozenset[int]:
+        """See ``ControllerCore.doubtful``."""
+        return self._core.doubtful
+
     def add_command(self, command: WrenchCommand) -> None:
         """Add a recorded command, which the estimator needs to know."""
         wrench = np.array([*command.force_N, *command.torque_N_m])

@@ -2,8 +2,9 @@
 """Speed of simulated missions: ``python benchmarks/simulate.py [--quick] [--json FILE] [--only nominal swarm]``.
 
 ``nominal``: ``fault-drill`` without faults, in lock-step and in real time, with statistical perception and with images;
-``swarm``: random seeds. All on one core; seconds are those of the processor. ``--only instructions``: instructions per tick of
-4 s in lock-step with statistical perception, without those of the start, which do not depend on the load of the machine, by valgrind.
+``swarm``: random seeds. All on one core, with logs in memory; seconds are those of the processor. ``--only instructions``:
+instructions per tick of 4 s in lock-step with statistical perception, without those of the start, which do not depend on the load
+of the machine, by valgrind.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from common import Figures, make_parser, run_parts
 
 from chaserdock.simulation.campaign import Swarm, fly_seed
 from chaserdock.simulation.mission import simulate
+from chaserdock.simulation.swarm import memory_folder
 
 SCENARIO = "fault-drill"
 STATISTICAL = 'perception.name="statistical"'
@@ -34,7 +36,7 @@ def nominal(flights: int) -> Figures:
         for mode in ("lockstep", "realtime"):
             seconds = []
             for _ in range(flights):
-                with tempfile.TemporaryDirectory() as folder:
+                with tempfile.TemporaryDirectory(dir=memory_folder()) as folder:
                     begin_s = time.process_time()
                     conditions = (*overrides, f'simulation.mode="{mode}"')
                     simulate(find_scenario(SCENARIO), Path(folder) / "run", conditions)
@@ -66,6 +68,7 @@ from pathlib import Path
 from chaserdock_models.native import KernelLibrary
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock.simulation.mission import simulate
+from chaserdock.simulation.swarm import memory_folder
 KernelLibrary.level = property(lambda self: 2)  # valgrind does not know all instructions of the other one
 for duration in sys.argv[2:]:
     short = ("timeline=[]", "settling_s=0.0", "steady_until_s=1.0", "success.docked=[]", f"duration_s={duration}")

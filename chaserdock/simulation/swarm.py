@@ -328,7 +328,7 @@ def fly_case(
     The log stays in ``folder`` if one is given. Raises ScenarioError.
     """
     with contextlib.ExitStack() as stack:
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=_memory_folder())))
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
         path = (folder or scratch) / "scenario.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(toml_document(case), encoding="utf-8")
@@ -385,7 +385,7 @@ def _check_consistency(checks: Invariants) -> None:
             checks.violate("covariance consistency", name, f"mean NEES {mean:.0f} in one flight")
 
 
-def _memory_folder() -> str | None:
+def memory_folder() -> str | None:
     """Return a folder in memory for logs that are not kept, if this system has one."""
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 

@@ -318,7 +318,7 @@ def _report_restarts(
     stale = _stale_ns(record, p)
     for i in sorted(record.inputs.odometry):
         if state.alive[i] and state.measured_ns[i] < stale <= state.odometry_ns[i]:
-            text = f"chaser {i}: no measurement of its pose fitted for {p.restart_after_s:g} s; started again from its odometry"
+            text = f"chaser {i}: no measurement supported its estimate for {p.restart_after_s:g} s; started again from its odometry"
             events.append(EstimatorEvent(record.time_ns, "warning", text))
 
 

@@ -2,9 +2,9 @@
 """Updates of the joint filter by a tick's odometry and sightings, with a gate for each channel. Pure functions.
 
 A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
-until it has fitted as often: a jump or a constant error then changes nothing. A chaser of which no measurement was used for
-``restart_after_s``, or none of its pose while sightings contradict it, is started again from its odometry: an estimate that
-contradicts all measurements cannot recover otherwise.
+until it has fitted as often: a jump or a constant error then changes nothing. A chaser whose estimate no measurement of
+translation, or none of rotation, has supported for ``restart_after_s`` is started again from its odometry: an estimate that
+contradicts all of them cannot recover otherwise.
 A velocity or rate that does not fit in two ticks in a row, by no more than the thrusters can cause within a tick, is followed.
 Noise that exceeds the gate in a single tick, which happens in about every flight, must not pass for a force. A sighting by shape
 that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can cause, is followed as well, unless
@@ -319,9 +319,15 @@ def update(
 
 
 def _is_supported(fits: Mapping[int, bool], contradicted: bool) -> bool:
-    """Return whether measurements support a chaser's estimate: those of rates do not while its sightings are ``contradicted``."""
-    pose = fits.get(SIGHTING_CHANNEL, False) or all(fits.get(k, False) for k in _POSE)
-    return pose or (not contradicted and any(fits.values()))
+    """Return whether measurements support a chaser's estimate: a sighting, or odometry of translation and rotation.
+
+    Of each, one of two channels is enough, as the other may lie; while sightings ``contradicted`` the estimate, those of the pose
+    must fit.
+    """
+    if fits.get(SIGHTING_CHANNEL, False):
+        return True
+    needed = ((k,) for k in _POSE) if contradicted else zip(_POSE, _RATES, strict=True)
+    return all(any(fits.get(k, False) for k in channels) for channels in needed)
 
 
 def _update_chaser(

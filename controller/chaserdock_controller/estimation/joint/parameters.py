@@ -74,8 +74,8 @@ class JointParameters:
     rejections_to_new_view: a chaser's sightings by shape that are rejected this many times in a row are taken for those of a new
         view, whose error is unknown, if they then fit: where the tracker renders its view again, its error can jump by several sigmas.
     collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
-    restart_after_s: a chaser whose odometry was missing, or of which no measurement was used, for so long is started again from its
-        odometry.
+    restart_after_s: a chaser whose odometry was missing, or whose estimate no measurement supported, for so long is started again
+        from its odometry.
     iterated_updates, iterations: the first updates after a start of the target are iterated, as they are far from linear.
     mean_motion_rad_s: of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire; the target stays at the
         origin of the Hill frame, where these forces vanish.

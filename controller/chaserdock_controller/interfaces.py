@@ -90,8 +90,9 @@ class Observation:
 
     ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states, of ``outdated`` chasers extrapolated;
     ``invalid``: why a state is not. ``outdated``: valid odometry of earlier ticks, with the times of these, of chasers without newer.
-    ``lost``: last odometry of chasers that are obstacles to the others. ``ahead``: what acts on a chaser until
-    ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
+    ``lost``: last odometry of chasers that are obstacles to the others. ``interrupted``: chasers without odometry for a while before
+    this tick, as they sent none or this controller received none. ``ahead``: what acts on a chaser until ``effective_ns``, as
+    durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
     ``isolated``: thrusters that chasers report as closed. ``thruster_impulses``: of the thrusters (n,) since the tick before, N s,
     as chasers report them. ``last_commands``: to chasers without odometry in this tick, (6,); what they fly now is not known.
     """
@@ -113,6 +114,7 @@ class Observation:
     input_limits: Mapping[int, Array]
     isolated: Mapping[int, tuple[int, ...]]
     events: tuple[LogEntry, ...]
+    interrupted: frozenset[int] = frozenset()
 
     @property
     def time_s(self) -> float:

@@ -84,6 +84,17 @@ def test_loss_expiry_and_return_are_each_reported_once() -> None:
     assert back == ("info", "chaser 0: odometry received again")
 
 
+def test_chasers_are_absent_until_their_next_odometry() -> None:
+    """Also without ticks in between, as for a controller that received nothing."""
+    lost = LostChasers()
+    lost.update({0: odometry(0, 1.0, Q[1:]), 1: odometry(1, 0.5, Q[1:])}, 10**9)
+    back_ns = round((0.75 + ABSENT_S) * 1e9)
+    assert lost.absent(back_ns) == {1}
+    lost.update({1: odometry(1, 0.75 + ABSENT_S, Q[1:])}, back_ns)
+    assert lost.absent(back_ns) == set()
+    assert lost.absent(round(100e9)) == {0, 1}
+
+
 def test_short_interruption_is_not_a_loss() -> None:
     lost = LostChasers()
     lost.update({0: odometry(0, 1.0, Q[1:])}, 10**9)

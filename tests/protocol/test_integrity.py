@@ -101,14 +101,14 @@ def test_chaser_without_sightings_does_not_disagree() -> None:
     assert [agreement.update(t / 10, (), ()) for t in range(50)] == [[]] * 50
 
 
-def test_odometry_is_doubtful_until_sightings_agree_since_it_was_lost() -> None:
-    """Sightings of chaser 1 disagree from 2 to 3 s and from 5 to 6 s; its odometry is lost until 1 s, and from 4 to 5 s."""
+def test_odometry_is_doubtful_until_sightings_agree_since_it_was_interrupted() -> None:
+    """Sightings of chaser 1 disagree from 2 to 3 s and from 5 to 6 s; its odometry is interrupted until 1 s, and from 4 to 5 s."""
     agreement, doubtful_at = SensorConsistency(), []
     for tick in range(160):
         now_s = tick / 16  # exact
         rejected = {1} if 2.0 <= now_s < 3.0 or 5.0 <= now_s < 6.0 else set()
-        lost = {1} if now_s < 1.0 or 4.0 <= now_s < 5.0 else set()
-        agreement.update(now_s, {0, 1} - rejected - lost, rejected, lost)
+        interrupted = {1} if now_s < 1.0 or 4.0 <= now_s < 5.0 else set()
+        agreement.update(now_s, {0, 1} - rejected - interrupted, rejected, interrupted)
         doubtful_at += [now_s] if agreement.doubtful else []
     # From 2 to 3 s, after a second of agreement, a camera fault is likelier: a jump of the odometry would have been noticed.
     assert doubtful_at[0] == pytest.approx(5.0 + DISAGREES_S, abs=1 / 16)

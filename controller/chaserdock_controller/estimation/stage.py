@@ -85,7 +85,7 @@ class EstimationStage:
         visible_to = frozenset(s.chaser for s in o.sightings if s.solutions)
         events: list[LogEntry] = [(e.level, e.text) for e in estimator.drain_events()]
         accepted, rejected = sorted(visible_to - set(target.rejected)), sorted(target.rejected)
-        events += self.consistency.update(o.time_s, accepted, rejected, o.lost)
+        events += self.consistency.update(o.time_s, accepted, rejected, o.interrupted)
         return TargetEstimation(
             target=target,
             at_effect=estimator.estimate_at(o.effective_ns) if known else None,

@@ -47,6 +47,10 @@ class LostChasers:
         self.reported = set(lost)
         return events
 
+    def absent(self, now_ns: int) -> frozenset[int]:
+        """Return the chasers whose last odometry is ``ABSENT_S`` old or older."""
+        return frozenset(i for i, o in self.last.items() if (now_ns - o.sim_time_ns) / 1e9 >= ABSENT_S)
+
     def obstacles(self, now_ns: int) -> dict[int, Odometry]:
         """Return the last odometry of the lost chasers that are obstacles."""
         return {

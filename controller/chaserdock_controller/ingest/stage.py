@@ -37,6 +37,7 @@ class IngestStage:
         self.thrusters.update(inputs.thrusters)
         effective_ns = self._scenario.timing.effective_ns(inputs.tick)
         sightings, events = valid_sightings(inputs.sightings)
+        interrupted = self.lost_chasers.absent(inputs.time_ns)
         events += self.lost_chasers.update(odometry, inputs.time_ns)
         return Observation(
             tick=inputs.tick,
@@ -56,6 +57,7 @@ class IngestStage:
             input_limits={i: self.thrusters.limits(i) for i in inputs.odometry},
             isolated=self.thrusters.isolated(),
             events=tuple(events),
+            interrupted=interrupted,
         )
 
     def _outdated(self, inputs: TickInputs) -> dict[int, Odometry]:

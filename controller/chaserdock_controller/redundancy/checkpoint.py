@@ -146,7 +146,7 @@ class ShapeState(Struct, forbid_unknown_fields=True):
 class ConsistencyState(Struct, forbid_unknown_fields=True):
     inconsistent: set[int]
     confirmed: set[int]
-    _lost_s: dict[int, float]
+    _interrupted_s: dict[int, float]
     _since_s: dict[int, tuple[bool, float]]
 
 

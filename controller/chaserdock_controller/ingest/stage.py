@@ -35,9 +35,9 @@ class IngestStage:
         invalid = {i: reason for i, o in sources.items() if (reason := why_invalid(o))}
         odometry = {i: o for i, o in inputs.odometry.items() if i not in invalid}
         self.thrusters.update(inputs.thrusters)
+        interrupted = self.lost_chasers.absent(inputs.time_ns)
         effective_ns = self._scenario.timing.effective_ns(inputs.tick)
         sightings, events = valid_sightings(inputs.sightings)
-        interrupted = self.lost_chasers.absent(inputs.time_ns)
         events += self.lost_chasers.update(odometry, inputs.time_ns)
         return Observation(
             tick=inputs.tick,

@@ -53,8 +53,5 @@ class LostChasers:
 
     def obstacles(self, now_ns: int) -> dict[int, Odometry]:
         """Return the last odometry of the lost chasers that are obstacles."""
-        return {
-            i: o
-            for i, o in sorted(self.last.items())
-            if ABSENT_S <= (now_ns - o.sim_time_ns) / 1e9 <= FORGOTTEN_S
-        }
+        absent = {i: self.last[i] for i in sorted(self.absent(now_ns))}
+        return {i: o for i, o in absent.items() if (now_ns - o.sim_time_ns) / 1e9 <= FORGOTTEN_S}

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hatchling build hook: compile the C kernels whenever the package is built or installed for editing.
+"""Hatchling build hook: compile the C kernels whenever the package is built or installed for
+editing.
 
-The environment variable CHASERDOCK_TARGET names the machine that a wheel is for (``TARGETS`` of the kernels' build.py); by
-default it is the one that builds.
+The environment variable CHASERDOCK_TARGET names the machine that a wheel is for (``TARGETS`` of the
+kernels' build.py); by default it is the one that builds.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ class KernelsHook(BuildHookInterface):
         build = runpy.run_path(str(root / _BUILD), run_name="chaserdock_kernels")
         name = os.environ.get("CHASERDOCK_TARGET", "")
         if name and name not in build["TARGETS"]:
-            raise ValueError(f"CHASERDOCK_TARGET={name}: must be one of {', '.join(build['TARGETS'])}")
+            raise ValueError(
+                f"CHASERDOCK_TARGET={name}: must be one of {', '.join(build['TARGETS'])}"
+            )
         target = build["TARGETS"][name] if name else build["this_machine"]()
         if version == "editable":
             build["compile_all"](root)

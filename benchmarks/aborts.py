@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Aborts at random moments of a rendezvous: ``python benchmarks/aborts.py [--scenario v-bar] [--aborts 1000] [--quick]``.
+"""Aborts at random moments of a rendezvous: ``python benchmarks/aborts.py [--scenario v-bar]
+[--aborts 1000] [--quick]``.
 
-The guidance of the controller chooses each abort (controller.md, passive safety); its burn and two orbits of coast are those of the
-nonlinear relative motion with J2. Counts those that enter the keep-out (chaserdock/evaluation/abort_study.py).
+The guidance of the controller chooses each abort (controller.md, passive safety); its burn and two
+orbits of coast are those of the nonlinear relative motion with J2. Counts those that enter the
+keep-out (chaserdock/evaluation/abort_study.py).
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""acados on the problem of `nmpc/problem.py`, for comparison in `nmpc.py`: SQP-RTI, HPIPM and compiled code.
+"""acados on the problem of `nmpc/problem.py`, for comparison in `nmpc.py`: SQP-RTI, HPIPM and
+compiled code.
 
-"coupled" is one optimal control problem of all chasers; "decoupled" is one for each chaser, solved in sequence in one
-thread, with the others' last plans as moving obstacles. Needs acados_template and its libraries (ACADOS_SOURCE_DIR), and
-a C compiler at run time. Two constraints that are inactive in the hard case are omitted, which favours acados: the outer
-bound and the corridors.
+"coupled" is one optimal control problem of all chasers; "decoupled" is one for each chaser, solved
+in sequence in one thread, with the others' last plans as moving obstacles. Needs acados_template
+and its libraries (ACADOS_SOURCE_DIR), and a C compiler at run time. Two constraints that are
+inactive in the hard case are omitted, which favours acados: the outer bound and the corridors.
 """
 
 from __future__ import annotations
@@ -25,15 +26,19 @@ from chaserdock_controller.nmpc.warm_start import Frame, PreparedProblem, status
 from chaserdock_models.arrays import Array
 
 KINDS = ("coupled", "decoupled")
-# Lateral offset of the initial guess, m: the linearization at an exactly head-on path has no descent direction sideways.
+# Lateral offset of the initial guess, m: the linearization at an exactly head-on path has no
+# descent direction sideways.
 SIDESTEP_M = 0.2
-# SQP iterations of a cold start: with a single one the first seconds follow a poor plan, which costs 4 to 9 %.
+# SQP iterations of a cold start: with a single one the first seconds follow a poor plan, which
+# costs 4 to 9 %.
 COLD_ITERATIONS = 10
 
 
 @dataclass(frozen=True)
 class SolveTime:
-    """Times of a solve: acados' own total time (wall clock), and the processor time of the thread around the call."""
+    """Times of a solve: acados' own total time (wall clock), and the processor time of the thread
+    around the call.
+    """
 
     wall_s: float
     cpu_s: float
@@ -44,14 +49,20 @@ def _acados() -> Any:
 
 
 def _model(name: str, own: int, others: int, params: NmpcParameters) -> tuple[Any, int]:
-    """Return the AcadosModel of ``own`` chasers among ``others`` obstacles, and its number of distances.
+    """Return the AcadosModel of ``own`` chasers among ``others`` obstacles, and its number of
+    distances.
 
-    Parameters of a stage: target (3), keep-outs (own), distances of own pairs, obstacles (3 others), distances to them.
+    Parameters of a stage: target (3), keep-outs (own), distances of own pairs, obstacles (3
+    others), distances to them.
     """
     step = dynamics(params)
     pairs = [(i, j) for i in range(own) for j in range(i + 1, own)]
     x, u = ca.SX.sym("x", 13 * own), ca.SX.sym("u", 6 * own)
-    target, keep_out, distances = ca.SX.sym("target", 3), ca.SX.sym("d", own), ca.SX.sym("pairs", len(pairs))
+    target, keep_out, distances = (
+        ca.SX.sym("target", 3),
+        ca.SX.sym("d", own),
+        ca.SX.sym("pairs", len(pairs)),
+    )
     obstacles, clear = ca.SX.sym("obstacles", 3, others), ca.SX.sym("clear", own * others)
     at = [x[13 * i : 13 * i + 3] for i in range(own)]
     margins = [ca.norm_2(p - target) - keep_out[i] for i, p in enumerate(at)]
@@ -107,7 +118,8 @@ def _ocp(name: str, own: int, others: int, params: NmpcParameters, folder: str) 
     options.nlp_solver_type, options.integrator_type = "SQP_RTI", "DISCRETE"
     options.hessian_approx, options.qp_solver = "GAUSS_NEWTON", "PARTIAL_CONDENSING_HPIPM"
     options.qp_tol, options.qp_solver_iter_max = 1e-6, 100
-    # The fastest of the options tried: BALANCE takes 1.3 to 1.7 times as long; condensing helps small stages only.
+    # The fastest of the options tried: BALANCE takes 1.3 to 1.7 times as long; condensing helps
+    # small stages only.
     options.hpipm_mode = "SPEED"
     options.qp_solver_cond_N = d if own > 1 else max(1, d // 5)
     ocp.code_gen_options.ext_fun_compile_flags = "-O3 -march=native"
@@ -124,11 +136,12 @@ def _orientation_map(q_ref: Array) -> Array:
 
 
 class AcadosSolver:
-    """acados with the interface of `NmpcSolver`, ``kind`` "coupled" or "decoupled", for exactly ``n`` chasers.
+    """acados with the interface of `NmpcSolver`, ``kind`` "coupled" or "decoupled", for exactly
+    ``n`` chasers.
 
-    ``solve_time`` is the time of the last solve inside acados, without the transfer of the problem by Python; of a cold
-    start, that of its last SQP iteration. Code is generated and compiled at construction. Raise ValueError for another kind
-    or a falloff.
+    ``solve_time`` is the time of the last solve inside acados, without the transfer of the problem
+    by Python; of a cold start, that of its last SQP iteration. Code is generated and compiled at
+    construction. Raise ValueError for another kind or a falloff.
     """
 
     def __init__(self, kind: str, params: NmpcParameters, n: int) -> None:
@@ -147,17 +160,23 @@ class AcadosSolver:
                 first = group[0] == 0
                 make = _acados().AcadosOcpSolver
                 self._solvers.append(
-                    make(ocp, generate=first, build=first, check_reuse_possible=False, verbose=False)
+                    make(
+                        ocp, generate=first, build=first, check_reuse_possible=False, verbose=False
+                    )
                 )
 
     def reset(self) -> None:
         """Discard all warm starts."""
         self._frame.plans = {}
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """Solve one tick; arguments, result and errors as `RtiSolver.solve`; ValueError for corridors or another number of chasers.
+    def solve(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
+    ) -> NmpcPlan:
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`; ValueError for
+        corridors or another number of chasers.
 
-        ``iterations`` are those of HPIPM. The states are the rollout of the inputs through the model.
+        ``iterations`` are those of HPIPM. The states are the rollout of the inputs through the
+        model.
         """
         frame = self._frame
         cold = not frame.plans
@@ -182,19 +201,28 @@ class AcadosSolver:
             late = bool(np.any(solver.get_stats("qp_stat")))
             if usable:
                 limits = task.problem.input_max[group, None, :]
-                u[group] = np.clip(inputs.reshape(-1, len(group), 6).swapaxes(0, 1), -limits, limits)
+                u[group] = np.clip(
+                    inputs.reshape(-1, len(group), 6).swapaxes(0, 1), -limits, limits
+                )
             for i in group:
-                statuses[i], iterations[i] = status_of(usable, late), int(np.sum(solver.get_stats("qp_iter")))
+                statuses[i], iterations[i] = (
+                    status_of(usable, late),
+                    int(np.sum(solver.get_stats("qp_iter"))),
+                )
         self.solve_time = SolveTime(wall_s, cpu_s)
         return frame.finish(task, u, statuses, iterations)
 
     def _set_problem(self, row: int, task: PreparedProblem, guess: Array) -> None:
-        """Pass the tick's problem and the initial guess (N, D+1, 13) to the solver of group ``row``."""
+        """Pass the tick's problem and the initial guess (N, D+1, 13) to the solver of group
+        ``row``.
+        """
         solver, group, params = self._solvers[row], self._groups[row], self._frame.params
         p, d, own = task.problem, params.stages, len(group)
         others = [i for i in range(len(p.states)) if i not in group]
         q_refs = p.references[group, :, 3:]
-        if not np.array_equal(self._q_refs[row], q_refs):  # setting it makes acados factorize the cost again
+        if not np.array_equal(
+            self._q_refs[row], q_refs
+        ):  # setting it makes acados factorize the cost again
             self._q_refs[row] = q_refs.copy()
             for k in range(d + 1):
                 vx = np.zeros((12 * own if k < d else 6 * own, 13 * own))
@@ -214,11 +242,19 @@ class AcadosSolver:
         for k in range(d + 1):
             y = [p.references[group, k, :3].ravel(), np.zeros(3 * own)]
             obstacles = guess[others, k, :3].ravel()
-            values = [p.target_positions[k], p.min_distance_target_m[group, k], between, obstacles, clear]
+            values = [
+                p.target_positions[k],
+                p.min_distance_target_m[group, k],
+                between,
+                obstacles,
+                clear,
+            ]
             solver.set(k, "p", np.concatenate(values))
             solver.set(k, "x", guess[group, k].ravel())
             if k > 0:
-                solver.cost_set(k, "zl", np.full(own + len(between) + len(clear), float(slack_weight[0])))
+                solver.cost_set(
+                    k, "zl", np.full(own + len(between) + len(clear), float(slack_weight[0]))
+                )
             if k < d:
                 y.append(p.u_ref[group, k].ravel())
                 solver.set(k, "u", task.start[group, k].ravel())
@@ -228,7 +264,9 @@ class AcadosSolver:
 
 
 def sidestep(task: PreparedProblem) -> Array:
-    """Return the offsets (N, D+1, 3), m, of an initial guess at rest: a path to the reference, bent to its right."""
+    """Return the offsets (N, D+1, 3), m, of an initial guess at rest: a path to the reference, bent
+    to its right.
+    """
     p = task.problem
     path = p.references[:, -1, :3] - p.states[:, :3]
     right = np.cross(path, [0.0, 0.0, 1.0])

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resuming and distributing a campaign: ``python benchmarks/campaign.py [--runs N] [--out DIR] [--quick] [--json FILE]``.
+"""Resuming and distributing a campaign: ``python benchmarks/campaign.py [--runs N] [--out DIR]
+[--quick] [--json FILE]``.
 
-200 seeds (``--runs``) of a shortened ``single`` with small images, two at a time. When half of the results exist, all
-processes are killed with SIGKILL. The campaign is then resumed and must complete without repeating a finished run. A Dask
-cluster of two workers on this machine runs the same file; its table must equal that of the first campaign. Status 1
-otherwise. ``--out`` keeps the folders, and finished runs in it are not repeated.
+200 seeds (``--runs``) of a shortened ``single`` with small images, two at a time. When half of the
+results exist, all processes are killed with SIGKILL. The campaign is then resumed and must complete
+without repeating a finished run. A Dask cluster of two workers on this machine runs the same file;
+its table must equal that of the first campaign. Status 1 otherwise. ``--out`` keeps the folders,
+and finished runs in it are not repeated.
 """
 
 from __future__ import annotations
@@ -50,7 +52,9 @@ def table(folder: Path) -> list[dict[str, Any]]:
 
 
 def kill_half_way(file: Path, out: Path, half: int) -> int:
-    """Start the campaign, kill all its processes when ``half`` of the results exist, and return the number of results."""
+    """Start the campaign, kill all its processes when ``half`` of the results exist, and return the
+    number of results.
+    """
     command = chaserdock_command("campaign", file, "--out", out, "--jobs", "2")
     running = psutil.Popen(command, stdout=subprocess.DEVNULL)
     while running.poll() is None and len(results(out)) < half:
@@ -66,7 +70,9 @@ def kill_half_way(file: Path, out: Path, half: int) -> int:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--runs", type=int, default=200, help="number of seeds")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to keep; default: a temporary one")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to keep; default: a temporary one"
+    )
     options = parser.parse_args()
     runs = 6 if options.quick else options.runs
     folder = options.out or Path(tempfile.mkdtemp())
@@ -84,16 +90,21 @@ def main() -> None:
     os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
     from distributed import LocalCluster
 
-    cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
+    cluster: Any = LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=""
+    )
     with cluster:
-        run_chaserdock("campaign", file, "--out", distributed, "--cluster", cluster.scheduler_address)
+        run_chaserdock(
+            "campaign", file, "--out", distributed, "--cluster", cluster.scheduler_address
+        )
     figures = {
         "runs": runs,
         "results_when_killed": killed_with,
         "results_kept": kept,
         "rows": len(rows),
         "distinct_flights": len({row["digest"] for row in rows}),
-        "equal_table_on_cluster": json.dumps(table(distributed)) == json.dumps(rows),  # NaN equals NaN
+        "equal_table_on_cluster": json.dumps(table(distributed))
+        == json.dumps(rows),  # NaN equals NaN
     }
     print_figures(figures)
     write_json(options.json, figures)

@@ -1,18 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controller performance in closed loop: ``python benchmarks/closed_loop.py [--only PART ...] [--quick] [--json FILE]``.
+"""Controller performance in closed loop: ``python benchmarks/closed_loop.py [--only PART ...]
+[--quick] [--json FILE]``.
 
 Complete missions in one process (``chaserdock.evaluation.in_process``). Parts:
 
-- ``avoidance``: 20 seeded variations of ``collision-avoidance`` with images of 640 x 360 (``--full-images``: the
-  scenario's own, with four times as many pixels), every fourth exactly symmetric;
-- ``swap``: 20 variations of ``swap``, target measured with noise of 2 mm and 0.1 degrees; seed 0 is exactly head-on;
-- ``clutter``, ``clutter-dense``: sixteen chasers at random places fly to random places, all at once, in 100 seeds; exact knowledge;
+- ``avoidance``: 20 seeded variations of ``collision-avoidance`` with images of 640 x 360
+  (``--full-images``: the scenario's own, with four times as many pixels), every fourth exactly
+  symmetric;
+- ``swap``: 20 variations of ``swap``, target measured with noise of 2 mm and 0.1 degrees; seed 0 is
+  exactly head-on;
+- ``clutter``, ``clutter-dense``: sixteen chasers at random places fly to random places, all at
+  once, in 100 seeds; exact knowledge;
 - ``swap-images``: the first ``--images`` of them with rendered images;
-- ``tracking``: the paper's tumble with perfect knowledge, with and without feed-forward, with 5 % actuator gain error;
-- ``tracking-images``: the same with rendered images: servicer, two chasers on the paper's target, stronger actuators;
+- ``tracking``: the paper's tumble with perfect knowledge, with and without feed-forward, with 5 %
+  actuator gain error;
+- ``tracking-images``: the same with rendered images: servicer, two chasers on the paper's target,
+  stronger actuators;
 
-``--first`` and ``--flights`` choose seeds (20 by default, of ``clutter`` 100); ``--quick`` flies two variations and shorter runs.
-Distances are true, at every tick, between centres and, in clutter, between shapes.
+``--first`` and ``--flights`` choose seeds (20 by default, of ``clutter`` 100); ``--quick`` flies
+two variations and shorter runs. Distances are true, at every tick, between centres and, in clutter,
+between shapes.
 """
 
 from __future__ import annotations
@@ -94,7 +101,9 @@ def add_errors(out: Figures, name: str, errors: tuple[float, float]) -> None:
 
 
 def tracking(duration_s: float) -> Figures:
-    """Measure steady errors at the paper's tumble with perfect knowledge, starting 0.85 m behind the reference."""
+    """Measure steady errors at the paper's tumble with perfect knowledge, starting 0.85 m behind
+    the reference.
+    """
     out: Figures = {}
     for name, overrides, gain in (
         ("feed_forward", (), 1.0),
@@ -122,7 +131,15 @@ def tracking_with_images(duration_s: float) -> Figures:
     return out
 
 
-PARTS = ("avoidance", "swap", "clutter", "clutter-dense", "swap-images", "tracking", "tracking-images")
+PARTS = (
+    "avoidance",
+    "swap",
+    "clutter",
+    "clutter-dense",
+    "swap-images",
+    "tracking",
+    "tracking-images",
+)
 _CLUTTER_STAY_S = 3.0
 """A flight in clutter ends once all chasers are at their goals for this long."""
 
@@ -132,7 +149,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--flights", type=int, help="number of seeds")
     parser.add_argument("--images", type=int, default=2, help="number of seeds of swap with images")
-    parser.add_argument("--full-images", action="store_true", help="avoidance with the scenario's image size")
+    parser.add_argument(
+        "--full-images", action="store_true", help="avoidance with the scenario's image size"
+    )
     options = parser.parse_args()
     duration_s = 60.0 if options.quick else 120.0
 
@@ -157,7 +176,9 @@ def main() -> None:
         "clutter": lambda: in_clutter("clutter", CLUTTER),
         "clutter-dense": lambda: in_clutter("clutter-dense", DENSE_CLUTTER),
         "swap": lambda: variations("swap", seeds, swap, noisy),
-        "swap-images": lambda: variations("swap-images", seeds[: options.images], swap, RenderedImages),
+        "swap-images": lambda: variations(
+            "swap-images", seeds[: options.images], swap, RenderedImages
+        ),
         "tracking": lambda: tracking(duration_s),
         "tracking-images": lambda: tracking_with_images(min(duration_s, 80.0)),
     }

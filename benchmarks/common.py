@@ -29,13 +29,17 @@ Figures = dict[str, float]
 
 
 def use_one_thread() -> None:
-    """Compute in one thread, as the processes of a flight do: others of BLAS and OpenCV wait for work, which is CPU time as well."""
+    """Compute in one thread, as the processes of a flight do: others of BLAS and OpenCV wait for
+    work, which is CPU time as well.
+    """
     cv2.setNumThreads(1)
     threadpool_limits(1)
 
 
 def make_parser(description: str | None, parts: Iterable[str] = ()) -> argparse.ArgumentParser:
-    """Return a parser with the options of all benchmarks, and ``--only`` if there are parts to choose from."""
+    """Return a parser with the options of all benchmarks, and ``--only`` if there are parts to
+    choose from.
+    """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -54,7 +58,9 @@ def make_parser(description: str | None, parts: Iterable[str] = ()) -> argparse.
 
 
 def run_parts(options: argparse.Namespace, parts: Mapping[str, Callable[[], Figures]]) -> None:
-    """Run the parts that ``--only`` chooses, print the figures of each, and write all of them to ``--json``."""
+    """Run the parts that ``--only`` chooses, print the figures of each, and write all of them to
+    ``--json``.
+    """
     figures: Figures = {}
     for name in options.only:
         print(f"{name}:", flush=True)
@@ -71,10 +77,14 @@ def print_figures(figures: Mapping[str, float]) -> None:
 
 
 def write_json(path: Path | None, figures: Mapping[str, float]) -> None:
-    """Write figures, command, commit, machine and date as one flat object; figures that are not finite as null."""
+    """Write figures, command, commit, machine and date as one flat object; figures that are not
+    finite as null.
+    """
     if path is None:
         return
-    values = {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
+    values = {
+        name: float(value) if math.isfinite(value) else None for name, value in figures.items()
+    }
     about = {
         "command": " ".join(["python", *sys.argv]),
         "commit": commit(),
@@ -87,21 +97,31 @@ def write_json(path: Path | None, figures: Mapping[str, float]) -> None:
 def commit() -> str:
     """Return the commit of the working copy; it ends with ``-dirty`` if files are changed."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False
+    ).stdout.strip()
 
 
-def percentiles(values: Sequence[float] | np.ndarray, name: str, unit: str, *labels: str) -> Figures:
+def percentiles(
+    values: Sequence[float] | np.ndarray, name: str, unit: str, *labels: str
+) -> Figures:
     """Return figures ``NAME_LABEL_UNIT``; labels: median, p95, p99, max. NaN without values."""
     shares = {"median": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
     return {
-        f"{name}_{label}_{unit}": float(np.percentile(values, shares[label])) if len(values) else math.nan
+        f"{name}_{label}_{unit}": float(np.percentile(values, shares[label]))
+        if len(values)
+        else math.nan
         for label in labels
     }
 
 
 def read_lines(path: Path | None) -> Iterator[dict[str, Any]]:
-    """Yield the objects of a file of JSON lines; none if there is no file. Lines of an interrupted write are skipped."""
-    for line in path.read_text(encoding="utf-8").splitlines() if path is not None and path.exists() else []:
+    """Yield the objects of a file of JSON lines; none if there is no file. Lines of an interrupted
+    write are skipped.
+    """
+    for line in (
+        path.read_text(encoding="utf-8").splitlines() if path is not None and path.exists() else []
+    ):
         with suppress(json.JSONDecodeError):
             yield json.loads(line)
 
@@ -119,12 +139,16 @@ def chaserdock_command(*arguments: str | Path) -> list[str]:
 
 
 def run_chaserdock(*arguments: str | Path, expected: Sequence[int] = (0,)) -> None:
-    """Run ``chaserdock`` from the clone. Raise SystemExit with its output for another status than expected."""
+    """Run ``chaserdock`` from the clone. Raise SystemExit with its output for another status than
+    expected.
+    """
     done = subprocess.run(
         chaserdock_command(*arguments), cwd=ROOT, capture_output=True, text=True, check=False
     )
     if done.returncode not in expected:
-        raise SystemExit(f"chaserdock {arguments[0]}: status {done.returncode}\n{done.stdout}{done.stderr}")
+        raise SystemExit(
+            f"chaserdock {arguments[0]}: status {done.returncode}\n{done.stdout}{done.stderr}"
+        )
 
 
 def start_mission(

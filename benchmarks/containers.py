@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Failures of containers: ``python benchmarks/containers.py [--quick] [--json FILE] [--only FAULT ...]``.
+"""Failures of containers: ``python benchmarks/containers.py [--quick] [--json FILE] [--only FAULT
+...]``.
 
-Builds the image and flies a mission by compose.yaml for each fault, with access control, each in its own project. Figures:
-wall time until every process is expected again, simulated time without one, and whether the mission was a success.
-Faults: ``crash`` of a chaser (Docker restarts it), ``kill`` of a chaser (``docker kill``; ``docker start`` after 2 s),
-``pause`` of a chaser for 5 s, ``disconnect`` of a chaser from the network for 5 s, restart of the ``router``, crash of the
-``controller``. ``--quick``: 120 s of two chasers with small images (a shorter mission may end before a container is back).
+Builds the image and flies a mission by compose.yaml for each fault, with access control, each in
+its own project. Figures: wall time until every process is expected again, simulated time without
+one, and whether the mission was a success. Faults: ``crash`` of a chaser (Docker restarts it),
+``kill`` of a chaser (``docker kill``; ``docker start`` after 2 s), ``pause`` of a chaser for 5 s,
+``disconnect`` of a chaser from the network for 5 s, restart of the ``router``, crash of the
+``controller``. ``--quick``: 120 s of two chasers with small images (a shorter mission may end
+before a container is back).
 """
 
 from __future__ import annotations
@@ -31,7 +34,9 @@ FAULT_AT_TICK = 60
 
 
 def crash(container: str) -> None:
-    """Kill the chaserdock process; the container's main process ends with it, and Docker restarts the container."""
+    """Kill the chaserdock process; the container's main process ends with it, and Docker restarts
+    the container.
+    """
     code = (
         "import os,glob\n"
         "for f in glob.glob('/proc/[0-9]*/cmdline'):\n"
@@ -129,7 +134,9 @@ def main() -> None:
         raise SystemExit("the image cannot be built")
     scenario = "two-chaser-tracking" if options.quick else "four-chaser-docking"
     overrides = f"duration_s=120.0 {SMALL} {TOLERANT}" if options.quick else TOLERANT
-    run_parts(options, {fault: lambda fault=fault: fly(fault, scenario, overrides) for fault in FAULTS})
+    run_parts(
+        options, {fault: lambda fault=fault: fly(fault, scenario, overrides) for fault in FAULTS}
+    )
 
 
 if __name__ == "__main__":

@@ -1,38 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stopping a tumbling client: ``python benchmarks/detumble.py [--quick] [--json FILE] [--tumbles N] [--first SEED]
-[--sets 0123 013 03] [--silent | --rigid CASE | --vision | --optimum] [--limits FORCE TORQUE] [--set KEY=VALUE]
-[--results FILE]``.
+"""Stopping a tumbling client: ``python benchmarks/detumble.py [--quick] [--json FILE] [--tumbles N]
+[--first SEED] [--sets 0123 013 03] [--silent | --rigid CASE | --vision | --optimum] [--limits FORCE
+TORQUE] [--set KEY=VALUE] [--results FILE]``.
 
-Flies stacks of the client of ``detumble`` and some of its chasers, latched from the start, in one process with the
-scenario's sensors and statistical perception. Tumbles of 5 to 10 degrees/s and attitudes are drawn from the seed. Five
-seconds after the start all chasers are commanded to detumble. A set such as ``03`` names chasers of the scenario: 0 and 3
-are at opposite faces, 0 and 1 at adjacent ones.
+Flies stacks of the client of ``detumble`` and some of its chasers, latched from the start, in one
+process with the scenario's sensors and statistical perception. Tumbles of 5 to 10 degrees/s and
+attitudes are drawn from the seed. Five seconds after the start all chasers are commanded to
+detumble. A set such as ``03`` names chasers of the scenario: 0 and 3 are at opposite faces, 0 and 1
+at adjacent ones.
 
-Prints the time until the stack stays below 0.05 degrees/s and 1 mm/s, the impulse of all thrusters until then, and both over
-those of the linear programme: the shortest time, and the least impulse in that time, if the attitude were frozen.
-``--silent``: nobody commands; each chaser damps the stack by its own odometry for at most 120 s, until 10 s after it stopped. The
-stack is then one rigid body (``chaserdock.evaluation.rigid_stack``), not the physics engine's.
+Prints the time until the stack stays below 0.05 degrees/s and 1 mm/s, the impulse of all thrusters
+until then, and both over those of the linear programme: the shortest time, and the least impulse in
+that time, if the attitude were frozen. ``--silent``: nobody commands; each chaser damps the stack
+by its own odometry for at most 120 s, until 10 s after it stopped. The stack is then one rigid body
+(``chaserdock.evaluation.rigid_stack``), not the physics engine's.
 
-``--limits FORCE TORQUE``: load limits (N, N m) of every port, kept by the controller. The largest loads at a port are printed: from
-the physics engine's joints in every step, or with ``--rigid`` from the equations of motion at the same rate of 960 Hz.
+``--limits FORCE TORQUE``: load limits (N, N m) of every port, kept by the controller. The largest
+loads at a port are printed: from the physics engine's joints in every step, or with ``--rigid``
+from the equations of motion at the same rate of 960 Hz.
 
-``--rigid CASE``: identification and plan in closed loop with one rigid body (``chaserdock.evaluation.rigid_control``). The stated
-mass and inertia are 30 % wrong, the stated centre of mass 88 mm; thrusts (3 %) and pulses (2 %) have errors. CASE: ``plan`` (13.5 s;
-two chasers 14.4 s, one 50 s), ``known`` (the same, but mass, centre and inertia are stated as they are), ``identify`` (10 s of
-identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck`` (a thruster drawn from the seed is stuck off from
-the start, not reported), ``reported`` (the same, reported), ``lost`` (a chaser dies at a random moment), ``silent`` (feedback; no
+``--rigid CASE``: identification and plan in closed loop with one rigid body
+(``chaserdock.evaluation.rigid_control``). The stated mass and inertia are 30 % wrong, the stated
+centre of mass 88 mm; thrusts (3 %) and pulses (2 %) have errors. CASE: ``plan`` (13.5 s; two
+chasers 14.4 s, one 50 s), ``known`` (the same, but mass, centre and inertia are stated as they
+are), ``identify`` (10 s of identifying pulses before it, 30 s in all), ``fast`` (feedback only),
+``stuck`` (a thruster drawn from the seed is stuck off from the start, not reported), ``reported``
+(the same, reported), ``lost`` (a chaser dies at a random moment), ``silent`` (feedback; no
 controller from 1 s on, 120 s at most), ``limited`` (``--limits 2.5 0.9``).
 
-``--optimum``: no flight; the least impulse found that stops the stack in 15.5 s, over that of the linear programme, with the true
-stack, from 40 random guesses: what no controller can be expected to undercut.
+``--optimum``: no flight; the least impulse found that stops the stack in 15.5 s, over that of the
+linear programme, with the true stack, from 40 random guesses: what no controller can be expected to
+undercut.
 
-``--vision``: no capture; the chasers of each set keep their places around the free target for 60 s, which tumbles at 7 degrees/s
-about an axis drawn from the seed, with the same wrong statements. Prints the errors of the ratios of the inertia (its elements over
-its trace, as a share of the largest moment over the trace) and of the centre of mass, and the normalized squared errors of ratios
-(expected 5), centre (3) and relative poses (6). Sightings are drawn (``chaserdock.evaluation.free_tumble_flights``), or with
-``--set 'perception.name="default"'`` those of images.
+``--vision``: no capture; the chasers of each set keep their places around the free target for 60 s,
+which tumbles at 7 degrees/s about an axis drawn from the seed, with the same wrong statements.
+Prints the errors of the ratios of the inertia (its elements over its trace, as a share of the
+largest moment over the trace) and of the centre of mass, and the normalized squared errors of
+ratios (expected 5), centre (3) and relative poses (6). Sightings are drawn
+(``chaserdock.evaluation.free_tumble_flights``), or with ``--set 'perception.name="default"'`` those
+of images.
 
-``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it.
+``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in
+it.
 """
 
 from __future__ import annotations
@@ -45,7 +54,15 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
-from common import Figures, append_line, make_parser, percentiles, print_figures, read_lines, write_json
+from common import (
+    Figures,
+    append_line,
+    make_parser,
+    percentiles,
+    print_figures,
+    read_lines,
+    write_json,
+)
 
 from chaserdock.evaluation.detumble_flights import (
     DetumbleOutcome,
@@ -106,7 +123,9 @@ def figures_of(name: str, outcomes: list[DetumbleOutcome]) -> Figures:
     }
     if not stopped:
         return out
-    least = [(o, o.time_s, o.least) for o in stopped if o.time_s is not None and o.least is not None]
+    least = [
+        (o, o.time_s, o.least) for o in stopped if o.time_s is not None and o.least is not None
+    ]
     held_s = sum(o.held_s for o in stopped)
     for key, unit, values in (
         ("time", "s", [o.time_s for o in stopped if o.time_s is not None]),
@@ -118,7 +137,11 @@ def figures_of(name: str, outcomes: list[DetumbleOutcome]) -> Figures:
         ("final_rate", "deg_s", [o.final_rate_deg_s for o in stopped]),
         ("final_speed", "m_s", [o.final_speed_m_s for o in stopped]),
         ("port_force", "N", [o.peak_force_N for o in stopped if o.peak_force_N is not None]),
-        ("port_torque", "N_m", [o.peak_torque_N_m for o in stopped if o.peak_torque_N_m is not None]),
+        (
+            "port_torque",
+            "N_m",
+            [o.peak_torque_N_m for o in stopped if o.peak_torque_N_m is not None],
+        ),
     ):
         if values:
             out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
@@ -190,7 +213,9 @@ def fly_sets_silent(o: argparse.Namespace, seeds: range) -> Figures:
         o,
         seeds,
         known,
-        lambda chasers, seed: fly_silent(stack_scenario(seed, numbers_of(chasers), o.set), rest_s=10.0),
+        lambda chasers, seed: fly_silent(
+            stack_scenario(seed, numbers_of(chasers), o.set), rest_s=10.0
+        ),
         lambda chasers, seed, outcome: SilentRow(chasers, settings, seed, outcome),
         lambda chasers, seed, outcome: f"{chasers} seed {seed}: {outcome}",
         lambda chasers, outcomes: silent_figures(f"silent_{chasers}", outcomes),
@@ -223,7 +248,9 @@ def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> Stac
             if case == "reported":
                 events = FlightEvents(reported=(chaser, thruster))
         case "lost":
-            events = FlightEvents(loss=(float(rng.uniform(0.5, 10.0)), int(rng.integers(len(numbers)))))
+            events = FlightEvents(
+                loss=(float(rng.uniform(0.5, 10.0)), int(rng.integers(len(numbers))))
+            )
         case "silent":
             events = FlightEvents(silent_from_s=1.0)
     scenario = stack_scenario(seed, numbers, settings)
@@ -240,7 +267,9 @@ def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> Stac
 
 
 def drawn_thruster(rng: np.random.Generator, chasers: int) -> tuple[int, int]:
-    """Return chaser and number of one of the thrusters that may fire: those that push their chaser towards the port."""
+    """Return chaser and number of one of the thrusters that may fire: those that push their chaser
+    towards the port.
+    """
     scenario = stack_scenario(0, list(range(chasers)))
     able = [k for k, t in enumerate(scenario.chaser.thrusters) if t.direction[0] > 0.0]
     return int(rng.integers(chasers)), int(rng.choice(able))
@@ -269,7 +298,11 @@ def rigid_figures(name: str, flights: list[StackFlight]) -> Figures:
             "share",
             [f.mass_share for f in flights if f.mass_share is not None and not f.refused],
         ),
-        ("centre_error", "m", [f.centre_m for f in flights if f.centre_m is not None and not f.refused]),
+        (
+            "centre_error",
+            "m",
+            [f.centre_m for f in flights if f.centre_m is not None and not f.refused],
+        ),
         (
             "inertia_error",
             "share",
@@ -277,7 +310,11 @@ def rigid_figures(name: str, flights: list[StackFlight]) -> Figures:
         ),
         ("nees", "ratio", [f.nees for f in flights if f.nees is not None and not f.refused]),
         ("port_force", "N", [f.peak_force_N for f in flights if f.peak_force_N is not None]),
-        ("port_torque", "N_m", [f.peak_torque_N_m for f in flights if f.peak_torque_N_m is not None]),
+        (
+            "port_torque",
+            "N_m",
+            [f.peak_torque_N_m for f in flights if f.peak_torque_N_m is not None],
+        ),
     ):
         if values:
             out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
@@ -314,7 +351,9 @@ def print_optima(o: argparse.Namespace, seeds: range) -> Figures:
             scenario = stack_scenario(seed, numbers_of(chasers), [*wrong_knowledge(seed), *o.set])
             shares.append(optimum_share(scenario, OPTIMUM_S, OPTIMUM_GUESSES))
             print(f"{chasers}: seed {seed}: {shares[-1]:.3f}", file=sys.stderr, flush=True)
-        figures |= (part := percentiles(shares, f"optimum_{chasers}_over_lp", "ratio", "median", "max"))
+        figures |= (
+            part := percentiles(shares, f"optimum_{chasers}_over_lp", "ratio", "median", "max")
+        )
         print_figures(part)
     return figures
 
@@ -368,7 +407,11 @@ def fly_sets_whole(o: argparse.Namespace, seeds: range) -> Figures:
     """Fly every set of chasers with rendered images; return the figures."""
     settings = f"duration={o.duration:g} set={sorted(o.set)}"
     settings += f" limits={o.limits}" if o.limits else ""
-    rows = [msgspec.convert(row, DetumbleRow) for row in read_lines(o.results) if row["settings"] == settings]
+    rows = [
+        msgspec.convert(row, DetumbleRow)
+        for row in read_lines(o.results)
+        if row["settings"] == settings
+    ]
 
     def fly(chasers: str, seed: int) -> DetumbleOutcome:
         scenario = stack_scenario(seed, numbers_of(chasers), o.set)
@@ -397,16 +440,26 @@ def main() -> None:
     parser.add_argument("--silent", action="store_true", help="without a controller")
     cases = ("plan", "known", "identify", "fast", "stuck", "reported", "lost", "silent", "limited")
     parser.add_argument("--rigid", choices=cases, help="identification and plan, on one rigid body")
-    parser.add_argument("--vision", action="store_true", help="what the free tumble shows, without a capture")
-    parser.add_argument("--optimum", action="store_true", help="the least impulse, without a flight")
     parser.add_argument(
-        "--limits", type=float, nargs=2, metavar=("FORCE", "TORQUE"), help="of every port, N and N m"
+        "--vision", action="store_true", help="what the free tumble shows, without a capture"
+    )
+    parser.add_argument(
+        "--optimum", action="store_true", help="the least impulse, without a flight"
+    )
+    parser.add_argument(
+        "--limits",
+        type=float,
+        nargs=2,
+        metavar=("FORCE", "TORQUE"),
+        help="of every port, N and N m",
     )
     parser.add_argument("--tumbles", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sets", nargs="+", default=["0123", "013", "03"], metavar="CHASERS")
     parser.add_argument("--duration", type=float, default=30.0, help="s, from the command on")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override"
+    )
     parser.add_argument("--results", type=Path, metavar="FILE")
     o = parser.parse_args()
     fly = fly_sets_whole

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mission success over seeds under sensor errors and plant mismatch: ``python benchmarks/dispersion.py [--only SCENARIO ...]``.
+"""Mission success over seeds under sensor errors and plant mismatch: ``python
+benchmarks/dispersion.py [--only SCENARIO ...]``.
 
-Flies shipped scenarios in one process with ``truth.preset = "mismatch"`` under the grades ``lab`` and ``orbit``; each seed draws
-other errors of sensors, cameras, mass properties, thrust and disturbances. Scenarios with a capture are calibrated first under
-``orbit`` (``calibrate`` at 15 s, the approach 40 s later), and continue for up to 60 s after the scenario's end if a chaser has
-retreated and tries again; ``in_time`` counts those that succeeded before. Perception is statistical, or that of rendered images with
-``--images``. Prints, per scenario and grade, how many flights met the scenario's criteria on the true motion, the share of flights
-without any contact but a probe's tip, the causes of misses, and false alarms of thruster fault detection.
+Flies shipped scenarios in one process with ``truth.preset = "mismatch"`` under the grades ``lab``
+and ``orbit``; each seed draws other errors of sensors, cameras, mass properties, thrust and
+disturbances. Scenarios with a capture are calibrated first under ``orbit`` (``calibrate`` at 15 s,
+the approach 40 s later), and continue for up to 60 s after the scenario's end if a chaser has
+retreated and tries again; ``in_time`` counts those that succeeded before. Perception is
+statistical, or that of rendered images with ``--images``. Prints, per scenario and grade, how many
+flights met the scenario's criteria on the true motion, the share of flights without any contact but
+a probe's tip, the causes of misses, and false alarms of thruster fault detection.
 """
 
 from __future__ import annotations
@@ -51,7 +54,9 @@ EXTRA_S = 60.0
 
 
 class DispersedFlight(NamedTuple):
-    """How a flight ended: the criteria that it missed (none if it succeeded), whether it ended before the scenario does."""
+    """How a flight ended: the criteria that it missed (none if it succeeded), whether it ended
+    before the scenario does.
+    """
 
     missed: tuple[str, ...]
     in_time: bool
@@ -63,7 +68,9 @@ class DispersedFlight(NamedTuple):
 
 
 def overrides_of(name: str, grade: str, seed: int, images: bool) -> tuple[str, ...]:
-    """Return a shipped scenario's overrides for other errors; under ``orbit`` its captures follow a calibration of the cameras."""
+    """Return a shipped scenario's overrides for other errors; under ``orbit`` its captures follow a
+    calibration of the cameras.
+    """
     overrides = [f"seed={seed}", f'navigation.grade="{grade}"', 'truth.preset="mismatch"']
     if not images:
         overrides.append('perception.name="statistical"')
@@ -77,10 +84,16 @@ def overrides_of(name: str, grade: str, seed: int, images: bool) -> tuple[str, .
     everyone = list(range(len(nominal.chasers)))
     commands.append({"at_s": CALIBRATE_AT_S, "command": "calibrate", "chasers": everyone})
     timeline = ",".join(
-        "{" + ",".join(f"{key}={msgspec.json.encode(value).decode()}" for key, value in c.items()) + "}"
+        "{"
+        + ",".join(f"{key}={msgspec.json.encode(value).decode()}" for key, value in c.items())
+        + "}"
         for c in sorted(commands, key=lambda c: c["at_s"])
     )
-    return (*overrides, f"timeline=[{timeline}]", f"duration_s={nominal.duration_s + CALIBRATION_S}")
+    return (
+        *overrides,
+        f"timeline=[{timeline}]",
+        f"duration_s={nominal.duration_s + CALIBRATION_S}",
+    )
 
 
 def fly(name: str, grade: str, images: bool, seed: int) -> DispersedFlight:
@@ -106,7 +119,9 @@ def fly(name: str, grade: str, images: bool, seed: int) -> DispersedFlight:
             if scenario.settling_s <= tick.time_s < (scenario.steady_until_s or end_s):
                 steady += list(tick.tracking_errors.values())
             late = tick.time_s > end_s
-            captured = success.latched and all(mission.phase(i) == "verified" for i in success.latched)
+            captured = success.latched and all(
+                mission.phase(i) == "verified" for i in success.latched
+            )
             if captured and tick.time_s >= end_s:
                 break
         missed = [
@@ -122,7 +137,9 @@ def fly(name: str, grade: str, images: bool, seed: int) -> DispersedFlight:
         ]
         missed += [f"contact of {a} and {b}" for a, b in sorted(mission.contacts)]
         retreats = sum(len(mission.retreats(i)) for i in mission.chasers)
-        detected = [(chaser, text) for _, chaser, text in mission.thruster_events if ": detected" in text]
+        detected = [
+            (chaser, text) for _, chaser, text in mission.thruster_events if ": detected" in text
+        ]
     wrong = 0
     planned = [
         (f.chaser, f"thruster {f.thruster} {f.kind.replace('_', ' ')}: detected")
@@ -133,7 +150,9 @@ def fly(name: str, grade: str, images: bool, seed: int) -> DispersedFlight:
         wrong += known is None
         if known is not None:
             planned.remove(known)
-    missed += [f"chaser {chaser}: missed {text.removesuffix(': detected')}" for chaser, text in planned]
+    missed += [
+        f"chaser {chaser}: missed {text.removesuffix(': detected')}" for chaser, text in planned
+    ]
     rms = [math.sqrt(sum(e[k] ** 2 for e in steady) / len(steady)) for k in (0, 1)]
     return DispersedFlight(tuple(missed), not late, len(mission.contacts), retreats, wrong, *rms)
 
@@ -152,7 +171,9 @@ def fly_all(options: argparse.Namespace, name: str) -> Figures:
                 todo, pool.map(partial(fly, name, grade, options.images), todo), strict=True
             ):
                 known[seed] = outcome
-                append_line(options.results, key | {"seed": seed, "commit": commit(), "outcome": outcome})
+                append_line(
+                    options.results, key | {"seed": seed, "commit": commit(), "outcome": outcome}
+                )
                 if outcome.missed:
                     print(f"{name} {grade} seed {seed}: {'; '.join(outcome.missed)}", flush=True)
         part = figures_of(f"{name}_{grade}".replace("-", "_"), [known[s] for s in range(number)])
@@ -173,19 +194,32 @@ def figures_of(label: str, outcomes: list[DispersedFlight]) -> Figures:
         f"{label}_retreats": sum(o.retreats for o in outcomes),
         f"{label}_false_alarms": sum(o.false_alarms for o in outcomes),
         **percentiles([o.tracking_m for o in outcomes], f"{label}_tracking", "m", "median", "max"),
-        **percentiles([o.tracking_rad for o in outcomes], f"{label}_tracking", "rad", "median", "max"),
+        **percentiles(
+            [o.tracking_rad for o in outcomes], f"{label}_tracking", "rad", "median", "max"
+        ),
     }
 
 
 def main() -> None:
     """Fly the scenarios."""
     parser = make_parser(__doc__, SCENARIOS)
-    parser.add_argument("--grades", nargs="+", choices=GRADES, default=GRADES, help="grades (default: both)")
-    parser.add_argument("--seeds", type=int, metavar="N", help="flights (default: 100, 20 for the long ones)")
-    parser.add_argument("--images", action="store_true", help="rendered images instead of statistics")
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)")
     parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="append flights; flights in it are not repeated"
+        "--grades", nargs="+", choices=GRADES, default=GRADES, help="grades (default: both)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="flights (default: 100, 20 for the long ones)"
+    )
+    parser.add_argument(
+        "--images", action="store_true", help="rendered images instead of statistics"
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)"
+    )
+    parser.add_argument(
+        "--results",
+        type=Path,
+        metavar="FILE",
+        help="append flights; flights in it are not repeated",
     )
     options = parser.parse_args()
     run_parts(options, {name: partial(fly_all, options, name) for name in SCENARIOS})

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docking success: ``python benchmarks/docking.py [--quick] [--json FILE] [--flights N] [--images N] [--aborts N]
-[--aborts-images N] [--failures N] [--results FILE]``.
+"""Docking success: ``python benchmarks/docking.py [--quick] [--json FILE] [--flights N] [--images
+N] [--aborts N] [--aborts-images N] [--failures N] [--results FILE]``.
 
-Flies ``docking-contact`` many times in one process: from seeded starts, at target rates from zero to three times the
-paper's about any axis. ``--flights`` with a measurement model (2 mm and 0.1 degrees of white noise, no detection in every
-tenth image), ``--images`` with rendered images and the real perception, ``--aborts`` aborted at a random time
-(``--aborts-images`` with images), with a second approach after every fifth. ``--failures`` with a thruster that sticks
-open, and as many with one that sticks shut, not reported, thruster after thruster: at ``--failed-at``, or at a random
-time between 2 and 24 s. The approach is commanded at ``--approach-at``; ``--first`` is the first seed. Prints outcomes by
-cause, and figures at contact.
+Flies ``docking-contact`` many times in one process: from seeded starts, at target rates from zero
+to three times the paper's about any axis. ``--flights`` with a measurement model (2 mm and 0.1
+degrees of white noise, no detection in every tenth image), ``--images`` with rendered images and
+the real perception, ``--aborts`` aborted at a random time (``--aborts-images`` with images), with a
+second approach after every fifth. ``--failures`` with a thruster that sticks open, and as many with
+one that sticks shut, not reported, thruster after thruster: at ``--failed-at``, or at a random time
+between 2 and 24 s. The approach is commanded at ``--approach-at``; ``--first`` is the first seed.
+Prints outcomes by cause, and figures at contact.
 
-``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it, so that an
-interrupted batch continues.
+``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in
+it, so that an interrupted batch continues.
 """
 
 from __future__ import annotations
@@ -82,7 +83,9 @@ class Batch:
         outcome = flight(seed)
         self.commits.add(self._commit)
         print(f"{part} {outcome.line()}", file=sys.stderr, flush=True)
-        append_line(self.path, msgspec.to_builtins(DockingRow(part, self.settings, self._commit, outcome)))
+        append_line(
+            self.path, msgspec.to_builtins(DockingRow(part, self.settings, self._commit, outcome))
+        )
         return outcome
 
 
@@ -102,7 +105,11 @@ def docking_figures(name: str, outcomes: list[DockingOutcome]) -> Figures:
         ("contact_angle", "rad", [t.angle_rad for t in touches]),
         ("contact_closing", "m_s", [t.closing_m_s for t in touches]),
         ("contact_lateral_speed", "m_s", [t.lateral_speed_m_s for t in touches]),
-        ("momentum_error", "share", [o.linear_error for o in outcomes if o.linear_error is not None]),
+        (
+            "momentum_error",
+            "share",
+            [o.linear_error for o in outcomes if o.linear_error is not None],
+        ),
         (
             "angular_momentum_error",
             "share",
@@ -141,7 +148,9 @@ def abort_figures(name: str, outcomes: list[DockingOutcome]) -> Figures:
 
 
 def noisy(scenario: Scenario) -> PerceptionModel:
-    """Return a measurement model with 2 mm and 0.1 degrees of noise, and no detection in every tenth image."""
+    """Return a measurement model with 2 mm and 0.1 degrees of noise, and no detection in every
+    tenth image.
+    """
     return measurement_model(scenario, scenario.seed, 0.002, math.radians(0.1), dropout=0.1)
 
 
@@ -154,22 +163,29 @@ def main() -> None:
     parser.add_argument("--failures", type=int, default=12)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="kinds of failure")
     parser.add_argument("--failed-at", type=float, help="s; default: random")
-    parser.add_argument("--approach-at", type=float, default=APPROACH_AT_S, help="s; not for aborts")
+    parser.add_argument(
+        "--approach-at", type=float, default=APPROACH_AT_S, help="s; not for aborts"
+    )
     parser.add_argument("--actuation", choices=("thrusters", "ideal"), default="thrusters")
-    parser.add_argument("--rate", type=int, help="Hz, of control and images; default: the scenario's")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
+    parser.add_argument(
+        "--rate", type=int, help="Hz, of control and images; default: the scenario's"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override"
+    )
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="append flights; flights in it are not repeated"
+        "--results",
+        type=Path,
+        metavar="FILE",
+        help="append flights; flights in it are not repeated",
     )
     o = parser.parse_args()
     flights, images, aborts, aborts_images = (
         (4, 1, 4, 0) if o.quick else (o.flights, o.images, o.aborts, o.aborts_images)
     )
     failures = 0 if o.actuation == "ideal" else min(o.failures, 2) if o.quick else o.failures
-    settings = (
-        f"{o.actuation} rate={o.rate} approach={o.approach_at:g} failed={o.failed_at} set={sorted(o.set)}"
-    )
+    settings = f"{o.actuation} rate={o.rate} approach={o.approach_at:g} failed={o.failed_at} set={sorted(o.set)}"
     batch = Batch(o.results, settings)
     result: Figures = {}
 
@@ -180,7 +196,9 @@ def main() -> None:
         at_s = o.failed_at or float(np.random.default_rng([seed, 0xFA1]).uniform(2.0, 24.0))
         return kind, seed % 12, at_s
 
-    def dock_with(perception_of: PerceptionOf, kind: str | None = None) -> Callable[[int], DockingOutcome]:
+    def dock_with(
+        perception_of: PerceptionOf, kind: str | None = None
+    ) -> Callable[[int], DockingOutcome]:
         def flight(seed: int) -> DockingOutcome:
             failure = None if kind is None else failure_of(kind, seed)
             return dock(seed, scenario_of(seed, failure), perception_of, failure, o.approach_at)

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory growth over a long mission: ``python benchmarks/endurance.py [--hours 24] [--quick] [--json FILE]``.
+"""Memory growth over a long mission: ``python benchmarks/endurance.py [--hours 24] [--quick]
+[--json FILE]``.
 
-Flies the scenario ``endurance`` in lock-step as separate processes. The recorder rotates its log every simulated hour;
-finished parts are deleted. The resident set of each process is sampled twice a simulated hour, at least twelve times.
-Growth: median of the last three samples relative to that of the first three. Status 1 if a process grows by more than
-5 % or the flight is incomplete. ``--quick``: two hours.
+Flies the scenario ``endurance`` in lock-step as separate processes. The recorder rotates its log
+every simulated hour; finished parts are deleted. The resident set of each process is sampled twice
+a simulated hour, at least twelve times. Growth: median of the last three samples relative to that
+of the first three. Status 1 if a process grows by more than 5 % or the flight is incomplete.
+``--quick``: two hours.
 """
 
 from __future__ import annotations
@@ -49,10 +51,15 @@ def sample(fleet: Fleet, hub: Node, folder: Path, period_s: float) -> tuple[Samp
         match received.message if received is not None else None:
             case Tick(sim_time_ns=now_ns) if now_ns / 1e9 >= next_s:
                 for child in fleet.running():
-                    samples[child.name].append(float(psutil.Process(child.process.pid).memory_info().rss))
+                    samples[child.name].append(
+                        float(psutil.Process(child.process.pid).memory_info().rss)
+                    )
                 delete_finished_parts(folder)
                 shown = "  ".join(f"{name} {v[-1] / 1e6:.1f}" for name, v in samples.items() if v)
-                print(f"{next_s / 3600:5.2f} h ({time.monotonic() - begin_s:.0f} s): {shown} MB", flush=True)
+                print(
+                    f"{next_s / 3600:5.2f} h ({time.monotonic() - begin_s:.0f} s): {shown} MB",
+                    flush=True,
+                )
                 next_s += period_s
             case MissionEnd(complete=complete):
                 fleet.wait(60.0)
@@ -72,18 +79,28 @@ def main() -> None:
         network = ["-e", endpoint, "--namespace", namespace, "--lease", "600"]
         world = ["--set", f"duration_s={duration_s}", "-l", "tcp/127.0.0.1:0"]
         try:
-            start_mission(fleet, folder, SCENARIO, CHASERS, network, world, ("--rotate-time", "3600"))
+            start_mission(
+                fleet, folder, SCENARIO, CHASERS, network, world, ("--rotate-time", "3600")
+            )
             samples, complete = sample(fleet, hub, folder, min(SAMPLE_S, duration_s / 12))
             failures = [c.last_line() for c in fleet.children if c.process.poll() != 0]
         finally:
             fleet.end()
             hub.close()
     print(*failures, sep="\n", end="\n" if failures else "")
-    growth = {n: statistics.median(v[-3:]) / statistics.median(v[:3]) - 1.0 for n, v in samples.items() if v}
+    growth = {
+        n: statistics.median(v[-3:]) / statistics.median(v[:3]) - 1.0
+        for n, v in samples.items()
+        if v
+    }
     figures: Figures = {"simulated_s": duration_s, "complete": complete}
     for name, share in growth.items():
         key, values = name.replace("/", "_"), samples[name]
-        figures |= {f"{key}_first_bytes": values[0], f"{key}_last_bytes": values[-1], f"{key}_growth": share}
+        figures |= {
+            f"{key}_first_bytes": values[0],
+            f"{key}_last_bytes": values[-1],
+            f"{key}_growth": share,
+        }
     print_figures(figures)
     write_json(options.json, figures)
     sys.exit(0 if complete and max(growth.values()) <= LARGEST_GROWTH else 1)

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The physics engines against each other: ``python benchmarks/engines.py [--only PART ...] [--quick] [--json FILE]``.
+"""The physics engines against each other: ``python benchmarks/engines.py [--only PART ...]
+[--quick] [--json FILE]``.
 
-Parts: ``free``, ``thrusters``, ``capture`` and ``stack`` (open loop, 30 s, ``--quick`` 5 s; the cases of
-``chaserdock.evaluation.engine_comparison``) print the largest differences of any body and port, the change of momentum on each
-engine where no load acts, and the time per physics step. ``missions`` flies ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s)
-and ``four-chaser-capture`` (75 s) as ``chaserdock simulate`` does, on each engine with the perception ``statistical``, and prints
-their success and, in closed loop, the largest differences of any body. ``--seeds N``: number of seeds of each mission.
+Parts: ``free``, ``thrusters``, ``capture`` and ``stack`` (open loop, 30 s, ``--quick`` 5 s; the
+cases of ``chaserdock.evaluation.engine_comparison``) print the largest differences of any body and
+port, the change of momentum on each engine where no load acts, and the time per physics step.
+``missions`` flies ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s) and
+``four-chaser-capture`` (75 s) as ``chaserdock simulate`` does, on each engine with the perception
+``statistical``, and prints their success and, in closed loop, the largest differences of any body.
+``--seeds N``: number of seeds of each mission.
 """
 
 from __future__ import annotations
@@ -52,7 +55,9 @@ def case(name: str, duration_s: float) -> Figures:
 
 
 def missions(seeds: int) -> Figures:
-    """Return how many missions succeed on each engine, and the largest differences of any body between the engines."""
+    """Return how many missions succeed on each engine, and the largest differences of any body
+    between the engines.
+    """
     figures: Figures = {}
     for name, overrides in MISSIONS.items():
         successes, apart_m, apart_deg = dict.fromkeys(ENGINES, 0), 0.0, 0.0
@@ -61,7 +66,10 @@ def missions(seeds: int) -> Figures:
             for engine in ENGINES:
                 flights[engine], failures = fly_mission(name, engine, seed, overrides)
                 successes[engine] += not failures
-                print(f"  {name}, {engine}, seed {seed}: {'; '.join(failures) or 'success'}", flush=True)
+                print(
+                    f"  {name}, {engine}, seed {seed}: {'; '.join(failures) or 'success'}",
+                    flush=True,
+                )
             distance_m, angle_deg = tracks_apart(*flights.values())
             apart_m, apart_deg = max(apart_m, distance_m), max(apart_deg, angle_deg)
         figures |= {f"{name}_{engine}_success_share": n / seeds for engine, n in successes.items()}
@@ -73,7 +81,9 @@ def missions(seeds: int) -> Figures:
 def fly_mission(
     name: str, engine: str, seed: int, overrides: tuple[str, ...]
 ) -> tuple[Mapping[str, Track], list[str]]:
-    """Fly a mission in this process; return the true motion of its bodies, and why it is no success."""
+    """Fly a mission in this process; return the true motion of its bodies, and why it is no
+    success.
+    """
     settings = (*overrides, f"seed={seed}", f"world.engine={engine}", "perception.name=statistical")
     with tempfile.TemporaryDirectory() as folder:
         flight = simulate(shipped_scenario(name), Path(folder), settings)
@@ -84,12 +94,18 @@ def fly_mission(
 
 
 def tracks_apart(a: Mapping[str, Track], b: Mapping[str, Track]) -> tuple[float, float]:
-    """Return the largest differences of position (m) and attitude (degrees) of any body at one time."""
+    """Return the largest differences of position (m) and attitude (degrees) of any body at one
+    time.
+    """
     distance_m = angle_rad = 0.0
     for name, track in a.items():
         other = b[name]
-        distance_m = max(distance_m, float(np.linalg.norm(track.position_m - other.position_m, axis=1).max()))
-        angle_rad = max(angle_rad, float(np.max(rotations.angle_between(track.q_wxyz, other.q_wxyz))))
+        distance_m = max(
+            distance_m, float(np.linalg.norm(track.position_m - other.position_m, axis=1).max())
+        )
+        angle_rad = max(
+            angle_rad, float(np.max(rotations.angle_between(track.q_wxyz, other.q_wxyz)))
+        )
     return distance_m, math.degrees(angle_rad)
 
 

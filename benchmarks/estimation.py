@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Target estimation with rendered images: ``python benchmarks/estimation.py [--only PART ...] [--quick] [--json FILE]``.
+"""Target estimation with rendered images: ``python benchmarks/estimation.py [--only PART ...]
+[--quick] [--json FILE]``.
 
-Parts: ``exact`` (all image effects, cameras as calibrated; both targets, one and two chasers; the paper's perception and
-estimator on the same images), ``errors`` (calibration errors drawn from each seed, heavy noise), ``calibrate`` (the
-manoeuvre that estimates a camera's mounting), ``acquire`` (starts off the reference, the target often out of view),
-``faults`` (blind cameras, glare, a chaser that reports wrong poses). Figures: mean and worst over the seeds.
+Parts: ``exact`` (all image effects, cameras as calibrated; both targets, one and two chasers; the
+paper's perception and estimator on the same images), ``errors`` (calibration errors drawn from each
+seed, heavy noise), ``calibrate`` (the manoeuvre that estimates a camera's mounting), ``acquire``
+(starts off the reference, the target often out of view), ``faults`` (blind cameras, glare, a chaser
+that reports wrong poses). Figures: mean and worst over the seeds.
 
-``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it, so that an
-interrupted run continues.
+``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in
+it, so that an interrupted run continues.
 """
 
 from __future__ import annotations
@@ -41,15 +43,20 @@ from chaserdock.evaluation.perception import RenderedImages, States
 
 Row = dict[str, Any]
 SIDES = (((-1.0, 0.0, 0.0), 0.0), ((0.0, -1.0, 0.0), 90.0), ((1.0, 0.0, 0.0), 180.0))
-"""Reference positions (TRF, m) of the chasers, and the yaw (degrees) with which each faces the target."""
+"""Reference positions (TRF, m) of the chasers, and the yaw (degrees) with which each faces the
+target.
+"""
 SETTLED_S = 6.0
 
 
 def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: Any) -> Scenario:
-    """Return a scenario with all image effects; sun, target attitude and starts are drawn from the seed."""
+    """Return a scenario with all image effects; sun, target attitude and starts are drawn from the
+    seed.
+    """
     rng = np.random.default_rng([seed, 4])
     sun = rotations.rotate(
-        rotations.exp([0.0, 0.0, rng.uniform(-math.pi, math.pi)]), [1.0, 0.0, rng.uniform(-0.6, 0.9)]
+        rotations.exp([0.0, 0.0, rng.uniform(-math.pi, math.pi)]),
+        [1.0, 0.0, rng.uniform(-0.6, 0.9)],
     )
     flying = []
     for position, yaw_deg in SIDES[:number]:
@@ -90,8 +97,9 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
 
 @dataclass
 class EstimatorErrors:
-    """An estimator's errors against ground truth by tick: position (m), angle (rad), velocity (m/s), rate (rad/s), NEES of
-    the pose (6 degrees of freedom), the share of its six components inside 3 sigma, and the status."""
+    """An estimator's errors against ground truth by tick: position (m), angle (rad), velocity
+    (m/s), rate (rad/s), NEES of the pose (6 degrees of freedom), the share of its six components
+    inside 3 sigma, and the status."""
 
     time_s: list[float] = field(default_factory=list)
     position_m: list[float] = field(default_factory=list)
@@ -133,8 +141,9 @@ class EstimatorErrors:
 
 @dataclass
 class EstimationFlight:
-    """A flight: errors of its estimator and of the parallel estimators, tracking errors as (time s, m, rad) of all chasers, events as
-    (time s, level, text), whether each image had a detection by chaser, the last outputs, and reinitializations."""
+    """A flight: errors of its estimator and of the parallel estimators, tracking errors as (time s,
+    m, rad) of all chasers, events as (time s, level, text), whether each image had a detection by
+    chaser, the last outputs, and reinitializations."""
 
     estimates: EstimatorErrors
     parallel: dict[str, EstimatorErrors]
@@ -152,18 +161,24 @@ class EstimationFlight:
 
 
 class ParallelEstimator:
-    """Perception and estimator of another scenario on the images of a flight, without influence on it."""
+    """Perception and estimator of another scenario on the images of a flight, without influence on
+    it.
+    """
 
     def __init__(self, scenario: Scenario, own_perception: bool) -> None:
         self.errors = EstimatorErrors()
-        self._perceptions = [make_perception(scenario) for _ in scenario.chasers] if own_perception else []
+        self._perceptions = (
+            [make_perception(scenario) for _ in scenario.chasers] if own_perception else []
+        )
         self._core = ControllerCore(scenario, time.perf_counter)
 
     def update(self, record: TickRecord, images: dict[int, Image]) -> None:
         """Estimate the target from a tick's images and odometry."""
         sightings = record.sightings
         if self._perceptions and sightings:
-            sightings = tuple(look(self._perceptions[i], image, None) for i, image in images.items())
+            sightings = tuple(
+                look(self._perceptions[i], image, None) for i, image in images.items()
+            )
         inputs = TickInputs(record.tick, record.time_ns, record.odometry, sightings)
         estimate = self._core.estimate(inputs)
         self.errors.add(record.time_s, estimate, record.states["target"])
@@ -176,7 +191,8 @@ def fly(
     on_sighting: Callable[[Sighting], Sighting] = lambda sighting: sighting,
     until: Callable[[EstimatorErrors], bool] = lambda errors: False,
 ) -> EstimationFlight:
-    """Fly a scenario with rendered images to its end, or ``until`` the errors so far satisfy a condition.
+    """Fly a scenario with rendered images to its end, or ``until`` the errors so far satisfy a
+    condition.
 
     ``on_image`` changes an image before perception, ``on_sighting`` what a chaser reports of it.
     """
@@ -223,7 +239,9 @@ def fly(
 
 
 def changed(scenario: Scenario, **sections: Any) -> Scenario:
-    """Return a scenario with some fields replaced and validated; dictionaries are merged into their sections."""
+    """Return a scenario with some fields replaced and validated; dictionaries are merged into their
+    sections.
+    """
     values = scenario.model_dump()
     for name, value in sections.items():
         merge = isinstance(value, dict) and isinstance(values[name], dict)
@@ -248,7 +266,9 @@ HEAVY = {
 
 
 def with_errors(scenario: Scenario) -> Scenario:
-    """Return the scenario with calibration errors and heavy noise, whose sigmas the filter has as parameters."""
+    """Return the scenario with calibration errors and heavy noise, whose sigmas the filter has as
+    parameters.
+    """
     return changed(scenario, camera={"effects": HEAVY}, navigation=ERRORS)
 
 
@@ -295,7 +315,9 @@ def errors(target: str, chasers: int, seed: int) -> Row:
 
 
 def calibrate(target: str, seed: int) -> Row:
-    """Fly one chaser with a mounting error of 0.3 degrees (one sigma, each axis); it calibrates from 5 s on, for 30 s."""
+    """Fly one chaser with a mounting error of 0.3 degrees (one sigma, each axis); it calibrates
+    from 5 s on, for 30 s.
+    """
     scenario = scenario_of(target, 1, seed, 46.0)
     scenario = changed(
         scenario,
@@ -321,7 +343,9 @@ LOCKED_S = 3.0
 
 
 def acquire(seed: int) -> Row:
-    """Fly one chaser that starts up to 0.5 m and 20 degrees off, until the estimate is right for 3 s, at most 30 s."""
+    """Fly one chaser that starts up to 0.5 m and 20 degrees off, until the estimate is right for 3
+    s, at most 30 s.
+    """
     rng = np.random.default_rng([seed, 11])
     offset, turn = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     start = {
@@ -336,7 +360,11 @@ def acquire(seed: int) -> Row:
     def locked(e: EstimatorErrors) -> bool:
         n = round(LOCKED_S * scenario.time.rate_hz)
         right = np.array(e.position_m[-n:]) < 0.02, np.array(e.angle_rad[-n:]) < math.radians(3.0)
-        return len(e.status) >= n and set(e.status[-n:]) == {"tracking"} and bool((right[0] & right[1]).all())
+        return (
+            len(e.status) >= n
+            and set(e.status[-n:]) == {"tracking"}
+            and bool((right[0] & right[1]).all())
+        )
 
     flown = fly(scenario, until=locked)
     e = flown.estimates
@@ -348,7 +376,9 @@ def acquire(seed: int) -> Row:
         "locked_s": e.time_s[-1] - LOCKED_S if done else 99.0,
         "wrong_lock_ticks": int(wrong.sum()),
         "in_view_at_start": float(flown.detections[0][0]),
-        "searched": float(any(text.endswith("searching (from acquire)") for _, _, text in flown.events)),
+        "searched": float(
+            any(text.endswith("searching (from acquire)") for _, _, text in flown.events)
+        ),
         "lost": float("lost" in e.status),
         "events": [f"{t:.2f} {text}" for t, _, text in flown.events][:20],
     }
@@ -358,13 +388,18 @@ WRONG_IRF_M, WRONG_RAD = (0.2, 0.0, 0.0), (0.0, 0.0, math.radians(15.0))
 
 
 def fault(which: str, seed: int) -> Row:
-    """Fly with a fault from 8 s to 28 s (both cameras blind: to 13 s); wrong poses are reported from the start."""
+    """Fly with a fault from 8 s to 28 s (both cameras blind: to 13 s); wrong poses are reported
+    from the start.
+    """
     n = 3 if which == "wrong_poses" else 2
     scenario = scenario_of("servicer", n, seed, 14.0 if which == "wrong_poses" else 32.0)
     if which == "sun":
         camera = scenario.camera.model_dump()
         # Chaser 0 looks along +X of the target, which is nearly that of the world.
-        camera |= {"sun_direction": (1.0, -0.1, 0.12), "effects": camera["effects"] | {"glare": 3000.0}}
+        camera |= {
+            "sun_direction": (1.0, -0.1, 0.12),
+            "effects": camera["effects"] | {"glare": 3000.0},
+        }
         scenario = changed(scenario, camera=camera)
 
     def on_image(image: Image) -> Image:
@@ -402,7 +437,11 @@ PARTS: dict[str, tuple[int, int, dict[str, Callable[[int], Row]]]] = {
     "errors": (20, 2, {f"{t} 2": partial(errors, t, 2) for t in TARGETS}),
     "calibrate": (20, 2, {"servicer 1": partial(calibrate, "servicer")}),
     "acquire": (200, 8, {"": acquire}),
-    "faults": (1, 1, {w: partial(fault, w) for w in ("one_blind", "both_blind", "sun", "wrong_poses")}),
+    "faults": (
+        1,
+        1,
+        {w: partial(fault, w) for w in ("one_blind", "both_blind", "sun", "wrong_poses")},
+    ),
 }
 """Number of seeds, number with ``--quick``, and the kinds of flight of each part."""
 LOWEST_IS_WORST = ("inside_3_sigma", "detected", "found", "good", "named")
@@ -439,7 +478,10 @@ def fly_part(part: str, seeds: range, results: Path | None) -> Figures:
 def main() -> None:
     parser = make_parser(__doc__, PARTS)
     parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="append flights; flights in it are not repeated"
+        "--results",
+        type=Path,
+        metavar="FILE",
+        help="append flights; flights in it are not repeated",
     )
     parser.add_argument("--seeds", type=int, help="number of seeds")
     parser.add_argument("--first", type=int, default=0, help="first seed")

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A log read by independent programs: ``python benchmarks/external_tools.py LOG [--tools DIR] [--image PNG] [--json FILE]``.
+"""A log read by independent programs: ``python benchmarks/external_tools.py LOG [--tools DIR]
+[--image PNG] [--json FILE]``.
 
-Installs evo, pymcap-cli, mcap and rerun into a separate virtual environment (``--tools``: kept there, otherwise
-temporary) and checks:
+Installs evo, pymcap-cli, mcap and rerun into a separate virtual environment (``--tools``: kept
+there, otherwise temporary) and checks:
 
 - evo_ape on the tracks of ``chaserdock log tracks``: root mean square errors within 1 % of ours;
 - pymcap-cli doctor: no error;
 - the reader of the mcap package: every channel has a schema, every message is readable;
-- rerun: draws the log without a window and saves the image to ``--image``. Without a graphics card it needs Mesa's
-  Vulkan driver (Debian: mesa-vulkan-drivers).
+- rerun: draws the log without a window and saves the image to ``--image``. Without a graphics card
+  it needs Mesa's Vulkan driver (Debian: mesa-vulkan-drivers).
 
 Status 1 if a check fails. ``--quick`` changes nothing.
 """
@@ -87,11 +88,22 @@ def evo(programs: Path, log: Path, work: Path) -> CheckedFigures:
     figures: Figures = {}
     for relation, key in (("trans_part", "position_m"), ("angle_rad", "orientation_rad")):
         result = work / f"{relation}.zip"
-        call(programs / "evo_ape", "tum", *tracks, "-r", relation, "--save_results", result, HOME=str(work))
+        call(
+            programs / "evo_ape",
+            "tum",
+            *tracks,
+            "-r",
+            relation,
+            "--save_results",
+            result,
+            HOME=str(work),
+        )
         with zipfile.ZipFile(result) as archive:
             figures[f"evo_rms_{key}"] = float(json.loads(archive.read("stats.json"))["rmse"])
         figures[f"our_rms_{key}"] = float(np.sqrt(np.mean(errors[key] ** 2)))
-    ratios = [figures[f"evo_rms_{k}"] / figures[f"our_rms_{k}"] for k in ("position_m", "orientation_rad")]
+    ratios = [
+        figures[f"evo_rms_{k}"] / figures[f"our_rms_{k}"] for k in ("position_m", "orientation_rad")
+    ]
     return figures, all(abs(ratio - 1.0) <= TOLERANCE for ratio in ratios)
 
 
@@ -106,7 +118,9 @@ def doctor(programs: Path, log: Path) -> CheckedFigures:
 
 def mcap_reader(programs: Path, log: Path) -> CheckedFigures:
     """Read all messages with the reader of the mcap package."""
-    channels, without_schema, read, total = map(int, call(programs / "python", "-c", READ, log).split())
+    channels, without_schema, read, total = map(
+        int, call(programs / "python", "-c", READ, log).split()
+    )
     figures: Figures = {
         "mcap_channels": channels,
         "mcap_channels_without_schema": without_schema,
@@ -131,7 +145,9 @@ def rerun(programs: Path, log: Path, image: Path) -> CheckedFigures:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("log", type=Path, metavar="LOG", help="mission.mcap")
-    parser.add_argument("--tools", type=Path, metavar="DIR", help="virtual environment of the tools, kept")
+    parser.add_argument(
+        "--tools", type=Path, metavar="DIR", help="virtual environment of the tools, kept"
+    )
     parser.add_argument("--image", type=Path, metavar="PNG", default=Path("rerun.png"))
     options = parser.parse_args()
     log: Path = options.log.resolve()

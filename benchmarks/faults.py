@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults during a shortened docking: ``python benchmarks/faults.py [--runs N] [--quick] [--json FILE]``.
+"""Random faults during a shortened docking: ``python benchmarks/faults.py [--runs N] [--quick]
+[--json FILE]``.
 
-Each run flies the scenario ``fault-drill`` as separate processes with one fault; kind, process, time and severity are
-drawn from the number of the run. Outcomes: ``docked``; ``safe`` (not docked, and the log states why); ``no reason named``;
-``collision``; ``stalled``. Results are appended to ``--out`` (JSON lines); runs that it contains are not repeated.
-``--quick``: one run of each kind. Status 1 if a run is neither docked nor safe, or its log is incomplete.
+Each run flies the scenario ``fault-drill`` as separate processes with one fault; kind, process,
+time and severity are drawn from the number of the run. Outcomes: ``docked``; ``safe`` (not docked,
+and the log states why); ``no reason named``; ``collision``; ``stalled``. Results are appended to
+``--out`` (JSON lines); runs that it contains are not repeated. ``--quick``: one run of each kind.
+Status 1 if a run is neither docked nor safe, or its log is incomplete.
 """
 
 from __future__ import annotations
@@ -117,7 +119,9 @@ def evaluate(
         mode=mode,
         outcome=outcome,
         reason=reason,
-        log_complete=lost == 0 and summary["sim_time_s"] > end_s and (recorder_killed or bool(begins)),
+        log_complete=lost == 0
+        and summary["sim_time_s"] > end_s
+        and (recorder_killed or bool(begins)),
         nearest_chasers_m=summary["min_distance_chasers_m"],
         nearest_target_m=min(c["min_distance_target_m"] for c in summary["chasers"].values()),
         digest=summary["digest"],
@@ -126,7 +130,9 @@ def evaluate(
 
 
 def read_results(path: Path, mode: str) -> dict[int, FaultResult]:
-    """Return earlier results by number; a result whose fault is no longer that of its number is ignored."""
+    """Return earlier results by number; a result whose fault is no longer that of its number is
+    ignored.
+    """
     results = [FaultResult(**row) for row in read_lines(path)]
     return {r.number: r for r in results if r.mode == mode and r.fault == fault_of(r.number)}
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robustness of the decoders: ``python benchmarks/fuzz.py [--messages N] [--quick] [--json FILE]``.
 
-Feeds seeded mutations of one valid sample to the decoder of every topic (and of the two queries), to the scenario loader
-and to the log reader. Any exception but the decoder's own error is a crash; accepted messages are checked again by
-``tests/fuzzing.py``. Memory is the resident set of this process. Status 1 on a crash or an accepted invalid message.
+Feeds seeded mutations of one valid sample to the decoder of every topic (and of the two queries),
+to the scenario loader and to the log reader. Any exception but the decoder's own error is a crash;
+accepted messages are checked again by ``tests/fuzzing.py``. Memory is the resident set of this
+process. Status 1 on a crash or an accepted invalid message.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from message_samples import SAMPLES
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--messages", type=int, default=1_000_000, help="mutated messages per topic")
+    parser.add_argument(
+        "--messages", type=int, default=1_000_000, help="mutated messages per topic"
+    )
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     number = 20_000 if options.quick else options.messages
@@ -32,7 +35,8 @@ def main() -> None:
     figures: Figures = {}
     bad = 0
     runs: dict[str, Callable[[], Outcome]] = {
-        name: partial(fuzz_messages, kind, number, options.seed) for name, kind in boundaries().items()
+        name: partial(fuzz_messages, kind, number, options.seed)
+        for name, kind in boundaries().items()
     }
     runs["scenario loader"] = partial(fuzz_scenarios, max(200, number // 50), options.seed)
     runs["log reader"] = partial(fuzz_logs, max(50, number // 500), options.seed)
@@ -58,8 +62,14 @@ def main() -> None:
             f"{key}_growth_bytes": after - before,
         }
     last = process.memory_info().rss
-    figures |= {"crashes_and_invalid_accepted": bad, "memory_before_bytes": first, "memory_after_bytes": last}
-    print(f"memory {first / 1e6:.0f} -> {last / 1e6:.0f} MB; {bad} crashes or accepted invalid messages")
+    figures |= {
+        "crashes_and_invalid_accepted": bad,
+        "memory_before_bytes": first,
+        "memory_after_bytes": last,
+    }
+    print(
+        f"memory {first / 1e6:.0f} -> {last / 1e6:.0f} MB; {bad} crashes or accepted invalid messages"
+    )
     write_json(options.json, figures)
     sys.exit(1 if bad else 0)
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robustness of the C kernels: ``python benchmarks/fuzz_kernels.py [--inputs N] [--quick] [--json FILE]``.
+"""Robustness of the C kernels: ``python benchmarks/fuzz_kernels.py [--inputs N] [--quick] [--json
+FILE]``.
 
-Compiles all kernels with AddressSanitizer and UndefinedBehaviorSanitizer. Part ``fuzz`` calls each with seeded random arrays, NaN,
-infinities and denormals among them, and checks what the kernel promises (tests/native); part ``tests`` runs the Python tests that call
-the kernels. Status 1 if anything is found; 2 without gcc. Repeat a finding, "KERNEL, input I, seed S", with
-``--kernel KERNEL --first I --inputs 1 --seed S``.
+Compiles all kernels with AddressSanitizer and UndefinedBehaviorSanitizer. Part ``fuzz`` calls each
+with seeded random arrays, NaN, infinities and denormals among them, and checks what the kernel
+promises (tests/native); part ``tests`` runs the Python tests that call the kernels. Status 1 if
+anything is found; 2 without gcc. Repeat a finding, "KERNEL, input I, seed S", with ``--kernel
+KERNEL --first I --inputs 1 --seed S``.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 import sanitizers
 
 
-def fuzz_all(kernel: str | None, inputs: int, seed: int, first: int, jobs: int) -> tuple[Figures, int]:
+def fuzz_all(
+    kernel: str | None, inputs: int, seed: int, first: int, jobs: int
+) -> tuple[Figures, int]:
     """Run the fuzz targets; return figures and the number of kernels with a finding."""
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as threads:
         programs = threads.map(
@@ -57,7 +61,9 @@ def fuzz_all(kernel: str | None, inputs: int, seed: int, first: int, jobs: int) 
 
 def main() -> None:
     parser = make_parser(__doc__, ("fuzz", "tests"))
-    parser.add_argument("--inputs", type=int, help="inputs per kernel (default 1000000, with --quick 50000)")
+    parser.add_argument(
+        "--inputs", type=int, help="inputs per kernel (default 1000000, with --quick 50000)"
+    )
     parser.add_argument("--first", type=int, default=0, help="number of the first input")
     parser.add_argument("--kernel", help="this kernel only")
     parser.add_argument("--seed", type=int, default=1)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and memory of the commands that read a log: ``python benchmarks/long_logs.py LOG [--hours 10] [--quick] [--json FILE]``.
+"""Time and memory of the commands that read a log: ``python benchmarks/long_logs.py LOG [--hours
+10] [--quick] [--json FILE]``.
 
-Runs each command on the given log and on a log of many hours. The long log repeats the given one with continued ticks and
-times, without images (ten hours of them would be hundreds of gigabytes). LOG is a run's folder or log, for example of
-``chaserdock run four-chaser-docking``.
+Runs each command on the given log and on a log of many hours. The long log repeats the given one
+with continued ticks and times, without images (ten hours of them would be hundreds of gigabytes).
+LOG is a run's folder or log, for example of ``chaserdock run four-chaser-docking``.
 """
 
 from __future__ import annotations
@@ -26,18 +27,26 @@ _TIMES = ("sim_time_ns", "effective_time_ns", "expires_ns")
 
 
 def repeat(log: Path, out: Path, hours: float) -> int:
-    """Write ``log`` repeatedly to the new file ``out`` until it is ``hours`` long; return the number of messages."""
+    """Write ``log`` repeatedly to the new file ``out`` until it is ``hours`` long; return the
+    number of messages.
+    """
     text, run = read_scenario(log)
     records = [
-        r for r in read_log(log) if r.topic is not topics.IMAGE and not isinstance(r.message, MissionEnd)
+        r
+        for r in read_log(log)
+        if r.topic is not topics.IMAGE and not isinstance(r.message, MissionEnd)
     ]
     ticks = 1 + max(getattr(r.message, "tick", 0) for r in records)
     scenario = msgspec.json.decode(text)
     period_ns = round(ticks * 1e9 / scenario["time"]["rate_hz"])
     times = max(1, round(hours * 3.6e12 / period_ns))
-    scenario["duration_s"] = (times * ticks - 1) / scenario["time"]["rate_hz"]  # the first tick is at zero
+    scenario["duration_s"] = (times * ticks - 1) / scenario["time"][
+        "rate_hz"
+    ]  # the first tick is at zero
     writer = LogWriter(out)
-    writer.describe(msgspec.json.encode(scenario).decode(), {k: v for k, v in run.items() if k != "crc32"})
+    writer.describe(
+        msgspec.json.encode(scenario).decode(), {k: v for k, v in run.items() if k != "crc32"}
+    )
     seq: dict[str, int] = {}
     encoder = msgspec.msgpack.Encoder()
     for k in range(times):
@@ -48,13 +57,17 @@ def repeat(log: Path, out: Path, hours: float) -> int:
             if hasattr(m, "tick"):
                 changes["tick"] = m.tick + k * ticks
             copy = msgspec.structs.replace(m, seq=seq[r.key], **changes)
-            writer.write(r.key, encoding_of(type(m)), encoder.encode(copy), r.sent_ns + k * period_ns)
+            writer.write(
+                r.key, encoding_of(type(m)), encoder.encode(copy), r.sent_ns + k * period_ns
+            )
     writer.close()
     return writer.messages
 
 
 def cost_of(*arguments: str | Path) -> tuple[float, float]:
-    """Run ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise SystemExit if it fails."""
+    """Run ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise
+    SystemExit if it fails.
+    """
     begin_s = time.perf_counter()
     no_output = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
     command = chaserdock_command(*arguments)
@@ -80,7 +93,10 @@ def costs(log: Path, label: str) -> Figures:
             "log_tracks": ("log", "tracks", log, "--out", out / "tracks"),
         }.items():
             wall_s, peak_bytes = cost_of(*arguments)
-            part = {f"{label}_{command}_wall_s": wall_s, f"{label}_{command}_peak_bytes": peak_bytes}
+            part = {
+                f"{label}_{command}_wall_s": wall_s,
+                f"{label}_{command}_peak_bytes": peak_bytes,
+            }
             print_figures(part)
             figures |= part
     return figures
@@ -94,8 +110,8 @@ def main() -> None:
     figures = costs(options.log, "given")
     with tempfile.TemporaryDirectory(prefix="long-log-") as folder:
         long = Path(folder) / "long.mcap"
-        # In a process of its own: Linux reports for a child at least the largest resident set that its parent had when it
-        # started the child, and a writer keeps the index of all its chunks.
+        # In a process of its own: Linux reports for a child at least the largest resident set that
+        # its parent had when it started the child, and a writer keeps the index of all its chunks.
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             messages = pool.submit(
                 repeat, options.log, long, 0.2 if options.quick else options.hours

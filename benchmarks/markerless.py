@@ -1,38 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Perception by shape: ``python benchmarks/markerless.py [--views N] [--ranges M ...] [--only PART] [--results FILE] [--quick]
-[--json FILE]``.
+"""Perception by shape: ``python benchmarks/markerless.py [--views N] [--ranges M ...] [--only PART]
+[--results FILE] [--quick] [--json FILE]``.
 
-Images of ``geo_servicer``, 960 x 540 pixels, 60 degrees, by the world's renderer of meshes, with cast shadows, specular reflection,
-insulation texture, point spread and noise. The tracker has its own renderer and estimates the light. Attitudes and suns in
-front of the target are random. Parts:
+Images of ``geo_servicer``, 960 x 540 pixels, 60 degrees, by the world's renderer of meshes, with
+cast shadows, specular reflection, insulation texture, point spread and noise. The tracker has its
+own renderer and estimates the light. Attitudes and suns in front of the target are random. Parts:
 
-- ``exact`` and ``knowledge``: tracking from a prior 1 % of the range and 1.5 degrees off, at 1, 3 and 10 m, with the exact mesh, and
-  with one that is simplified to 1 mm, with panels wrong by 0.5 degrees and a scale wrong by 0.3 % (standard deviations, drawn for each
-  view; the truth stays the same);
-- ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are averaged by their covariances;
-- ``triangulated``: as ``knowledge``, after one image of each of four cameras around the target at 1 to 1.6 m, whose distances odometry
-  of grade `lab` measures, which tells the scale;
-- ``independent`` and ``independent-knowledge``: as ``exact`` and ``knowledge``, with images by the ray tracer Embree, without
-  texture;
-- ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
-  target is darker than 5 grey levels are left out, here and with the lamp;
-- ``backlit-flight`` and ``lamp-flight``: the views of ``backlit`` and ``lamp`` as in flight, each the last of 30 images of a target
-  that turns;
-- ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp, that of `harsh-light`, and at 1 to 3 m
-  of a target that moves by four pixels during the exposure; the pose is that in the middle of it;
-- ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and those that pass the
-  gate;
-- ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the Earth, and in front of space by one
-  of two cameras that see the target at right angles;
-- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated by the controller's filter from 36 views from all around
-  at 1 to 1.6 m, by two cameras on opposite sides whose distance odometry of grade `lab` measures; twelve views of each of
-  ``views / 12`` drawn meshes;
-- ``sequence`` and ``closing``: a tumbling target, followed at 15 Hz from its acquisition on, at 3 m and from 1.4 to 0.55 m;
-- ``shaded``: CPU time per image on the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that others expect, the least of
-  three repetitions, as other programs on the machine prolong it.
+- ``exact`` and ``knowledge``: tracking from a prior 1 % of the range and 1.5 degrees off, at 1, 3
+  and 10 m, with the exact mesh, and with one that is simplified to 1 mm, with panels wrong by 0.5
+  degrees and a scale wrong by 0.3 % (standard deviations, drawn for each view; the truth stays the
+  same);
+- ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are
+  averaged by their covariances;
+- ``triangulated``: as ``knowledge``, after one image of each of four cameras around the target at 1
+  to 1.6 m, whose distances odometry of grade `lab` measures, which tells the scale;
+- ``independent`` and ``independent-knowledge``: as ``exact`` and ``knowledge``, with images by the
+  ray tracer Embree, without texture;
+- ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun
+  behind the target; views in which the target is darker than 5 grey levels are left out, here and
+  with the lamp;
+- ``backlit-flight`` and ``lamp-flight``: the views of ``backlit`` and ``lamp`` as in flight, each
+  the last of 30 images of a target that turns;
+- ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp,
+  that of `harsh-light`, and at 1 to 3 m of a target that moves by four pixels during the exposure;
+  the pose is that in the middle of it;
+- ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m:
+  gross errors, and those that pass the gate;
+- ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the
+  Earth, and in front of space by one of two cameras that see the target at right angles;
+- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated by the controller's
+  filter from 36 views from all around at 1 to 1.6 m, by two cameras on opposite sides whose
+  distance odometry of grade `lab` measures; twelve views of each of ``views / 12`` drawn meshes;
+- ``sequence`` and ``closing``: a tumbling target, followed at 15 Hz from its acquisition on, at 3 m
+  and from 1.4 to 0.55 m;
+- ``shaded``: CPU time per image on the shaded side of tumbling targets at 0.8 to 2.2 m, from poses
+  that others expect, the least of three repetitions, as other programs on the machine prolong it.
 
-Gross: an error above 2 degrees or 2 % of range that passes the gate. Times are CPU times of this process. ``--results FILE`` appends
-every view to FILE (JSON lines) and does not repeat views that are in it.
+Gross: an error above 2 degrees or 2 % of range that passes the gate. Times are CPU times of this
+process. ``--results FILE`` appends every view to FILE (JSON lines) and does not repeat views that
+are in it.
 """
 
 from __future__ import annotations
@@ -123,11 +129,20 @@ class SatelliteImages:
 
     def mean_grey(self, image: NDArray[np.uint8], pose: PoseInCamera) -> float:
         """Return the mean grey level of the target in an image (h, w)."""
-        return float(image[self.coverage(pose.position, rotations.from_matrix(pose.rotation))].mean())
+        return float(
+            image[self.coverage(pose.position, rotations.from_matrix(pose.rotation))].mean()
+        )
 
-    def blurred(self, pose: PoseInCamera, step_m: Array, light: Light, number: int) -> NDArray[np.uint8]:
-        """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure, ``pose`` in the middle of it."""
-        q, total = rotations.from_matrix(pose.rotation), np.zeros((CAMERA.height_px, CAMERA.width_px))
+    def blurred(
+        self, pose: PoseInCamera, step_m: Array, light: Light, number: int
+    ) -> NDArray[np.uint8]:
+        """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure,
+        ``pose`` in the middle of it.
+        """
+        q, total = (
+            rotations.from_matrix(pose.rotation),
+            np.zeros((CAMERA.height_px, CAMERA.width_px)),
+        )
         shares = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
         for share in shares:
             at = pose.position + share * step_m
@@ -135,7 +150,9 @@ class SatelliteImages:
         return self._effects.apply(np.rint(total / _EXPOSURES).astype(np.uint8), 0, number)
 
     def coverage(self, position: Array, q: Array) -> NDArray[np.bool_]:
-        """Return the mask (h, w) of the pixels on the target: those that light from everywhere brightens."""
+        """Return the mask (h, w) of the pixels on the target: those that light from everywhere
+        brightens.
+        """
         light = Light((0.0, 0.0, -1.0), 0.0, 1.0)
         image = self._renderer.render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
         return image > SPACE_LEVEL + 4
@@ -158,10 +175,18 @@ class Cells:
     path: Path | None
 
     def rows(
-        self, cell: str, views: int, view: Callable[[np.random.Generator, int], ViewRow], like: str = ""
+        self,
+        cell: str,
+        views: int,
+        view: Callable[[np.random.Generator, int], ViewRow],
+        like: str = "",
     ) -> list[ViewRow]:
-        """Return the rows of a cell; ``view`` makes that of a number with a generator of its own, or that of the cell ``like``."""
-        known = {line["number"]: line["row"] for line in read_lines(self.path) if line["cell"] == cell}
+        """Return the rows of a cell; ``view`` makes that of a number with a generator of its own,
+        or that of the cell ``like``.
+        """
+        known = {
+            line["number"]: line["row"] for line in read_lines(self.path) if line["cell"] == cell
+        }
         for number in range(views):
             if number not in known:
                 known[number] = view(
@@ -172,22 +197,28 @@ class Cells:
 
 
 def inspect(views: int) -> Figures:
-    """Estimate the geometry from many views, correct the mesh, and track ``views`` single images at 1 m."""
+    """Estimate the geometry from many views, correct the mesh, and track ``views`` single images at
+    1 m.
+    """
     rng, scene = np.random.default_rng(21), SatelliteImages()
     errors, nees, rejected, shape_nees, used, scale_off = [], [], 0, [], [], []
     for number in range(max(views // _VIEWS_AFTER, 1)):
         turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in KNOWN.joints}
         scale = rng.normal(0.0, SCALE_SIGMA)
-        mesh = TrackerMesh.of_mesh(with_geometry_errors(KNOWN, scale, turns), PANEL_SIGMA_RAD, SCALE_SIGMA)
+        mesh = TrackerMesh.of_mesh(
+            with_geometry_errors(KNOWN, scale, turns), PANEL_SIGMA_RAD, SCALE_SIGMA
+        )
         _ = mesh.suns
         fused = inspected(scene, mesh, rng, 1000 * number)
-        # The tracker's mesh is the true one with errors, which it should find with the opposite sign.
+        # The tracker's mesh is the true one with errors, which it should find with the opposite
+        # sign.
         true = -np.append(
             np.concatenate([turns[j] for j in KNOWN.joints]) / PANEL_SIGMA_RAD, scale / SCALE_SIGMA
         )
         off = fused.mean()[: len(true)] - true
         shape_nees.append(
-            float(off @ np.linalg.solve(fused.covariance()[: len(true), : len(true)], off)) / len(true)
+            float(off @ np.linalg.solve(fused.covariance()[: len(true), : len(true)], off))
+            / len(true)
         )
         used.append(len(fused.cells))
         scale_off.append(off[-1] * SCALE_SIGMA)
@@ -215,8 +246,9 @@ def inspect(views: int) -> Figures:
 
 @dataclass(frozen=True)
 class CamerasAround:
-    """Cameras around the target at one time, with odometry of grade `lab`: ``turns``, (3, 3), of their axes about the target, and
-    ``shifts_m`` (n, 3) of their lenses, which flight software does not know."""
+    """Cameras around the target at one time, with odometry of grade `lab`: ``turns``, (3, 3), of
+    their axes about the target, and ``shifts_m`` (n, 3) of their lenses, which flight software does
+    not know."""
 
     turns: tuple[Array, ...]
     shifts_m: Array
@@ -228,13 +260,17 @@ class CamerasAround:
     def fused(
         self, before: ShapeFilter, mesh: TrackerMesh, scene: SatelliteImages, rng: np.random.Generator, first: int, inspect: bool
     ) -> ShapeFilter:  # fmt: skip
-        """Return the geometry after one image of each camera at 1 to 1.6 m: by their distances, and if they ``inspect`` by each."""
+        """Return the geometry after one image of each camera at 1 to 1.6 m: by their distances, and
+        if they ``inspect`` by each.
+        """
         fused, count, seen_from = before, len(mesh.modes_m), []
         pose, light = random_view(rng, 1.0, CAMERA)
         for number, turn in enumerate(self.turns):
             aside, _ = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
             seen = PoseInCamera(aside.position, turn @ pose.rotation)
-            image = scene.image(seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), first + number)
+            image = scene.image(
+                seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), first + number
+            )
             lens_m = seen.rotation.T @ (self.shifts_m[number] - seen.position)
             lens_m += rng.normal(0.0, LAB.position_noise_m, 3)
             found = _track(image, mesh, perturbed(seen, rng, *PRIOR))
@@ -259,23 +295,32 @@ class CamerasAround:
         return fused
 
 
-def inspected(scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int) -> ShapeFilter:
+def inspected(
+    scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int
+) -> ShapeFilter:
     """Return the geometry by the views of two cameras on opposite sides of the target."""
-    cameras, fused = CamerasAround.drawn((np.eye(3), HALF_TURN), rng), ShapeFilter.prior(len(mesh.modes_m))
+    cameras, fused = (
+        CamerasAround.drawn((np.eye(3), HALF_TURN), rng),
+        ShapeFilter.prior(len(mesh.modes_m)),
+    )
     for number in range(0, _VIEWS_BEFORE, 2):
         fused = cameras.fused(fused, mesh, scene, rng, first + number, inspect=True)
     return fused
 
 
 def triangulated(cells: Cells, range_m: float, views: int) -> Figures:
-    """Track single images after one image of each of four cameras around the target, whose distances tell the scale."""
+    """Track single images after one image of each of four cameras around the target, whose
+    distances tell the scale.
+    """
     scene, quarter = SatelliteImages(), RIGHT_ANGLE
     turns = tuple(np.linalg.matrix_power(quarter, k) for k in range(4))
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
         mesh = _drawn_mesh(rng)
         before = ShapeFilter.prior(len(mesh.modes_m))
-        fused = CamerasAround.drawn(turns, rng).fused(before, mesh, scene, rng, 5 * number, inspect=False)
+        fused = CamerasAround.drawn(turns, rng).fused(
+            before, mesh, scene, rng, 5 * number, inspect=False
+        )
         corrected = mesh.corrected(fused.mean(), fused.covariance())
         pose, light = random_view(rng, range_m, CAMERA)
         image = scene.image(pose, light, 5 * number + 4)
@@ -389,7 +434,9 @@ def independent(cells: Cells, name: str, range_m: float, views: int) -> Figures:
     def view(rng: np.random.Generator, number: int) -> ViewRow:
         drawn = tracker if name == "independent" else _drawn_mesh(rng, plain(KNOWN))
         pose, light = random_view(rng, range_m, CAMERA)
-        exact = trace(mesh, CAMERA, pose.position, rotations.from_matrix(pose.rotation), light, 3).level
+        exact = trace(
+            mesh, CAMERA, pose.position, rotations.from_matrix(pose.rotation), light, 3
+        ).level
         spread = cv2.GaussianBlur(exact, (0, 0), Effects().point_spread_px)
         image = effects.apply(np.rint(np.clip(spread, 0.0, 255.0)).astype(np.uint8), 0, number)
         return tracked_view(image, drawn, pose, perturbed(pose, rng, *PRIOR))
@@ -447,12 +494,16 @@ def lamp(cells: Cells, views: int) -> Figures:
 
 
 def in_flight(
-    cells: Cells, cell: str, views: int, draw: Callable[[np.random.Generator], tuple[PoseInCamera, Light]]
+    cells: Cells,
+    cell: str,
+    views: int,
+    draw: Callable[[np.random.Generator], tuple[PoseInCamera, Light]],
 ) -> Figures:
     """Follow the target to each view of a cell through the images of two seconds.
 
-    Images without a track start from the pose that others expect. Figures: of the last images; images without a pose before the first
-    one, the most of a view, and after it, as a share; and the mean NEES of all images.
+    Images without a track start from the pose that others expect. Figures: of the last images;
+    images without a pose before the first one, the most of a view, and after it, as a share; and
+    the mean NEES of all images.
     """
     scene, key, acquisition = SatelliteImages(), f"{cell}_flight", Acquisition(CAMERA, EXACT)
 
@@ -464,13 +515,19 @@ def in_flight(
         perception, seen, nees = ModelPerception(CAMERA, EXACT, acquisition), [], []
         perception.prepare()
         for k in range(1 - FLIGHT_IMAGES, 1):
-            moved = PoseInCamera(pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation)
+            moved = PoseInCamera(
+                pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation
+            )
             near = perturbed(moved, rng, *NEAR_PRIOR)
             expected = near.position, rotations.from_matrix(near.rotation)
             image = scene.image(moved, light, number)
             begin_s = time.process_time()
             solutions = perception.estimate(image, expected).solutions
-            row |= {"s": time.process_time() - begin_s, "valid": float(bool(solutions)), "wrong": 0.0}
+            row |= {
+                "s": time.process_time() - begin_s,
+                "valid": float(bool(solutions)),
+                "wrong": 0.0,
+            }
             seen.append(bool(solutions))
             if solutions:
                 best = solutions[0]
@@ -479,7 +536,11 @@ def in_flight(
                 nees.append(row["nees"])
         first = seen.index(True) if any(seen) else FLIGHT_IMAGES
         lost = float(np.mean(np.logical_not(seen[first:]))) if any(seen) else 1.0
-        return row | {"first": first, "lost": lost, "nees_all": float(np.mean(nees)) if nees else np.nan}
+        return row | {
+            "first": first,
+            "lost": lost,
+            "nees_all": float(np.mean(nees)) if nees else np.nan,
+        }
 
     rows = cells.rows(f"{cell}-flight", views, view, cell)
     bright = [row for row in rows if row["grey"] >= LEAST_GREY]
@@ -498,7 +559,12 @@ def blur(cells: Cells, views: int) -> Figures:
     def view(rng: np.random.Generator, number: int) -> ViewRow:
         pose, light = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
         along = rng.uniform(0.0, 2.0 * np.pi)
-        step_m = _BLUR_PX * pose.position[2] / CAMERA.fx_px * np.array([np.cos(along), np.sin(along), 0.0])
+        step_m = (
+            _BLUR_PX
+            * pose.position[2]
+            / CAMERA.fx_px
+            * np.array([np.cos(along), np.sin(along), 0.0])
+        )
         image = scene.blurred(pose, step_m, light, number)
         return tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
 
@@ -539,7 +605,8 @@ def acquire(cells: Cells, key: str, views: int) -> Figures:
         scene = SatelliteImages(earth_behind(rng) if key == "earth" else None)
         right, took_s = [], []
         for turn in (np.eye(3), RIGHT_ANGLE) if key == "pair" else (np.eye(3),):
-            # The same target and sun, in the axes of another camera that looks at the target from aside.
+            # The same target and sun, in the axes of another camera that looks at the target from
+            # aside.
             seen = PoseInCamera(pose.position, turn @ pose.rotation)
             image = scene.image(seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), number)
             begin_s = time.process_time()
@@ -565,7 +632,9 @@ def acquire(cells: Cells, key: str, views: int) -> Figures:
 
 
 def follow(key: str, images: int, first_m: float, closing_m: float) -> Figures:
-    """Follow a target that turns at 4 degrees/s and, once acquired, comes ``closing_m`` nearer with each image."""
+    """Follow a target that turns at 4 degrees/s and, once acquired, comes ``closing_m`` nearer with
+    each image.
+    """
     scene, perception = SatelliteImages(), ModelPerception(CAMERA, EXACT)
     perception.prepare()
     pose, _ = random_view(np.random.default_rng(9), first_m, CAMERA)
@@ -599,14 +668,18 @@ def follow(key: str, images: int, first_m: float, closing_m: float) -> Figures:
 
 
 def shaded() -> Figures:
-    """Start from expected poses, and follow, on the shaded side of targets that turn at 4 degrees/s; 40 images of each."""
+    """Start from expected poses, and follow, on the shaded side of targets that turn at 4
+    degrees/s; 40 images of each.
+    """
     scene, least_s, seen = SatelliteImages(), [], 0
     for number, (range_m, sun) in enumerate(_SHADED):
         rng = np.random.default_rng(number)
         pose, _ = random_view(rng, range_m, CAMERA)
         views = []
         for k in range(_SHADED_IMAGES):
-            moved = PoseInCamera(pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation)
+            moved = PoseInCamera(
+                pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation
+            )
             near = perturbed(moved, rng, *NEAR_PRIOR)
             expected = near.position, rotations.from_matrix(near.rotation)
             views.append((scene.image(moved, Light(sun, 0.92, 0.08), k), expected))
@@ -676,7 +749,12 @@ def main() -> None:
     parser = make_parser(__doc__, parts)
     parser.add_argument("--views", type=int, help="views per cell (default 300, with --quick 20)")
     parser.add_argument(
-        "--ranges", type=float, nargs="+", default=RANGES_M, metavar="M", help="ranges of the tracking cells"
+        "--ranges",
+        type=float,
+        nargs="+",
+        default=RANGES_M,
+        metavar="M",
+        help="ranges of the tracking cells",
     )
     parser.add_argument(
         "--results", type=Path, metavar="FILE", help="append views; those in it are not repeated"

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Missions with perception by shape: ``python benchmarks/markerless_missions.py [--only PART] [--flights N] [--first SEED]
-[--set KEY=VALUE] [--results FILE] [--quick] [--json FILE]``.
+"""Missions with perception by shape: ``python benchmarks/markerless_missions.py [--only PART]
+[--flights N] [--first SEED] [--set KEY=VALUE] [--results FILE] [--quick] [--json FILE]``.
 
-Complete missions in one process (``chaserdock.evaluation.in_process``), with rendered images. The seed draws the errors of the
-target's geometry, of sensors and of images.
+Complete missions in one process (``chaserdock.evaluation.in_process``), with rendered images. The
+seed draws the errors of the target's geometry, of sensors and of images.
 
 - ``docking``: ``markerless-docking`` to its end;
 - ``capture``: ``markerless-capture`` until the docking is verified, or to its end;
-- ``inspection``: ``markerless-inspection`` to its end; trackers correct their mesh by the controller's estimate.
+- ``inspection``: ``markerless-inspection`` to its end; trackers correct their mesh by the
+  controller's estimate.
 
-A flight's line states how it ended; the figures are the worst over flights, and times are CPU times of this process by part.
-``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it. ``--quick``: one flight
-of 30 s, which cannot dock.
+A flight's line states how it ended; the figures are the worst over flights, and times are CPU times
+of this process by part. ``--results FILE`` appends every flight to FILE (JSON lines) and does not
+repeat flights that are in it. ``--quick``: one flight of 30 s, which cannot dock.
 """
 
 from __future__ import annotations
@@ -51,12 +52,13 @@ STEADY_RAD = math.radians(0.3)
 class MarkerlessOutcome(msgspec.Struct, frozen=True):
     """How one flight ended.
 
-    ``steady_position_m``, ``steady_orientation_rad``: RMS tracking errors of the worst chaser in the steady interval.
-    ``estimate_*``: of the target's estimate from its first sighting on, RMS and most; ``nees``: mean, 6 expected, and of position and
-    rotation alone, 3 expected.
-    ``seen_share``: of the images, by chaser. ``unseen_s``: longest time without a sighting after the first, by chaser.
-    ``*_ms``: CPU time per tick by part; ``image_*_ms``: of the perception, per image. ``touch_m``, ``touch_deg``: at the latch.
-    ``geometry_views``: views of an inspection; ``geometry_nees``: normalized squared error of its estimate per parameter, 1 expected.
+    ``steady_position_m``, ``steady_orientation_rad``: RMS tracking errors of the worst chaser in
+    the steady interval. ``estimate_*``: of the target's estimate from its first sighting on, RMS
+    and most; ``nees``: mean, 6 expected, and of position and rotation alone, 3 expected.
+    ``seen_share``: of the images, by chaser. ``unseen_s``: longest time without a sighting after
+    the first, by chaser. ``*_ms``: CPU time per tick by part; ``image_*_ms``: of the perception,
+    per image. ``touch_m``, ``touch_deg``: at the latch. ``geometry_views``: views of an inspection;
+    ``geometry_nees``: normalized squared error of its estimate per parameter, 1 expected.
     """
 
     seed: int
@@ -129,7 +131,9 @@ class TimedMission(InProcessMission):
 
 
 class EstimateError(NamedTuple):
-    """Error of the target's estimate, and its normalized squares: of the pose, of position and of rotation alone."""
+    """Error of the target's estimate, and its normalized squares: of the pose, of position and of
+    rotation alone.
+    """
 
     position_m: float
     rotation_rad: float
@@ -270,7 +274,9 @@ def outcome(
 def geometry_nees(scenario: Scenario, estimate: GeometryEstimate) -> float:
     """Return the normalized squared error of estimated joints and scale, per parameter."""
     scale, turns = true_geometry_errors(scenario)
-    known = {f"{joint} {axis}": turn[k] for joint, turn in turns.items() for k, axis in enumerate("xyz")}
+    known = {
+        f"{joint} {axis}": turn[k] for joint, turn in turns.items() for k, axis in enumerate("xyz")
+    }
     known["scale"] = scale
     at = [k for k, name in enumerate(estimate.names) if name in known]
     off = np.array([estimate.values[k] - known[estimate.names[k]] for k in at])
@@ -289,7 +295,9 @@ def line_of(o: MarkerlessOutcome) -> str:
     if o.touch_m is not None and o.touch_deg is not None:
         text += f"; contact {1e3 * o.touch_m:.2f} mm {o.touch_deg:.2f} deg"
     if o.geometry_nees is not None:
-        text += f"; geometry from {o.geometry_views} views, NEES {o.geometry_nees:.2f} per parameter"
+        text += (
+            f"; geometry from {o.geometry_views} views, NEES {o.geometry_nees:.2f} per parameter"
+        )
     return text + "".join(f"; retreat: {reason}" for reason in o.retreats)
 
 
@@ -313,7 +321,9 @@ def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | 
     def worst(of: Callable[[MarkerlessOutcome], float]) -> float:
         return max(map(of, outcomes))
 
-    steady = [o.steady_position_m <= 0.003 and o.steady_orientation_rad <= STEADY_RAD for o in outcomes]
+    steady = [
+        o.steady_position_m <= 0.003 and o.steady_orientation_rad <= STEADY_RAD for o in outcomes
+    ]
     return {
         f"{part}_flights": len(outcomes),
         f"{part}_succeeded": sum(o.success for o in outcomes),
@@ -342,8 +352,12 @@ def main() -> None:
     parser = make_parser(__doc__, SCENARIOS)
     parser.add_argument("--flights", type=int, default=5, help="number of seeds")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
-    parser.add_argument("--results", type=Path, metavar="FILE", help="append flights; those in it are kept")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override"
+    )
+    parser.add_argument(
+        "--results", type=Path, metavar="FILE", help="append flights; those in it are kept"
+    )
     options = parser.parse_args()
     use_one_thread()
     flights = 1 if options.quick else options.flights
@@ -351,7 +365,10 @@ def main() -> None:
     changes += QUICK if options.quick else ()
     run_parts(
         options,
-        {part: (lambda part=part: fly_part(part, seeds, changes, options.results)) for part in SCENARIOS},
+        {
+            part: (lambda part=part: fly_part(part, seeds, changes, options.results))
+            for part in SCENARIOS
+        },
     )
 
 

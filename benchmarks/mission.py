@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Speed and accuracy of the main mission: ``python benchmarks/mission.py [--quick] [--json FILE]``.
 
-Flies ``four-chaser-docking`` in lock-step three times, in separate processes, with images and recording, and prints
-medians. ``--quick``: once, 30 s, without docking.
+Flies ``four-chaser-docking`` in lock-step three times, in separate processes, with images and
+recording, and prints medians. ``--quick``: once, 30 s, without docking.
 """
 
 from __future__ import annotations
@@ -46,9 +46,13 @@ def figures(summaries: list[dict[str, Any]]) -> Figures:
         "solve_p95_s": median(lambda s: s["solver"]["solve_s"]["p95"]),
         "peak_memory_bytes": median(lambda s: s["peak_memory_bytes"]),
         "steady_position_rms_worst_chaser_m": median(lambda s: worst(s, "position_mse_m2")),
-        "steady_orientation_rms_worst_chaser_rad": median(lambda s: worst(s, "orientation_mse_rad2")),
+        "steady_orientation_rms_worst_chaser_rad": median(
+            lambda s: worst(s, "orientation_mse_rad2")
+        ),
         "estimate_position_rms_m": median(lambda s: s["target_estimate"]["position_rms_m"]),
-        "estimate_orientation_rms_rad": median(lambda s: s["target_estimate"]["orientation_rms_rad"]),
+        "estimate_orientation_rms_rad": median(
+            lambda s: s["target_estimate"]["orientation_rms_rad"]
+        ),
     }
     for name in summaries[0]["cpu_s"]:
         key = f"cpu_{name.replace('/', '_')}_s_per_s"

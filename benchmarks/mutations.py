@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Strength of the tests: ``python benchmarks/mutations.py [--only TEXT ...] [--quick] [--json FILE]``.
+"""Strength of the tests: ``python benchmarks/mutations.py [--only TEXT ...] [--quick] [--json
+FILE]``.
 
-Each mutant in tests/mutants.toml changes one place of the sources in a copy of this checkout, in which its tests must then fail.
-Without a change they must pass. ``--quick`` takes every fifth mutant. Status 1 if a mutant survives. Tests that do not end
-within ``--timeout`` count as failed and are reported apart.
+Each mutant in tests/mutants.toml changes one place of the sources in a copy of this checkout, in
+which its tests must then fail. Without a change they must pass. ``--quick`` takes every fifth
+mutant. Status 1 if a mutant survives. Tests that do not end within ``--timeout`` count as failed
+and are reported apart.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ COPIED = (
 def failed(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
     """Run test files until one test fails. Return its name, "timeout", or "" if all pass.
 
-    Raises RuntimeError if tests cannot be run, for example because their modules cannot be imported.
+    Raises RuntimeError if tests cannot be run, for example because their modules cannot be
+    imported.
     """
     try:
         arguments = (
@@ -57,7 +60,9 @@ def failed(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
     except subprocess.TimeoutExpired:
         return "timeout"
     if done.returncode not in (0, 1):
-        raise RuntimeError(f"pytest {' '.join(tests)}: status {done.returncode}\n{done.stdout}{done.stderr}")
+        raise RuntimeError(
+            f"pytest {' '.join(tests)}: status {done.returncode}\n{done.stdout}{done.stderr}"
+        )
     lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
     return (
         lines[0].split(" ", 1)[1].split(" - ")[0]
@@ -69,7 +74,9 @@ def failed(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
 
 
 def killer(folder: Path, mutant: Mutant, timeout_s: float) -> str:
-    """Return the test that kills a mutant, "" if it survives. The sources in ``folder`` are then as before."""
+    """Return the test that kills a mutant, "" if it survives. The sources in ``folder`` are then as
+    before.
+    """
     path = folder / mutant.change.file
     source = path.read_bytes()
     apply([mutant.change], folder)
@@ -81,9 +88,15 @@ def killer(folder: Path, mutant: Mutant, timeout_s: float) -> str:
 
 def main() -> int:
     parser = make_parser(__doc__)
-    parser.add_argument("--only", nargs="+", metavar="TEXT", help="mutants whose file or text contains one")
     parser.add_argument(
-        "--timeout", type=float, default=600.0, metavar="SECONDS", help="for the tests of one mutant"
+        "--only", nargs="+", metavar="TEXT", help="mutants whose file or text contains one"
+    )
+    parser.add_argument(
+        "--timeout",
+        type=float,
+        default=600.0,
+        metavar="SECONDS",
+        help="for the tests of one mutant",
     )
     options = parser.parse_args()
     mutants = [m for m in read_mutants() if any(text in m.name for text in options.only or [""])]
@@ -102,7 +115,9 @@ def main() -> int:
         sound: set[tuple[str, ...]] = set()
         for k, mutant in enumerate(mutants, 1):
             begin_s = time.monotonic()
-            if mutant.tests not in sound and (test := failed(folder, mutant.tests, options.timeout)):
+            if mutant.tests not in sound and (
+                test := failed(folder, mutant.tests, options.timeout)
+            ):
                 raise SystemExit(f"fails without a mutant: {test}")
             sound.add(mutant.tests)
             test = killer(folder, mutant, options.timeout)

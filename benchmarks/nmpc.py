@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solve times and closed-loop cost of the NMPC back ends: ``python benchmarks/nmpc.py [--quick] [--json FILE]``.
+"""Solve times and closed-loop cost of the NMPC back ends: ``python benchmarks/nmpc.py [--quick]
+[--json FILE]``.
 
-Hard case: D = 30 stages (3 s), cuboids of 10 kg, 3 N, 0.3 N m on a ring around the target; half of the chasers swap positions
-with a neighbour, head-on. Closed loop, perfect state, 10 commands a second. A solve is timed by wall clock and by the
-processor time of its thread, which load on the machine affects less. ``--solver`` (repeatable) chooses back ends, ``--n``
-(repeatable) the numbers of chasers. An unavailable back end is listed with the reason. A flight that uses more than
-``--cell-s`` of processor time is shortened and reported as such. acados (`acados_solver.py`) is measured wherever its
-Python package is installed, coupled and decoupled, by its own total time and by processor time. ``--flights R`` repeats
-each case, identical to the bit, and takes the minimum time of each tick, which excludes other load. Also: steady tracking
-at the paper's rates, the first solve of a fresh process, and the compilation of the kernels.
+Hard case: D = 30 stages (3 s), cuboids of 10 kg, 3 N, 0.3 N m on a ring around the target; half of
+the chasers swap positions with a neighbour, head-on. Closed loop, perfect state, 10 commands a
+second. A solve is timed by wall clock and by the processor time of its thread, which load on the
+machine affects less. ``--solver`` (repeatable) chooses back ends, ``--n`` (repeatable) the numbers
+of chasers. An unavailable back end is listed with the reason. A flight that uses more than
+``--cell-s`` of processor time is shortened and reported as such. acados (`acados_solver.py`) is
+measured wherever its Python package is installed, coupled and decoupled, by its own total time and
+by processor time. ``--flights R`` repeats each case, identical to the bit, and takes the minimum
+time of each tick, which excludes other load. Also: steady tracking at the paper's rates, the first
+solve of a fresh process, and the compilation of the kernels.
 """
 
 from __future__ import annotations
@@ -57,7 +60,9 @@ SIZE_M = (0.25, 0.25, 0.05)
 def parameters(mass_kg: float, force_N: float, torque_N_m: float) -> NmpcParameters:
     x, y, z = cuboid_inertia(mass_kg, SIZE_M)
     inertia = ((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z))
-    return NmpcParameters(mass_kg, inertia, force_N, torque_N_m, **nmpc_settings(Controller(), Limits()))
+    return NmpcParameters(
+        mass_kg, inertia, force_N, torque_N_m, **nmpc_settings(Controller(), Limits())
+    )
 
 
 HARD = parameters(10.0, 3.0, 0.3)
@@ -65,7 +70,9 @@ PAPER = parameters(30.0, 2.0, 0.05)
 
 
 def advance(states: Array, inputs: Array, params: NmpcParameters, duration_s: float) -> Array:
-    """Return the states after ``duration_s`` under constant inputs (N, 6); integrates with a quarter of the step."""
+    """Return the states after ``duration_s`` under constant inputs (N, 6); integrates with a
+    quarter of the step.
+    """
     x = np.empty((len(states), 5, 13))
     x[:, 0] = states
     held = np.repeat(inputs[:, None], 4, axis=1)
@@ -128,7 +135,9 @@ def fly_hard(solver: NmpcSolver, n: int, ticks: int, cell_s: float) -> Flown:
             rotations.multiply(x[6:10], rotations.conjugate(g[3:]))[1:]
             for x, g in zip(states, goal, strict=True)
         ]
-        cost += TICK_S * (65.0 * np.sum((states[:, :3] - goal[:, :3]) ** 2) + 35.0 * np.sum(np.square(error)))
+        cost += TICK_S * (
+            65.0 * np.sum((states[:, :3] - goal[:, :3]) ** 2) + 35.0 * np.sum(np.square(error))
+        )
         cost += TICK_S * np.sum(np.array([3.5] * 3 + [40.0] * 3) * plan.inputs[:, 0] ** 2)
         states = advance(states, plan.inputs[:, 0], HARD, TICK_S)
         gaps = np.linalg.norm(states[:, None, :3] - states[None, :, :3], axis=-1) + 9.0 * np.eye(n)
@@ -140,12 +149,19 @@ def fly_hard(solver: NmpcSolver, n: int, ticks: int, cell_s: float) -> Flown:
 
 
 def tracking(gain: float, duration_s: float) -> tuple[float, float]:
-    """Return steady RMS errors of position (m) and orientation (rad) of `rti` at the paper's rates with feed-forward.
+    """Return steady RMS errors of position (m) and orientation (rad) of `rti` at the paper's rates
+    with feed-forward.
 
-    Perfect state, 15 commands a second; actuators deliver ``gain`` times the command. The second half is evaluated.
+    Perfect state, 15 commands a second; actuators deliver ``gain`` times the command. The second
+    half is evaluated.
     """
     v, w = np.array([1.5e-2, 0.75e-2, 3e-2]), np.array([1.5e-2, 4.5e-2, 3e-2])
-    offset, q_off, tick_s, d = np.array([-1.0, 0, 0]), np.array([1.0, 0, 0, 0]), 1.0 / 15.0, PAPER.stages
+    offset, q_off, tick_s, d = (
+        np.array([-1.0, 0, 0]),
+        np.array([1.0, 0, 0, 0]),
+        1.0 / 15.0,
+        PAPER.stages,
+    )
     times = PAPER.dt_s * np.arange(d + 1)
     wrench = feed_forward(w, np.tile(offset, (d, 1)), np.zeros((d, 3)), np.zeros((d, 3)), q_off, PAPER.mass_kg,
                           PAPER.inertia_kg_m2)  # fmt: skip
@@ -174,7 +190,9 @@ def tracking(gain: float, duration_s: float) -> tuple[float, float]:
 
 
 def solver_of(name: str, n: int) -> NmpcSolver:
-    """Return a back end, ``acados_coupled`` or ``acados_decoupled``. Raise ValueError if it is unavailable."""
+    """Return a back end, ``acados_coupled`` or ``acados_decoupled``. Raise ValueError if it is
+    unavailable.
+    """
     if not name.startswith("acados_"):
         return make_solver(name, HARD, n)
     try:
@@ -184,7 +202,9 @@ def solver_of(name: str, n: int) -> NmpcSolver:
 
 
 def first_solve_s(solver: str) -> float:
-    """Return the wall time from the start of a process to the end of its first solve with four chasers."""
+    """Return the wall time from the start of a process to the end of its first solve with four
+    chasers.
+    """
     code = (
         "import sys; sys.path.insert(0, 'benchmarks'); import nmpc; s, p = nmpc.hard_case(4); "
         f"nmpc.make_solver({solver!r}, nmpc.HARD, 4).solve(p, 0.0)"
@@ -244,13 +264,19 @@ def measure(names: list[str], sizes: list[int], ticks: int, cell_s: float, fligh
 
 
 def ratios(figures: Figures) -> Figures:
-    """Return each back end's closed-loop cost relative to ipopt, its solve times relative to rti, and rti's growth with N."""
+    """Return each back end's closed-loop cost relative to ipopt, its solve times relative to rti,
+    and rti's growth with N.
+    """
     out: Figures = {}
     for key, value in figures.items():
         name, _, rest = key.partition("_n")
         if rest.endswith("closed_loop_cost") and name != "ipopt" and f"ipopt_n{rest}" in figures:
             out[f"{key}_over_ipopt"] = value / figures[f"ipopt_n{rest}"]
-        if re.search("solve_cpu_(median|p95|max)", rest) and name != "rti" and f"rti_n{rest}" in figures:
+        if (
+            re.search("solve_cpu_(median|p95|max)", rest)
+            and name != "rti"
+            and f"rti_n{rest}" in figures
+        ):
             out[f"{key.removesuffix('_s')}_over_rti"] = value / figures[f"rti_n{rest}"]
     for label in LABELS:
         one, many = (figures.get(f"rti_n{n}_solve_cpu_{label}_s") for n in (1, 16))
@@ -267,7 +293,9 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=1, metavar="R")
     options = parser.parse_args()
     sizes, ticks, cell_s, duration_s = (
-        ([1, 2, 4], 30, 10.0, 20.0) if options.quick else ([1, 2, 4, 8, 16], 150, options.cell_s, 60.0)
+        ([1, 2, 4], 30, 10.0, 20.0)
+        if options.quick
+        else ([1, 2, 4, 8, 16], 150, options.cell_s, 60.0)
     )
     names: list[str] = options.solver or [n for n in BACK_ENDS if n != "open" or not options.quick]
     solvers = [*names, *(f"acados_{kind}" for kind in KINDS)]

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observability of camera calibration errors in flight: ``python benchmarks/observability.py [--json FILE]``.
+"""Observability of camera calibration errors in flight: ``python benchmarks/observability.py
+[--json FILE]``.
 
-Stacks the Jacobians of all poses measured in a minute with respect to the target's state (12) and the errors of each
-camera (rotation of the mounting: 3; or rotation, position and focal length: 7). Rows are divided by the sigma of a
-measurement, columns multiplied by the prior sigma. Figures: the number of unobservable directions, and the posterior
-sigma of the mounting rotation (prior: 0.3 degrees). In synchronized flight the chasers stay 1 m from the target and
-rotate with it; in the calibration manoeuvre chaser 0 also turns about its line of sight. ``--quick`` changes nothing.
+Stacks the Jacobians of all poses measured in a minute with respect to the target's state (12) and
+the errors of each camera (rotation of the mounting: 3; or rotation, position and focal length: 7).
+Rows are divided by the sigma of a measurement, columns multiplied by the prior sigma. Figures: the
+number of unobservable directions, and the posterior sigma of the mounting rotation (prior: 0.3
+degrees). In synchronized flight the chasers stay 1 m from the target and rotate with it; in the
+calibration manoeuvre chaser 0 also turns about its line of sight. ``--quick`` changes nothing.
 """
 
 from __future__ import annotations
@@ -14,7 +16,11 @@ import itertools
 import math
 
 import numpy as np
-from chaserdock_controller.estimation.camera_calibration import ERRORS, NO_ERROR, predict_measurement
+from chaserdock_controller.estimation.camera_calibration import (
+    ERRORS,
+    NO_ERROR,
+    predict_measurement,
+)
 from chaserdock_controller.estimation.motion_models import constant_rates
 from chaserdock_controller.estimation.types import CameraPose
 from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_turns

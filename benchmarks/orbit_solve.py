@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a solve with ``[orbit]`` over that without: ``python benchmarks/orbit_solve.py [--scenario low-orbit] [--ticks 600]``.
+"""Time of a solve with ``[orbit]`` over that without: ``python benchmarks/orbit_solve.py
+[--scenario low-orbit] [--ticks 600]``.
 
-Two missions in one process, equal but for ``[orbit]``, with statistical perception, tick by tick in turn. Prints the medians of the
-solver's and of the whole controller's processor time, and their ratios. ``--safety enforce``: passive safety in the first of them.
+Two missions in one process, equal but for ``[orbit]``, with statistical perception, tick by tick in
+turn. Prints the medians of the solver's and of the whole controller's processor time, and their
+ratios. ``--safety enforce``: passive safety in the first of them.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ T = TypeVar("T")
 
 
 class TimedFlight:
-    """A mission whose controller is timed. ``solve_s``, ``tick_s``: processor time of each tick's solve and of its controller."""
+    """A mission whose controller is timed. ``solve_s``, ``tick_s``: processor time of each tick's
+    solve and of its controller.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self.mission = InProcessMission(scenario, RenderedImages(scenario))
@@ -55,7 +59,9 @@ def main() -> None:
     parser.add_argument("--safety", default="off", choices=("off", "monitor", "enforce"))
     options = parser.parse_args()
     overrides = ("perception.name='statistical'", "timeline=[]", "duration_s=1000.0")
-    in_orbit = load_shipped(options.scenario, *overrides, f"limits.passive_safety='{options.safety}'")
+    in_orbit = load_shipped(
+        options.scenario, *overrides, f"limits.passive_safety='{options.safety}'"
+    )
     free = load_shipped(options.scenario, *overrides, "limits.passive_safety='off'")
     pair = [TimedFlight(in_orbit), TimedFlight(free.model_copy(update={"orbit": None}))]
     for _ in range(60 if options.quick else options.ticks):
@@ -66,7 +72,11 @@ def main() -> None:
         ("solve", median(pair[0].solve_s), median(pair[1].solve_s)),
         ("tick", median(pair[0].tick_s), median(pair[1].tick_s)),
     ):
-        figures |= {f"orbit_{name}_s": orbit_s, f"free_{name}_s": free_s, f"ratio_{name}": orbit_s / free_s}
+        figures |= {
+            f"orbit_{name}_s": orbit_s,
+            f"free_{name}_s": free_s,
+            f"ratio_{name}": orbit_s / free_s,
+        }
     print_figures(figures)
     write_json(options.json, figures)
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence that ``chaserdock simulate`` finds bugs: ``python benchmarks/planted_bugs.py [--only NAME ...] [--seeds 500]``.
+"""Evidence that ``chaserdock simulate`` finds bugs: ``python benchmarks/planted_bugs.py [--only
+NAME ...] [--seeds 500]``.
 
-Each patch in tests/planted_bugs/ plants one bug in a copy of this checkout, in which random seeds are flown until one fails; the
-checkout itself must pass that seed. Prints a table: bug, scenario, seed, invariant. ``--check`` only applies all patches. The
-lines of a patch before its first ``---`` state the bug and, as ``Scenario: NAME``, what is flown (default: fault-drill), and as
-``Seed: NUMBER`` one that finds it (default: 1), the only one flown with ``--known``.
+Each patch in tests/planted_bugs/ plants one bug in a copy of this checkout, in which random seeds
+are flown until one fails; the checkout itself must pass that seed. Prints a table: bug, scenario,
+seed, invariant. ``--check`` only applies all patches. The lines of a patch before its first ``---``
+state the bug and, as ``Scenario: NAME``, what is flown (default: fault-drill), and as ``Seed:
+NUMBER`` one that finds it (default: 1), the only one flown with ``--known``.
 """
 
 from __future__ import annotations
@@ -32,13 +34,15 @@ COPIED = (
     "CITATION.cff",
 )
 _BUILD = "protocol/chaserdock_models/native/build.py"
-_FAILED = re.compile(r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,-]+?)(?: at [\d.]+ s)?: (.*)")
+_FAILED = re.compile(
+    r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,-]+?)(?: at [\d.]+ s)?: (.*)"
+)
 
 
 @dataclass(frozen=True)
 class PlantedBug:
-    """A planted bug: its number and name, what is wrong, the scenario to fly, a seed that finds it, and the
-    hunks."""
+    """A planted bug: its number and name, what is wrong, the scenario to fly, a seed that finds it,
+    and the hunks."""
 
     name: str
     text: str
@@ -57,7 +61,9 @@ class FailedSeed:
 
 
 def read_bug(path: Path) -> PlantedBug:
-    """Read a patch: a unified diff below a description. Raises ValueError for a line that is neither."""
+    """Read a patch: a unified diff below a description. Raises ValueError for a line that is
+    neither.
+    """
     head, file, stated = [], "", {"Scenario": "fault-drill", "Seed": "1"}
     hunks: list[tuple[str, list[str], list[str]]] = []
     for line in path.read_text(encoding="utf-8").splitlines():
@@ -82,7 +88,9 @@ def read_bug(path: Path) -> PlantedBug:
 
 
 def simulate(folder: Path, scenario: str, first: int, last: int) -> FailedSeed | None:
-    """Fly seeds with the sources in ``folder`` until one fails. Raises RuntimeError if the program fails otherwise."""
+    """Fly seeds with the sources in ``folder`` until one fails. Raises RuntimeError if the program
+    fails otherwise.
+    """
     seeds = f"{first}:{last}"
     done = run_python(
         folder, "-m", "chaserdock", "simulate", scenario, "--seeds", seeds, "--no-shrink", "--stop"
@@ -96,7 +104,9 @@ def simulate(folder: Path, scenario: str, first: int, last: int) -> FailedSeed |
 
 
 def hunt(bug: PlantedBug, first: int, last: int) -> FailedSeed | None:
-    """Return the first of the seeds that finds a bug. Raises RuntimeError if the patched sources cannot be flown."""
+    """Return the first of the seeds that finds a bug. Raises RuntimeError if the patched sources
+    cannot be flown.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         copy_checkout(folder, COPIED)
@@ -110,9 +120,15 @@ def hunt(bug: PlantedBug, first: int, last: int) -> FailedSeed | None:
 
 def main() -> int:
     parser = make_parser(__doc__)
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="bugs whose name contains one of these")
-    parser.add_argument("--seeds", type=int, default=500, metavar="N", help="most seeds to fly for a bug")
-    parser.add_argument("--known", action="store_true", help="fly only the seed that each patch states")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", help="bugs whose name contains one of these"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=500, metavar="N", help="most seeds to fly for a bug"
+    )
+    parser.add_argument(
+        "--known", action="store_true", help="fly only the seed that each patch states"
+    )
     parser.add_argument("--check", action="store_true", help="only check that the patches apply")
     options = parser.parse_args()
     bugs = [
@@ -152,11 +168,18 @@ def main() -> int:
             print(f"{bug.name}: {found.text}", file=sys.stderr, flush=True)
     missed = [name for name, seed in figures.items() if not seed]
     print(
-        f"{len(bugs) - len(missed)} of {len(bugs)} found" + (f"; not: {', '.join(missed)}" if missed else "")
+        f"{len(bugs) - len(missed)} of {len(bugs)} found"
+        + (f"; not: {', '.join(missed)}" if missed else "")
     )
-    wrong = [(*case, found) for case in sorted(flown) if (found := simulate(ROOT, case[0], case[1], case[1]))]
+    wrong = [
+        (*case, found)
+        for case in sorted(flown)
+        if (found := simulate(ROOT, case[0], case[1], case[1]))
+    ]
     for scenario, seed, found in wrong:
-        print(f"seed {seed} of {scenario} fails without a planted bug: {found.invariant}: {found.text}")
+        print(
+            f"seed {seed} of {scenario} fails without a planted bug: {found.invariant}: {found.text}"
+        )
     if flown and not wrong:
         print(f"all {len(flown)} seeds that found a bug pass without it")
     return 1 if missed or wrong else 0

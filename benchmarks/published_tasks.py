@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published rendezvous and docking tasks by their own criteria: ``python benchmarks/published_tasks.py [--quick] [--only PART]``.
+"""Published rendezvous and docking tasks by their own criteria: ``python
+benchmarks/published_tasks.py [--quick] [--only PART]``.
 
-``afrl``: three deputies dock from 100 to 150 m under the speed limit, 1,000 episodes. ``arch``: the spacecraft rendezvous of
-ARCH-COMP, 10^5 samples of its initial set without an abort (SRNA01) and with one at a random time within 240 minutes (SRA08). Both by
-laws of their own. ``afrl-scenario``, ``arch-scenario``: the shipped scenarios, flown as ``chaserdock simulate`` does, whole, with
-random starts (``--first``, ``--flights``), and judged by their own criteria.
+``afrl``: three deputies dock from 100 to 150 m under the speed limit, 1,000 episodes. ``arch``: the
+spacecraft rendezvous of ARCH-COMP, 10^5 samples of its initial set without an abort (SRNA01) and
+with one at a random time within 240 minutes (SRA08). Both by laws of their own. ``afrl-scenario``,
+``arch-scenario``: the shipped scenarios, flown as ``chaserdock simulate`` does, whole, with random
+starts (``--first``, ``--flights``), and judged by their own criteria.
 """
 
 from __future__ import annotations
@@ -55,8 +57,12 @@ def arch(options: argparse.Namespace) -> Figures:
     return figures
 
 
-def scenario(name: str, draw: Callable[[int], tuple[str, ...]], options: argparse.Namespace) -> Figures:
-    """Fly a shipped scenario with the starts of each seed; return how many flights meet all criteria, and the least margins."""
+def scenario(
+    name: str, draw: Callable[[int], tuple[str, ...]], options: argparse.Namespace
+) -> Figures:
+    """Fly a shipped scenario with the starts of each seed; return how many flights meet all
+    criteria, and the least margins.
+    """
     flights = range(options.first, options.first + (1 if options.quick else options.flights))
     passed, least = 0, {"speed_margin_m_s": 1e9, "abort_clear_m": 1e9}
     latest_s, cone_rad, apart_m = 0.0, 0.0, 1e9
@@ -68,15 +74,22 @@ def scenario(name: str, draw: Callable[[int], tuple[str, ...]], options: argpars
             figures = chaser["rendezvous"]
             least = {k: min(v, v if figures[k] is None else figures[k]) for k, v in least.items()}
             latest_s, cone_rad = (
-                max(a, figures[k] or 0.0) for a, k in ((latest_s, "arrived_s"), (cone_rad, "cone_angle_rad"))
+                max(a, figures[k] or 0.0)
+                for a, k in ((latest_s, "arrived_s"), (cone_rad, "cone_angle_rad"))
             )
             print(f"    seed {seed}, chaser {i}: {figures}", flush=True)
         for failure in found["failures"]:
             print(f"    seed {seed}: not met: {failure}", flush=True)
     figures = {"flights": len(flights), "passed": passed, **least}
-    figures |= {"latest_arrival_s": latest_s, "cone_angle_rad": cone_rad, "chasers_apart_m": apart_m}
+    figures |= {
+        "latest_arrival_s": latest_s,
+        "cone_angle_rad": cone_rad,
+        "chasers_apart_m": apart_m,
+    }
     return {
-        f"{name}_{key}": value for key, value in figures.items() if value not in (0.0, 1e9) or key == "passed"
+        f"{name}_{key}": value
+        for key, value in figures.items()
+        if value not in (0.0, 1e9) or key == "passed"
     }
 
 

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--only PART ...] [--flights 1] [--seconds 5]
-[--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
+"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--only PART ...] [--flights 1]
+[--seconds 5] [--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
 
-Flies ``four-chaser-docking`` in real time with ticks and images at 30 Hz, 640 x 480, all processes on this machine.
-``image_to_command``: from the sending of an image to the sending of the actuator command of that tick, by the senders'
-time stamps; the images of a tick are sent together, as by cameras that expose at once. ``tick_to_command``: the same from
-the sending of the tick, before the images are rendered.
+Flies ``four-chaser-docking`` in real time with ticks and images at 30 Hz, 640 x 480, all processes
+on this machine. ``image_to_command``: from the sending of an image to the sending of the actuator
+command of that tick, by the senders' time stamps; the images of a tick are sent together, as by
+cameras that expose at once. ``tick_to_command``: the same from the sending of the tick, before the
+images are rendered.
 
-Each part is a flight in which one process is disturbed: the recorder, or a viewer with one client. Windows of
-``--seconds`` alternate between ``undisturbed``, ``frozen`` (SIGSTOP) and ``slow`` (runs a tenth of the time), so that
-other load on the machine affects all conditions. ``lost``: ticks of a chaser without a command of the controller;
-``late``: commands later than 33 ms; ``p99_ratio``: 99th percentile relative to the undisturbed windows. Processor time is
-a share of one core. Measures wall time: run nothing else beside it. Prints medians over ``--flights``.
+Each part is a flight in which one process is disturbed: the recorder, or a viewer with one client.
+Windows of ``--seconds`` alternate between ``undisturbed``, ``frozen`` (SIGSTOP) and ``slow`` (runs
+a tenth of the time), so that other load on the machine affects all conditions. ``lost``: ticks of a
+chaser without a command of the controller; ``late``: commands later than 33 ms; ``p99_ratio``: 99th
+percentile relative to the undisturbed windows. Processor time is a share of one core. Measures wall
+time: run nothing else beside it. Prints medians over ``--flights``.
 """
 
 from __future__ import annotations
@@ -81,7 +83,9 @@ class LatencyObserver:
     last_tick: int = -1
 
     def receive(self, raw: RawSample) -> None:
-        """Note a message; called on a thread of Zenoh. Decodes as little as possible: the mission shares the cores."""
+        """Note a message; called on a thread of Zenoh. Decodes as little as possible: the mission
+        shares the cores.
+        """
         head = _head.decode(raw.payload)
         if raw.key == topics.TICK.key:
             self.ticks.setdefault(head.tick, raw.sent_ns)
@@ -180,14 +184,18 @@ def fly(part: str, seconds: float, rounds: int, keep: Path | None) -> Figures:
                 hub.subscribe_raw(topic.key.format(chaser="*"), observer.receive)
             duration_s = SETTLE_S + rounds * len(ROUND) * (seconds + PAUSE_S) + 5.0
             network = ["-e", endpoint, "--namespace", namespace, "--lease", str(LEASE_MS / 1000)]
-            changes = [word for o in (*OVERRIDES, f"duration_s={duration_s}") for word in ("--set", o)]
+            changes = [
+                word for o in (*OVERRIDES, f"duration_s={duration_s}") for word in ("--set", o)
+            ]
             world = ["--mode", "realtime", *changes, "-l", "tcp/127.0.0.1:0"]
             output = start_mission(fleet, Path(folder), SCENARIO, CHASERS, network, world)
             if part == "viewer":
                 port, token = free_port(), page_token()
                 os.environ[TOKEN_VARIABLE] = token
                 fleet.start("viewer", ["view", *network, "--port", str(port)], output)
-                threading.Thread(target=lambda: asyncio.run(read_viewer(port, token)), daemon=True).start()
+                threading.Thread(
+                    target=lambda: asyncio.run(read_viewer(port, token)), daemon=True
+                ).start()
             process = psutil.Process(next(c.process.pid for c in fleet.children if c.name == part))
             wait_for_images(observer, round(SETTLE_S * RATE_HZ), fleet, hub)
             for condition in ROUND * rounds:
@@ -202,16 +210,24 @@ def fly(part: str, seconds: float, rounds: int, keep: Path | None) -> Figures:
         out |= figures(f"{part}_{condition}", chosen, observer)
     reference = out[f"{part}_undisturbed_image_to_command_p99_s"]
     for condition in ("frozen", "slow"):
-        out[f"{part}_{condition}_p99_ratio"] = out[f"{part}_{condition}_image_to_command_p99_s"] / reference
+        out[f"{part}_{condition}_p99_ratio"] = (
+            out[f"{part}_{condition}_image_to_command_p99_s"] / reference
+        )
     return out
 
 
 def figures(name: str, windows: list[Window], observer: LatencyObserver) -> Figures:
     """Return the figures of all windows of one condition."""
-    keys = [(i, tick) for w in windows for tick in range(w.first, w.last + 1) for i in range(CHASERS)]
+    keys = [
+        (i, tick) for w in windows for tick in range(w.first, w.last + 1) for i in range(CHASERS)
+    ]
     sent = {key: observer.commands[key] for key in keys if key in observer.commands}
-    latency_s = np.array([(sent[k] - observer.images[k]) / 1e9 for k in sent if k in observer.images])
-    tick_s = np.array([(sent[k] - observer.ticks[k[1]]) / 1e9 for k in sent if k[1] in observer.ticks])
+    latency_s = np.array(
+        [(sent[k] - observer.images[k]) / 1e9 for k in sent if k in observer.images]
+    )
+    tick_s = np.array(
+        [(sent[k] - observer.ticks[k[1]]) / 1e9 for k in sent if k[1] in observer.ticks]
+    )
     out: Figures = {
         **percentiles(latency_s, f"{name}_image_to_command", "s", "median", "p99", "max"),
         **percentiles(tick_s, f"{name}_tick_to_command", "s", "median", "p99"),
@@ -245,7 +261,9 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=1, help="flights of each part")
     parser.add_argument("--seconds", type=float, default=5.0, help="length of a window")
     parser.add_argument("--rounds", type=int, default=3, help="rounds of four windows in a flight")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep logs and the output of the processes")
+    parser.add_argument(
+        "--keep", type=Path, metavar="DIR", help="keep logs and the output of the processes"
+    )
     options = parser.parse_args()
     flights, rounds = (1, 1) if options.quick else (options.flights, options.rounds)
 

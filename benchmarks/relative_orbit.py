@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: ``python benchmarks/relative_orbit.py [--json FILE]``.
+"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: ``python
+benchmarks/relative_orbit.py [--json FILE]``.
 
-Two spacecraft 100 m apart fly one orbit under two-body gravity, and with J2. ``--basilisk PYTHON``: an interpreter with the
-package ``bsk``, which flies them in Basilisk; it needs an environment of its own, as its releases demand older versions of
-matplotlib and pillow than chaserdock is locked to: ``python -m venv bsk && bsk/bin/pip install bsk``. Without it the
-recorded results are compared; ``--write`` records them (tests/models/basilisk_relative_orbit.json). ``--quick``:
-a third of the cases.
+Two spacecraft 100 m apart fly one orbit under two-body gravity, and with J2. ``--basilisk PYTHON``:
+an interpreter with the package ``bsk``, which flies them in Basilisk; it needs an environment of
+its own, as its releases demand older versions of matplotlib and pillow than chaserdock is locked
+to: ``python -m venv bsk && bsk/bin/pip install bsk``. Without it the recorded results are compared;
+``--write`` records them (tests/models/basilisk_relative_orbit.json). ``--quick``: a third of the
+cases.
 """
 
 from __future__ import annotations
@@ -81,7 +83,9 @@ print("RESULT" + json.dumps(results))
 
 
 def cases() -> list[dict[str, Any]]:
-    """Return the cases: orbit, J2, and start in the Hill frame, with the speed that keeps the distance along track bounded."""
+    """Return the cases: orbit, J2, and start in the Hill frame, with the speed that keeps the
+    distance along track bounded.
+    """
     made: list[dict[str, Any]] = []
     for orbit, (elements, j2) in ORBITS.items():
         for name, start in STARTS.items():
@@ -106,7 +110,12 @@ def fly_in_basilisk(python: str, folder: Path) -> list[dict[str, Any]]:
     rows += [f"2,0,{-EARTH_J2 / math.sqrt(5):.17g},0", "2,1,0,0", "2,2,0,0"]
     coefficients.write_text("\n".join(rows) + "\n")
     flown = cases()
-    given = {"mu": EARTH_MU_M3_S2, "radius": EARTH_RADIUS_M, "coefficients": str(coefficients), "cases": []}
+    given = {
+        "mu": EARTH_MU_M3_S2,
+        "radius": EARTH_RADIUS_M,
+        "coefficients": str(coefficients),
+        "cases": [],
+    }
     for case in flown:
         orbit = state_of(OrbitalElements(**case["elements"]))
         body = to_eci(orbit, case["position_m"], case["velocity_m_s"], case["j2"])
@@ -120,7 +129,11 @@ def fly_in_basilisk(python: str, folder: Path) -> list[dict[str, Any]]:
             }
         )
     done = subprocess.run(
-        [python, "-c", _BASILISK], input=json.dumps(given), capture_output=True, text=True, check=False
+        [python, "-c", _BASILISK],
+        input=json.dumps(given),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         raise SystemExit(f"Basilisk failed: {done.stderr.strip()[-2000:]}")
@@ -135,7 +148,9 @@ def fly_in_basilisk(python: str, folder: Path) -> list[dict[str, Any]]:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--basilisk", metavar="PYTHON", help="interpreter with the package bsk")
-    parser.add_argument("--write", action="store_true", help="record Basilisk's results for the tests")
+    parser.add_argument(
+        "--write", action="store_true", help="record Basilisk's results for the tests"
+    )
     arguments = parser.parse_args()
     if arguments.basilisk:
         with tempfile.TemporaryDirectory() as folder:
@@ -150,7 +165,9 @@ def main() -> None:
         start = (case["position_m"], case["velocity_m_s"])
         position, _ = propagate_relative(state_of(elements), *start, case["duration_s"], case["j2"])
         figures[f"{case['name']}_to_basilisk_m"] = math.dist(position, case["end_position_m"])
-        linear = cw_transition(elements.mean_motion_rad_s, case["duration_s"]) @ np.concatenate(start)
+        linear = cw_transition(elements.mean_motion_rad_s, case["duration_s"]) @ np.concatenate(
+            start
+        )
         figures[f"{case['name']}_cw_error_m"] = math.dist(linear[:3], case["end_position_m"])
     print_figures(figures)
     write_json(arguments.json, figures)

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The renderer of meshes: ``python benchmarks/rendering.py [--views N] [--only PART] [--quick] [--json FILE]``.
+"""The renderer of meshes: ``python benchmarks/rendering.py [--views N] [--only PART] [--quick]
+[--json FILE]``.
 
 Parts:
 
-- ``time``: CPU time of one image of 960 x 540 pixels of each shipped satellite at 1 and 3 m, random attitudes and suns, one thread;
-  the least of four runs of each view.
-- ``accuracy``: against images of Embree, 480 x 270 pixels with 36 rays each: mean grey-level error inside surfaces, and the
-  displacement of silhouettes and shadow edges by blocks of 12 pixels. Textures are left out.
+- ``time``: CPU time of one image of 960 x 540 pixels of each shipped satellite at 1 and 3 m, random
+  attitudes and suns, one thread; the least of four runs of each view.
+- ``accuracy``: against images of Embree, 480 x 270 pixels with 36 rays each: mean grey-level error
+  inside surfaces, and the displacement of silhouettes and shadow edges by blocks of 12 pixels.
+  Textures are left out.
 """
 
 from __future__ import annotations
@@ -48,7 +50,10 @@ def measure_time(views: int) -> Figures:
                     runs.append(time.thread_time() - begin_s)
                 times.append(min(runs))
             key = f"{name}_{range_m:g}m"
-            figures |= {f"{key}_mean_s": float(np.mean(times)), f"{key}_max_s": float(np.max(times))}
+            figures |= {
+                f"{key}_mean_s": float(np.mean(times)),
+                f"{key}_max_s": float(np.max(times)),
+            }
     return figures
 
 
@@ -61,7 +66,9 @@ def measure_accuracy(views: int) -> Figures:
             for range_m in RANGES_M:
                 pose, light = random_view(rng, range_m, camera)
                 q = rotations.from_matrix(pose.rotation)
-                grey, silhouette, shadow = compare(satellite(name), camera, pose.position, q, light, 6)
+                grey, silhouette, shadow = compare(
+                    satellite(name), camera, pose.position, q, light, 6
+                )
                 greys.append(grey)
                 silhouettes.append(np.abs(silhouette))
                 shadows.append(np.abs(shadow))
@@ -79,12 +86,17 @@ def measure_accuracy(views: int) -> Figures:
 def main() -> None:
     """Run the parts."""
     parser = make_parser(__doc__, ("time", "accuracy"))
-    parser.add_argument("--views", type=int, help="views by satellite and range (default 20; 2 with --quick)")
+    parser.add_argument(
+        "--views", type=int, help="views by satellite and range (default 20; 2 with --quick)"
+    )
     options = parser.parse_args()
     views = options.views or (2 if options.quick else 20)
     run_parts(
         options,
-        {"time": lambda: measure_time(views), "accuracy": lambda: measure_accuracy(max(1, views // 4))},
+        {
+            "time": lambda: measure_time(views),
+            "accuracy": lambda: measure_accuracy(max(1, views // 4)),
+        },
     )
 
 

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole rendezvous from 200 m to the verified latch: ``python benchmarks/rendezvous.py [--scenario v-bar r-bar] [--seeds N]``.
+"""Whole rendezvous from 200 m to the verified latch: ``python benchmarks/rendezvous.py [--scenario
+v-bar r-bar] [--seeds N]``.
 
-One process, with statistical perception. ``--markers``: markers in rendered images instead of statistical ones, and bearing and
-range where these are more accurate. ``--images``: only the last leg, with rendered images and without ranging.
-``--leg N``: one leg. Prints time, change of velocity, tracking at the hold points, step of the estimate at the first markers, and
-contact. ``--quick``: only the last leg, from the last hold point on. ``--events``: print the controller's events.
+One process, with statistical perception. ``--markers``: markers in rendered images instead of
+statistical ones, and bearing and range where these are more accurate. ``--images``: only the last
+leg, with rendered images and without ranging. ``--leg N``: one leg. Prints time, change of
+velocity, tracking at the hold points, step of the estimate at the first markers, and contact.
+``--quick``: only the last leg, from the last hold point on. ``--events``: print the controller's
+events.
 """
 
 from __future__ import annotations
@@ -74,10 +77,14 @@ def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--scenario", nargs="+", default=["v-bar", "r-bar"], help="shipped scenarios")
+    parser.add_argument(
+        "--scenario", nargs="+", default=["v-bar", "r-bar"], help="shipped scenarios"
+    )
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each, from 0")
     parser.add_argument("--images", action="store_true", help="last leg with rendered images")
-    parser.add_argument("--markers", action="store_true", help="rendered images, and ranging far away")
+    parser.add_argument(
+        "--markers", action="store_true", help="rendered images, and ranging far away"
+    )
     parser.add_argument(
         "--leg",
         type=int,

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default estimator against the paper's under sensor errors: ``python benchmarks/robustness.py [--only PART ...] [--quick]``.
+"""Default estimator against the paper's under sensor errors: ``python benchmarks/robustness.py
+[--only PART ...] [--quick]``.
 
-Parts: ``grades`` (rendered images; the grades of ``[navigation]`` and ``harsh-light``, also after ``calibrate``, with plant
-mismatch unless ``--nominal``), ``sources`` (statistical sightings; each error source alone, from 0 to 10 times its figure in the
-grade ``lab``), ``failures`` (``lab`` with plant mismatch and the statistical perception; no sight for 20 s, and odometry of one
-chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a tenth of its sigma of position).
+Parts: ``grades`` (rendered images; the grades of ``[navigation]`` and ``harsh-light``, also after
+``calibrate``, with plant mismatch unless ``--nominal``), ``sources`` (statistical sightings; each
+error source alone, from 0 to 10 times its figure in the grade ``lab``), ``failures`` (``lab`` with
+plant mismatch and the statistical perception; no sight for 20 s, and odometry of one chaser that
+jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a tenth of its sigma of position).
 
-Figures of ``grades`` and ``sources`` are RMS over all chasers in the steady state (from 32 s on in ``grades``, 15 s after the end
-of a calibration; from 20 s on in ``sources``), mean over the seeds, in closed loop: the error of each chaser's pose relative to
-the target, ``estimate``, and of its distance from the reference on the true target, ``tracking``; ``nees`` of the relative pose
-(6 expected); ``worst_nees`` of a flight; share of gated sightings. The paper's estimator takes odometry as exact; its relative
-pose is that of odometry and target estimate. ``--figure FILE`` draws the curves of ``sources``.
+Figures of ``grades`` and ``sources`` are RMS over all chasers in the steady state (from 32 s on in
+``grades``, 15 s after the end of a calibration; from 20 s on in ``sources``), mean over the seeds,
+in closed loop: the error of each chaser's pose relative to the target, ``estimate``, and of its
+distance from the reference on the true target, ``tracking``; ``nees`` of the relative pose (6
+expected); ``worst_nees`` of a flight; share of gated sightings. The paper's estimator takes
+odometry as exact; its relative pose is that of odometry and target estimate. ``--figure FILE``
+draws the curves of ``sources``.
 """
 
 from __future__ import annotations
@@ -65,8 +69,12 @@ class Flight:
     images: bool
 
 
-def scenario_of(name: str, estimator: str, seed: int, duration_s: float, *overrides: str) -> Scenario:
-    """Return a shipped scenario with another estimator, seed and length, without its commands and criteria."""
+def scenario_of(
+    name: str, estimator: str, seed: int, duration_s: float, *overrides: str
+) -> Scenario:
+    """Return a shipped scenario with another estimator, seed and length, without its commands and
+    criteria.
+    """
     fixed = (
         f"seed={seed}",
         f"duration_s={duration_s}",
@@ -78,10 +86,14 @@ def scenario_of(name: str, estimator: str, seed: int, duration_s: float, *overri
 
 
 def relative_error(tick: TickRecord, chaser: int) -> tuple[Array, float]:
-    """Return the error (6,) of a chaser's estimated pose relative to the target (TRF, m; CRF, rad) and its NEES, NaN without
-    a covariance."""
+    """Return the error (6,) of a chaser's estimated pose relative to the target (TRF, m; CRF, rad)
+    and its NEES, NaN without a covariance."""
     assert tick.outputs is not None
-    estimate, true, own = tick.outputs.target, tick.states["target"], tick.states[f"chaser/{chaser}"]
+    estimate, true, own = (
+        tick.outputs.target,
+        tick.states["target"],
+        tick.states[f"chaser/{chaser}"],
+    )
     truth = relative_pose(own.position_m, own.q_wxyz, true.position_m, true.q_wxyz)
     found = next((r for r in estimate.relative if r.chaser == chaser), None)
     if found is None:
@@ -94,7 +106,9 @@ def relative_error(tick: TickRecord, chaser: int) -> tuple[Array, float]:
 
 
 def fly(flight: Flight) -> Array:
-    """Fly a mission; return its figures (7,): estimate m, rad, tracking m, rad, NEES, gated share, re-initializations."""
+    """Fly a mission; return its figures (7,): estimate m, rad, tracking m, rad, NEES, gated share,
+    re-initializations.
+    """
     scenario = flight.scenario
     perception = (
         RenderedImages(scenario)
@@ -113,18 +127,28 @@ def fly(flight: Flight) -> Array:
                 error, value = relative_error(tick, i)
                 nees.append(value)
                 rows.append(
-                    [np.sum(error[:3] ** 2), np.sum(error[3:] ** 2), *np.square(tick.tracking_errors[i])]
+                    [
+                        np.sum(error[:3] ** 2),
+                        np.sum(error[3:] ** 2),
+                        *np.square(tick.tracking_errors[i]),
+                    ]
                 )
-        calibrated = {text.split(":")[0] for _, _, text in mission.events if "camera calibrated" in text}
+        calibrated = {
+            text.split(":")[0] for _, _, text in mission.events if "camera calibrated" in text
+        }
         if scenario.timeline and len(calibrated) < len(scenario.chasers):
-            raise SystemExit(f"{flight.label}: only {sorted(calibrated)} completed the calibration manoeuvre")
+            raise SystemExit(
+                f"{flight.label}: only {sorted(calibrated)} completed the calibration manoeuvre"
+            )
         restarts = mission.controller.estimator.reinitialisations
     share = gated / max(1, accepted + gated)
     return np.array([*np.sqrt(np.mean(rows, axis=0)), np.mean(nees), share, restarts])
 
 
 def fly_all(flights: Sequence[Flight], jobs: int) -> Figures:
-    """Fly missions in processes; return the mean figures of each label, and print them as they come."""
+    """Fly missions in processes; return the mean figures of each label, and print them as they
+    come.
+    """
     figures: Figures = {}
     with ProcessPoolExecutor(jobs) as pool:
         results = zip(flights, pool.map(fly, flights), strict=True)
@@ -137,7 +161,15 @@ def fly_all(flights: Sequence[Flight], jobs: int) -> Figures:
 
 def mean_figures(label: str, flights: Sequence[Array]) -> Figures:
     """Return the mean over flights, by name, and the largest NEES."""
-    units = ("estimate_m", "estimate_rad", "tracking_m", "tracking_rad", "nees", "gated_share", "restarts")
+    units = (
+        "estimate_m",
+        "estimate_rad",
+        "tracking_m",
+        "tracking_rad",
+        "nees",
+        "gated_share",
+        "restarts",
+    )
     values = {unit: float(v) for unit, v in zip(units, np.mean(flights, axis=0), strict=True)}
     values["worst_nees"] = max(float(row[4]) for row in flights)
     return {f"{label}_{unit}": v for unit, v in values.items() if not math.isnan(v)}
@@ -154,14 +186,20 @@ def grades(options: argparse.Namespace) -> Figures:
                 for seed in range(seeds):
                     overrides = (f'navigation.grade="{grade}"', *truth)
                     scenario = scenario_of(name, estimator, seed, duration_s, *overrides)
-                    flights.append(Flight(f"{grade}_{number}_{estimator}", scenario, settled_s, True))
+                    flights.append(
+                        Flight(f"{grade}_{number}_{estimator}", scenario, settled_s, True)
+                    )
             if estimator != "joint":
                 continue
-            calibrate = f'timeline=[{{at_s=20.0,command="calibrate",chasers={list(range(number))}}}]'
+            calibrate = (
+                f'timeline=[{{at_s=20.0,command="calibrate",chasers={list(range(number))}}}]'
+            )
             for seed in range(seeds):
                 overrides = ('navigation.grade="orbit"', *truth, calibrate)
                 scenario = scenario_of(name, estimator, seed, CALIBRATED_S + 12.0, *overrides)
-                flights.append(Flight(f"orbit_calibrated_{number}_{estimator}", scenario, CALIBRATED_S, True))
+                flights.append(
+                    Flight(f"orbit_calibrated_{number}_{estimator}", scenario, CALIBRATED_S, True)
+                )
         for seed in range(seeds):
             overrides = ('navigation.grade="lab"', *truth)
             scenario = scenario_of("harsh-light", estimator, seed, duration_s, *overrides)
@@ -180,23 +218,33 @@ def sources(options: argparse.Namespace) -> Figures:
             for estimator in options.estimators:
                 overrides = ('navigation.grade="exact"', *values)
                 for seed in range(seeds):
-                    scenario = scenario_of("four-chaser-docking", estimator, seed, duration_s, *overrides)
-                    flights.append(Flight(f"{source}_{factor:g}_{estimator}", scenario, 20.0, False))
+                    scenario = scenario_of(
+                        "four-chaser-docking", estimator, seed, duration_s, *overrides
+                    )
+                    flights.append(
+                        Flight(f"{source}_{factor:g}_{estimator}", scenario, 20.0, False)
+                    )
     figures = fly_all(flights, options.jobs)
     if options.figure is not None:
         draw_sources(figures, factors, options.estimators, options.figure)
     return figures
 
 
-def draw_sources(figures: Figures, factors: Sequence[float], estimators: Sequence[str], path: Path) -> None:
-    """Draw the position error of the estimate over the factor of each source, one panel a source, to an image file."""
+def draw_sources(
+    figures: Figures, factors: Sequence[float], estimators: Sequence[str], path: Path
+) -> None:
+    """Draw the position error of the estimate over the factor of each source, one panel a source,
+    to an image file.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 2.6), layout="constrained")
     panels = figure.subplots(1, len(SOURCES), sharey=True)
     for panel, source in zip(panels, SOURCES, strict=True):
         for estimator, style in zip(estimators, ("o-", "s--"), strict=False):
-            errors_mm = [figures[f"{source}_{factor:g}_{estimator}_estimate_m"] * 1e3 for factor in factors]
+            errors_mm = [
+                figures[f"{source}_{factor:g}_{estimator}_estimate_m"] * 1e3 for factor in factors
+            ]
             panel.semilogy(factors, errors_mm, style, markersize=4, label=estimator)
         panel.set_title(source, fontsize=10)
         panel.set_xlabel("times lab", fontsize=9)
@@ -234,7 +282,9 @@ FAILED_AT_S, BLIND_S, FAILED_CHASER = 35.0, 20.0, 1
 
 
 class FailureMission(InProcessMission):
-    """A mission with a failure from ``FAILED_AT_S`` on: of all cameras for ``BLIND_S``, or of the odometry of one chaser."""
+    """A mission with a failure from ``FAILED_AT_S`` on: of all cameras for ``BLIND_S``, or of the
+    odometry of one chaser.
+    """
 
     def __init__(self, scenario: Scenario, failure: str) -> None:
         see = RenderedImages(scenario)
@@ -252,15 +302,24 @@ class FailureMission(InProcessMission):
 
     def measure(self, chaser: int, time_ns: int, states: States) -> Odometry:
         odometry = super().measure(chaser, time_ns, states)
-        failed = self._change is not None and chaser == FAILED_CHASER and time_ns / 1e9 >= FAILED_AT_S
+        failed = (
+            self._change is not None and chaser == FAILED_CHASER and time_ns / 1e9 >= FAILED_AT_S
+        )
         return self._change(odometry) if self._change is not None and failed else odometry
 
 
 def fly_failure(failure: str, seed: int) -> Array:
-    """Return RMS tracking error (m) of the failed chaser before and after the failure, the largest tracking error of all
-    chasers after it (m), and the time until a warning names the failed odometry (s)."""
-    overrides = ('navigation.grade="lab"', 'truth.preset="mismatch"', 'perception.name="statistical"')
-    scenario = scenario_of("four-chaser-docking", "joint", seed, FAILED_AT_S + BLIND_S + 10.0, *overrides)
+    """Return RMS tracking error (m) of the failed chaser before and after the failure, the largest
+    tracking error of all chasers after it (m), and the time until a warning names the failed
+    odometry (s)."""
+    overrides = (
+        'navigation.grade="lab"',
+        'truth.preset="mismatch"',
+        'perception.name="statistical"',
+    )
+    scenario = scenario_of(
+        "four-chaser-docking", "joint", seed, FAILED_AT_S + BLIND_S + 10.0, *overrides
+    )
     before, after, largest = [], [], 0.0
     with FailureMission(scenario, failure) as mission:
         for tick in mission.ticks():
@@ -269,7 +328,9 @@ def fly_failure(failure: str, seed: int) -> Array:
             own_m, _ = tick.tracking_errors[FAILED_CHASER]
             (before if tick.time_s < FAILED_AT_S else after).append(own_m**2)
             if tick.time_s >= FAILED_AT_S:
-                largest = max(largest, *(distance_m for distance_m, _ in tick.tracking_errors.values()))
+                largest = max(
+                    largest, *(distance_m for distance_m, _ in tick.tracking_errors.values())
+                )
         reports = [
             time_s - FAILED_AT_S
             for time_s, level, text in mission.events
@@ -316,7 +377,11 @@ def main() -> None:
     )
     parser.add_argument("--nominal", action="store_true", help="without plant mismatch in grades")
     parser.add_argument(
-        "--estimators", nargs="+", choices=ESTIMATORS, default=ESTIMATORS, help="estimators (default: both)"
+        "--estimators",
+        nargs="+",
+        choices=ESTIMATORS,
+        default=ESTIMATORS,
+        help="estimators (default: both)",
     )
     parser.add_argument(
         "--rows",
@@ -325,8 +390,12 @@ def main() -> None:
         metavar="TEXT",
         help="of grades, rows whose name begins so, such as orbit_calibrated_4 (default: all)",
     )
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)")
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw the curves of sources (SVG, PNG)")
+    parser.add_argument(
+        "--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)"
+    )
+    parser.add_argument(
+        "--figure", type=Path, metavar="FILE", help="draw the curves of sources (SVG, PNG)"
+    )
     options = parser.parse_args()
     run_parts(options, {name: partial(part, options) for name, part in PARTS.items()})
 

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of the bridge to ROS 2: ``python benchmarks/ros2.py [--quick] [--json FILE] [--only PART ...]``.
+"""Cost of the bridge to ROS 2: ``python benchmarks/ros2.py [--quick] [--json FILE] [--only PART
+...]``.
 
-Parts: ``cost`` (wall time for each message of the mission, in the bridge's steps, and what remains per message of ROS 2 beside
-serialization). The messages are those of a golden log; a reader in another session takes what is sent. Serialization is CDR and,
-of an image, the decoding of JPEG. ``large_image``: the same for 0.9 MB. ``--quick``: fewer repetitions.
+Parts: ``cost`` (wall time for each message of the mission, in the bridge's steps, and what remains
+per message of ROS 2 beside serialization). The messages are those of a golden log; a reader in
+another session takes what is sent. Serialization is CDR and, of an image, the decoding of JPEG.
+``large_image``: the same for 0.9 MB. ``--quick``: fewer repetitions.
 """
 
 from __future__ import annotations
@@ -76,10 +78,13 @@ def cost(repetitions: int) -> Figures:
                 jpeg, convert = convert - with_raw, with_raw
             data = [bytes(TYPES.serialize_cdr(part.message, part.type_name)) for part in parts]
             cdr = median_us(
-                lambda ps=parts: [TYPES.serialize_cdr(p.message, p.type_name) for p in ps], repetitions
+                lambda ps=parts: [TYPES.serialize_cdr(p.message, p.type_name) for p in ps],
+                repetitions,
             )
             send = median_us(
-                lambda ps=parts, ds=data: [publishers[p.topic].send(d) for p, d in zip(ps, ds, strict=True)],
+                lambda ps=parts, ds=data: [
+                    publishers[p.topic].send(d) for p, d in zip(ps, ds, strict=True)
+                ],
                 repetitions,
             )
             beside = (decode + convert + send) / len(parts)
@@ -101,14 +106,20 @@ def cost(repetitions: int) -> Figures:
 
 def large_image(repetitions: int) -> Figures:
     """Return the cost of the steps for an image of the default camera's size, not compressed."""
-    endpoint, kind, topic = f"tcp/127.0.0.1:{free_port()}", "sensor_msgs/msg/Image", "/chaser_0/image"
+    endpoint, kind, topic = (
+        f"tcp/127.0.0.1:{free_port()}",
+        "sensor_msgs/msg/Image",
+        "/chaser_0/image",
+    )
     session, reader = PlainSession((), (endpoint,), "router"), PlainSession((endpoint,), (), "peer")
     ros, listener = RosNode(session, 0, "bridge"), RosNode(reader, 0, "reader")
     try:
         publisher = ros.publisher(topic, kind, blocking=True)
         listener.subscribe(topic, kind, lambda message: None)
         time.sleep(0.5)
-        message = Image(chaser=0, width_px=1280, height_px=720, encoding="mono8", data=bytes(1280 * 720))
+        message = Image(
+            chaser=0, width_px=1280, height_px=720, encoding="mono8", data=bytes(1280 * 720)
+        )
         converted, payload = conversion.image(message), codec.encode(message)
         cdr = bytes(TYPES.serialize_cdr(converted, kind))
         figures = {
@@ -129,7 +140,10 @@ def large_image(repetitions: int) -> Figures:
 def main() -> None:
     options = make_parser(__doc__, ("cost", "large_image")).parse_args()
     repetitions = 100 if options.quick else 1000
-    run_parts(options, {"cost": lambda: cost(repetitions), "large_image": lambda: large_image(repetitions)})
+    run_parts(
+        options,
+        {"cost": lambda: cost(repetitions), "large_image": lambda: large_image(repetitions)},
+    )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of a tick with 1 to 16 chasers, by part: ``python benchmarks/scale.py [--quick] [--json FILE]``.
+"""Cost of a tick with 1 to 16 chasers, by part: ``python benchmarks/scale.py [--quick] [--json
+FILE]``.
 
-The first N chasers of ``sixteen-chasers``. In one process (``chaserdock.evaluation.in_process``) each part is timed by
-the thread's processor time, medians over ticks: render, physics, perceive, fuse, solve, guide (references, prediction,
-messages). Then ``chaserdock run`` flies the same mission in lock-step: wall time per tick, and processor time of its
-processes. ``record`` is the recorder's; ``transport`` is what world, chasers and controller use beyond the parts:
-encoding, Zenoh, decoding and waiting. ``--quick``: 1, 2 and 4 chasers. ``--chasers`` (repeatable) chooses;
+The first N chasers of ``sixteen-chasers``. In one process (``chaserdock.evaluation.in_process``)
+each part is timed by the thread's processor time, medians over ticks: render, physics, perceive,
+fuse, solve, guide (references, prediction, messages). Then ``chaserdock run`` flies the same
+mission in lock-step: wall time per tick, and processor time of its processes. ``record`` is the
+recorder's; ``transport`` is what world, chasers and controller use beyond the parts: encoding,
+Zenoh, decoding and waiting. ``--quick``: 1, 2 and 4 chasers. ``--chasers`` (repeatable) chooses;
 ``--parts-only`` omits the lock-step missions.
 """
 
@@ -51,7 +53,9 @@ def first(n: int) -> str:
 
 
 class Clock:
-    """Processor time of this thread in wrapped functions, by part; nested parts are not counted twice."""
+    """Processor time of this thread in wrapped functions, by part; nested parts are not counted
+    twice.
+    """
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = defaultdict(float)
@@ -110,7 +114,8 @@ def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
 
 
 def fly(n: int, duration_s: float) -> dict[str, float]:
-    """Run the mission with ``n`` chasers; return wall time and processor time of each command, s per tick.
+    """Run the mission with ``n`` chasers; return wall time and processor time of each command, s
+    per tick.
 
     Raise SystemExit if it fails.
     """
@@ -143,7 +148,9 @@ def fly(n: int, duration_s: float) -> dict[str, float]:
 
 
 def measure(n: int, ticks: int, duration_s: float | None) -> dict[str, float]:
-    """Return seconds per tick with ``n`` chasers by part; without lock-step mission if ``duration_s`` is None."""
+    """Return seconds per tick with ``n`` chasers by part; without lock-step mission if
+    ``duration_s`` is None.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.toml"
         path.write_text(first(n), encoding="utf-8")

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distance of a chaser's shape from cuboids: our kernel and the library coal: ``python benchmarks/shapes.py [--quick] [--json FILE]``.
+"""Distance of a chaser's shape from cuboids: our kernel and the library coal: ``python
+benchmarks/shapes.py [--quick] [--json FILE]``.
 
-Random poses of a chaser (body and probe) about random cuboids. Time per pair of a chaser and a cuboid: of the planner's kernel (gap
-along one direction, with its gradient) in a plan's check, and of ``coal.distance`` between boxes, and between convex hulls of 8 and
-of 42 points, called from Python as a planner in Python would. The gap is at most the distance: how much less is printed. Only ours
-without ``coal`` (``pip install coal``), which the product does not need.
+Random poses of a chaser (body and probe) about random cuboids. Time per pair of a chaser and a
+cuboid: of the planner's kernel (gap along one direction, with its gradient) in a plan's check, and
+of ``coal.distance`` between boxes, and between convex hulls of 8 and of 42 points, called from
+Python as a planner in Python would. The gap is at most the distance: how much less is printed. Only
+ours without ``coal`` (``pip install coal``), which the product does not need.
 """
 
 from __future__ import annotations
@@ -49,13 +51,17 @@ def random_states(rng: np.random.Generator, number: int) -> Array:
     """Return states (number, 13) of a chaser 1 to 3 m from the origin."""
     states = np.zeros((number, 13))
     along = rng.normal(size=(number, 3))
-    states[:, :3] = along / np.linalg.norm(along, axis=1, keepdims=True) * rng.uniform(1.0, 3.0, (number, 1))
+    states[:, :3] = (
+        along / np.linalg.norm(along, axis=1, keepdims=True) * rng.uniform(1.0, 3.0, (number, 1))
+    )
     states[:, 6:10] = rotations.normalize(rng.normal(size=(number, 4)))
     return states
 
 
 def kernel_s(params: NmpcParameters, table: Array, states: Array, repeats: int) -> float:
-    """Return the processor time (s) per pair of our kernel: that of checking plans with the cuboids, less that without."""
+    """Return the processor time (s) per pair of our kernel: that of checking plans with the
+    cuboids, less that without.
+    """
     d = params.stages
     problem = NmpcInput(
         states=states[:1],
@@ -93,7 +99,9 @@ def placed(coal: Any, row: Array) -> Any:
 
 
 def hull(coal: Any, row: Array, points: int) -> Any:
-    """Return the convex hull of a cuboid's corners and of further points on the ellipsoid about it, so that all are its vertices."""
+    """Return the convex hull of a cuboid's corners and of further points on the ellipsoid about it,
+    so that all are its vertices.
+    """
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * row[12:]
     spread = np.random.default_rng(points).normal(size=(points - 8, 3))
     spread /= np.linalg.norm(spread, axis=1, keepdims=True)
@@ -133,7 +141,10 @@ def coal_figures(coal: Any, table: Array, states: Array, repeats: int) -> Figure
     parts, cuboids = [kinds["box"](row) for row in body], [kinds["box"](row) for row in table]
     below = np.array(
         [
-            min(distance_of(coal, part, at, cuboid, place) for part, at in zip(parts, pose, strict=True))
+            min(
+                distance_of(coal, part, at, cuboid, place)
+                for part, at in zip(parts, pose, strict=True)
+            )
             - distance_from_cuboids(row[None], body, state[:3], state[6:10])
             for state, pose in zip(states, poses, strict=True)
             for row, cuboid, place in zip(table, cuboids, places, strict=True)

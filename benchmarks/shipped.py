@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every shipped scenario under other grades: ``python benchmarks/shipped.py [--grades GRADE ...] [--only SCENARIO ...]``.
+"""Every shipped scenario under other grades: ``python benchmarks/shipped.py [--grades GRADE ...]
+[--only SCENARIO ...]``.
 
-Flies each scenario once under every grade, seed 0, with rendered images and plant mismatch (``truth.preset = "mismatch"``), all
-processes in one (``chaserdock simulate``), which gives the same flight as separate ones. Under ``orbit`` captures follow a
-calibration of the cameras. Prints a row of a table: RMS tracking error of the worst chaser in steady state against ground truth, and
-the criteria that the flight missed.
+Flies each scenario once under every grade, seed 0, with rendered images and plant mismatch
+(``truth.preset = "mismatch"``), all processes in one (``chaserdock simulate``), which gives the
+same flight as separate ones. Under ``orbit`` captures follow a calibration of the cameras. Prints a
+row of a table: RMS tracking error of the worst chaser in steady state against ground truth, and the
+criteria that the flight missed.
 """
 
 from __future__ import annotations
@@ -40,11 +42,16 @@ def fly(name: str, grade: str) -> Summary:
 
 
 def cell_of(summary: Summary) -> tuple[str, float, float]:
-    """Return a flight's cell of the table, and the RMS tracking errors (m, rad) of its worst chaser."""
+    """Return a flight's cell of the table, and the RMS tracking errors (m, rad) of its worst
+    chaser.
+    """
     steady = [c.steady for c in summary.chasers.values()]
     rms = [
         math.sqrt(max((x for x in values if x is not None), default=math.nan))
-        for values in ([s.position_mse_m2 for s in steady], [s.orientation_mse_rad2 for s in steady])
+        for values in (
+            [s.position_mse_m2 for s in steady],
+            [s.orientation_mse_rad2 for s in steady],
+        )
     ]
     text = f"{rms[0] * 1e3:.2f} mm, {math.degrees(rms[1]):.3f} deg"
     return text + "".join(f"; missed: {failure}" for failure in summary.failures), rms[0], rms[1]
@@ -55,7 +62,9 @@ def main() -> None:
     names = [name for name in cd.list_scenarios() if name not in NOT_FLOWN]
     parser = make_parser(__doc__, names)
     parser.add_argument("--grades", nargs="+", choices=GRADES, default=["exact", "lab", "orbit"])
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)")
+    parser.add_argument(
+        "--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)"
+    )
     options = parser.parse_args()
     figures: Figures = {}
     print(f"| scenario | {' | '.join(options.grades)} |\n|{' --- |' * (1 + len(options.grades))}")

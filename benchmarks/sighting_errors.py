@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of sightings by shape in flights, over their stated covariances: ``python benchmarks/sighting_errors.py
-[--only PART] [--flights N] [--first SEED] [--set KEY=VALUE] [--quick] [--json FILE]``.
+"""Errors of sightings by shape in flights, over their stated covariances: ``python
+benchmarks/sighting_errors.py [--only PART] [--flights N] [--first SEED] [--set KEY=VALUE] [--quick]
+[--json FILE]``.
 
-Parts: ``docking``, ``capture`` and ``inspection``, the missions of ``markerless_missions.py``, flown in one process with rendered
-images. ``--quick``: one flight of 30 s. Each sighting is compared with the true pose of the target in the true camera, of position
-and rotation apart:
+Parts: ``docking``, ``capture`` and ``inspection``, the missions of ``markerless_missions.py``,
+flown in one process with rendered images. ``--quick``: one flight of 30 s. Each sighting is
+compared with the true pose of the target in the true camera, of position and rotation apart:
 
 - squared error normalized by the stated covariance, 3 expected;
-- correlation of the errors of one chaser at several lags, and of two chasers at one tick: mean products of errors, as ratios to
-  their mean square. Errors are whitened by the stated covariance in the axes of TRF, and their mean is not subtracted.
+- correlation of the errors of one chaser at several lags, and of two chasers at one tick: mean
+  products of errors, as ratios to their mean square. Errors are whitened by the stated covariance
+  in the axes of TRF, and their mean is not subtracted.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ KINDS = {"position": slice(0, 3), "rotation": slice(3, 6)}
 
 
 def whitened_error(true_position_m: Array, true_q: Array, solution: PoseSolution) -> Array:
-    """Return the error (6,) of a solution over its stated covariance, in the axes of TRF; true pose in IRF."""
+    """Return the error (6,) of a solution over its stated covariance, in the axes of TRF; true pose
+    in IRF.
+    """
     q = np.array(solution.q_wxyz)
     error = pose_error(true_position_m, true_q, np.array(solution.position_m), q)
     axes = np.eye(6)
@@ -52,7 +56,9 @@ def whitened_error(true_position_m: Array, true_q: Array, solution: PoseSolution
 
 
 class JudgedImages(RenderedImages):
-    """Rendered images and perceptions that keep the whitened errors (6,) of all images, by chaser; NaN without a pose."""
+    """Rendered images and perceptions that keep the whitened errors (6,) of all images, by chaser;
+    NaN without a pose.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario)
@@ -71,14 +77,18 @@ class JudgedImages(RenderedImages):
         sighting = super().see(chaser, image)
         single = len(sighting.solutions) == 1
         error = (
-            whitened_error(*self._truth[chaser], sighting.solutions[0]) if single else np.full(6, math.nan)
+            whitened_error(*self._truth[chaser], sighting.solutions[0])
+            if single
+            else np.full(6, math.nan)
         )
         self.errors[chaser].append(error)
         return sighting
 
 
 def correlation(a: Array, b: Array) -> float:
-    """Return the correlation of errors (images, 3) without subtracting their means; of images in which both are known."""
+    """Return the correlation of errors (images, 3) without subtracting their means; of images in
+    which both are known.
+    """
     both = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
     a, b = a[both], b[both]
     return float(np.sum(a * b) / math.sqrt(np.sum(a * a) * np.sum(b * b)))
@@ -94,7 +104,9 @@ def statistics(errors: Array, images_per_s: float) -> Figures:
         for lag_s in LAGS_S:
             lag = max(1, round(lag_s * images_per_s))
             values = [correlation(e[:-lag], e[lag:]) for e in of_kind]
-            figures[f"{kind}_correlation_{f'{lag_s:g}_s' if lag_s else 'next'}"] = float(np.mean(values))
+            figures[f"{kind}_correlation_{f'{lag_s:g}_s' if lag_s else 'next'}"] = float(
+                np.mean(values)
+            )
         pairs = [correlation(*pair) for pair in itertools.combinations(of_kind, 2)]
         figures[f"{kind}_correlation_cameras"] = float(np.mean(pairs))
     return figures
@@ -106,7 +118,9 @@ def fly(scenario: Scenario) -> Figures:
     with InProcessMission(scenario, images) as flight:
         while flight.tick < scenario.ticks:
             flight.step()
-    return statistics(np.array(images.errors), scenario.timing.rate_hz / scenario.timing.ticks_per_image)
+    return statistics(
+        np.array(images.errors), scenario.timing.rate_hz / scenario.timing.ticks_per_image
+    )
 
 
 def fly_part(part: str, seeds: range, changes: tuple[str, ...]) -> Figures:
@@ -122,13 +136,17 @@ def main() -> None:
     parser = make_parser(__doc__, SCENARIOS)
     parser.add_argument("--flights", type=int, default=2, help="number of seeds")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override"
+    )
     options = parser.parse_args()
     use_one_thread()
     flights = 1 if options.quick else options.flights
     seeds, changes = range(options.first, options.first + flights), tuple(options.set)
     changes += QUICK if options.quick else ()
-    run_parts(options, {part: (lambda part=part: fly_part(part, seeds, changes)) for part in SCENARIOS})
+    run_parts(
+        options, {part: (lambda part=part: fly_part(part, seeds, changes)) for part in SCENARIOS}
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of simulated missions: ``python benchmarks/simulate.py [--quick] [--json FILE] [--only nominal swarm]``.
+"""Speed of simulated missions: ``python benchmarks/simulate.py [--quick] [--json FILE] [--only
+nominal swarm]``.
 
-``nominal``: ``fault-drill`` without faults, in lock-step and in real time, with statistical perception and with images;
-``swarm``: random seeds. All on one core, with logs in memory; seconds are those of the processor. ``--only instructions``:
-instructions per tick of 4 s in lock-step with statistical perception, without those of the start, which do not depend on the load
-of the machine, by valgrind.
+``nominal``: ``fault-drill`` without faults, in lock-step and in real time, with statistical
+perception and with images; ``swarm``: random seeds. All on one core, with logs in memory; seconds
+are those of the processor. ``--only instructions``: instructions per tick of 4 s in lock-step with
+statistical perception, without those of the start, which do not depend on the load of the machine,
+by valgrind.
 """
 
 from __future__ import annotations
@@ -57,7 +59,9 @@ def swarm(seeds: int) -> Figures:
         "seeds": seeds,
         "seeds_per_core_s": seeds / elapsed_s,
         "simulated_over_processor_time": simulated_s / elapsed_s,
-        **{f"outcome_{name.replace(' ', '_')}": number for name, number in sorted(outcomes.items())},
+        **{
+            f"outcome_{name.replace(' ', '_')}": number for name, number in sorted(outcomes.items())
+        },
     }
 
 
@@ -78,17 +82,26 @@ for duration in sys.argv[2:]:
 
 
 def instructions() -> Figures:
-    """Count the instructions by which a second flight exceeds a shorter one: neither start nor imports count."""
+    """Count the instructions by which a second flight exceeds a shorter one: neither start nor
+    imports count.
+    """
     short, long = (str(ticks / 10.0) for ticks in (_SHORT_TICKS, _SHORT_TICKS + _TICKS))
     return {"instructions_per_tick": (_count(short, long) - _count(short, short)) / _TICKS}
 
 
 def _count(*durations_s: str) -> int:
     """Return the instructions of a process that flies for these durations."""
-    valgrind = ["valgrind", "--tool=cachegrind", "--cache-sim=no", "--cachegrind-out-file=/dev/null"]
+    valgrind = [
+        "valgrind",
+        "--tool=cachegrind",
+        "--cache-sim=no",
+        "--cachegrind-out-file=/dev/null",
+    ]
     command = [*valgrind, sys.executable, "-c", _FLIGHTS, SCENARIO, *durations_s]
     environment = {**os.environ, "PYTHONHASHSEED": "0"}
-    output = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stderr
+    output = subprocess.run(
+        command, check=True, capture_output=True, text=True, env=environment
+    ).stderr
     found = re.search(r"I\s+refs:\s+([0-9,]+)", output)
     if found is None:
         raise RuntimeError(f"valgrind counts no instructions:\n{output}")

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Take-over by the standby controller: ``python benchmarks/standby.py [--flights 5] [--only PART ...] [--quick] [--json FILE]``.
+"""Take-over by the standby controller: ``python benchmarks/standby.py [--flights 5] [--only PART
+...] [--quick] [--json FILE]``.
 
-Flies ``fault-drill`` in real time, all processes as clients of a router. During the final approach the commanding
-controller is killed (``kill``: SIGKILL), stopped for 3 s (``freeze``: SIGSTOP, SIGCONT), or cut off from the router for
-3 s in both directions without closing a connection (``partition``). ``takeover``: wall time from the fault to the sending
-of the standby's first command. ``two_commanding``: commands of an older term that a chaser executed after one of a newer
-term. ``identity``: pairs of lock-step flights, one with the controller killed, whose bodies must move identically.
-Measures wall time: run nothing else beside it.
+Flies ``fault-drill`` in real time, all processes as clients of a router. During the final approach
+the commanding controller is killed (``kill``: SIGKILL), stopped for 3 s (``freeze``: SIGSTOP,
+SIGCONT), or cut off from the router for 3 s in both directions without closing a connection
+(``partition``). ``takeover``: wall time from the fault to the sending of the standby's first
+command. ``two_commanding``: commands of an older term that a chaser executed after one of a newer
+term. ``identity``: pairs of lock-step flights, one with the controller killed, whose bodies must
+move identically. Measures wall time: run nothing else beside it.
 """
 
 from __future__ import annotations
@@ -84,7 +86,9 @@ class Proxy:
 
 @dataclass
 class TakeoverObserver:
-    """Sending time of the first command of each controller (wall clock, ns), and progress of the flight."""
+    """Sending time of the first command of each controller (wall clock, ns), and progress of the
+    flight.
+    """
 
     first_command_ns: dict[str, int] = field(default_factory=dict)
     time_s: float = 0.0
@@ -92,8 +96,12 @@ class TakeoverObserver:
     ended: bool = False
 
     def first_of_another(self, commander: str) -> int | None:
-        """Return when the first command of another controller was sent since ``first_command_ns`` was cleared."""
-        return min((at for name, at in self.first_command_ns.items() if name != commander), default=None)
+        """Return when the first command of another controller was sent since ``first_command_ns``
+        was cleared.
+        """
+        return min(
+            (at for name, at in self.first_command_ns.items() if name != commander), default=None
+        )
 
     def receive(self, raw: RawSample) -> None:
         """Note a message; called on a thread of Zenoh."""
@@ -111,7 +119,9 @@ class TakeoverObserver:
 
 @dataclass(frozen=True)
 class Takeover:
-    """Outcome of one flight. ``takeover_s``: from the fault to the first command of another controller; infinite if none."""
+    """Outcome of one flight. ``takeover_s``: from the fault to the first command of another
+    controller; infinite if none.
+    """
 
     takeover_s: float
     docked: bool
@@ -149,7 +159,14 @@ def fly(fault: InjectedFault, at_s: float) -> Takeover:
     namespace, port = f"standby-{uuid.uuid4().hex[:8]}", free_port()
 
     def network(router_port: int) -> list[str]:
-        endpoint = ["-m", "client", "-e", f"tcp/127.0.0.1:{router_port}", "--lease", str(LEASE_MS / 1000)]
+        endpoint = [
+            "-m",
+            "client",
+            "-e",
+            f"tcp/127.0.0.1:{router_port}",
+            "--lease",
+            str(LEASE_MS / 1000),
+        ]
         return ["--namespace", namespace, *endpoint]
 
     with tempfile.TemporaryDirectory() as name:
@@ -168,7 +185,9 @@ def fly(fault: InjectedFault, at_s: float) -> Takeover:
                 for process, proxy in proxies.items()
             }
             world = ["--mode", "realtime", "--set", "controller.standby=true"]
-            start_mission(fleet, folder, SCENARIO, CHASERS, network(port), world, controllers=controllers)
+            start_mission(
+                fleet, folder, SCENARIO, CHASERS, network(port), world, controllers=controllers
+            )
             for topic in (topics.WRENCH, topics.TICK, topics.END):
                 node.subscribe_raw(topic.key.format(chaser="*"), observer.receive)
             wait(lambda: observer.time_s >= at_s, fleet, 120.0)
@@ -194,7 +213,9 @@ def wait(done: Callable[[], bool], fleet: Fleet, timeout_s: float) -> None:
     while not done():
         time.sleep(0.005)
         if time.monotonic() > deadline or (world.process.poll() is not None and not done()):
-            raise SystemExit(f"the flight does not continue: {[c.last_line() for c in fleet.children]}")
+            raise SystemExit(
+                f"the flight does not continue: {[c.last_line() for c in fleet.children]}"
+            )
 
 
 def evaluate(log: Path, first_command_ns: int | None, fault_ns: int) -> Takeover:
@@ -209,12 +230,16 @@ def evaluate(log: Path, first_command_ns: int | None, fault_ns: int) -> Takeover
     flight = load_flight(log)
     summary = summarize(log)
     return Takeover(
-        takeover_s=(first_command_ns - fault_ns) / 1e9 if first_command_ns is not None else float("inf"),
+        takeover_s=(first_command_ns - fault_ns) / 1e9
+        if first_command_ns is not None
+        else float("inf"),
         docked=all(summary["chasers"][i]["docked"] for i in ("0", "3")),
         collisions=summary["collisions"],
         two_commanding=two_commanding,
         hand_overs=sum(e.what == "hand-over" for e in flight.events),
-        stale_refused=sum(n for reason, n in flight.rejected.items() if reason.endswith("stale term")),
+        stale_refused=sum(
+            n for reason, n in flight.rejected.items() if reason.endswith("stale term")
+        ),
     )
 
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster performance: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART ...]``.
+"""Thruster performance: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART
+...]``.
 
-Parts: ``allocation`` (random wrenches), ``pulses`` (delivered against commanded impulse), ``tracking`` (measurements
-without noise, the paper's rates), ``failures`` (every thruster of tetra12 stuck on, and stuck off, not reported, at 30 s),
-``healthy`` (false alarms). Missions fly in one process with a measurement model in place of images. ``--quick``: fewer
-and shorter.
+Parts: ``allocation`` (random wrenches), ``pulses`` (delivered against commanded impulse),
+``tracking`` (measurements without noise, the paper's rates), ``failures`` (every thruster of
+tetra12 stuck on, and stuck off, not reported, at 30 s), ``healthy`` (false alarms). Missions fly in
+one process with a measurement model in place of images. ``--quick``: fewer and shorter.
 """
 
 from __future__ import annotations
@@ -37,10 +38,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "carrier_15_hz": {"modulation": {"carrier_hz": 15}},
     "schmitt": {"modulation": {"modulator": "schmitt"}},
 }
-"""At 15 Hz: without test burns; one carrier period per tick; a Schmitt trigger instead of pulse-width modulation."""
+"""At 15 Hz: without test burns; one carrier period per tick; a Schmitt trigger instead of
+pulse-width modulation.
+"""
 
 
-def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **changes: Any) -> Scenario:
+def scenario(
+    duration_s: float, body: str = "tetra12", rate_hz: int = 15, **changes: Any
+) -> Scenario:
     """Return a scenario with one chaser a metre from the target, with thrusters by default."""
     chaser = {"body": body, "actuation": "thrusters", **changes.pop("chaser", {})}
     start = {
@@ -91,10 +96,11 @@ def allocation(quick: bool) -> Figures:
 
 
 def pulses(quick: bool) -> Figures:
-    """Measure the largest difference of delivered and commanded impulse over a second of random thrusts, in minimum pulses.
+    """Measure the largest difference of delivered and commanded impulse over a second of random
+    thrusts, in minimum pulses.
 
-    ``less_late``: without what was commanded within a carrier period after its pulse had been sent, which is zero where
-    every tick begins a period.
+    ``less_late``: without what was commanded within a carrier period after its pulse had been sent,
+    which is zero where every tick begins a period.
     """
     out: Figures = {}
     for rate_hz, carrier_hz in ((10, 10), (15, 10), (30, 10), (15, 15)):
@@ -114,9 +120,12 @@ def pulses(quick: bool) -> Figures:
             for p in modulator.pulses(thrusts, full, begin, end):
                 valves.pulse(p.thruster, p.open_ns, p.close_ns)
         # Every second tick-aligned: whole seconds hold whole periods.
-        edges = np.array([timing.effective_ns(k * rate_hz) for k in range(1, ticks // rate_hz)], dtype=float)
+        edges = np.array(
+            [timing.effective_ns(k * rate_hz) for k in range(1, ticks // rate_hz)], dtype=float
+        )
         total = CommandedImpulse(
-            np.array([timing.effective_ns(k) for k in range(ticks + 1)], dtype=float), np.array(commanded)
+            np.array([timing.effective_ns(k) for k in range(ticks + 1)], dtype=float),
+            np.array(commanded),
         )
         off = valves.impulses(edges) - np.diff(total.until(edges), axis=0)
         late = np.diff(total.late(edges, 1e9 / carrier_hz), axis=0)
@@ -136,10 +145,14 @@ class CommandedImpulse:
 
     def until(self, times_ns: Array) -> Array:
         """Return the impulse up to times (M,) ns: (M, n) N s."""
-        return np.array([np.interp(times_ns, self.times_ns, column) for column in self.total_N_s.T]).T
+        return np.array(
+            [np.interp(times_ns, self.times_ns, column) for column in self.total_N_s.T]
+        ).T
 
     def late(self, ends_ns: Array, period_ns: float) -> Array:
-        """Return, per period that ends at times (M,), the impulse less that of the thrust at its begin, (M, n)."""
+        """Return, per period that ends at times (M,), the impulse less that of the thrust at its
+        begin, (M, n).
+        """
         begins = ends_ns - period_ns
         first = self.until(begins + 1e-3 * period_ns) - self.until(begins)
         return self.until(ends_ns) - self.until(begins) - 1e3 * first
@@ -169,28 +182,41 @@ def tracking(quick: bool) -> Figures:
 
 
 def _isolated_s(record: FlightRecord, thruster: int) -> float:
-    """Return the time from a thruster's failure to the closing of its shut-off valve; infinite if never."""
-    times = [c.effective_time_ns / 1e9 - FAILED_AT_S for c in record.commands_of(0) if thruster in c.isolated]
+    """Return the time from a thruster's failure to the closing of its shut-off valve; infinite if
+    never.
+    """
+    times = [
+        c.effective_time_ns / 1e9 - FAILED_AT_S
+        for c in record.commands_of(0)
+        if thruster in c.isolated
+    ]
     return times[0] if times else math.inf
 
 
 def failures(quick: bool) -> Figures:
-    """Let every thruster fail at 30 s, not reported: time to isolation, wrongly isolated thrusters, errors afterwards."""
+    """Let every thruster fail at 30 s, not reported: time to isolation, wrongly isolated thrusters,
+    errors afterwards.
+    """
     out: Figures = {}
     thrusters = (0, 5, 10) if quick else range(12)
     for kind in ("stuck_on", "stuck_off"):
         delays, wrong, peaks, final = [], 0, [], []
         for thruster in thrusters:
             failure = {"chaser": 0, "thruster": thruster, "at_s": FAILED_AT_S, "kind": kind}
-            record = fly(scenario(80.0 if kind == "stuck_off" else 60.0, thruster_failure=[failure]))
+            record = fly(
+                scenario(80.0 if kind == "stuck_off" else 60.0, thruster_failure=[failure])
+            )
             delays.append(_isolated_s(record, thruster))
             wrong += len({j for c in record.commands_of(0) for j in c.isolated} - {thruster})
             late = record.time_s >= FAILED_AT_S
             errors = record.position_error_m[late, 0], record.orientation_error_rad[late, 0]
             peaks.append((float(errors[0].max()), float(errors[1].max())))
             final.append(record.rms(record.time_s[-1] - 10.0)[0])
-            print(f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, peak {peaks[-1][0] * 1e3:.1f} mm, "
-                  f"{math.degrees(peaks[-1][1]):.2f} deg; {record.thruster_events}", file=sys.stderr)  # fmt: skip
+            print(
+                f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, peak {peaks[-1][0] * 1e3:.1f} mm, "
+                f"{math.degrees(peaks[-1][1]):.2f} deg; {record.thruster_events}",
+                file=sys.stderr,
+            )
         out |= {
             f"failures_{kind}_flights": float(len(delays)),
             f"failures_{kind}_isolated": float(np.isfinite(delays).sum()),
@@ -205,7 +231,9 @@ def failures(quick: bool) -> Figures:
 
 
 def healthy(quick: bool) -> Figures:
-    """Count false alarms without failures: random starts, up to three times the paper's rates, noisy measurements, both bodies."""
+    """Count false alarms without failures: random starts, up to three times the paper's rates,
+    noisy measurements, both bodies.
+    """
     alarms, flights = 0, 4 if quick else 20
     for seed in range(flights):
         rng = np.random.default_rng(100 + seed)
@@ -215,7 +243,9 @@ def healthy(quick: bool) -> Figures:
             "start_rotation_rad": rng.uniform(-0.2, 0.2, 3).tolist(),
             "start_velocity_m_s": rng.uniform(-0.02, 0.02, 3).tolist(),
         }
-        target = {key: _randomly_rotated(rng, np.array(v) * times) for key, v in PAPER_RATES.items()}
+        target = {
+            key: _randomly_rotated(rng, np.array(v) * times) for key, v in PAPER_RATES.items()
+        }
         s = scenario(40.0 if quick else 60.0, ("tetra12", "slider")[seed % 2], (15, 10, 30)[seed % 3], start=start,
                      target=target)  # fmt: skip
         record = record_flight(s, measurement_model(s, seed, 0.002, math.radians(0.1)))
@@ -240,7 +270,9 @@ PARTS = {
 
 def main() -> None:
     options = make_parser(__doc__, PARTS).parse_args()
-    run_parts(options, {name: lambda part=part: part(options.quick) for name, part in PARTS.items()})
+    run_parts(
+        options, {name: lambda part=part: part(options.quick) for name, part in PARTS.items()}
+    )
 
 
 if __name__ == "__main__":

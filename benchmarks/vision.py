@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy, range and speed of perception, and both renderers: ``python benchmarks/vision.py [--quick] [--json FILE]
-[--only PART ...]``.
+"""Accuracy, range and speed of perception, and both renderers: ``python benchmarks/vision.py
+[--quick] [--json FILE] [--only PART ...]``.
 
-Parts: ``rendering`` (time and corner errors of the renderers), ``speed`` (image to pose), ``reach`` (share of detected
-views by distance), ``near`` (the body fills the image), ``metre`` (a lit and a shadowed face at 1 m), ``accuracy`` (random
-views of both targets with all effects at default strength, by the default perception and by the paper's), ``far`` (the
-servicer at 5 to 7.5 m: views without a pose, errors, and NEES over the stated covariance; ``--strip PX``: fit borders that
-end at neighbours beside a part of a side as strips below this width, 1.5 by default), ``bearing`` (the servicer at 7 to 200 m, by
-bearing and range). Gross error: more than 10 degrees or
-10 cm (for an ambiguous view: of the solution nearer to the truth).
+Parts: ``rendering`` (time and corner errors of the renderers), ``speed`` (image to pose), ``reach``
+(share of detected views by distance), ``near`` (the body fills the image), ``metre`` (a lit and a
+shadowed face at 1 m), ``accuracy`` (random views of both targets with all effects at default
+strength, by the default perception and by the paper's), ``far`` (the servicer at 5 to 7.5 m: views
+without a pose, errors, and NEES over the stated covariance; ``--strip PX``: fit borders that end at
+neighbours beside a part of a side as strips below this width, 1.5 by default), ``bearing`` (the
+servicer at 7 to 200 m, by bearing and range). Gross error: more than 10 degrees or 10 cm (for an
+ambiguous view: of the solution nearer to the truth).
 """
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_agents.chaser.perception import Method, Perception, PerceptionResult, make_perception
+from chaserdock_agents.chaser.perception import (
+    Method,
+    Perception,
+    PerceptionResult,
+    make_perception,
+)
 from chaserdock_agents.chaser.perception.corners import SETTINGS
 from chaserdock_agents.chaser.sighting import decode_image, look
 from chaserdock_models import rotations
@@ -82,7 +88,10 @@ class Views:
 
     def _complete_markers(self, position: Array, q: Array) -> int:
         """Return the number of markers that face the camera with all corners in the image."""
-        corners = rotations.rotate(q, np.array([m.corners_trf_m() for m in self.model.markers])) + position
+        corners = (
+            rotations.rotate(q, np.array([m.corners_trf_m() for m in self.model.markers]))
+            + position
+        )
         normals = rotations.rotate(q, np.array([m.normal_trf() for m in self.model.markers]))
         px = self.camera.project(corners)
         inside = (px > 2.0) & (px < (self.camera.width_px - 3.0, self.camera.height_px - 3.0))
@@ -93,28 +102,43 @@ class Views:
         return Perception(self.camera, self.model, method)
 
     def random_views(self, count: int, near_m: float, far_m: float, seed: int) -> Iterator[View]:
-        """Yield views at random attitudes, the centre in the middle 40 % of width and height, the sun in a random direction."""
+        """Yield views at random attitudes, the centre in the middle 40 % of width and height, the
+        sun in a random direction.
+        """
         generator = np.random.default_rng(seed)
         size = np.array([self.camera.width_px, self.camera.height_px])
         for _ in range(count):
             z = generator.uniform(near_m, far_m)
             px = generator.uniform(0.3, 0.7, 2) * size
-            ray = (px - (self.camera.cx_px, self.camera.cy_px)) / (self.camera.fx_px, self.camera.fy_px)
+            ray = (px - (self.camera.cx_px, self.camera.cy_px)) / (
+                self.camera.fx_px,
+                self.camera.fy_px,
+            )
             q = rotations.normalize(generator.normal(size=4))
             yield self.view(np.append(ray, 1.0) * z, q, generator.normal(size=3))
 
     def face_views(
-        self, count: int, distance_m: float, tilt_rad: float, lit: bool, seed: int, lateral_m: float = 0.0
+        self,
+        count: int,
+        distance_m: float,
+        tilt_rad: float,
+        lit: bool,
+        seed: int,
+        lateral_m: float = 0.0,
     ) -> Iterator[View]:
-        """Yield views of a face: the body's centre at ``distance_m``, tilt up to ``tilt_rad``, random roll, lateral offset up
-        to ``lateral_m``; the sun behind the camera, or behind the target."""
+        """Yield views of a face: the body's centre at ``distance_m``, tilt up to ``tilt_rad``,
+        random roll, lateral offset up to ``lateral_m``; the sun behind the camera, or behind the
+        target."""
         generator = np.random.default_rng(seed)
         for k in range(count):
             tilt = generator.normal(size=3) * (1.0, 1.0, 0.0)
             tilt *= tilt_rad * generator.uniform() / np.linalg.norm(tilt)
-            turn = rotations.multiply(FACING, rotations.exp([0.0, 0.0, generator.uniform(-np.pi, np.pi)]))
+            turn = rotations.multiply(
+                FACING, rotations.exp([0.0, 0.0, generator.uniform(-np.pi, np.pi)])
+            )
             q = rotations.multiply(
-                rotations.multiply(rotations.exp(tilt), turn), rotations.conjugate(face_rotation(k % 6))
+                rotations.multiply(rotations.exp(tilt), turn),
+                rotations.conjugate(face_rotation(k % 6)),
             )
             sun = np.array([*generator.uniform(-0.5, 0.5, 2), -1.0 if lit else 1.0])
             position = np.array([*generator.uniform(-lateral_m, lateral_m, 2), distance_m])
@@ -164,7 +188,9 @@ class ViewResults:
 
 
 def accuracy(count: int) -> Figures:
-    """Evaluate random views of both targets at 0.5 to 2 m by both methods (the baseline on a tenth of them)."""
+    """Evaluate random views of both targets at 0.5 to 2 m by both methods (the baseline on a tenth
+    of them).
+    """
     out: Figures = {}
     for target in ("servicer", "paper"):
         views = Views(target)
@@ -195,14 +221,17 @@ def at_one_metre(count: int) -> Figures:
 
 
 def reach(count: int) -> Figures:
-    """Return the share of views in which the servicer is detected without gross error: by the gap from lens to face (docking:
-    up to 5 degrees, 1 cm off the axis), and by distance (up to 40 degrees)."""
+    """Return the share of views in which the servicer is detected without gross error: by the gap
+    from lens to face (docking: up to 5 degrees, 1 cm off the axis), and by distance (up to 40
+    degrees)."""
     out: Figures = {}
     views = Views("servicer")
     perception = views.perception()
     half_m = 0.2
 
-    def detected(distance_m: float, tilt_deg: float, lateral_m: float, faces: tuple[int, ...]) -> float:
+    def detected(
+        distance_m: float, tilt_deg: float, lateral_m: float, faces: tuple[int, ...]
+    ) -> float:
         results = ViewResults()
         shown = views.face_views(6 * count, distance_m, np.deg2rad(tilt_deg), True, 6, lateral_m)
         for k, view in enumerate(shown):
@@ -217,7 +246,9 @@ def reach(count: int) -> Figures:
             half_m + gap_m, 5.0, 0.01, (0, 1)
         )
     for distance_m in (2.0, 3.0, 4.0, 4.5):
-        out[f"servicer_detected_at_{distance_m:g}_m_share"] = detected(distance_m, 40.0, 0.2, tuple(range(6)))
+        out[f"servicer_detected_at_{distance_m:g}_m_share"] = detected(
+            distance_m, 40.0, 0.2, tuple(range(6))
+        )
     return out
 
 
@@ -231,7 +262,9 @@ def near_views(count: int) -> Figures:
 
 
 def speed(count: int) -> Figures:
-    """Time image to pose without prediction, with an inexact prediction (tracking), and by the baseline."""
+    """Time image to pose without prediction, with an inexact prediction (tracking), and by the
+    baseline.
+    """
     out: Figures = {}
     for target in ("servicer", "paper"):
         for width, height in ((640, 480), (1280, 720)):
@@ -256,7 +289,9 @@ def speed(count: int) -> Figures:
 
 
 def rendering(count: int) -> Figures:
-    """Time the exact renderer and TinyRenderer (bias removed) at 640 x 480, and the errors of the corners fitted in their images."""
+    """Time the exact renderer and TinyRenderer (bias removed) at 640 x 480, and the errors of the
+    corners fitted in their images.
+    """
     views = Views("servicer", 640, 480)
     renderers = {
         "exact": views.renderer,
@@ -292,16 +327,28 @@ def rendering(count: int) -> Figures:
 
 
 def far(count: int) -> Figures:
-    """Return figures of views of the servicer, in whose images its markers are hardly large enough; of two solutions the nearer."""
+    """Return figures of views of the servicer, in whose images its markers are hardly large enough;
+    of two solutions the nearer.
+    """
     scenario = load_shipped("docking-contact", 'navigation.grade="exact"')
-    cameras, perception, camera = Cameras(scenario), make_perception(scenario), scenario.camera_model()
+    cameras, perception, camera = (
+        Cameras(scenario),
+        make_perception(scenario),
+        scenario.camera_model(),
+    )
     zero, out = np.zeros(3), {}
     for metres in (5.0, 6.0, 6.5, 7.0, 7.5):
         rng, found = np.random.default_rng([24, int(10 * metres)]), []
         for k in range(count):
-            q, turn = rotations.exp(rng.normal(0.0, 0.15, 3)), rotations.exp(rng.normal(0.0, 0.01, 3))
+            q, turn = (
+                rotations.exp(rng.normal(0.0, 0.15, 3)),
+                rotations.exp(rng.normal(0.0, 0.01, 3)),
+            )
             own = np.array([-metres, *rng.normal(0.0, 0.05 * metres, 2)])
-            states = {"target": BodyState(zero, zero, q, zero), "chaser/0": BodyState(own, zero, turn, zero)}
+            states = {
+                "target": BodyState(zero, zero, q, zero),
+                "chaser/0": BodyState(own, zero, turn, zero),
+            }
             seen = perception.estimate(decode_image(cameras.image(0, k, k, 0, states)))
             eye, attitude = camera.irf_pose_in_world(own, turn)
             true_m = rotations.rotate_inverse(attitude, -eye)
@@ -319,22 +366,28 @@ def far(count: int) -> Figures:
             f"{at}without_a_pose": count - len(found),
             f"{at}nees_mean": float(squares.mean()),
             f"{at}depth_rms_m": float(np.sqrt(np.mean(e[:, 2] ** 2))),
-            f"{at}angle_rms_deg": float(np.degrees(np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1))))),
+            f"{at}angle_rms_deg": float(
+                np.degrees(np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1))))
+            ),
         }
     return out
 
 
 def bearing(count: int) -> Figures:
-    """Return figures of the position by bearing and range, by range: random attitude and place in the image, eight suns, among stars.
+    """Return figures of the position by bearing and range, by range: random attitude and place in
+    the image, eight suns, among stars.
 
-    ``nees_bearing_mean``: per degree of freedom, of the two across the line of sight. With the prediction that a flight has;
-    ``alone``: views that are measured without it, too, and ``alone_wrong``: with something else taken for the target. Views with
-    markers do not count.
+    ``nees_bearing_mean``: per degree of freedom, of the two across the line of sight. With the
+    prediction that a flight has; ``alone``: views that are measured without it, too, and
+    ``alone_wrong``: with something else taken for the target. Views with markers do not count.
     """
     suns = np.random.default_rng(24).normal(size=(8, 3)).tolist()
     scenarios = [
         load_shipped(
-            "docking-contact", 'navigation.grade="exact"', "ranging={}", f"camera.sun_direction={sun}"
+            "docking-contact",
+            'navigation.grade="exact"',
+            "ranging={}",
+            f"camera.sun_direction={sun}",
         )
         for sun in suns
     ]
@@ -356,7 +409,10 @@ def bearing(count: int) -> Figures:
                 rotations.normalize(rng.normal(size=4)),
                 np.array([-metres, *rng.uniform(-0.2, 0.2, 2) * metres]),
             )
-            states = {"target": BodyState(zero, zero, q, zero), "chaser/0": BodyState(own, zero, still, zero)}
+            states = {
+                "target": BodyState(zero, zero, q, zero),
+                "chaser/0": BodyState(own, zero, still, zero),
+            }
             eye, attitude = camera.irf_pose_in_world(own, still)
             true_m = rotations.rotate_inverse(attitude, -eye)
             image = lit[k % len(lit)].image(0, k, k, 0, states)
@@ -368,7 +424,9 @@ def bearing(count: int) -> Figures:
             free = look(perception, image, None)
             if free.solutions:
                 alone += 1
-                wrong += np.linalg.norm(np.array(free.solutions[0].position_m) - true_m) > 10.0 * sigma_m
+                wrong += (
+                    np.linalg.norm(np.array(free.solutions[0].position_m) - true_m) > 10.0 * sigma_m
+                )
             if not seen.solutions:
                 missed += 1
                 continue

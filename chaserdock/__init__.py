@@ -6,8 +6,8 @@
 >>> result.summary.success, result.summary.chasers[0].steady.position_mse_m2                 # doctest: +SKIP
 >>> result.log.table("controller/target").to_pandas()                                        # doctest: +SKIP
 
-Errors are ``ChaserdockError`` or a subclass, with the text that the command line prints. Nothing is printed, no signal
-handler is installed; the functions work in notebooks and in threads.
+Errors are ``ChaserdockError`` or a subclass, with the text that the command line prints. Nothing is
+printed, no signal handler is installed; the functions work in notebooks and in threads.
 """
 
 from __future__ import annotations

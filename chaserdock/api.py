@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions of the Python API, which ``import chaserdock`` exports. Heavy imports wait until a function needs them."""
+"""Functions of the Python API, which ``import chaserdock`` exports. Heavy imports wait until a
+function needs them.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ class OverrideError(ChaserdockError):
 
 @dataclass(frozen=True)
 class RunResult:
-    """A flown mission: ``summary`` and the folder ``dir`` with its files; ``summary.success`` is the verdict."""
+    """A flown mission: ``summary`` and the folder ``dir`` with its files; ``summary.success`` is
+    the verdict.
+    """
 
     summary: Summary
     dir: Path
@@ -66,9 +70,9 @@ def run(
         on_event: called in this thread with the objects that ``chaserdock run --json`` prints.
         **changes: scenario values; tables are merged: ``duration_s=20, camera={"width_px": 640}``.
 
-    A mission that fails is a result with ``summary.success == False``. Raises ScenarioError for an invalid scenario or
-    override, RunError when the mission cannot start or leaves no log. An exception, such as KeyboardInterrupt, ends all
-    processes of the mission.
+    A mission that fails is a result with ``summary.success == False``. Raises ScenarioError for an
+    invalid scenario or override, RunError when the mission cannot start or leaves no log. An
+    exception, such as KeyboardInterrupt, ends all processes of the mission.
     """
     from .launch.launcher import RunError, fly_mission
     from .launch.progress import Show, print_json_line
@@ -100,7 +104,9 @@ def open_log(source: StrPath | Sequence[StrPath]) -> Log:
 def load_scenario(
     scenario: StrPath, *, overrides: Mapping[str, object] | None = None, **changes: object
 ) -> Scenario:
-    """Load a scenario file, or a shipped scenario by name, with overrides as in ``run``. Raises ScenarioError."""
+    """Load a scenario file, or a shipped scenario by name, with overrides as in ``run``. Raises
+    ScenarioError.
+    """
     from chaserdock_protocol.scenario import load_scenario as load
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
@@ -114,8 +120,12 @@ def list_scenarios() -> list[str]:
     return shipped_names()
 
 
-def override_texts(overrides: Mapping[str, object] | None, changes: Mapping[str, object]) -> tuple[str, ...]:
-    """Return overrides as ``key.path=VALUE`` in TOML's notation, nested tables flattened. Raises OverrideError."""
+def override_texts(
+    overrides: Mapping[str, object] | None, changes: Mapping[str, object]
+) -> tuple[str, ...]:
+    """Return overrides as ``key.path=VALUE`` in TOML's notation, nested tables flattened. Raises
+    OverrideError.
+    """
     texts: list[str] = []
     for key, value in [*_flatten("", changes), *_flatten("", overrides or {})]:
         try:

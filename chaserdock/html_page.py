@@ -30,7 +30,8 @@ def html_page(title: str, body: Iterable[str], script: str = "") -> str:
 def table(head: Iterable[str], rows: Iterable[Iterable[str]], text: bool = False) -> str:
     """Return a table as HTML; the first cell of each row is its header.
 
-    Cells are plain text or ``Markup``. ``text``: the other columns are text, which is left-aligned, instead of numbers.
+    Cells are plain text or ``Markup``. ``text``: the other columns are text, which is left-aligned,
+    instead of numbers.
     """
     kind = ' class="text"' if text else ""
     top = "".join(f'<th scope="col"{kind}>{_html(cell)}</th>' for cell in head)
@@ -38,9 +39,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]], text: bool = False
     for first, *rest in rows:
         cells = "".join(f"<td{kind}>{_html(cell)}</td>" for cell in rest)
         lines.append(f'<tr><th scope="row">{_html(first)}</th>{cells}</tr>')
-    return (
-        f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
-    )
+    return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
 
 
 def _html(cell: str) -> str:

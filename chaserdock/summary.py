@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a flight as typed values; docs/summary.md describes the fields. SI units and radians."""
+"""The summary of a flight as typed values; docs/summary.md describes the fields. SI units and
+radians.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,9 @@ class SteadyErrors(Struct, frozen=True, kw_only=True):
 
 
 class PortLoadPeaks(Struct, frozen=True, kw_only=True):
-    """Largest loads at a chaser's port, over all physics steps; ``closing_impulse_N_s``: largest in a tick, where a latch
-    closed. ``limit_exceeded_s``: end of the first tick with a load beyond the port's limits, or None."""
+    """Largest loads at a chaser's port, over all physics steps; ``closing_impulse_N_s``: largest in
+    a tick, where a latch closed. ``limit_exceeded_s``: end of the first tick with a load beyond the
+    port's limits, or None."""
 
     peak_force_N: float
     peak_torque_N_m: float
@@ -46,8 +49,8 @@ class Capture(Struct, frozen=True, kw_only=True):
 
 
 class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
-    """Smallest margin of the coasts after a loss of thrust, when it occurred, the closest approach of that coast, and the share
-    of the plans that were safe."""
+    """Smallest margin of the coasts after a loss of thrust, when it occurred, the closest approach
+    of that coast, and the share of the plans that were safe."""
 
     min_margin_sigmas: float
     min_margin_time_s: float
@@ -56,8 +59,9 @@ class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
 
 
 class RendezvousFigures(Struct, frozen=True, kw_only=True):
-    """What the criteria of a published task judge: least margin to the speed limit, largest angle from the cone's axis, arrival, and
-    the first abort with the least half edge of a cube about the target that the chaser touched since. None: no such part."""
+    """What the criteria of a published task judge: least margin to the speed limit, largest angle
+    from the cone's axis, arrival, and the first abort with the least half edge of a cube about the
+    target that the chaser touched since. None: no such part."""
 
     speed_margin_m_s: float | None
     cone_angle_rad: float | None
@@ -68,7 +72,9 @@ class RendezvousFigures(Struct, frozen=True, kw_only=True):
 
 
 class PoseEstimateErrors(Struct, frozen=True, kw_only=True):
-    """Errors of an estimated pose after the settling time, and the mean NEES (6 expected); None without an estimate there."""
+    """Errors of an estimated pose after the settling time, and the mean NEES (6 expected); None
+    without an estimate there.
+    """
 
     position_rms_m: float | None
     orientation_rms_rad: float | None
@@ -104,7 +110,9 @@ class TargetEstimateErrors(PoseEstimateErrors, frozen=True, kw_only=True):
 
 
 class StackRest(Struct, frozen=True, kw_only=True):
-    """Rates at the end of the target with the chasers latched to it, and since when they are within ``success.detumbled``."""
+    """Rates at the end of the target with the chasers latched to it, and since when they are within
+    ``success.detumbled``.
+    """
 
     speed_m_s: float
     rate_rad_s: float
@@ -128,7 +136,9 @@ class SolveTimes(Struct, frozen=True, kw_only=True):
 
 
 class Solver(Struct, frozen=True, kw_only=True):
-    """The NMPC solver: its name, solve times, failures, and plans with a relaxed keep-out constraint."""
+    """The NMPC solver: its name, solve times, failures, and plans with a relaxed keep-out
+    constraint.
+    """
 
     name: str
     solve_s: SolveTimes
@@ -151,7 +161,9 @@ class MessageCount(Struct, frozen=True, kw_only=True):
 
 
 class PlumeSummary(Struct, frozen=True, kw_only=True):
-    """What the plumes of thrusters gave a body: sums of the magnitudes of the impulses per tick, and the largest force."""
+    """What the plumes of thrusters gave a body: sums of the magnitudes of the impulses per tick,
+    and the largest force.
+    """
 
     impulse_N_s: float
     angular_impulse_N_m_s: float

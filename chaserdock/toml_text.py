@@ -11,7 +11,9 @@ from typing import Any
 
 
 def toml_value(value: Any) -> str:
-    """Return a number, string, boolean, path, array or inline table. Raise TypeError for another type."""
+    """Return a number, string, boolean, path, array or inline table. Raise TypeError for another
+    type.
+    """
     match value:
         case bool():
             return str(value).lower()
@@ -22,7 +24,9 @@ def toml_value(value: Any) -> str:
         case Real():
             return repr(float(value))
         case Mapping():
-            items = (f"{json.dumps(k, ensure_ascii=False)} = {toml_value(v)}" for k, v in value.items())
+            items = (
+                f"{json.dumps(k, ensure_ascii=False)} = {toml_value(v)}" for k, v in value.items()
+            )
             return "{" + ", ".join(items) + "}"
         case list() | tuple():
             return "[" + ", ".join(map(toml_value, value)) + "]"
@@ -30,7 +34,9 @@ def toml_value(value: Any) -> str:
 
 
 def toml_document(values: Mapping[str, Any]) -> str:
-    """Return the text of a file with these keys. A table may be empty. Raise TypeError as ``toml_value``."""
+    """Return the text of a file with these keys. A table may be empty. Raise TypeError as
+    ``toml_value``.
+    """
     return "\n".join(_table(values, ())).lstrip("\n") + "\n"
 
 

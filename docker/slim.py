@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Removes what no process of a mission loads from the installed packages. Runs in the image layer that installs them.
+"""Removes what no process of a mission loads from the installed packages. Runs in the image layer
+that installs them.
 
-Removed: PyBullet's models and examples, its OpenGL renderer, pyarrow's Flight and S3, MuJoCo's plugins, test suites, compiler headers
-and static libraries, and the symbols and debug information of shared libraries (150 MB, most of them PyBullet's). Identical files
-(wheels cannot contain symbolic links, so libraries are stored under each of their names) become hard links.
+Removed: PyBullet's models and examples, its OpenGL renderer, pyarrow's Flight and S3, MuJoCo's
+plugins, test suites, compiler headers and static libraries, and the symbols and debug information
+of shared libraries (150 MB, most of them PyBullet's). Identical files (wheels cannot contain
+symbolic links, so libraries are stored under each of their names) become hard links.
 tests/chaserdock/test_compose.py limits the size of the image and flies a mission in it.
 """
 
@@ -48,9 +50,11 @@ def remove() -> None:
 
 
 def without_symbols(library: bytes) -> bytes:
-    """Return a shared library (64-bit ELF) without what the loader does not map: symbols, debug information, section table.
+    """Return a shared library (64-bit ELF) without what the loader does not map: symbols, debug
+    information, section table.
 
-    Everything up to the end of the last segment stays in place, so that also libraries that were edited after linking load.
+    Everything up to the end of the last segment stays in place, so that also libraries that were
+    edited after linking load.
     """
     if library[:6] != b"\x7fELF\x02\x01":
         return library

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Generate docs/api.md from the docstrings of the public Python API: ``python docs/make_api.py``.
 
-``--print`` prints it instead. tests/chaserdock/test_docs.py compares the committed file with the output.
+``--print`` prints it instead. tests/chaserdock/test_docs.py compares the committed file with the
+output.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ result.log.table("controller/target").column_names
 
 
 def _documented(text: str | None) -> str:
-    """Return a docstring as Markdown: names in two backticks become code in one, doctests become blocks."""
+    """Return a docstring as Markdown: names in two backticks become code in one, doctests become
+    blocks.
+    """
     lines, out, inside = inspect.cleandoc(text or "").splitlines(), [], False
     for line in lines:
         example = line.startswith((">>> ", "... "))
@@ -42,7 +45,9 @@ def _documented(text: str | None) -> str:
             inside = example
         out.append(line.removeprefix(">>> ").partition("  #")[0].rstrip() if example else line)
     whole = re.sub(r"``(.+?)``", r"`\1`", "\n".join([*out, "```"] if inside else out))
-    return re.sub(r"^    (\**\w+): ", r"- `\1`: ", whole.replace("Args:\n", "Arguments:\n\n"), flags=re.M)
+    return re.sub(
+        r"^    (\**\w+): ", r"- `\1`: ", whole.replace("Args:\n", "Arguments:\n\n"), flags=re.M
+    )
 
 
 def _parameter(parameter: inspect.Parameter) -> str:
@@ -63,7 +68,9 @@ def _signature(name: str, function: Any) -> str:
     line = f"{name}({', '.join(parameters)}) -> {signature.return_annotation}"
     if len(line) <= 100:
         return line
-    return "\n".join([f"{name}(", *(f"    {p}," for p in parameters), f") -> {signature.return_annotation}"])
+    return "\n".join(
+        [f"{name}(", *(f"    {p}," for p in parameters), f") -> {signature.return_annotation}"]
+    )
 
 
 def _code(text: str) -> str:

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders the images of docs/cameras.md: ``python docs/make_camera_images.py [FOLDER]`` (default: docs/images).
+"""Renders the images of docs/cameras.md: ``python docs/make_camera_images.py [FOLDER]`` (default:
+docs/images).
 
-One image for each effect and target: the view of chaser 0 of ``harsh-light`` at its start, with one setting changed.
+One image for each effect and target: the view of chaser 0 of ``harsh-light`` at its start, with one
+setting changed.
 """
 
 from __future__ import annotations
@@ -57,7 +59,9 @@ IMAGES: dict[str, tuple[str, ...]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "docs" / "images", metavar="FOLDER")
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=ROOT / "docs" / "images", metavar="FOLDER"
+    )
     folder: Path = parser.parse_args().folder
     for name, changes in IMAGES.items():
         base = () if name == "camera-harsh-light" else WITHOUT_EFFECTS

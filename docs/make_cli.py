@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Generate docs/cli.md from the program: ``python docs/make_cli.py``.
 
-``--print`` prints it instead. tests/chaserdock/test_cli.py compares the committed file with the output.
+``--print`` prints it instead. tests/chaserdock/test_cli.py compares the committed file with the
+output.
 """
 
 from __future__ import annotations
@@ -109,7 +110,9 @@ def fields(kind: type[msgspec.Struct]) -> list[str]:
     assert isinstance(shape, msgspec.inspect.StructType)
     rows = ["| field | type |", "| --- | --- |"]
     for field in shape.fields:
-        words = "object" if isinstance(field.type, msgspec.inspect.DictType) else describe(field.type)
+        words = (
+            "object" if isinstance(field.type, msgspec.inspect.DictType) else describe(field.type)
+        )
         rows.append(f"| `{field.encode_name}` | {words} |")
     return [*rows, ""]
 
@@ -135,7 +138,9 @@ def parameters(command: Any) -> list[str]:
         else:
             name = ", ".join(f"`{o}`" for o in (*p.opts, *p.secondary_opts))
         choices = p.type_descriptor.choices
-        words = (f"one of {', '.join(f'`{c.value}`' for c in choices)}; " if choices else "") + (p.help or "")
+        words = (f"one of {', '.join(f'`{c.value}`' for c in choices)}; " if choices else "") + (
+            p.help or ""
+        )
         words = words.replace("|", "\\|").replace("\n", " ")
         default = p.default
         shown = (
@@ -159,10 +164,18 @@ def page() -> str:
     for panel, members in panels_of(get_command(app)).items():
         parts += [f"## {panel}", ""]
         for name, member in members.items():
-            listed = commands(member, (name,)) if isinstance(member, GroupedHelp) else [((name,), member)]
+            listed = (
+                commands(member, (name,))
+                if isinstance(member, GroupedHelp)
+                else [((name,), member)]
+            )
             for path, command in listed:
                 parts += [f"### {' '.join(path)}", synopsis(path, command), ""]
-                parts += [" ".join(inspect.cleandoc(command.help or "").split()), "", *parameters(command)]
+                parts += [
+                    " ".join(inspect.cleandoc(command.help or "").split()),
+                    "",
+                    *parameters(command),
+                ]
     return "\n".join(parts).rstrip() + "\n"
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/phases.md from the transition table of guidance: ``python docs/make_phases.py``; ``--print`` prints it."""
+"""Writes docs/phases.md from the transition table of guidance: ``python docs/make_phases.py``;
+``--print`` prints it.
+"""
 
 from __future__ import annotations
 

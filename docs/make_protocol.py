@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generate docs/protocol.md from the message types and the topics table: ``python docs/make_protocol.py``.
+"""Generate docs/protocol.md from the message types and the topics table: ``python
+docs/make_protocol.py``.
 
 ``--print`` prints it instead. tests/protocol/test_protocol_page.py checks the committed file.
 """
@@ -36,7 +37,12 @@ _QUERIES = (
 )
 """Key, request and reply of each query."""
 _WITHOUT_HEAD = sorted(
-    {f"`{kind.__name__}`" for _, *pair in _QUERIES for kind in pair if not issubclass(kind, messages.Message)}
+    {
+        f"`{kind.__name__}`"
+        for _, *pair in _QUERIES
+        for kind in pair
+        if not issubclass(kind, messages.Message)
+    }
 )
 
 INTRODUCTION = f"""# The protocol
@@ -181,7 +187,9 @@ def describe(kind: shapes.Type) -> str:
 def _describe_tuple(kind: shapes.TupleType | shapes.VarTupleType) -> str:
     if isinstance(kind, shapes.TupleType):
         items = [describe(item) for item in kind.item_types]
-        return f"{len(items)} of {items[0]}" if len(set(items)) == 1 else f"list of {', '.join(items)}"
+        return (
+            f"{len(items)} of {items[0]}" if len(set(items)) == 1 else f"list of {', '.join(items)}"
+        )
     least, most = kind.min_length or 0, kind.max_length
     if least == most:
         return f"{most} of {describe(kind.item_type)}"
@@ -231,13 +239,17 @@ def fields_of(kind: type[Struct]) -> list[str]:
     """Return a table of a type's own fields; the three that all messages have are described once."""
     shape = shapes.type_info(kind)
     assert isinstance(shape, shapes.StructType)
-    common = set(messages.Message.__struct_fields__) if issubclass(kind, messages.Message) else set()
+    common = (
+        set(messages.Message.__struct_fields__) if issubclass(kind, messages.Message) else set()
+    )
     own = [field for field in shape.fields if kind is messages.Message or field.name not in common]
     if not own:
         return ["No fields of its own.", ""]
     rows = ["| field | type | default |", "| --- | --- | --- |"]
     for field in own:
-        plain = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        plain = (
+            field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        )
         default = "" if field.required else f"`{msgspec.json.encode(plain).decode()}`"
         rows.append(f"| `{field.name}` | {describe(field.type)} | {default} |")
     return [*rows, ""]
@@ -273,7 +285,10 @@ def page() -> str:
     parts = [INTRODUCTION, "## Topics", *topic_table(), ""]
     parts += ["Queries: request, answer.", "", "| key | request | answer |", "| --- | --- | --- |"]
     for key, asked, answered in _QUERIES:
-        names = [f"[{k.__name__}](#{k.__name__.lower()}) v{messages.VERSION[k]}" for k in (asked, answered)]
+        names = [
+            f"[{k.__name__}](#{k.__name__.lower()}) v{messages.VERSION[k]}"
+            for k in (asked, answered)
+        ]
         parts.append(f"| `{key}` | {' | '.join(names)} |")
     overview = inspect.cleandoc(messages.__doc__ or "")
     common = overview[overview.index("Common fields") :]

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/scenario.md and scenarios/scenario.schema.json from the schema: ``python docs/make_scenario.py``.
+"""Write docs/scenario.md and scenarios/scenario.schema.json from the schema: ``python
+docs/make_scenario.py``.
 
-``--print`` prints the page, ``--print-schema`` the JSON schema instead. tests/protocol/test_scenario_page.py compares them.
+``--print`` prints the page, ``--print-schema`` the JSON schema instead.
+tests/protocol/test_scenario_page.py compares them.
 """
 
 from __future__ import annotations
@@ -139,10 +141,15 @@ def sections(path: str, node: SchemaNode, root: SchemaNode) -> list[str]:
     title = "Top level" if not path else f"`[{path}]`"
     summary = re.sub(r"``(.+?)``", r"`\1`", " ".join(node["description"].split()))
     out = [f"## {title}", "", summary, ""]
-    out += ["| key | type | unit | default | range | description |", "| --- | --- | --- | --- | --- | --- |"]
+    out += [
+        "| key | type | unit | default | range | description |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     entries = [(key, entry, resolved(entry, root)) for key, entry in node["properties"].items()]
     # As in a file: values before tables.
-    for key, entry, inner in sorted(entries, key=lambda e: type_of(e[2], root).endswith(("table", "tables"))):
+    for key, entry, inner in sorted(
+        entries, key=lambda e: type_of(e[2], root).endswith(("table", "tables"))
+    ):
         words = (type_of(inner, root), unit_of(key), default_of(entry, key in required, inner))
         item = resolved(item_of(inner) or {}, root) if inner.get("type") == "array" else inner
         cells = [f"`{key}`", *words, range_of(inner, root), description_of(entry, root)]

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build the documentation as a self-contained site: ``python docs/make_site.py [OUT]`` (default: ``site/``).
+"""Build the documentation as a self-contained site: ``python docs/make_site.py [OUT]`` (default:
+``site/``).
 
-Needs the packages of requirements-dev.txt. The pages are written for GitHub. Here their mathematics becomes MathML, and files outside
-docs/ that they link to become pages, so that every link is checked; notebooks are shown with their stored outputs. A warning is an
-error. Every page names the version. ``--releases`` adds the documentation of each tag vX.Y.Z in a folder of that name, each built by
-its own make_site.py, and the page ``versions.html``, to which the first page links. Searching needs a server:
-``python -m http.server -d site``.
+Needs the packages of requirements-dev.txt. The pages are written for GitHub. Here their mathematics
+becomes MathML, and files outside docs/ that they link to become pages, so that every link is
+checked; notebooks are shown with their stored outputs. A warning is an error. Every page names the
+version. ``--releases`` adds the documentation of each tag vX.Y.Z in a folder of that name, each
+built by its own make_site.py, and the page ``versions.html``, to which the first page links.
+Searching needs a server: ``python -m http.server -d site``.
 """
 
 from __future__ import annotations
@@ -64,7 +66,9 @@ def _inline(text: str) -> str:
 
 
 def notebook_page(file: Path, images: Path) -> str:
-    """Return a notebook with its stored outputs as Markdown; its figures are written into the folder ``images``."""
+    """Return a notebook with its stored outputs as Markdown; its figures are written into the
+    folder ``images``.
+    """
     parts = []
     for number, cell in enumerate(json.loads(file.read_text(encoding="utf-8"))["cells"]):
         source = "".join(cell["source"]).rstrip()
@@ -86,7 +90,9 @@ def notebook_page(file: Path, images: Path) -> str:
 
 
 class Stage:
-    """The pages of the site, collected in ``folder``; ``add`` copies a page with everything it links to."""
+    """The pages of the site, collected in ``folder``; ``add`` copies a page with everything it
+    links to.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -100,7 +106,9 @@ class Stage:
         return place if file.suffix == ".md" else f"{place}.md"
 
     def add(self, file: Path) -> None:
-        """Add a page or image; a source file becomes a page that shows it. Raises SiteError for a broken link."""
+        """Add a page or image; a source file becomes a page that shows it. Raises SiteError for a
+        broken link.
+        """
         if file in self._staged:
             return
         self._staged.add(file)
@@ -116,7 +124,8 @@ class Stage:
             code = file.read_text(encoding="utf-8").rstrip()
             language = _LANGUAGES.get(file.suffix, "text")
             place.write_text(
-                f"# {file.relative_to(ROOT).as_posix()}\n\n````{language}\n{code}\n````\n", encoding="utf-8"
+                f"# {file.relative_to(ROOT).as_posix()}\n\n````{language}\n{code}\n````\n",
+                encoding="utf-8",
             )
         else:
             shutil.copyfile(file, place)
@@ -130,7 +139,9 @@ class Stage:
             file = (page.parent / found[2]).resolve()
             file = file / "README.md" if file.is_dir() else file
             if not (file.is_file() and file.is_relative_to(ROOT)):
-                raise SiteError(f"{page.relative_to(ROOT)}: {found[2]}: no such file in the repository")
+                raise SiteError(
+                    f"{page.relative_to(ROOT)}: {found[2]}: no such file in the repository"
+                )
             self.add(file)
             return f"{found[1]}{posixpath.relpath(self.place_of(file), here or '.')}{found[3]}"
 
@@ -174,7 +185,9 @@ def version() -> str:
 
 
 def build_releases(out: Path) -> list[str]:
-    """Build the documentation of each release into a folder of ``out``, newest first; return their tags. Raises SiteError."""
+    """Build the documentation of each release into a folder of ``out``, newest first; return their
+    tags. Raises SiteError.
+    """
     listed = subprocess.run(
         ["git", "tag", "--list", "v[0-9]*.[0-9]*.[0-9]*", "--sort=-v:refname"],
         cwd=ROOT, capture_output=True, text=True, check=False,
@@ -189,7 +202,9 @@ def build_releases(out: Path) -> list[str]:
                 [sys.executable, f"{name}/tree/docs/make_site.py", str(out / tag)],
                 ["git", "worktree", "remove", "--force", f"{name}/tree"],
             ):
-                done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+                done = subprocess.run(
+                    command, cwd=ROOT, capture_output=True, text=True, check=False
+                )
                 if done.returncode != 0:
                     raise SiteError(f"{tag}: {' '.join(command)}: {done.stdout}{done.stderr}")
     items = "".join(f'<li><a href="{tag}/index.html">{tag}</a></li>' for tag in tags)
@@ -209,7 +224,9 @@ def build_releases(out: Path) -> list[str]:
 
 
 def build(out: Path) -> None:
-    """Build the site into ``out``, which is replaced. Raises SiteError with the output of the site generator."""
+    """Build the site into ``out``, which is replaced. Raises SiteError with the output of the site
+    generator.
+    """
     with tempfile.TemporaryDirectory(prefix="chaserdock-docs-") as name:
         work = Path(name)
         stage = Stage(work / "pages")

@@ -8,10 +8,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 
-def run(description: str | None, path: Path, page: Callable[[], str], **others: Callable[[], str]) -> None:
-    """Write ``page()`` to ``path``. With ``--print`` print it; with ``--print-NAME`` print what ``others[NAME]`` returns."""
+def run(
+    description: str | None, path: Path, page: Callable[[], str], **others: Callable[[], str]
+) -> None:
+    """Write ``page()`` to ``path``. With ``--print`` print it; with ``--print-NAME`` print what
+    ``others[NAME]`` returns.
+    """
     parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument(
@@ -19,7 +25,11 @@ def run(description: str | None, path: Path, page: Callable[[], str], **others: 
     )
     for name, text in others.items():
         choice.add_argument(
-            f"--print-{name}", dest="text", action="store_const", const=text, help=f"print the {name}"
+            f"--print-{name}",
+            dest="text",
+            action="store_const",
+            const=text,
+            help=f"print the {name}",
         )
     text = parser.parse_args().text
     if text is None:

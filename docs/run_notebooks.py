@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Execute the notebooks of examples/ and store their outputs: ``python docs/run_notebooks.py [NAME ...]`` (default: all).
+"""Execute the notebooks of examples/ and store their outputs: ``python docs/run_notebooks.py [NAME
+...]`` (default: all).
 
-Each runs in a new folder, from which ``../tests`` is that of the clone. Needs the packages of requirements-dev.txt.
+Each runs in a new folder, from which ``../tests`` is that of the clone. Needs the packages of
+requirements-dev.txt.
 """
 
 from __future__ import annotations
@@ -25,9 +27,13 @@ TIMEOUT_S = 600
 
 
 def executed(path: Path, folder: Path) -> Any:
-    """Return the notebook with the outputs of an execution in ``folder``. Raises CellExecutionError."""
+    """Return the notebook with the outputs of an execution in ``folder``. Raises
+    CellExecutionError.
+    """
     notebook = nbformat.read(path, as_version=4)
-    client = NotebookClient(notebook, timeout=TIMEOUT_S, resources={"metadata": {"path": str(folder)}})
+    client = NotebookClient(
+        notebook, timeout=TIMEOUT_S, resources={"metadata": {"path": str(folder)}}
+    )
     # Cells call ``!chaserdock``: the command of this environment, also where it is not activated.
     path_variable = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     client.execute(env=os.environ | {"PATH": path_variable})
@@ -35,7 +41,9 @@ def executed(path: Path, folder: Path) -> Any:
 
 
 def without_traces(notebook: Any, folder: Path) -> Any:
-    """Remove what differs between machines and executions, such as the name of ``folder``, from a notebook; return it."""
+    """Remove what differs between machines and executions, such as the name of ``folder``, from a
+    notebook; return it.
+    """
     notebook.metadata = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},

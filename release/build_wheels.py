@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build what a package index receives, and inspect it: ``python release/build_wheels.py [--out dist]``.
+"""Build what a package index receives, and inspect it: ``python release/build_wheels.py [--out
+dist]``.
 
-Makes the sdist, and from the sdist one wheel for each kind of machine, all cross-compiled with zig on this one. Needs Python
-3.11 or later and pip; the tools (release/requirements.txt) are installed into a temporary environment. Fails if an index would
-reject a file, or if a file lacks a part: exact list of kernels, machine and oldest system of each, platform tag, version.
+Makes the sdist, and from the sdist one wheel for each kind of machine, all cross-compiled with zig
+on this one. Needs Python 3.11 or later and pip; the tools (release/requirements.txt) are installed
+into a temporary environment. Fails if an index would reject a file, or if a file lacks a part:
+exact list of kernels, machine and oldest system of each, platform tag, version.
 """
 
 from __future__ import annotations
@@ -35,7 +37,11 @@ KERNELS = {
     "chaserdock_world/physics/native/kernels.so",
 }
 # Files that a mission needs beside modules.
-DATA = ("chaserdock/shipped/single.toml", "chaserdock/py.typed", "chaserdock_models/native/kernels.c")
+DATA = (
+    "chaserdock/shipped/single.toml",
+    "chaserdock/py.typed",
+    "chaserdock_models/native/kernels.c",
+)
 _WHEEL = re.compile(r"chaserdock-(?P<version>[^-]+)-py3-none-(?P<platform>[a-z0-9_]+)\.whl")
 _AUDITED = re.compile(r'following platform tag:\s+"([a-z0-9_]+)"')
 
@@ -46,7 +52,9 @@ class ReleaseError(Exception):
 
 @dataclass(frozen=True)
 class MachO:
-    """What a macOS library states of itself: its processor, its oldest system, the libraries it needs, its signature."""
+    """What a macOS library states of itself: its processor, its oldest system, the libraries it
+    needs, its signature.
+    """
 
     arm64: bool
     oldest_macos: tuple[int, int]
@@ -55,7 +63,9 @@ class MachO:
 
 
 def read_macho(content: bytes) -> MachO:
-    """Read the header and load commands of a 64-bit Mach-O file (Apple's mach-o/loader.h). Raises ReleaseError."""
+    """Read the header and load commands of a 64-bit Mach-O file (Apple's mach-o/loader.h). Raises
+    ReleaseError.
+    """
     if len(content) < 32 or content[:4] != b"\xcf\xfa\xed\xfe":
         raise ReleaseError("not a 64-bit Mach-O file")
     _, processor, _, _, commands, _, _, _ = struct.unpack_from("<8I", content)
@@ -91,7 +101,8 @@ def check_wheel(wheel: Path, expected: str) -> str:
     if named is None:
         raise ReleaseError(f"{wheel.name}: not named as a wheel of chaserdock for any Python 3")
     platform = named["platform"]
-    # The platforms that the Python Package Index accepts (warehouse, forklift/legacy.py), of those built here.
+    # The platforms that the Python Package Index accepts (warehouse, forklift/legacy.py), of those
+    # built here.
     if not re.fullmatch(r"manylinux_2_\d+_(x86_64|aarch64)|macosx_1[1-9]_0_arm64", platform):
         raise ReleaseError(f"{wheel.name}: an index does not accept the platform {platform}")
     with zipfile.ZipFile(wheel) as archive:
@@ -99,7 +110,9 @@ def check_wheel(wheel: Path, expected: str) -> str:
         libraries = {name for name in names if name.endswith((".so", ".dylib"))}
         missing = [name for name in DATA if name not in names]
         if libraries != KERNELS or missing or len(names) != len(set(names)):
-            raise ReleaseError(f"{wheel.name}: libraries {sorted(libraries)}, missing files {missing}")
+            raise ReleaseError(
+                f"{wheel.name}: libraries {sorted(libraries)}, missing files {missing}"
+            )
         metadata = archive.read(f"chaserdock-{named['version']}.dist-info/METADATA").decode()
         if f"\nVersion: {expected}\n" not in metadata:
             raise ReleaseError(f"{wheel.name}: not version {expected}")
@@ -113,7 +126,9 @@ def check_wheel(wheel: Path, expected: str) -> str:
 
 
 def check_release_version(found: str, root: Path = ROOT) -> None:
-    """Raise ReleaseError if a release has another version than CITATION.cff; a development version needs no entry."""
+    """Raise ReleaseError if a release has another version than CITATION.cff; a development version
+    needs no entry.
+    """
     if re.fullmatch(r"\d+\.\d+\.\d+", found) and found != cited(root):
         raise ReleaseError(f"the tag says {found}, CITATION.cff {cited(root)}")
 
@@ -142,23 +157,32 @@ class Tools:
         return done.stdout
 
     def build(self, tree: Path, out: Path, kind: str, **environment: str) -> Path:
-        """Build ``kind`` (``sdist`` or ``wheel``) of a source tree into ``out`` and return the new file."""
+        """Build ``kind`` (``sdist`` or ``wheel``) of a source tree into ``out`` and return the new
+        file.
+        """
         before = set(out.iterdir())
         self.run("hatchling", "build", "-t", kind, "-d", str(out), cwd=tree, **environment)
         (made,) = set(out.iterdir()) - before
         return made
 
     def audit(self, wheel: Path, platform: str) -> None:
-        """Raise ReleaseError unless auditwheel finds that a Linux wheel keeps what its platform tag promises."""
-        # The kernels for AVX2 are chosen at run time: they do not raise the processor that a wheel needs.
-        said = self.run("auditwheel", "show", "--disable-isa-ext-check", str(wheel), cwd=wheel.parent)
+        """Raise ReleaseError unless auditwheel finds that a Linux wheel keeps what its platform tag
+        promises.
+        """
+        # The kernels for AVX2 are chosen at run time: they do not raise the processor that a wheel
+        # needs.
+        said = self.run(
+            "auditwheel", "show", "--disable-isa-ext-check", str(wheel), cwd=wheel.parent
+        )
         found = _AUDITED.search(said)
         if found is None or not fits(found[1], platform):
             raise ReleaseError(f"{wheel.name}: auditwheel finds:\n{said}")
 
 
 def fits(audited: str, platform: str) -> bool:
-    """Return whether a wheel that runs on the platform ``audited`` may claim ``platform``, which must not be older."""
+    """Return whether a wheel that runs on the platform ``audited`` may claim ``platform``, which
+    must not be older.
+    """
 
     def parts(tag: str) -> tuple[int, str] | None:
         found = re.fullmatch(r"manylinux_2_(\d+)_(\w+)", tag)
@@ -195,7 +219,10 @@ def main() -> int:
     out: Path = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
-        print(f"build_wheels: {out} is not empty; everything in it would be published", file=sys.stderr)
+        print(
+            f"build_wheels: {out} is not empty; everything in it would be published",
+            file=sys.stderr,
+        )
         return 2
     try:
         for file in build(out.resolve()):

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The version of this source tree: ``python release/version.py`` prints it. Building the package asks ``version``.
+"""The version of this source tree: ``python release/version.py`` prints it. Building the package
+asks ``version``.
 
-It is, in this order: the environment variable CHASERDOCK_VERSION (for builds without git, as in a container); what git says; what
-``git archive`` wrote into .git_archival.txt; the version of CITATION.cff with the suffix ``+nogit``. In an sdist the build
-backend takes it from PKG-INFO and does not ask here. A release is a commit with the tag vX.Y.Z.
+It is, in this order: the environment variable CHASERDOCK_VERSION (for builds without git, as in a
+container); what git says; what ``git archive`` wrote into .git_archival.txt; the version of
+CITATION.cff with the suffix ``+nogit``. In an sdist the build backend takes it from PKG-INFO and
+does not ask here. A release is a commit with the tag vX.Y.Z.
 """
 
 from __future__ import annotations
@@ -19,9 +21,11 @@ _TAGS = ("--tags", "--match", "v[0-9]*")
 
 
 def from_description(text: str) -> str | None:
-    """Return the version (PEP 440) that the output of ``git describe`` stands for; None if no tag is in it.
+    """Return the version (PEP 440) that the output of ``git describe`` stands for; None if no tag
+    is in it.
 
-    A commit after a tag is a development version of the next patch release, or of the next release candidate.
+    A commit after a tag is a development version of the next patch release, or of the next release
+    candidate.
     """
     found = _DESCRIBED.fullmatch(text.strip())
     if found is None:
@@ -45,7 +49,9 @@ def cited(root: Path) -> str:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Return the output of git; None where it fails, is not installed, or ``root`` is not the top of a clone."""
+    """Return the output of git; None where it fails, is not installed, or ``root`` is not the top
+    of a clone.
+    """
     if not (root / ".git").exists():
         return None  # git would search the folders above
     command = ["git", "-c", f"safe.directory={root}", *arguments]
@@ -64,7 +70,10 @@ def version(root: Path = ROOT) -> str:
     described = _git(root, "describe", *_TAGS)
     if described is not None and (known := from_description(described)):
         return known
-    commits, commit = _git(root, "rev-list", "--count", "HEAD"), _git(root, "rev-parse", "--short", "HEAD")
+    commits, commit = (
+        _git(root, "rev-list", "--count", "HEAD"),
+        _git(root, "rev-parse", "--short", "HEAD"),
+    )
     if commits and commit:
         return f"{cited(root)}.dev{commits}+g{commit}"
     archival = root / ".git_archival.txt"

@@ -12,7 +12,12 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 PATIENCE_MS = 600_000.0
 """Generous: rendering without a GPU is slow, and no test measures it."""
-_NO_GPU = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+_NO_GPU = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
 
 
 def why_no_browser() -> str:
@@ -21,7 +26,11 @@ def why_no_browser() -> str:
 
 
 def chromium_path() -> str | None:
-    return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    return (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
 
 
 @contextmanager

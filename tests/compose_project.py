@@ -16,10 +16,15 @@ _MISSION_S = 900.0
 
 
 def compose_command() -> list[str]:
-    """Return the installed Compose: Docker's plugin or docker-compose; raises SystemExit without any."""
+    """Return the installed Compose: Docker's plugin or docker-compose; raises SystemExit without
+    any.
+    """
     for command in (["docker", "compose"], ["docker-compose"]):
         try:
-            if subprocess.run([*command, "version"], capture_output=True, check=False).returncode == 0:
+            if (
+                subprocess.run([*command, "version"], capture_output=True, check=False).returncode
+                == 0
+            ):
                 return command
         except FileNotFoundError:
             continue
@@ -36,7 +41,9 @@ class Project:
         self._command = [*compose_command(), "-p", self.name]
         self._before = set(folder.glob("runs/*/mission.mcap"))
 
-    def compose(self, *arguments: str, timeout_s: float = _MISSION_S) -> subprocess.CompletedProcess[str]:
+    def compose(
+        self, *arguments: str, timeout_s: float = _MISSION_S
+    ) -> subprocess.CompletedProcess[str]:
         """Run Compose in the project; its output is in the result."""
         return subprocess.run(
             [*self._command, *arguments],
@@ -67,14 +74,18 @@ class Project:
             if new:
                 return new.pop()
             time.sleep(0.2)
-        raise SystemExit(f"{self.name}: no log after {timeout_s:g} s:\n{self.compose('logs').stdout[-3000:]}")
+        raise SystemExit(
+            f"{self.name}: no log after {timeout_s:g} s:\n{self.compose('logs').stdout[-3000:]}"
+        )
 
     def wait_for_tick(self, log: Path, tick: int, timeout_s: float = 300.0) -> None:
         """Wait until a tick has been recorded."""
         deadline = time.monotonic() + timeout_s
         while last_tick(log) < tick:
             if time.monotonic() > deadline:
-                raise SystemExit(f"{self.name}: tick {tick} was not recorded within {timeout_s:g} s")
+                raise SystemExit(
+                    f"{self.name}: tick {tick} was not recorded within {timeout_s:g} s"
+                )
             time.sleep(0.5)
 
     def wait(self) -> int:

@@ -17,16 +17,20 @@ from harness import DRILL, SHORT, run
 
 Fly = Callable[..., Path]
 
-# The hundreds of processes that tests start would each compile every module again, and every run of the tests these.
+# The hundreds of processes that tests start would each compile every module again, and every run of
+# the tests these.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
-# Programs that a shell starts in the background ignore Ctrl-C, and so would all processes that tests start and interrupt.
+# Programs that a shell starts in the background ignore Ctrl-C, and so would all processes that
+# tests start and interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the files with the longest missions first: at the end, workers share short tests, and none waits for another."""
+    """Run the files with the longest missions first: at the end, workers share short tests, and
+    none waits for another.
+    """
     minutes: Counter[Path] = Counter()
     for item in items:
         if slow := item.get_closest_marker("slow"):
@@ -36,7 +40,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def shared_flight(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Fly:
-    """Return a function that flies a scenario once per test session, whichever worker asks first, and returns its folder."""
+    """Return a function that flies a scenario once per test session, whichever worker asks first,
+    and returns its folder.
+    """
     base = tmp_path_factory.getbasetemp()
     folder = (base if worker_id == "master" else base.parent) / "shared-flights"
     folder.mkdir(exist_ok=True)

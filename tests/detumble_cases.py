@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A target of 150 kg with `tetra12` chasers at the middles of its faces, shared by the tests of detumbling."""
+"""A target of 150 kg with `tetra12` chasers at the middles of its faces, shared by the tests of
+detumbling.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ PORTS = (
 def target_alone() -> TargetBody:
     """Return the target: principal axes turned against TRF, centre of mass beside its middle."""
     turn = rotations.to_matrix(rotations.exp(np.array([0.4, -0.3, 0.5])))
-    return TargetBody(150.0, turn @ np.diag([15.0, 20.0, 25.0]) @ turn.T, np.array([0.06, -0.05, 0.04]))
+    return TargetBody(
+        150.0, turn @ np.diag([15.0, 20.0, 25.0]) @ turn.T, np.array([0.06, -0.05, 0.04])
+    )
 
 
 def mounted(chasers: tuple[int, ...]) -> dict[int, MountedChaser]:
@@ -43,12 +47,16 @@ def mounted(chasers: tuple[int, ...]) -> dict[int, MountedChaser]:
 
 def stack_of(chasers: dict[int, MountedChaser]) -> TargetBody:
     """Return the target with chasers fixed to it."""
-    parts = [(BODY.mass_kg, np.asarray(BODY.inertia), c.position_m, c.q_wxyz) for c in chasers.values()]
+    parts = [
+        (BODY.mass_kg, np.asarray(BODY.inertia), c.position_m, c.q_wxyz) for c in chasers.values()
+    ]
     return attach_bodies(target_alone(), parts)
 
 
 def stack_thrusters(chasers: tuple[int, ...]) -> tuple[TargetBody, Array, Array]:
-    """Return the stack, the wrenches (6, n) of its thrusters and their limits (n,), zero where the plume hits something."""
+    """Return the stack, the wrenches (6, n) of its thrusters and their limits (n,), zero where the
+    plume hits something.
+    """
     found = mounted(chasers)
     body = stack_of(found)
     ports = [np.array(position) for position, _, _ in PORTS]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builders shared by the tests of docking by capture: a servicer, a chaser before its port, a world and a guidance."""
+"""Builders shared by the tests of docking by capture: a servicer, a chaser before its port, a world
+and a guidance.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,9 @@ def world(
     omega_rad_s: tuple[float, float, float] = (0.045, 0.135, 0.09),
     **changes: Any,
 ) -> Physics:
-    """Chaser 0 with its tip ``gap_m`` before its port, closing in on the tumbling target in the target's own frame."""
+    """Chaser 0 with its tip ``gap_m`` before its port, closing in on the tumbling target in the
+    target's own frame.
+    """
     mission = scenario(target={"omega_rad_s": list(omega_rad_s)}, **changes)
     physics = Physics(mission)
     target = physics.state(TARGET)
@@ -105,7 +109,9 @@ def momenta(physics: Physics, name: str) -> tuple[Array, Array]:
     arm = rotations.rotate(s.q_wxyz, plant.centre_of_mass_m)
     velocity = s.velocity_m_s + rotations.cross(rotations.rotate(s.q_wxyz, s.omega_rad_s), arm)
     spin = rotations.rotate(s.q_wxyz, plant.inertia_kg_m2 @ s.omega_rad_s)
-    return plant.mass_kg * velocity, spin + rotations.cross(s.position_m + arm, plant.mass_kg * velocity)
+    return plant.mass_kg * velocity, spin + rotations.cross(
+        s.position_m + arm, plant.mass_kg * velocity
+    )
 
 
 def tip_of(state: BodyState) -> Array:
@@ -113,7 +119,9 @@ def tip_of(state: BodyState) -> Array:
 
 
 def balance(physics: Physics, wrench: Array) -> tuple[Array, Array]:
-    """Make one step; return force and torque about the tip (3,) that the chaser's motion demands of the port, WRF."""
+    """Make one step; return force and torque about the tip (3,) that the chaser's motion demands of
+    the port, WRF.
+    """
     before, (p, h) = physics.state("chaser/0"), momenta(physics, "chaser/0")
     physics.advance(1, {"chaser/0": wrench})
     p_after, h_after = momenta(physics, "chaser/0")

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's renderer with them.
+"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's renderer
+with them.
 
-Light as of the renderer: Lambert, Blinn's highlight, hard shadows of the sun. Textures are left out. Each pixel has
-``samples`` squared rays.
+Light as of the renderer: Lambert, Blinn's highlight, hard shadows of the sun. Textures are left
+out. Each pixel has ``samples`` squared rays.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ _LEAST_EDGE_PX = 6.0
 
 @dataclass(frozen=True)
 class RayTraced:
-    """By pixel (h, w): grey ``level``, ``covered`` share, ``sunlit`` share of the covered part, levels ``lit`` and ``dark`` with and
-    without sun, and whether all rays of the pixel and of its neighbours hit one smooth part (``inside``)."""
+    """By pixel (h, w): grey ``level``, ``covered`` share, ``sunlit`` share of the covered part,
+    levels ``lit`` and ``dark`` with and without sun, and whether all rays of the pixel and of its
+    neighbours hit one smooth part (``inside``)."""
 
     level: Array
     covered: Array
@@ -44,7 +46,9 @@ def plain(mesh: TriangleMesh, material: Material | None = None) -> TriangleMesh:
     """Return a mesh without textures, or of one material."""
     return replace(
         mesh,
-        parts=tuple(replace(p, material=material or replace(p.material, texture="")) for p in mesh.parts),
+        parts=tuple(
+            replace(p, material=material or replace(p.material, texture="")) for p in mesh.parts
+        ),
     )
 
 
@@ -65,22 +69,31 @@ def trace(
     widest = np.arcsin(min(radius_m / distance_m, 1.0)) + 2.0 / camera.fx_px
     y, x = (axis.ravel() for axis in np.mgrid[0:h, 0:w].astype(float))
     centres = np.stack(
-        [(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px, np.ones_like(x)], axis=-1
+        [(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px, np.ones_like(x)],
+        axis=-1,
     )
     cosines = centres @ position / distance_m / np.linalg.norm(centres, axis=1)
     near = np.flatnonzero(cosines > np.cos(widest))
     x, y = x[near], y[near]
     steps = (np.arange(samples) + 0.5) / samples - 0.5
-    surfaces = np.array([(p.material.diffuse, p.material.specular, p.material.shininess) for p in mesh.parts])
+    surfaces = np.array(
+        [(p.material.diffuse, p.material.specular, p.material.shininess) for p in mesh.parts]
+    )
     for number, (j, i) in enumerate((j, i) for j in steps for i in steps):
         rays = np.stack(
-            [(x + i - camera.cx_px) / camera.fx_px, (y + j - camera.cy_px) / camera.fy_px, np.ones_like(x)],
+            [
+                (x + i - camera.cx_px) / camera.fx_px,
+                (y + j - camera.cy_px) / camera.fy_px,
+                np.ones_like(x),
+            ],
             axis=-1,
         )
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         hit = scene.run(np.zeros_like(rays, dtype=np.float32), rays.astype(np.float32), output=1)
         hits = np.flatnonzero(hit["primID"] >= 0)
-        lit, dark, sunlit = _shade(scene, hit, hits, rays[hits], corners, normals, soup.part, surfaces, light)
+        lit, dark, sunlit = _shade(
+            scene, hit, hits, rays[hits], corners, normals, soup.part, surfaces, light
+        )
         seen = near[hits]
         part = np.full(h * w, -1)
         part[seen] = soup.part[hit["primID"][hits]]
@@ -123,7 +136,9 @@ def _shade(
     normal = (normals[triangle] * mix).sum(axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     points = (corners[triangle] * mix).sum(axis=1)
-    flat = np.cross(corners[triangle, 1] - corners[triangle, 0], corners[triangle, 2] - corners[triangle, 0])
+    flat = np.cross(
+        corners[triangle, 1] - corners[triangle, 0], corners[triangle, 2] - corners[triangle, 0]
+    )
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     sun = light.direction_w
     cosine = normal @ sun
@@ -135,14 +150,18 @@ def _shade(
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     gloss = np.maximum((normal * half).sum(axis=1), 0.0) ** np.floor(shininess)
     dark = WHITE_LEVEL * light.ambient * diffuse
-    lit = dark + np.where(faces, WHITE_LEVEL * light.sun * (diffuse * cosine + specular * gloss), 0.0)
+    lit = dark + np.where(
+        faces, WHITE_LEVEL * light.sun * (diffuse * cosine + specular * gloss), 0.0
+    )
     return np.minimum(lit, 255.0), dark, faces & ~blocked
 
 
 def compare(
     mesh: TriangleMesh, camera: Camera, position: Array, q: Array, light: Light, samples: int
 ) -> tuple[float, Array, Array]:
-    """Return the mean grey-level error inside surfaces, and the displacements, px, of silhouettes and shadow edges by block."""
+    """Return the mean grey-level error inside surfaces, and the displacements, px, of silhouettes
+    and shadow edges by block.
+    """
     mesh = plain(mesh)
     traced = trace(mesh, camera, position, q, light, samples)
     image = draw(mesh, camera, position, q, light)
@@ -182,13 +201,21 @@ def dilated(mask: Mask) -> Mask:
 
 
 def displacements(drawn: Array, traced: Array, valid: Mask) -> Array:
-    """Return the mean displacement, px, of the edges in each block: excess area over length of edge.
+    """Return the mean displacement, px, of the edges in each block: excess area over length of
+    edge.
 
-    ``drawn`` and ``traced`` (h, w): shares, 0 to 1; pixels that are not ``valid``, and blocks with little edge, do not count.
+    ``drawn`` and ``traced`` (h, w): shares, 0 to 1; pixels that are not ``valid``, and blocks with
+    little edge, do not count.
     """
     dy, dx = np.zeros_like(traced), np.zeros_like(traced)
     dx[:, 1:-1], dy[1:-1] = (traced[:, 2:] - traced[:, :-2]) / 2, (traced[2:] - traced[:-2]) / 2
-    wide = valid & np.roll(valid, 1, 0) & np.roll(valid, -1, 0) & np.roll(valid, 1, 1) & np.roll(valid, -1, 1)
+    wide = (
+        valid
+        & np.roll(valid, 1, 0)
+        & np.roll(valid, -1, 0)
+        & np.roll(valid, 1, 1)
+        & np.roll(valid, -1, 1)
+    )
     length = np.where(wide, np.hypot(dx, dy), 0.0)
     excess = np.where(wide, drawn - traced, 0.0)
     rows, columns = (n // BLOCK_PX * BLOCK_PX for n in traced.shape)

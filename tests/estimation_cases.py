@@ -58,7 +58,9 @@ def eye_of(chaser: int, time_ns: int) -> CameraPose:
     """The camera of a chaser in synchronized flight 1 m from the target."""
     p, q = truth(time_ns)
     place = p + rot.rotate(q, rot.rotate(LOOKS[chaser % 4], [-1.0, 0.0, 0.0]))
-    return CameraPose(place, rot.multiply(rot.multiply(q, LOOKS[chaser % 4]), Q_CRF_IRF_FORWARD_WXYZ))
+    return CameraPose(
+        place, rot.multiply(rot.multiply(q, LOOKS[chaser % 4]), Q_CRF_IRF_FORWARD_WXYZ)
+    )
 
 
 def see(
@@ -73,8 +75,9 @@ def see(
     markers: int = 4,
     camera: np.ndarray | None = None,
 ) -> Measurement:
-    """A measurement with white noise R; ``shift`` and ``turn`` are errors in TRF; ``flip`` is a rotation
-    vector in TRF axes that makes the second hypothesis of an ambiguous view; ``camera`` (7,): its calibration errors."""
+    """A measurement with white noise R; ``shift`` and ``turn`` are errors in TRF; ``flip`` is a
+    rotation vector in TRF axes that makes the second hypothesis of an ambiguous view; ``camera``
+    (7,): its calibration errors."""
     p, q = truth(time_ns)
     eye = eye_of(chaser, time_ns)
     if camera is not None:
@@ -105,7 +108,9 @@ def nees(e: TargetState) -> float:
     return float(d @ np.linalg.solve(e.covariance, d))
 
 
-def fly(estimator: Mekf | PaperEstimator, chasers: int, seconds: float, seed: int = 0) -> list[TargetState]:
+def fly(
+    estimator: Mekf | PaperEstimator, chasers: int, seconds: float, seed: int = 0
+) -> list[TargetState]:
     rng = np.random.default_rng(seed)
     return [
         estimator.update([see(rng, c, ns(k)) for c in range(chasers)], ns(k))

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeded mutations of messages, scenarios and logs at their decoders, and an independent check of what is accepted.
+"""Seeded mutations of messages, scenarios and logs at their decoders, and an independent check of
+what is accepted.
 
-``mutate`` works on bytes (bit flips, cuts, splices, wrong lengths), ``value_mutator`` on the decoded map (other types,
-huge and non-finite numbers, deep nesting). Equal seeds make equal mutations. ``garbage_in`` checks accepted messages by
-their type annotations alone and shares no code with the codec.
+``mutate`` works on bytes (bit flips, cuts, splices, wrong lengths), ``value_mutator`` on the
+decoded map (other types, huge and non-finite numbers, deep nesting). Equal seeds make equal
+mutations. ``garbage_in`` checks accepted messages by their type annotations alone and shares no
+code with the codec.
 """
 
 from __future__ import annotations
@@ -108,14 +110,28 @@ def mutate(payload: bytes, rng: random.Random) -> bytes:
 
 
 def _places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     places = [(*path, key) for key, _ in items]
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     return places + [place for key, item in items for place in _places(item, (*path, key))]
 
 
 def value_mutator(payload: bytes) -> Callable[[random.Random], bytes]:
-    """Return a function that makes well-formed msgpack of the same map with one or two values changed."""
+    """Return a function that makes well-formed msgpack of the same map with one or two values
+    changed.
+    """
     places = _places(msgpack.unpackb(payload))
 
     def mutated(rng: random.Random) -> bytes:
@@ -144,7 +160,7 @@ def value_mutator(payload: bytes) -> Callable[[random.Random], bytes]:
     return mutated
 
 
-# -- check of accepted messages ------------------------------------------------------------------------------
+# -- check of accepted messages --------------------------------------------------------------------
 
 
 def garbage_in(message: msgspec.Struct) -> str | None:
@@ -212,14 +228,21 @@ def _wrong_tuple(value: Any, kinds: tuple[Any, ...]) -> str | None:
     each = [kinds[0]] * len(value) if len(kinds) == 2 and kinds[1] is Ellipsis else list(kinds)
     if len(each) != len(value):
         return f"{len(value)} items in place of {len(each)}"
-    return next((w for v, k in zip(value, each, strict=True) if (w := _wrong(v, k)) is not None), None)
+    return next(
+        (w for v, k in zip(value, each, strict=True) if (w := _wrong(v, k)) is not None), None
+    )
 
 
 def _wrong_dict(value: Any, kinds: tuple[Any, ...]) -> str | None:
     if type(value) is not dict or len(value) > MOST_ITEMS:
         return "no dictionary, or too large"
     return next(
-        (w for k, v in value.items() if (w := _wrong(k, kinds[0]) or _wrong(v, kinds[1])) is not None), None
+        (
+            w
+            for k, v in value.items()
+            if (w := _wrong(k, kinds[0]) or _wrong(v, kinds[1])) is not None
+        ),
+        None,
     )
 
 
@@ -236,12 +259,14 @@ def _out_of_bounds(value: Any, metas: list[msgspec.Meta]) -> str | None:
     return None
 
 
-# -- the boundaries --------------------------------------------------------------------------------------------
+# -- the boundaries --------------------------------------------------------------------------------
 
 
 @dataclass
 class Outcome:
-    """Counts of mutated inputs; every crash and every accepted invalid message (``garbage``) with its input."""
+    """Counts of mutated inputs; every crash and every accepted invalid message (``garbage``) with
+    its input.
+    """
 
     total: int = 0
     accepted: int = 0
@@ -253,7 +278,10 @@ class Outcome:
 def boundaries() -> dict[str, type[msgspec.Struct]]:
     """Return every key that carries messages, and its type."""
     keys = {topic.key: topic.kind for topic in topics.TOPICS}
-    return keys | {f"{topics.JOIN_KEY} (query)": JoinRequest, f"{topics.JOIN_KEY} (reply)": JoinReply}
+    return keys | {
+        f"{topics.JOIN_KEY} (query)": JoinRequest,
+        f"{topics.JOIN_KEY} (reply)": JoinReply,
+    }
 
 
 def fuzz_messages(kind: type[msgspec.Struct], number: int, seed: int) -> Outcome:

@@ -63,12 +63,21 @@ def run(
     scenario: str, out: Path, *overrides: str, timeout_s: float = 600.0, **options: Any
 ) -> tuple[int, str]:
     """``chaserdock run``; status and output."""
-    arguments = ["run", scenario, "--out", str(out), *options.pop("arguments", ()), *sets(*overrides)]
+    arguments = [
+        "run",
+        scenario,
+        "--out",
+        str(out),
+        *options.pop("arguments", ()),
+        *sets(*overrides),
+    ]
     return finished(*arguments, timeout_s=timeout_s, **options)
 
 
 def simulated_digest(scenario: str, out: Path, *overrides: str) -> str:
-    """Simulate a shipped scenario in this process, every process of it to its end; the digest of its log."""
+    """Simulate a shipped scenario in this process, every process of it to its end; the digest of
+    its log.
+    """
     flight = simulate(ROOT / "scenarios" / f"{scenario}.toml", out, overrides)
     assert (flight.crashes, flight.stalled) == ({}, ())
     return load_flight(out / "mission.mcap").digest
@@ -82,7 +91,9 @@ def descendants(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
     return psutil.Process(process.pid).children(recursive=True)
 
 
-def find_child(process: subprocess.Popen[bytes], *words: str, timeout_s: float = 20.0) -> psutil.Process:
+def find_child(
+    process: subprocess.Popen[bytes], *words: str, timeout_s: float = 20.0
+) -> psutil.Process:
     """The child of a launcher whose command line holds all ``words`` in a row."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:

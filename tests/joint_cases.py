@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic flights for the joint filter: chasers around a tumbling target, with the errors of a navigation grade."""
+"""Synthetic flights for the joint filter: chasers around a tumbling target, with the errors of a
+navigation grade.
+"""
 
 from __future__ import annotations
 
@@ -43,14 +45,21 @@ class TrueChaser:
 
 
 class SyntheticFlight:
-    """N chasers that hold a place around a target with constant rates, with the errors of ``errors``, one ``step`` per tick.
+    """N chasers that hold a place around a target with constant rates, with the errors of
+    ``errors``, one ``step`` per tick.
 
-    The chasers follow the reference exactly by a wrench computed from it, plus a command noise; ``disturbance`` acts on them.
-    ``view_error``: ratio of the part of a sighting's error that is constant.
+    The chasers follow the reference exactly by a wrench computed from it, plus a command noise;
+    ``disturbance`` acts on them. ``view_error``: ratio of the part of a sighting's error that is
+    constant.
     """
 
     def __init__(
-        self, scenario: Scenario, errors: NavigationErrors, chasers: int, seed: int, disturbance: float = 0.0
+        self,
+        scenario: Scenario,
+        errors: NavigationErrors,
+        chasers: int,
+        seed: int,
+        disturbance: float = 0.0,
     ) -> None:
         self.rng = np.random.default_rng(seed)
         self.errors, self.n, self.tick = errors, chasers, 0
@@ -62,7 +71,9 @@ class SyntheticFlight:
         for i in range(chasers):
             angle = 2 * math.pi * i / max(chasers, 4)
             place = np.array(
-                places[i % 4] if chasers <= 4 else (math.cos(angle), math.sin(angle), 0.3 * (i % 3 - 1))
+                places[i % 4]
+                if chasers <= 4
+                else (math.cos(angle), math.sin(angle), 0.3 * (i % 3 - 1))
             )
             q = _facing(-place)
             state = np.concatenate([place, self.target[3:6], q, np.zeros(3)])
@@ -139,14 +150,22 @@ class SyntheticFlight:
         error = rotations.log(rotations.multiply(rotations.conjugate(s[6:10]), wanted))
         rate = rotations.rotate_inverse(self._place(i)[1], t[10:13])
         inertia = np.array(self.body.inertia)
-        return inertia * (0.5 * error + 1.2 * (rate - s[10:13])) + np.cross(s[10:13], inertia * s[10:13])
+        return inertia * (0.5 * error + 1.2 * (rate - s[10:13])) + np.cross(
+            s[10:13], inertia * s[10:13]
+        )
 
     def _odometry(self, i: int) -> Odometry:
         e, r, c = self.errors, self.rng, self.chasers[i]
         s = c.state
-        turn = r.normal(0, 1, 3) * [e.attitude_roll_noise_rad, e.attitude_noise_rad, e.attitude_noise_rad]
+        turn = r.normal(0, 1, 3) * [
+            e.attitude_roll_noise_rad,
+            e.attitude_noise_rad,
+            e.attitude_noise_rad,
+        ]
         q = rotations.multiply(s[6:10], rotations.exp(c.attitude_drift_rad))
-        attitude = np.diag(np.square([e.attitude_roll_noise_rad, e.attitude_noise_rad, e.attitude_noise_rad]))
+        attitude = np.diag(
+            np.square([e.attitude_roll_noise_rad, e.attitude_noise_rad, e.attitude_noise_rad])
+        )
         return Odometry(
             tick=self.tick,
             sim_time_ns=self.time_ns,
@@ -167,7 +186,9 @@ class SyntheticFlight:
         line = rotations.rotate_inverse(q_eye, self.target[:3] - eye) - c.camera_shift_m
         turn = rotations.exp(-c.camera_turn_rad)
         seen = rotations.rotate(turn, line) / [1, 1, 1 + c.camera_focal_share]
-        q = rotations.multiply(turn, rotations.multiply(rotations.conjugate(q_eye), self.target[6:10]))
+        q = rotations.multiply(
+            turn, rotations.multiply(rotations.conjugate(q_eye), self.target[6:10])
+        )
         noise = r.normal(0, SIGHTING_SIGMAS)
         solution = PoseSolution(
             position_m=vector(seen + noise[:3]),
@@ -181,7 +202,9 @@ class SyntheticFlight:
         )  # fmt: skip
 
     def relative_error(self, estimator: JointEstimator, i: int) -> tuple[float, float, float]:
-        """Return the error of a chaser's estimated pose relative to the target: m, rad, and NEES (of 6)."""
+        """Return the error of a chaser's estimated pose relative to the target: m, rad, and NEES
+        (of 6).
+        """
         pose = next(r for r in estimator.relative_poses() if r.chaser == i)
         t, s = self.target, self.chasers[i].state
         place = rotations.rotate_inverse(t[6:10], s[:3] - t[:3])
@@ -197,9 +220,13 @@ WHITE = SightingNoise(white_ratio=0.85, view_ratio=0.0, view_time_s=1.0)
 
 
 def parameters(scenario: Scenario, errors: NavigationErrors, **more: object) -> JointParameters:
-    """Return the parameters of a filter that knows the errors' sigmas; sightings without a persistent error."""
+    """Return the parameters of a filter that knows the errors' sigmas; sightings without a
+    persistent error.
+    """
     options = {"single_marker": WHITE, "floor_sighting_m": 0.0, "floor_sighting_rad": 0.0, **more}
-    return JointParameters(MekfParameters(), scenario.chaser, scenario.camera_model(), errors, **options)  # type: ignore[arg-type]
+    return JointParameters(
+        MekfParameters(), scenario.chaser, scenario.camera_model(), errors, **options
+    )  # type: ignore[arg-type]
 
 
 def _facing(direction: Array) -> Array:

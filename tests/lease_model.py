@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Model check of command authority: ``python tests/lease_model.py --steps 1000000``.
 
-Random walks through the state machines that fly (``LeaseGrantor`` of each chaser, ``LeaseHolder`` of each controller) with the
-worst network there is: messages come in any order, late, twice or never; processes restart without memory, some while their
-predecessor still runs; the world takes living processes for lost. Checked after every step: no tick has two commanders, unless a
-controller is lost in it; a chaser flies the holder of its lease only, and no two controllers in one tick; what is flown was
-commanded with authority; ticks and terms that a chaser states never fall. At the end of a walk the network recovers, and within
-``UNITED_TICKS`` one controller must command all chasers, for good.
+Random walks through the state machines that fly (``LeaseGrantor`` of each chaser, ``LeaseHolder``
+of each controller) with the worst network there is: messages come in any order, late, twice or
+never; processes restart without memory, some while their predecessor still runs; the world takes
+living processes for lost. Checked after every step: no tick has two commanders, unless a controller
+is lost in it; a chaser flies the holder of its lease only, and no two controllers in one tick; what
+is flown was commanded with authority; ticks and terms that a chaser states never fall. At the end
+of a walk the network recovers, and within ``UNITED_TICKS`` one controller must command all chasers,
+for good.
 """
 
 from __future__ import annotations
@@ -48,8 +50,8 @@ class Controller:
 
 @dataclass
 class Chaser:
-    """One start of a chaser. ``executed``: the newest tick whose command it has flown; ``stated``: tick, revision and term of
-    its last lease."""
+    """One start of a chaser. ``executed``: the newest tick whose command it has flown; ``stated``:
+    tick, revision and term of its last lease."""
 
     leases: LeaseGrantor
     tick: Tick | None = None
@@ -60,7 +62,8 @@ class Chaser:
 class Model:
     """World, network, chasers and controllers; ``steps`` counts what has happened.
 
-    ``claims``: who commands, by tick and the number of its controllers, negative so that later claims are greater.
+    ``claims``: who commands, by tick and the number of its controllers, negative so that later
+    claims are greater.
     """
 
     def __init__(self, seed: int) -> None:
@@ -84,13 +87,15 @@ class Model:
         self.starts += 1
         return Controller(LeaseHolder(name, f"i{self.starts}"))
 
-    # -- the world --------------------------------------------------------------------------------------------
+    # -- the world ---------------------------------------------------------------------------------
 
     def open_tick(self) -> None:
         """Open a tick for all processes that are not away."""
         self.tick, self.revision = self.tick + 1, 0
         names = [f"chaser/{i}" for i in range(self.n)] + list(CONTROLLERS)
-        self.taking_part = {n: self.taking_part.get(n, self.tick) for n in names if n not in self.away}
+        self.taking_part = {
+            n: self.taking_part.get(n, self.tick) for n in names if n not in self.away
+        }
         self.away = {n for n in sorted(self.away) if self.draw.random() < 0.7}
         self._publish_tick()
 
@@ -102,7 +107,9 @@ class Model:
             self._publish_tick()
 
     def restart(self, name: str) -> None:
-        """Start a process again, without memory. What was on its way to it is lost, unless it is a controller that still runs."""
+        """Start a process again, without memory. What was on its way to it is lost, unless it is a
+        controller that still runs.
+        """
         if self.tick < 0:
             return
         self.lose(name)
@@ -119,7 +126,9 @@ class Model:
         self.in_flight = [(to, message) for to, message in self.in_flight if to is not gone]
 
     def _publish_tick(self) -> None:
-        instances = {n: c.leases.instance for n, c in self.controllers.items() if n in self.taking_part}
+        instances = {
+            n: c.leases.instance for n, c in self.controllers.items() if n in self.taking_part
+        }
         message = Tick(
             tick=self.tick,
             revision=self.revision,
@@ -135,7 +144,7 @@ class Model:
         """Return the controllers, with those that were replaced and still run."""
         return [*self.controllers.values(), *self.replaced]
 
-    # -- the processes ----------------------------------------------------------------------------------------
+    # -- the processes -----------------------------------------------------------------------------
 
     def send(self, to: object, message: object) -> None:
         """Put a message on its way."""
@@ -161,7 +170,10 @@ class Model:
                 raise TypeError(f"{message} to {to}")
 
     def _chaser_tick(self, chaser: Chaser, tick: Tick) -> None:
-        if chaser.tick is not None and (tick.tick, tick.revision) < (chaser.tick.tick, chaser.tick.revision):
+        if chaser.tick is not None and (tick.tick, tick.revision) < (
+            chaser.tick.tick,
+            chaser.tick.revision,
+        ):
             return
         chaser.tick = tick
         if (lease := chaser.leases.update(tick)) is not None:
@@ -203,7 +215,9 @@ class Model:
             self.send(controller, lease)
 
     def act(self, controller: Controller) -> None:
-        """Let a controller process one of its last ticks: command it, or leave the leases that it cannot use."""
+        """Let a controller process one of its last ticks: command it, or leave the leases that it
+        cannot use.
+        """
         if not controller.ticks:
             return
         tick = self.draw.choice(controller.ticks)
@@ -220,7 +234,7 @@ class Model:
                 mode = "yield" if gives_back else "wait"
                 self.send(self.chasers[i], command_of(tick, i, mode, me, idle_term))
 
-    # -- the walk ---------------------------------------------------------------------------------------------
+    # -- the walk ----------------------------------------------------------------------------------
 
     def step(self) -> None:
         """Let one random thing happen."""
@@ -241,7 +255,8 @@ class Model:
             self.deliver(0 if newest_last else self.draw.randrange(len(self.in_flight)), again)
 
     def recover(self) -> None:
-        """Let all processes take part and all messages arrive; check that one controller soon commands all chasers, for good.
+        """Let all processes take part and all messages arrive; check that one controller soon
+        commands all chasers, for good.
 
         ``united``: ticks until then.
         """
@@ -264,7 +279,9 @@ class Model:
                     raise TwoCommanders(f"{k} ticks after the last loss the chasers fly {flown}")
 
 
-def command_of(tick: Tick, chaser: int, mode: str, sender: tuple[str, str], term: int) -> WrenchCommand:
+def command_of(
+    tick: Tick, chaser: int, mode: str, sender: tuple[str, str], term: int
+) -> WrenchCommand:
     """Return a command without content."""
     return WrenchCommand(
         tick=tick.tick,

@@ -28,7 +28,11 @@ def flight(ticks: int) -> Iterator[tuple[topics.Topic, int | str | None, m.Messa
     """Return the messages of a short mission with two chasers."""
     for k in range(ticks):
         head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * 66_666_666}
-        yield topics.TICK, None, m.Tick(**head, images=True, chasers=(0, 1), controllers={"controller": "c"})
+        yield (
+            topics.TICK,
+            None,
+            m.Tick(**head, images=True, chasers=(0, 1), controllers={"controller": "c"}),
+        )
         for i in (0, 1):
             state = {
                 "position_m": (float(k), float(i), 0.5),

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record the golden logs: ``python tests/make_golden.py``. Only after a deliberate change of the replies.
+"""Record the golden logs: ``python tests/make_golden.py``. Only after a deliberate change of the
+replies.
 
-``two-chasers``: images through commands, of every process. ``capture``: one chaser docks on thrusters and is verified; for the
-controller and the pilot, without images and truth.
+``two-chasers``: images through commands, of every process. ``capture``: one chaser docks on
+thrusters and is verified; for the controller and the pilot, without images and truth.
 """
 
 from __future__ import annotations

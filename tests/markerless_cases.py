@@ -37,7 +37,9 @@ PANELS = (1, 2)
 def mesh_of(
     boxes: tuple[Box, ...] = BOXES, panel_sigma_rad: float = 0.0, scale_sigma: float = 0.0
 ) -> TrackerMesh:
-    """Return the mesh of ``boxes``; modes: each panel about its boom (the y axis), and the scale of all."""
+    """Return the mesh of ``boxes``; modes: each panel about its boom (the y axis), and the scale of
+    all.
+    """
     exact = TrackerMesh.of_boxes(boxes, 0.0)
     vertices = exact.vertices_m
     modes = []
@@ -45,7 +47,9 @@ def mesh_of(
         for panel in PANELS:
             mode = np.zeros_like(vertices)
             own = slice(8 * panel, 8 * panel + 8)
-            mode[own] = panel_sigma_rad * np.cross([0.0, 1.0, 0.0], vertices[own] - boxes[panel].position_m)
+            mode[own] = panel_sigma_rad * np.cross(
+                [0.0, 1.0, 0.0], vertices[own] - boxes[panel].position_m
+            )
             modes.append(mode)
     if scale_sigma > 0.0:
         modes.append(scale_sigma * vertices)
@@ -61,13 +65,19 @@ def wrong_boxes(panel_rad: tuple[float, float], scale: float) -> tuple[Box, ...]
         w, x, y, z = rotations.exp(np.array([0.0, angle, 0.0])).tolist()
         (a, b, c), (d, e, f) = (scale * np.array(v) for v in (box.size_m, box.position_m))
         out.append(
-            Box((float(a), float(b), float(c)), (float(d), float(e), float(f)), (w, x, y, z), box.shade)
+            Box(
+                (float(a), float(b), float(c)),
+                (float(d), float(e), float(f)),
+                (w, x, y, z),
+                box.shade,
+            )
         )
     return tuple(out)
 
 
 class Scene:
-    """A ray tracer of the cuboids, with cast shadows; independent of the tracker's and of the world's rasterizer.
+    """A ray tracer of the cuboids, with cast shadows; independent of the tracker's and of the
+    world's rasterizer.
 
     ``background`` (h, w): grey levels behind the target, None for space.
     """
@@ -92,7 +102,10 @@ class Scene:
             x = (np.arange(low[0], high[0])[:, None] + offsets).ravel()
             y = (np.arange(low[1], high[1])[:, None] + offsets).ravel()
             px = self.camera.undistort(np.stack(np.meshgrid(x, y), axis=-1))
-            ideal = (px - (self.camera.cx_px, self.camera.cy_px)) / (self.camera.fx_px, self.camera.fy_px)
+            ideal = (px - (self.camera.cx_px, self.camera.cy_px)) / (
+                self.camera.fx_px,
+                self.camera.fy_px,
+            )
             rays = (
                 np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=-1).reshape(-1, 3)
                 @ pose.rotation
@@ -152,7 +165,9 @@ def _rays_near(box: Box, origin: Array, rays: Array) -> NDArray[np.int64]:
 
 
 def _enter(box: Box, origin: Array, rays: Array) -> tuple[Array, NDArray[np.int64], Array]:
-    """Return the distance at which rays enter a box, infinite for a miss, the axis of the side, and the rays in box axes."""
+    """Return the distance at which rays enter a box, infinite for a miss, the axis of the side, and
+    the rays in box axes.
+    """
     to_box = rotations.to_matrix(np.array(box.q_wxyz))
     start, direction = (origin - np.array(box.position_m)) @ to_box, rays @ to_box
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -178,7 +193,9 @@ def backlit_view(rng: np.random.Generator, camera: Camera) -> tuple[PoseInCamera
 
 
 def satellite_image(pose: PoseInCamera, light: Light, number: int) -> NDArray[np.uint8]:
-    """Return an image (540, 960), 60 degrees wide, of `geo_servicer` by the world's renderer, as benchmarks/markerless.py makes it."""
+    """Return an image (540, 960), 60 degrees wide, of `geo_servicer` by the world's renderer, as
+    benchmarks/markerless.py makes it.
+    """
     camera = Camera.from_hfov(960, 540, np.deg2rad(60.0))
     renderer = MeshRenderer(camera, satellite("geo_servicer"), None, Effects().point_spread_px)
     q = rotations.from_matrix(pose.rotation)
@@ -186,8 +203,12 @@ def satellite_image(pose: PoseInCamera, light: Light, number: int) -> NDArray[np
     return CameraEffects(960, 540, Effects(), 11).apply(exact, 0, number)
 
 
-def random_view(rng: np.random.Generator, range_m: float, camera: Camera) -> tuple[PoseInCamera, Light]:
-    """Draw an attitude, a place in the middle of the image and a direction of the sun in front of the target."""
+def random_view(
+    rng: np.random.Generator, range_m: float, camera: Camera
+) -> tuple[PoseInCamera, Light]:
+    """Draw an attitude, a place in the middle of the image and a direction of the sun in front of
+    the target.
+    """
     aside = rng.uniform(-0.1, 0.1, 2) * (camera.width_px, camera.height_px) / camera.fx_px
     rotation = rotations.to_matrix(rotations.normalize(rng.normal(size=4)))
     sun = rng.normal(size=3)
@@ -196,8 +217,12 @@ def random_view(rng: np.random.Generator, range_m: float, camera: Camera) -> tup
     return PoseInCamera(position, rotation), Light(tuple(sun.tolist()))
 
 
-def perturbed(pose: PoseInCamera, rng: np.random.Generator, share: float, angle_rad: float) -> PoseInCamera:
-    """Return ``pose`` moved by ``share`` of its range and turned by ``angle_rad``, in random directions."""
+def perturbed(
+    pose: PoseInCamera, rng: np.random.Generator, share: float, angle_rad: float
+) -> PoseInCamera:
+    """Return ``pose`` moved by ``share`` of its range and turned by ``angle_rad``, in random
+    directions.
+    """
     move: Array = rng.normal(size=3)
     axis: Array = rng.normal(size=3)
     move *= share * np.linalg.norm(pose.position) / np.linalg.norm(move)

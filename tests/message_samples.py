@@ -49,7 +49,11 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.BodyTruth(**HEAD, body="chaser/0", position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
     m.DrawnTruth(
         **HEAD,
-        bodies=(m.DrawnBody(body="chaser/0", mass_kg=12.5, inertia_kg_m2=(0.25,) * 9, centre_of_mass_m=V),),
+        bodies=(
+            m.DrawnBody(
+                body="chaser/0", mass_kg=12.5, inertia_kg_m2=(0.25,) * 9, centre_of_mass_m=V
+            ),
+        ),
     ),
     m.WorldTruth(**HEAD, contacts=(("chaser/0", "target"),), saturated=(1,), late_commands=2),
     m.PlumeLoad(**HEAD, body="target", impulse_N_s=V, angular_impulse_N_m_s=V, peak_force_N=0.5),
@@ -66,7 +70,12 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         closing_impulse_N_s=0.125,
     ),
     m.StackEstimate(
-        **HEAD, chasers=(0, 3), stack=MASS, target=MASS, thrust_factors=(0.875, 1.0), failed=((1,), ())
+        **HEAD,
+        chasers=(0, 3),
+        stack=MASS,
+        target=MASS,
+        thrust_factors=(0.875, 1.0),
+        failed=((1,), ()),
     ),
     m.Sighting(
         **HEAD,
@@ -168,7 +177,16 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         pulses=(m.ThrusterPulse(thruster=3, open_ns=9, close_ns=19),),
         isolated=(0, 11),
     ),
-    m.Lease(**HEAD, chaser=1, revision=1, holder="standby", instance="s1", term=2, from_tick=3, until_tick=9),
+    m.Lease(
+        **HEAD,
+        chaser=1,
+        revision=1,
+        holder="standby",
+        instance="s1",
+        term=2,
+        from_tick=3,
+        until_tick=9,
+    ),
     m.ThrusterReport(
         **HEAD,
         chaser=0,
@@ -192,10 +210,14 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         operated=(m.OperatorCommand(command="hold", chaser=1),),
         state=b"\x80",
     ),
-    m.Presence(**HEAD, process="chaser/0", instance="abc", heard={"controller": "c1", "world": "w1"}),
+    m.Presence(
+        **HEAD, process="chaser/0", instance="abc", heard={"controller": "c1", "world": "w1"}
+    ),
     m.Farewell(**HEAD, process="chaser/0", published={"chaser/0/sighting": 4}),
     m.JoinRequest(process="chaser/0", instance="abc"),
-    m.JoinReply(accepted=True, reason="", run_id="r", mode="realtime", scenario_json="{}", faults="{}"),
+    m.JoinReply(
+        accepted=True, reason="", run_id="r", mode="realtime", scenario_json="{}", faults="{}"
+    ),
     m.ScenarioRequest(process="recorder"),
     m.ScenarioReply(run_id="r", scenario_json="{}"),
 )

@@ -10,7 +10,12 @@ from pathlib import Path
 
 from chaserdock_protocol.topics import TOPICS
 from chaserdock_protocol.transport import Link, Node, Tls
-from chaserdock_protocol.transport.access_control import OBSERVERS, access_control, common_name, identities
+from chaserdock_protocol.transport.access_control import (
+    OBSERVERS,
+    access_control,
+    common_name,
+    identities,
+)
 
 from chaserdock.launch.keys import init_keys
 from chaserdock.launch.launcher import free_port
@@ -41,7 +46,9 @@ def router_with_rights(keys: Path) -> Iterator[str]:
     """The endpoint of a router that enforces the rights."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
     rules = access_control(NAMESPACE, CHASERS)
-    link = Link(NAMESPACE, (), (endpoint,), "router", tls=tls_of(keys, "router"), access_control=rules)
+    link = Link(
+        NAMESPACE, (), (endpoint,), "router", tls=tls_of(keys, "router"), access_control=rules
+    )
     node = Node("router", "operator", link)
     try:
         yield endpoint
@@ -50,7 +57,9 @@ def router_with_rights(keys: Path) -> Iterator[str]:
 
 
 def keys_with_owners() -> list[tuple[str, str]]:
-    """Every concrete key of the topics table and who may publish on it: one process, of controllers each."""
+    """Every concrete key of the topics table and who may publish on it: one process, of controllers
+    each.
+    """
     out = []
     for topic in TOPICS:
         if "{chaser}" in topic.key:

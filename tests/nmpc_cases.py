@@ -14,7 +14,14 @@ from chaserdock_controller.guidance.reference import (
     reference_state,
     reference_trajectory,
 )
-from chaserdock_controller.nmpc import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver, kernels, make_solver
+from chaserdock_controller.nmpc import (
+    NmpcInput,
+    NmpcParameters,
+    NmpcPlan,
+    NmpcSolver,
+    kernels,
+    make_solver,
+)
 from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -124,18 +131,23 @@ def fly(
 
 
 def tumbling(n: int, feed: bool = True) -> tuple[Callable[[Array, float], NmpcInput], Array]:
-    """Return the paper's tracking problem as a function of state and time, and states on the references."""
+    """Return the paper's tracking problem as a function of state and time, and states on the
+    references.
+    """
     d = PARAMS.stages
     times = PARAMS.dt_s * np.arange(d + 1)
 
     def problem_at(states: Array, now_s: float) -> NmpcInput:
         p, q = (a[0] for a in predict_target(np.zeros(3), V_TARGET, LEVEL, W_TARGET, [now_s]))
         references = [
-            reference_trajectory(p, V_TARGET, q, W_TARGET, OFFSETS[i], Q_OFFSETS[i], times) for i in range(n)
+            reference_trajectory(p, V_TARGET, q, W_TARGET, OFFSETS[i], Q_OFFSETS[i], times)
+            for i in range(n)
         ]
         zero = np.zeros((d, 3))
         wrench = [
-            feed_forward(W_TARGET, np.tile(OFFSETS[i], (d, 1)), zero, zero, Q_OFFSETS[i], MASS_KG, INERTIA)
+            feed_forward(
+                W_TARGET, np.tile(OFFSETS[i], (d, 1)), zero, zero, Q_OFFSETS[i], MASS_KG, INERTIA
+            )
             for i in range(n)
         ]
         return NmpcInput(
@@ -149,7 +161,9 @@ def tumbling(n: int, feed: bool = True) -> tuple[Callable[[Array, float], NmpcIn
         )
 
     start = [
-        reference_state(np.zeros(3), V_TARGET, LEVEL, W_TARGET, OFFSETS[i], np.zeros(3), Q_OFFSETS[i])
+        reference_state(
+            np.zeros(3), V_TARGET, LEVEL, W_TARGET, OFFSETS[i], np.zeros(3), Q_OFFSETS[i]
+        )
         for i in range(n)
     ]
     return problem_at, np.array(start)
@@ -163,7 +177,11 @@ def far_start(n: int) -> tuple[Callable[[Array, float], NmpcInput], Array]:
     return problem_at, states
 
 
-def swap(side_m: float = 0.0, half_m: float = 0.8) -> tuple[Callable[[Array, float], NmpcInput], Array]:
-    """Return a problem of two chasers that swap positions head-on, 2 m from the target, and their states."""
+def swap(
+    side_m: float = 0.0, half_m: float = 0.8
+) -> tuple[Callable[[Array, float], NmpcInput], Array]:
+    """Return a problem of two chasers that swap positions head-on, 2 m from the target, and their
+    states.
+    """
     a, b = np.array([-half_m, 2.0, 0.0]), np.array([half_m, 2.0, side_m])
     return (lambda x, _t: fixed_problem(x, np.array([b, a]))), np.array([at_rest(a), at_rest(b)])

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array interface of the parts of the NMPC's compiled kernels, which a solver calls inside of one kernel only.
+"""Array interface of the parts of the NMPC's compiled kernels, which a solver calls inside of one
+kernel only.
 
 Arrays are C-contiguous float64 (int64 where stated) of the given shapes; nothing is checked here.
 """
@@ -33,7 +34,8 @@ def roll_linearized(model: Model, x: Array, u: Array, limits: Array, mats: Array
 def quadratic_model(
     weights: Weights, x: Array, u: Array, refs: Array, u_ref: Array, limits: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Quadratic cost model of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled inputs w = u / limits.
+    """Quadratic cost model of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled
+    inputs w = u / limits.
 
     Returns q_pos and q_att (D+1, 3, 3), qx (D+1, 12), r_diag, r and w_bar (D, 6).
     """
@@ -64,8 +66,8 @@ class _Rows(Structure):
 
 @dataclass(frozen=True)
 class HalfSpaceRows:
-    """Half-spaces a' dp_k + b' dv_k >= c of each chaser: stage (N, M), a and b (N, M, 3), c (N, M); the first n_rows (N,) are
-    used."""
+    """Half-spaces a' dp_k + b' dv_k >= c of each chaser: stage (N, M), a and b (N, M, 3), c (N, M);
+    the first n_rows (N,) are used."""
 
     stage: IntArray
     a: Array
@@ -75,12 +77,15 @@ class HalfSpaceRows:
 
 
 def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> HalfSpaceRows:
-    """Build the rows of all chasers about rollouts x (N, D+1, 13); ``problem`` as `check_input` returns it.
+    """Build the rows of all chasers about rollouts x (N, D+1, 13); ``problem`` as `check_input`
+    returns it.
 
     reach_m (N, D+1): how far admissible inputs can move a chaser from its rollout.
     """
     n, nodes, _ = x.shape
-    extra = sum(0 if a is None else a.shape[k] for a, k in ((problem.boxes, 1), (problem.coasts, 2)))
+    extra = sum(
+        0 if a is None else a.shape[k] for a, k in ((problem.boxes, 1), (problem.coasts, 2))
+    )
     width = (nodes - 1) * (n + 2 + extra)
     rows = HalfSpaceRows(
         np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64),
@@ -103,7 +108,19 @@ class _Qp(Structure):
         ("w2", c_double),
         *(
             (name, c_void_p)
-            for name in ("mats", "q_pos", "q_att", "qx", "r_diag", "r", "w_bar", "stage", "a", "c", "b")
+            for name in (
+                "mats",
+                "q_pos",
+                "q_att",
+                "qx",
+                "r_diag",
+                "r",
+                "w_bar",
+                "stage",
+                "a",
+                "c",
+                "b",
+            )
         ),
     ]
 
@@ -135,8 +152,8 @@ def solve_qp(
     mats: Array, h: float, model: tuple[Array, ...], stage: IntArray, a: Array, c: Array, w1: float, w2: float,
     max_iterations: int = MAX_ITERATIONS, b: Array | None = None,
 ) -> QpAnswer:  # fmt: skip
-    """Solve the QP of one chaser: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows (R,), (R, 3),
-    (R,), and with velocities (R, 3)."""
+    """Solve the QP of one chaser: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows
+    (R,), (R, 3), (R,), and with velocities (R, 3)."""
     d, rows = len(mats), len(stage)
     dx, dw, mul = np.empty((d + 1, 12)), np.empty((d, 6)), np.empty(2 * rows + 12 * d)
     qp = _Qp(

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pytest plug-in: load the kernels that `sanitizers.run_tests` compiled into SANITIZED_KERNELS/0, 1, ..."""
+"""pytest plug-in: load the kernels that `sanitizers.run_tests` compiled into SANITIZED_KERNELS/0,
+1, ...
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ for number, folder in enumerate(NATIVE_FOLDERS):
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--all-kernels", action="store_true", help="fail unless the tests call all kernels")
+    parser.addoption(
+        "--all-kernels", action="store_true", help="fail unless the tests call all kernels"
+    )
 
 
 @pytest.hookimpl(trylast=True)

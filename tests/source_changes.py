@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes of source files by exact text, applied to a copy of the checkout: planted bugs and mutants."""
+"""Changes of source files by exact text, applied to a copy of the checkout: planted bugs and
+mutants.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +38,7 @@ class Mutant:
     @property
     def name(self) -> str:
         """Return the file and what replaces what, on one line."""
-        return (
-            f"{self.change.file}: {' '.join(self.change.old.split())} -> {' '.join(self.change.new.split())}"
-        )
+        return f"{self.change.file}: {' '.join(self.change.old.split())} -> {' '.join(self.change.new.split())}"
 
 
 def read_mutants(path: Path = MUTANTS) -> list[Mutant]:
@@ -48,7 +48,9 @@ def read_mutants(path: Path = MUTANTS) -> list[Mutant]:
 
 
 def apply(changes: Sequence[Change], folder: Path, write: bool = True) -> None:
-    """Apply changes to the sources in ``folder``. Raises ValueError for text that its file does not contain exactly once."""
+    """Apply changes to the sources in ``folder``. Raises ValueError for text that its file does not
+    contain exactly once.
+    """
     for change in changes:
         path = folder / change.file
         source = path.read_text(encoding="utf-8") if path.is_file() else ""
@@ -65,7 +67,9 @@ def copy_checkout(folder: Path, names: Sequence[str]) -> None:
     for name in names:
         if (ROOT / name).is_dir():
             shutil.copytree(
-                ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules")
+                ROOT / name,
+                folder / name,
+                ignore=shutil.ignore_patterns("__pycache__", "node_modules"),
             )
         else:
             shutil.copy(ROOT / name, folder / name)
@@ -74,7 +78,9 @@ def copy_checkout(folder: Path, names: Sequence[str]) -> None:
 def run_python(
     folder: Path, *arguments: str, timeout_s: float | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run Python in a copy of the checkout, which imports the packages of the copy. Raises TimeoutExpired."""
+    """Run Python in a copy of the checkout, which imports the packages of the copy. Raises
+    TimeoutExpired.
+    """
     paths = [str(folder), *(str(folder / name) for name in SOURCES if name != "chaserdock")]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, *arguments]

@@ -16,7 +16,9 @@ PACKAGES = {
     "chaserdock_agents": ROOT / "agents" / "chaserdock_agents",
     "chaserdock_controller": ROOT / "controller" / "chaserdock_controller",
 }
-MODULES = [(package, path) for package, folder in PACKAGES.items() for path in sorted(folder.rglob("*.py"))]
+MODULES = [
+    (package, path) for package, folder in PACKAGES.items() for path in sorted(folder.rglob("*.py"))
+]
 FLYING = [p for _, p in MODULES if p.is_relative_to(PACKAGES["chaserdock_controller"])] + [
     p for _, p in MODULES if p.is_relative_to(PACKAGES["chaserdock_agents"] / "chaser")
 ]
@@ -35,7 +37,9 @@ def module_name(path: Path) -> str:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Yield the full names of the modules that a module imports, anywhere in it; relative names are resolved."""
+    """Yield the full names of the modules that a module imports, anywhere in it; relative names are
+    resolved.
+    """
     package = next(f for f in PACKAGES.values() if path.is_relative_to(f))
     parts = (package.name, *path.relative_to(package).parts[:-1])
     for node in ast.walk(tree_of(path)):

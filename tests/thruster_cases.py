@@ -32,7 +32,9 @@ def box(s: Scenario) -> Array:
 
 def at_rest(s: Scenario, tick: int) -> Odometry:
     still: Any = (0.0, 0.0, 0.0)
-    return odometry(tick=tick, time_ns=s.timing.tick_time_ns(tick), velocity_m_s=still, omega_rad_s=still)
+    return odometry(
+        tick=tick, time_ns=s.timing.tick_time_ns(tick), velocity_m_s=still, omega_rad_s=still
+    )
 
 
 def wrench(s: Scenario, tick: int, force_N: float = 0.0, **changes: Any) -> WrenchCommand:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Target and chasers with meshes in the outside view, rendered as for the simulated cameras, with each chaser in its colour."""
+"""Target and chasers with meshes in the outside view, rendered as for the simulated cameras, with
+each chaser in its colour.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,15 @@ from numpy.typing import NDArray
 from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint
 
 _AMBIENT = 0.45
-"""Share of light from everywhere: more than in the cameras' images, so that the shaded side is visible."""
+"""Share of light from everywhere: more than in the cameras' images, so that the shaded side is
+visible.
+"""
 _GAMMA = 0.6
 """Exponent of the grey levels for display, as in snapshots."""
 _BRIGHTER = 1.5
-"""Factor of a chaser's colour relative to grey of the same brightness, which its low components would darken."""
+"""Factor of a chaser's colour relative to grey of the same brightness, which its low components
+would darken.
+"""
 _BLACK = Material("black", diffuse=0.0)
 
 
@@ -51,7 +57,11 @@ class BodyRenderer:
         self._space = Background(camera, np.zeros(2), (look.width_px, look.height_px), earth)
 
     def render(
-        self, look: Viewpoint, target: BodyPose, chasers: dict[int, BodyPose], tint: Callable[[int], Array]
+        self,
+        look: Viewpoint,
+        target: BodyPose,
+        chasers: dict[int, BodyPose],
+        tint: Callable[[int], Array],
     ) -> RenderedBodies:
         """Render the bodies at their poses; ``tint`` returns the colour (3,), BGR, of a chaser.
 
@@ -60,7 +70,9 @@ class BodyRenderer:
         eye, attitude = look.centre_m + look.axes()[2] * look.distance_m, look.attitude()
 
         def grey(black: int | None) -> NDArray[np.uint8]:
-            bodies = [(self._black if i == black else self._boxes, *pose) for i, pose in chasers.items()]
+            bodies = [
+                (self._black if i == black else self._boxes, *pose) for i, pose in chasers.items()
+            ]
             return self._renderer.render(eye, attitude, *target, bodies, self._light)
 
         whole, behind = grey(None), self._space.draw(attitude, self._light)
@@ -70,6 +82,10 @@ class BodyRenderer:
             hue = _BRIGHTER * tint(i) / tint(i).max() - 1.0
             colours += own[:, :, None] * hue
         levels = np.array([255.0 * (v / 255.0) ** _GAMMA for v in range(256)]).astype(np.uint8)
-        bgr: BgrImage = np.asarray(cv2.LUT(np.clip(colours, 0.0, 255.0).astype(np.uint8), levels), np.uint8)
-        space: BgrImage = np.asarray(cv2.LUT(np.repeat(behind[:, :, None], 3, axis=2), levels), np.uint8)
+        bgr: BgrImage = np.asarray(
+            cv2.LUT(np.clip(colours, 0.0, 255.0).astype(np.uint8), levels), np.uint8
+        )
+        space: BgrImage = np.asarray(
+            cv2.LUT(np.repeat(behind[:, :, None], 3, axis=2), levels), np.uint8
+        )
         return RenderedBodies(space, bgr, np.any(bgr != space, axis=2))

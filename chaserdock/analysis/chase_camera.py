@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""External view of a mission, drawn with OpenCV: rendered bodies, or flat faces in order of depth (painter's algorithm)."""
+"""External view of a mission, drawn with OpenCV: rendered bodies, or flat faces in order of depth
+(painter's algorithm).
+"""
 
 from __future__ import annotations
 
@@ -29,14 +31,18 @@ _PLUME = np.array([255.0, 214.0, 150.0])
 
 
 def tint(chaser: int) -> Array:
-    """Return a chaser's colour (3,), BGR, 0 to 255: that of the figures, lightened for the dark background."""
+    """Return a chaser's colour (3,), BGR, 0 to 255: that of the figures, lightened for the dark
+    background.
+    """
     rgb = np.array(to_rgb(colour(chaser)))
     return (255.0 * (0.78 * rgb + 0.22))[::-1]
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera aimed at ``centre_m`` (WRF) from a distance of ``distance_m``: azimuth and elevation in WRF, radians."""
+    """A camera aimed at ``centre_m`` (WRF) from a distance of ``distance_m``: azimuth and elevation
+    in WRF, radians.
+    """
 
     centre_m: Array
     distance_m: float
@@ -69,7 +75,9 @@ class Viewpoint:
         return rotations.from_matrix(np.stack([right, -up, -back], axis=1))
 
     def project(self, points_m: Array) -> tuple[Array, Array]:
-        """Return pixels (..., 2) and depths (...) in metres of points (..., 3) WRF; pixels are invalid at depths <= 0."""
+        """Return pixels (..., 2) and depths (...) in metres of points (..., 3) WRF; pixels are
+        invalid at depths <= 0.
+        """
         local = (points_m - self.centre_m) @ self.axes().T
         depth = self.distance_m - local[..., 2]
         scale = self.focal_px / np.maximum(depth, _NEAR_M)[..., None]
@@ -79,7 +87,9 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class RenderedBodies:
-    """Bodies as rendered (`body_renderer`): ``behind`` and ``bgr`` (h, w, 3), space without and with them; ``covered`` (h, w)."""
+    """Bodies as rendered (`body_renderer`): ``behind`` and ``bgr`` (h, w, 3), space without and
+    with them; ``covered`` (h, w).
+    """
 
     behind: BgrImage
     bgr: BgrImage
@@ -117,10 +127,11 @@ def draw(
 ) -> BgrImage:
     """Draw target and chasers into an image (height, width, 3), BGR.
 
-    ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each chaser, and the target's
-    under None. ``seeing``: chasers whose image was used; their camera frustums are brighter. ``plumes``: nozzles and ends of
-    thruster plumes (K, 2, 3) of each chaser, CRF. ``background``: stars and Earth; plain space without. ``rendered``: takes the
-    place of the background and of the faces of the scene.
+    ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each
+    chaser, and the target's under None. ``seeing``: chasers whose image was used; their camera
+    frustums are brighter. ``plumes``: nozzles and ends of thruster plumes (K, 2, 3) of each chaser,
+    CRF. ``background``: stars and Earth; plain space without. ``rendered``: takes the place of the
+    background and of the faces of the scene.
     """
     space = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
     if rendered is not None:
@@ -142,7 +153,12 @@ def draw(
 
 
 def _draw_faces(
-    image: BgrImage, scene: Scene, view: Viewpoint, sun: Array, target: BodyPose, chasers: dict[int, BodyPose]
+    image: BgrImage,
+    scene: Scene,
+    view: Viewpoint,
+    sun: Array,
+    target: BodyPose,
+    chasers: dict[int, BodyPose],
 ) -> None:
     """Draw the faces of the bodies that are turned towards the view, the farthest first."""
     bodies: list[tuple[BodyPose, tuple[Face, ...], Array | None]] = [(target, scene.target, None)]
@@ -157,14 +173,24 @@ def _draw_faces(
             if normal @ away > 0.0:
                 light = 0.45 + 0.55 * max(0.0, float(normal @ sun))
                 visible.append(
-                    (float(np.linalg.norm(away)) - face.lift_m, position, attitude, face, corners, light, hue)
+                    (
+                        float(np.linalg.norm(away)) - face.lift_m,
+                        position,
+                        attitude,
+                        face,
+                        corners,
+                        light,
+                        hue,
+                    )
                 )
     visible.sort(key=lambda item: -item[0])
     for _, position, attitude, face, corners, light, hue in visible:
         px, depth = view.project(corners)
         if np.any(depth <= _NEAR_M):
             continue
-        bgr = np.full(3, float(face.grey)) if hue is None else hue * (0.3 + 0.75 * face.grey / 128.0)
+        bgr = (
+            np.full(3, float(face.grey)) if hue is None else hue * (0.3 + 0.75 * face.grey / 128.0)
+        )
         _fill(image, px, bgr * light)
         for quad, grey in face.decals:
             px, _ = view.project(rotations.rotate(attitude, quad) + position)
@@ -172,7 +198,11 @@ def _draw_faces(
 
 
 def _draw_cameras(
-    image: BgrImage, view: Viewpoint, scene: Scene, chasers: dict[int, BodyPose], seeing: frozenset[int]
+    image: BgrImage,
+    view: Viewpoint,
+    scene: Scene,
+    chasers: dict[int, BodyPose],
+    seeing: frozenset[int],
 ) -> None:
     """Draw the frustum of each chaser's camera, and its number."""
     for i, (position, attitude) in chasers.items():
@@ -184,8 +214,13 @@ def _draw_cameras(
             _lines(image, view, np.stack([origin, corner]), bgr)
         _lines(image, view, far, bgr, closed=True)
         (x, y), _ = view.project(position)
-        label_px = (round(float(np.clip(x, -1e4, 1e4))) + 22, round(float(np.clip(y, -1e4, 1e4))) - 20)
-        cv2.putText(image, str(i), label_px, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
+        label_px = (
+            round(float(np.clip(x, -1e4, 1e4))) + 22,
+            round(float(np.clip(y, -1e4, 1e4))) - 20,
+        )
+        cv2.putText(
+            image, str(i), label_px, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA
+        )
 
 
 def _draw_plume(image: BgrImage, view: Viewpoint, nozzle: Array, end: Array) -> None:

@@ -52,9 +52,11 @@ class Columns:
         self._data = array("d")
 
     def table(self) -> Array:
-        """Return all rows (K, width), read-only; no row may be added afterwards. Raise ValueError for an incomplete row.
+        """Return all rows (K, width), read-only; no row may be added afterwards. Raise ValueError
+        for an incomplete row.
 
-        A large table is mapped from its file and occupies memory while it, or a part of it, is referenced.
+        A large table is mapped from its file and occupies memory while it, or a part of it, is
+        referenced.
         """
         if self._file is None:
             return np.frombuffer(self._data, dtype=float).reshape(-1, self.width)
@@ -70,5 +72,7 @@ def nanoseconds(time_s: Array) -> NDArray[np.int64]:
 
 
 def rows_since(time_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Return for each of ``at_ns`` the last row of the ascending ``time_ns`` that is not later, or -1."""
+    """Return for each of ``at_ns`` the last row of the ascending ``time_ns`` that is not later, or
+    -1.
+    """
     return np.searchsorted(time_ns, at_ns, side="right") - 1

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Success criteria of a recorded flight: which can be judged, docking and goals, evaluated on ground truth."""
+"""Success criteria of a recorded flight: which can be judged, docking and goals, evaluated on
+ground truth.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ _VERIFIED = ("verified", "identify", "detumble", "stack_hold")
 def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
     """Return the capture of a chaser as plain values for JSON; None without a port.
 
-    ``latched``: at the end. ``latch_time_s`` and the contact values are those of the touch that closed the latch.
+    ``latched``: at the end. ``latch_time_s`` and the contact values are those of the touch that
+    closed the latch.
     """
     if flight.scenario.docking.port_of(chaser) is None:
         return None
@@ -43,12 +46,17 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
 
 
 def port_load_of(loads: LoadHistory, s: Scenario, chaser: int) -> dict[str, float | None]:
-    """Return the largest loads at a chaser's port as plain values for JSON, and when a limit was first exceeded."""
+    """Return the largest loads at a chaser's port as plain values for JSON, and when a limit was
+    first exceeded.
+    """
     beyond = np.zeros(len(loads.time_s), dtype=bool)
     for quantity, limit, _ in _load_limits(s, chaser):
         beyond |= loads.of(quantity) > limit
     first = np.flatnonzero(beyond)
-    return {**loads.peaks(), "limit_exceeded_s": float(loads.time_s[first[0]]) if len(first) else None}
+    return {
+        **loads.peaks(),
+        "limit_exceeded_s": float(loads.time_s[first[0]]) if len(first) else None,
+    }
 
 
 def _load_limits(s: Scenario, chaser: int) -> list[tuple[str, float, str]]:
@@ -82,7 +90,9 @@ def overloads(result: dict[str, Any], s: Scenario) -> list[str]:
 
 
 def nearest_allowed_m(s: Scenario, chaser: int) -> float:
-    """Return the smallest allowed distance of a chaser from the target's centre; smaller for a chaser with a port."""
+    """Return the smallest allowed distance of a chaser from the target's centre; smaller for a
+    chaser with a port.
+    """
     port, limit = s.docking.port_of(chaser), s.limits.min_distance_target_m
     if port is None:
         return limit
@@ -98,7 +108,8 @@ def capture_failures(result: dict[str, Any], s: Scenario) -> list[str]:
         if capture is None or not capture["latched"]:
             refused = capture["refused"] if capture else []
             out.append(
-                f"chaser {i} is not latched" + (f"; last rejected touch: {refused[-1]}" if refused else "")
+                f"chaser {i} is not latched"
+                + (f"; last rejected touch: {refused[-1]}" if refused else "")
             )
         elif not capture["verified"]:
             out.append(f"chaser {i} is latched but not verified by a pull test")
@@ -124,21 +135,28 @@ def capture_text(capture: dict[str, Any]) -> str:
 
 
 def stack_rest(flight: RecordedFlight) -> dict[str, float | None] | None:
-    """Return the rates at the end of the target with the chasers latched then; None where nothing is judged.
+    """Return the rates at the end of the target with the chasers latched then; None where nothing
+    is judged.
 
-    ``since_s``: simulated time from which on both were within ``success.detumbled``; None if they are not at the end.
+    ``since_s``: simulated time from which on both were within ``success.detumbled``; None if they
+    are not at the end.
     """
     limits = flight.scenario.success.detumbled
     if limits is None or "target" not in flight.truth:
         return None
     names = ["target", *(f"chaser/{i}" for i in flight.world.latched)]
-    tracks, drawn = {name: flight.truth[name] for name in names}, {body.body: body for body in flight.drawn}
+    tracks, drawn = (
+        {name: flight.truth[name] for name in names},
+        {body.body: body for body in flight.drawn},
+    )
     n = min(len(track.time_s) for track in tracks.values())
     momentum, mass = np.zeros((n, 3)), 0.0
     for name, track in tracks.items():
         own = drawn[name]
         turning = np.cross(track.omega_rad_s[:n], own.centre_of_mass_m)
-        momentum += own.mass_kg * (track.velocity_m_s[:n] + rotations.rotate(track.q_wxyz[:n], turning))
+        momentum += own.mass_kg * (
+            track.velocity_m_s[:n] + rotations.rotate(track.q_wxyz[:n], turning)
+        )
         mass += own.mass_kg
     speed = np.linalg.norm(momentum, axis=1) / mass
     rate = np.linalg.norm(tracks["target"].omega_rad_s[:n], axis=1)
@@ -165,9 +183,11 @@ def rest_failures(result: dict[str, Any], s: Scenario) -> list[str]:
 
 
 def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
-    """Return the simulated time (s) from which on a chaser stays at the goal of its last ``goto``; None if it does not.
+    """Return the simulated time (s) from which on a chaser stays at the goal of its last ``goto``;
+    None if it does not.
 
-    The goal is the one of the scenario, on the true target. Chasers without a ``goto`` in the time line have none.
+    The goal is the one of the scenario, on the true target. Chasers without a ``goto`` in the time
+    line have none.
     """
     goal, success = flight.scenario.goal_of(chaser), flight.scenario.success
     if goal is None:
@@ -183,7 +203,9 @@ def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
 
 
 def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[str]:
-    """Return the violations of ``success.reached``, given the time from which on the chaser stayed at its goal."""
+    """Return the violations of ``success.reached``, given the time from which on the chaser stayed
+    at its goal.
+    """
     success, goal = scenario.success, scenario.goal_of(chaser)
     if chaser not in success.reached or goal is None:
         return []
@@ -198,11 +220,13 @@ def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[s
 
 
 def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
-    """Return the scenario with the success criteria that its duration allows to judge, and a line for each other one.
+    """Return the scenario with the success criteria that its duration allows to judge, and a line
+    for each other one.
 
-    A scenario that is shortened by an override can end before the part of the flight that a criterion is about: before
-    ``settling_s`` (tracking and estimation errors), or before the time line commands the approach or the ``goto`` of a
-    chaser (``docked``, ``latched``, ``reached``, ``arrival``) or the first ``detumble``. Such criteria are neither met nor violated.
+    A scenario that is shortened by an override can end before the part of the flight that a
+    criterion is about: before ``settling_s`` (tracking and estimation errors), or before the time
+    line commands the approach or the ``goto`` of a chaser (``docked``, ``latched``, ``reached``,
+    ``arrival``) or the first ``detumble``. Such criteria are neither met nor violated.
     """
     success, changes, skipped = scenario.success, {}, []
     end_s = min(scenario.steady_until_s or scenario.duration_s, scenario.duration_s)
@@ -214,7 +238,9 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
     ):
         if getattr(success, name) is not None and from_s >= until_s:
             changes[name] = None
-            skipped.append(f"success.{name}: the flight ends at {until_s:g} s, settling_s is {from_s:g} s")
+            skipped.append(
+                f"success.{name}: the flight ends at {until_s:g} s, settling_s is {from_s:g} s"
+            )
     for name, command in (("docked", "approach"), ("latched", "approach"), ("reached", "goto")):
         late = {
             i: first_s
@@ -247,14 +273,19 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
 
 
 def _late_arrivals(scenario: Scenario) -> dict[int, float]:
-    """Return the chasers of ``success.arrival`` whose first ``goto`` is not before the end, with its time (s)."""
+    """Return the chasers of ``success.arrival`` whose first ``goto`` is not before the end, with
+    its time (s).
+    """
     arrival = scenario.success.arrival
     first = {i: _first_command_s(scenario, "goto", i) for i in (arrival.chasers if arrival else ())}
-    return {i: at_s for i, at_s in first.items() if at_s is not None and at_s >= scenario.duration_s}
+    return {
+        i: at_s for i, at_s in first.items() if at_s is not None and at_s >= scenario.duration_s
+    }
 
 
 def _first_command_s(scenario: Scenario, command: str, chaser: int) -> float | None:
     """Return the time of the first such command of the time line to a chaser, or None."""
     return min(
-        (e.at_s for e in scenario.timeline if e.command == command and chaser in e.chasers), default=None
+        (e.at_s for e in scenario.timeline if e.command == command and chaser in e.chasers),
+        default=None,
     )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of a recorded flight, one function each: the paper's figures and diagnostics.
 
-A function raises ``MissingData`` when the log lacks what it needs. Errors refer to ground truth, as in ``summary``. A
-chaser has the same colour in all figures.
+A function raises ``MissingData`` when the log lacks what it needs. Errors refer to ground truth, as
+in ``summary``. A chaser has the same colour in all figures.
 """
 
 from __future__ import annotations
@@ -72,7 +72,9 @@ def _figure(title: str, caption: str) -> Callable[[Drawing], Drawing]:
 
 
 def flown(flight: RecordedFlight) -> list[int]:
-    """Return the chasers whose motion is in the log. Raise MissingData without any, or without target."""
+    """Return the chasers whose motion is in the log. Raise MissingData without any, or without
+    target.
+    """
     if "target" not in flight.truth:
         raise MissingData("the log holds no ground truth of the target")
     numbers = flight.flown
@@ -87,11 +89,15 @@ def _span_s(times_s: Array) -> tuple[float, float]:
 
 
 def _path(own: Track, target: Track) -> tuple[Array, Array]:
-    """Return the drawn positions of a chaser, including the last one: WRF, and relative to the target in TRF."""
+    """Return the drawn positions of a chaser, including the last one: WRF, and relative to the
+    target in TRF.
+    """
     n = min(len(own.time_s), len(target.time_s))
     rows = np.unique(np.append(np.arange(n)[decimated(n)], n - 1))
     position = own.position_m[rows]
-    return position, rotations.rotate_inverse(target.q_wxyz[rows], position - target.position_m[rows])
+    return position, rotations.rotate_inverse(
+        target.q_wxyz[rows], position - target.position_m[rows]
+    )
 
 
 @_figure("Trajectories", "Paths of the centres of mass; dot: start, triangle: end.")
@@ -100,7 +106,9 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
     target = flight.truth["target"]
     paths = {i: _path(flight.truth[f"chaser/{i}"], target) for i in numbers}
     figure = Figure(figsize=(9.6, 4.8))
-    for place, title in enumerate(("World frame (WRF)", "Relative to the target, target frame (TRF)")):
+    for place, title in enumerate(
+        ("World frame (WRF)", "Relative to the target, target frame (TRF)")
+    ):
         axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
         if place:
             axes.scatter(0.0, 0.0, 0.0, color=FAINT, marker="s", s=28, label="target")
@@ -119,7 +127,9 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
         axes.set_title(title)
         axes.set(xlabel="x / m", ylabel="y / m", zlabel="z / m")
         axes.xaxis.labelpad = axes.yaxis.labelpad = 7.0
-        _equal_scale(axes, [paths[i][place] for i in numbers] + ([] if place else [target.position_m]))
+        _equal_scale(
+            axes, [paths[i][place] for i in numbers] + ([] if place else [target.position_m])
+        )
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
             axis.pane.set_visible(False)
             axis.set_major_locator(MaxNLocator(5))
@@ -130,12 +140,16 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 def _equal_scale(axes: Any, paths: list[Array]) -> None:
-    """Set limits around the paths and the origin of the axes with one scale, the box no larger than the paths need."""
+    """Set limits around the paths and the origin of the axes with one scale, the box no larger than
+    the paths need.
+    """
     points = np.concatenate([*paths, np.zeros((1, 3))])
     low, high = points.min(axis=0), points.max(axis=0)
     half = np.maximum(high - low, 0.3 * float(np.max(high - low)) + 1e-3) / 2.0 * 1.05
     middle = (low + high) / 2.0
-    for set_limits, m, h in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, half, strict=True):
+    for set_limits, m, h in zip(
+        (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, half, strict=True
+    ):
         set_limits(m - h, m + h)
     axes.set_box_aspect(half, zoom=1.0)
 
@@ -177,7 +191,9 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
         (top, s.success.steady_position_rms_m, "m"),
         (bottom, s.success.steady_orientation_rms_deg, "°"),
     ):
-        axes.axvspan(s.settling_s, s.steady_until_s or s.duration_s, color=FAINT, alpha=0.08, linewidth=0)
+        axes.axvspan(
+            s.settling_s, s.steady_until_s or s.duration_s, color=FAINT, alpha=0.08, linewidth=0
+        )
         _mark_phases(axes, flight, axes is top)
         if limit is not None:
             limit_line(axes, limit, f"RMS limit in the shaded interval: {limit:g} {unit}")
@@ -218,12 +234,16 @@ def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
         axes[k].annotate(name, (0.03, 0.95), xycoords="axes fraction", va="top", weight="bold")
         axes[3 + k].set_xlabel("time / s")
     axes[0].set_xlim(_span_s(flight.truth["target"].time_s))
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, handlelength=1.4)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, handlelength=1.4
+    )
     return figure
 
 
 def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float, float]]:
-    """Return begin (s), end (s) and limit of the closing speed (m/s) for the phases of a chaser that have one."""
+    """Return begin (s), end (s) and limit of the closing speed (m/s) for the phases of a chaser
+    that have one.
+    """
     s, history = flight.scenario, flight.references.get(chaser)
     if history is None:
         return []
@@ -238,7 +258,9 @@ def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float
             "final": docking.final.closing_m_s,
             "contact": docking.tolerances.closing_m_s,
         }
-    ends = [begin_s for begin_s, _ in history.phases[1:]] + [float(flight.truth["target"].time_s[-1])]
+    ends = [begin_s for begin_s, _ in history.phases[1:]] + [
+        float(flight.truth["target"].time_s[-1])
+    ]
     return [
         (begin_s, end_s, limits[phase])
         for (begin_s, phase), end_s in zip(history.phases, ends, strict=True)
@@ -247,7 +269,9 @@ def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float
 
 
 def keep_out(flight: RecordedFlight, chaser: int) -> tuple[Array, Array]:
-    """Return times (K,) s and, from each on, the distance from the target (K,) m that a chaser keeps; NaN: none."""
+    """Return times (K,) s and, from each on, the distance from the target (K,) m that a chaser
+    keeps; NaN: none.
+    """
     end_s = float(flight.truth["target"].time_s[-1])
     history = flight.references.get(chaser)
     if history is None:
@@ -280,10 +304,14 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
             speed = -np.gradient(distance, time_s)
             bottom.plot(time_s[d], speed[d] * 1e3, color=colour(i), linestyle=dashes(i))
         for begin_s, end_s, limit in speed_limits(flight, i):
-            bottom.plot((begin_s, end_s), (limit * 1e3,) * 2, color=colour(i), linestyle=":", linewidth=1.3)
+            bottom.plot(
+                (begin_s, end_s), (limit * 1e3,) * 2, color=colour(i), linestyle=":", linewidth=1.3
+            )
             fastest = max(fastest, limit * 1e3)
     if any(_docks_at_distance(flight, i) for i in numbers):
-        limit_line(top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m")
+        limit_line(
+            top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m"
+        )
     top.set(ylabel="distance to the target / m", ylim=(nearest * 0.5, None))
     bottom.set(ylabel="closing speed / mm s⁻¹", xlabel="time / s", xlim=_span_s(target.time_s))
     fastest = fastest or s.approach.max_speed_m_s * 1e3
@@ -298,7 +326,9 @@ def _docks_at_distance(flight: RecordedFlight, chaser: int) -> bool:
     """Return whether a chaser approaches the docking distance, instead of a port."""
     history = flight.references.get(chaser)
     phases = set() if history is None else {name for _, name in history.phases}
-    return flight.scenario.docking.port_of(chaser) is None and not phases.isdisjoint(("approach", "docked"))
+    return flight.scenario.docking.port_of(chaser) is None and not phases.isdisjoint(
+        ("approach", "docked")
+    )
 
 
 @_figure(
@@ -313,14 +343,27 @@ def loads(flight: RecordedFlight, _: Traces) -> Figure:
     for i, history in flight.loads.items():
         d = decimated(len(history.time_s))
         time_s, style = history.time_s[d], dashes(i)
-        top.plot(time_s, history.of("peak_force_N")[d], color=colour(i), linestyle=style, label=f"chaser {i}")
         top.plot(
-            time_s, history.of("peak_shear_N")[d], color=colour(i), linestyle=style, linewidth=0.5, alpha=0.7
+            time_s,
+            history.of("peak_force_N")[d],
+            color=colour(i),
+            linestyle=style,
+            label=f"chaser {i}",
+        )
+        top.plot(
+            time_s,
+            history.of("peak_shear_N")[d],
+            color=colour(i),
+            linestyle=style,
+            linewidth=0.5,
+            alpha=0.7,
         )
         bottom.plot(time_s, history.of("peak_torque_N_m")[d], color=colour(i), linestyle=style)
     end_s = max(float(history.time_s[-1]) for history in flight.loads.values())
     top.set(ylabel="force / N", ylim=(0.0, None))
-    bottom.set(ylabel="torque / N m", xlabel="time / s", xlim=(0.0, max(end_s, 1e-3)), ylim=(0.0, None))
+    bottom.set(
+        ylabel="torque / N m", xlabel="time / s", xlim=(0.0, max(end_s, 1e-3)), ylim=(0.0, None)
+    )
     ports = [port for i in flight.loads if (port := flight.scenario.docking.port_of(i)) is not None]
     for axes, limits, unit in (
         (top, {port.force_limit_N for port in ports}, "N"),
@@ -403,7 +446,9 @@ def separation(flight: RecordedFlight, _: Traces) -> Figure:
         distance = a.distance_to(b)
         n = len(distance)
         d = decimated(n)
-        axes.plot(a.time_s[:n][d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i}, {j}")
+        axes.plot(
+            a.time_s[:n][d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i}, {j}"
+        )
     least = flight.scenario.limits.min_distance_chasers_m
     limit_line(axes, least, f"limit {least:g} m")
     axes.set(ylabel="distance / m", xlabel="time / s", ylim=(0, None))
@@ -432,17 +477,27 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     figure, axes = new_figure(len(traces.inputs), 2, height=1.55, sharex=True, sharey="col")
     for row, (i, applied) in enumerate(traces.inputs.items()):
         for column, (values, limit) in enumerate(
-            ((applied.force_N, body.force_max_N), (applied.torque_N_m * 1e3, body.torque_max_N_m * 1e3))
+            (
+                (applied.force_N, body.force_max_N),
+                (applied.torque_N_m * 1e3, body.torque_max_N_m * 1e3),
+            )
         ):
             a = axes[2 * row + column]
             for k, name in enumerate("xyz"):
                 a.stairs(
-                    values[:, k], applied.edges_s, color=AXES_XYZ[k], label=name, linewidth=0.9, baseline=None
+                    values[:, k],
+                    applied.edges_s,
+                    color=AXES_XYZ[k],
+                    label=name,
+                    linewidth=0.9,
+                    baseline=None,
                 )
             unit = 1e3 if column else 1.0
             for sign in (1.0, -1.0):
                 a.axhline(sign * limit, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
-                for most in () if attainable is None else np.unique(attainable[3 * column : 3 * column + 3]):
+                for most in (
+                    () if attainable is None else np.unique(attainable[3 * column : 3 * column + 3])
+                ):
                     a.axhline(sign * most * unit, color=LIMIT, linestyle=":", linewidth=0.9)
             reach = 1.15 * max(limit, largest[column] * unit)
             a.set_ylim(-reach, reach)
@@ -454,7 +509,9 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     return figure
 
 
-_DUTY = LinearSegmentedColormap.from_list("duty", [to_rgba(SERIES[0], 0.0), to_rgba(SERIES[0], 1.0)])
+_DUTY = LinearSegmentedColormap.from_list(
+    "duty", [to_rgba(SERIES[0], 0.0), to_rgba(SERIES[0], 1.0)]
+)
 """Transparent for closed valves, so that it suits light and dark pages."""
 
 
@@ -462,7 +519,9 @@ _DUTY = LinearSegmentedColormap.from_list("duty", [to_rgba(SERIES[0], 0.0), to_r
 def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
     firing = {i: t for i, t in traces.inputs.items() if t.thruster_duty.shape[1]}
     if not firing:
-        raise MissingData("the actuators were ideal, or the log holds no thruster data: no thrusters to draw")
+        raise MissingData(
+            "the actuators were ideal, or the log holds no thruster data: no thrusters to draw"
+        )
     figure, axes = new_figure(len(firing), height=1.9, sharex=True)
     for a, (i, applied) in zip(axes, firing.items(), strict=True):
         number = applied.thruster_duty.shape[1]
@@ -491,13 +550,16 @@ _OUTCOME_COLOURS: dict[ImageOutcome, str] = {
 
 
 def component_errors(flight: RecordedFlight) -> tuple[Array, Array, Array]:
-    """Return times (K,) s, errors (K, 12) truth minus estimate, and their sigmas (K, 12), decimated for drawing.
+    """Return times (K,) s, errors (K, 12) truth minus estimate, and their sigmas (K, 12), decimated
+    for drawing.
 
     Order and axes follow the covariance: position and velocity WRF, attitude and rate TRF.
     """
     a, b = (rows[decimated(len(rows))] for rows in known_estimates(flight))
     if not len(a):
-        raise MissingData("the target was never estimated in this log, or its ground truth is missing")
+        raise MissingData(
+            "the target was never estimated in this log, or its ground truth is missing"
+        )
     truth, e = flight.truth["target"], flight.estimate
     turn = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), truth.q_wxyz[b]))
     errors = np.concatenate(
@@ -547,11 +609,15 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 _TAIL_SHARE = 0.05
-"""Share of values on one side of the band from which on a filter is not called consistent: twice the expected one."""
+"""Share of values on one side of the band from which on a filter is not called consistent: twice
+the expected one.
+"""
 
 
 def consistency_text(nees: Array, low: float, high: float) -> str:
-    """Judge NEES values (K,) against the band from ``low`` to ``high``, which 2.5 % exceed on either side if consistent."""
+    """Judge NEES values (K,) against the band from ``low`` to ``high``, which 2.5 % exceed on
+    either side if consistent.
+    """
     above, below = float(np.mean(nees > high)), float(np.mean(nees < low))
     verdict = "consistent"
     if above > _TAIL_SHARE:
@@ -578,7 +644,9 @@ def consistency(flight: RecordedFlight, _: Traces) -> Figure:
     low, high = 2.0 * gammaincinv(6 / 2, (0.025, 0.975))  # quantiles of the chi-square distribution
     figure, (axes,) = new_figure(1)
     d = decimated(len(errors["nees"]))
-    axes.semilogy(errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=SERIES[0], linewidth=0.8)
+    axes.semilogy(
+        errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=SERIES[0], linewidth=0.8
+    )
     axes.axhspan(low, high, color=SERIES[2], alpha=0.15, linewidth=0)
     axes.axhline(6.0, color=SERIES[2], linewidth=0.8)
     axes.set_title(consistency_text(errors["nees"], low, high))
@@ -587,7 +655,9 @@ def consistency(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 def _bars(axes: Axes, outcomes: ImageOutcomes, row: float, period_s: float) -> None:
-    """Draw one row of the raster: a bar for each interval of images with the same outcome; gaps stay empty."""
+    """Draw one row of the raster: a bar for each interval of images with the same outcome; gaps
+    stay empty.
+    """
     spans: dict[ImageOutcome, list[tuple[float, float]]] = {}
     for first_s, last_s, outcome in outcomes.intervals(1.5 * period_s):
         spans.setdefault(outcome, []).append((first_s, last_s - first_s + period_s))
@@ -595,7 +665,9 @@ def _bars(axes: Axes, outcomes: ImageOutcomes, row: float, period_s: float) -> N
         axes.broken_barh(bars, (row - 0.36, 0.72), facecolor=_OUTCOME_COLOURS[outcome], linewidth=0)
 
 
-@_figure("Camera images", "Top: outcome of each image. Bottom: number of markers used for the pose.")
+@_figure(
+    "Camera images", "Top: outcome of each image. Bottom: number of markers used for the pose."
+)
 def cameras(flight: RecordedFlight, traces: Traces) -> Figure:
     if not traces.image_outcomes:
         raise MissingData("the log holds no image")
@@ -618,7 +690,9 @@ def cameras(flight: RecordedFlight, traces: Traces) -> Figure:
     for outcome, shade in _OUTCOME_COLOURS.items():
         if outcome in present:
             top.bar(0, 0, color=shade, label=outcome)
-    top.set_yticks(range(len(traces.image_outcomes)), [f"chaser {i}" for i in traces.image_outcomes])
+    top.set_yticks(
+        range(len(traces.image_outcomes)), [f"chaser {i}" for i in traces.image_outcomes]
+    )
     top.invert_yaxis()
     top.grid(False)
     legend_above(top)
@@ -640,7 +714,9 @@ def _distribution(axes: Axes, values: Array, number: int) -> None:
 
 
 class _FewTicks(LogLocator):
-    """Ticks at 1, 2 and 5 of each decade; over more than two decades at its beginning only, so that labels do not touch."""
+    """Ticks at 1, 2 and 5 of each decade; over more than two decades at its beginning only, so that
+    labels do not touch.
+    """
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
         wide = vmin > 0.0 and vmax / vmin > 100.0
@@ -671,11 +747,20 @@ def solver(flight: RecordedFlight, _: Traces) -> Figure:
     values = solves.wall_s
     figure, left, right = _time_and_distribution("solve time / ms")
     d, bad = decimated(len(values)), solves.imperfect
-    left.plot(solves.time_s[d], np.maximum(values[d], 1e-6) * 1e3, ".", markersize=2.2, color=SERIES[0])
+    left.plot(
+        solves.time_s[d], np.maximum(values[d], 1e-6) * 1e3, ".", markersize=2.2, color=SERIES[0]
+    )
     if np.any(bad):
         statuses = ", ".join(sorted(set(solves.statuses) - {"solved"}))
         d = decimated(int(np.sum(bad)))
-        left.plot(solves.time_s[bad][d], values[bad][d] * 1e3, "x", markersize=4, color=LIMIT, label=statuses)
+        left.plot(
+            solves.time_s[bad][d],
+            values[bad][d] * 1e3,
+            "x",
+            markersize=4,
+            color=LIMIT,
+            label=statuses,
+        )
         legend_above(left)
     limit_line(left, 1e3 / flight.scenario.time.rate_hz, "tick period")
     _distribution(right, np.maximum(values, 1e-6), 0)
@@ -696,13 +781,17 @@ def latency(_: RecordedFlight, traces: Traces) -> Figure:
     for i, rows in traces.latency.items():
         values = np.maximum(rows[:, 1], 1e-6)
         d = decimated(len(values))
-        left.plot(rows[d, 0], values[d] * 1e3, ".", markersize=2.2, color=colour(i), label=f"chaser {i}")
+        left.plot(
+            rows[d, 0], values[d] * 1e3, ".", markersize=2.2, color=colour(i), label=f"chaser {i}"
+        )
         _distribution(right, values, i)
     legend_above(left)
     return figure
 
 
-def draw_figures(flight: RecordedFlight, traces: Traces) -> Iterator[tuple[FigureKind, Figure | str]]:
+def draw_figures(
+    flight: RecordedFlight, traces: Traces
+) -> Iterator[tuple[FigureKind, Figure | str]]:
     """Yield every figure, or the reason why it is missing."""
     with styled():
         for kind in FIGURES:
@@ -713,7 +802,8 @@ def draw_figures(flight: RecordedFlight, traces: Traces) -> Iterator[tuple[Figur
 
 
 def write_figures(log: Path, out: Path, ending: str) -> tuple[list[Path], dict[str, str]]:
-    """Write all figures of a log (or run folder) to ``out``; return the files, and the reason of each missing figure.
+    """Write all figures of a log (or run folder) to ``out``; return the files, and the reason of
+    each missing figure.
 
     Raise LogError for an unreadable log and ChaserdockError for a folder that is not writable.
     """

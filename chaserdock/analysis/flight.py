@@ -61,7 +61,9 @@ _RATES = np.array([13 * k for k in (3, 4, 5, 9, 10, 11)])
 
 @dataclass
 class Track:
-    """Motion of one body: times (K,) s, positions and velocities (K, 3) WRF, attitudes (K, 4), rates (K, 3)."""
+    """Motion of one body: times (K,) s, positions and velocities (K, 3) WRF, attitudes (K, 4),
+    rates (K, 3).
+    """
 
     time_s: Array
     position_m: Array
@@ -95,10 +97,11 @@ class Tracks(Mapping[str, Track]):
 
 @dataclass
 class ReferenceHistory:
-    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s) and name of its phases.
+    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s)
+    and name of its phases.
 
-    ``keep_out`` (L, 2): from a time (s) on, the distance from the target's centre that its plan keeps, m; 0: none, it is
-    latched.
+    ``keep_out`` (L, 2): from a time (s) on, the distance from the target's centre that its plan
+    keeps, m; 0: none, it is latched.
     """
 
     time_s: Array
@@ -109,7 +112,9 @@ class ReferenceHistory:
 
 @dataclass
 class SightingHistory:
-    """Sightings of a chaser: exposure times (K,) s, whether the target was seen, number of markers used."""
+    """Sightings of a chaser: exposure times (K,) s, whether the target was seen, number of markers
+    used.
+    """
 
     time_s: Array
     seen: NDArray[np.bool_]
@@ -118,7 +123,9 @@ class SightingHistory:
 
 @dataclass
 class SolverHistory:
-    """Solves of the controller: times (K,) s, wall-clock durations (K,) s, whether a status other than ``solved`` occurred."""
+    """Solves of the controller: times (K,) s, wall-clock durations (K,) s, whether a status other
+    than ``solved`` occurred.
+    """
 
     name: str | None
     time_s: Array
@@ -129,7 +136,9 @@ class SolverHistory:
 
 @dataclass
 class WorldHistory:
-    """Totals of the world's ground truth. ``latched``: at the end; ``contacts``: number of times two bodies touched."""
+    """Totals of the world's ground truth. ``latched``: at the end; ``contacts``: number of times
+    two bodies touched.
+    """
 
     ticks: int = 0
     late_commands: int = 0
@@ -150,7 +159,9 @@ class WorldHistory:
 
 @dataclass
 class LoadHistory:
-    """Loads at a port: times (K,) s, and what ``LOAD_QUANTITIES`` names since the tick before, (K, 6)."""
+    """Loads at a port: times (K,) s, and what ``LOAD_QUANTITIES`` names since the tick before, (K,
+    6).
+    """
 
     time_s: Array
     values: Array
@@ -166,8 +177,8 @@ class LoadHistory:
 
 @dataclass
 class IdentificationHistory:
-    """Identified mass properties of the target, in the order of ``mass_properties.NAMES``: times (K,) s, values and standard
-    deviations (K, 10), SI units; the ``last`` message."""
+    """Identified mass properties of the target, in the order of ``mass_properties.NAMES``: times
+    (K,) s, values and standard deviations (K, 10), SI units; the ``last`` message."""
 
     time_s: Array
     values: Array
@@ -177,8 +188,8 @@ class IdentificationHistory:
 
 @dataclass
 class SafetyHistory:
-    """Certificates of passive safety of a chaser: times (K,) s, margins (K,) in sigmas, distances (K,) m of closest approach,
-    whether the plan was safe (K,)."""
+    """Certificates of passive safety of a chaser: times (K,) s, margins (K,) in sigmas, distances
+    (K,) m of closest approach, whether the plan was safe (K,)."""
 
     time_s: Array
     margin_sigmas: Array
@@ -188,8 +199,9 @@ class SafetyHistory:
 
 @dataclass
 class RelativeHistory:
-    """Estimated poses of a chaser relative to the target: times (K,) s, CRF's origin (K, 3) m in TRF, attitudes (K, 4), and
-    covariances (K, 21), upper triangles over position (TRF axes) and attitude (CRF axes)."""
+    """Estimated poses of a chaser relative to the target: times (K,) s, CRF's origin (K, 3) m in
+    TRF, attitudes (K, 4), and covariances (K, 21), upper triangles over position (TRF axes) and
+    attitude (CRF axes)."""
 
     time_s: Array
     position_m: Array
@@ -203,7 +215,9 @@ class RelativeHistory:
 
 @dataclass
 class PlumeTotals:
-    """What plumes gave a body: sums of the magnitudes of the impulses per tick, N s and N m s, and the largest force, N."""
+    """What plumes gave a body: sums of the magnitudes of the impulses per tick, N s and N m s, and
+    the largest force, N.
+    """
 
     impulse_N_s: float = 0.0
     angular_impulse_N_m_s: float = 0.0
@@ -219,10 +233,11 @@ class PlumeTotals:
 class RecordedFlight:
     """Content of a log without the images. Mappings by body name or chaser.
 
-    ``estimates`` holds the fused estimate as ``target``; ``estimate_known`` (K,): whether the target was tracked or
-    predicted. ``relative``: of the chasers whose pose the estimator publishes, while the target is known. ``identified``:
-    None without identification. ``expected_commands``: number of actuator commands that all ticks expected.
-    ``blas``: linear algebra library of each process, empty where older logs do not state it.
+    ``estimates`` holds the fused estimate as ``target``; ``estimate_known`` (K,): whether the
+    target was tracked or predicted. ``relative``: of the chasers whose pose the estimator
+    publishes, while the target is known. ``identified``: None without identification.
+    ``expected_commands``: number of actuator commands that all ticks expected. ``blas``: linear
+    algebra library of each process, empty where older logs do not state it.
     """
 
     scenario: Scenario
@@ -266,11 +281,15 @@ class RecordedFlight:
         return self.estimates["target"]
 
     def pose_covariance(self, rows: NDArray[np.intp]) -> Array:
-        """Return covariances (K, 6, 6) of position (WRF) and attitude (TRF) at these rows (K,) of the estimate."""
+        """Return covariances (K, 6, 6) of position (WRF) and attitude (TRF) at these rows (K,) of
+        the estimate.
+        """
         return _symmetric(self.covariances.table()[rows, :21])
 
     def variances(self, rows: NDArray[np.intp]) -> Array:
-        """Return variances (K, 12) of position and velocity (WRF), attitude and rate (TRF) at these rows of the estimate."""
+        """Return variances (K, 12) of position and velocity (WRF), attitude and rate (TRF) at these
+        rows of the estimate.
+        """
         table = self.covariances.table()[rows]
         pose, rates = table[:, :21][:, [0, 6, 11, 15, 18, 20]], table[:, 21:]
         return np.concatenate([pose[:, :3], rates[:, :3], pose[:, 3:], rates[:, 3:]], axis=1)
@@ -416,7 +435,8 @@ class _Collector:
         self.gaps.update(record.key, message.seq)
         if record.topic not in NOT_IN_DIGEST:
             content = msgspec.msgpack.encode(without_wall_time(message))
-            # A sum, as two controllers publish on the same keys, and their messages arrive in any order.
+            # A sum, as two controllers publish on the same keys, and their messages arrive in any
+            # order.
             number = int.from_bytes(hashlib.sha256(content).digest(), "big")
             self.hashes[record.key] = (self.hashes.get(record.key, 0) + number) % 2**256
 
@@ -484,7 +504,9 @@ def _identification_history(c: _Collector) -> IdentificationHistory | None:
 
 
 def load_flight(log: LogSource) -> RecordedFlight:
-    """Read the flight in a log. Raise LogError for a log that is unreadable or not recorded by chaserdock."""
+    """Read the flight in a log. Raise LogError for a log that is unreadable or not recorded by
+    chaserdock.
+    """
     scenario, run = logged_scenario(log)
     c = _Collector()
     for record in read_log(log):

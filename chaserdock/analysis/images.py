@@ -19,10 +19,11 @@ _MAX_WAITING = 4
 
 
 def pairs(log: Path, chasers: int) -> Iterator[Pair]:
-    """Yield every image with the sighting of the same exposure, or None; the images of one chaser in order of time.
+    """Yield every image with the sighting of the same exposure, or None; the images of one chaser
+    in order of time.
 
-    A log is ordered by arrival: a sighting may precede its image or follow the next one. Raise LogError for an
-    unreadable log.
+    A log is ordered by arrival: a sighting may precede its image or follow the next one. Raise
+    LogError for an unreadable log.
     """
     waiting: dict[int, deque[Image]] = defaultdict(deque)
     early: dict[int, dict[int, Sighting]] = defaultdict(dict)
@@ -47,10 +48,11 @@ def pairs(log: Path, chasers: int) -> Iterator[Pair]:
 def shots(
     log: Path, chasers: int, every_s: float, first_s: float = 0.0
 ) -> Iterator[tuple[float, dict[int, Pair]]]:
-    """Yield at ``first_s`` and then ``every_s`` (simulated seconds) the time and each chaser's latest image up to then.
+    """Yield at ``first_s`` and then ``every_s`` (simulated seconds) the time and each chaser's
+    latest image up to then.
 
-    The last item lies at or after the last image; there is none if that precedes ``first_s``. Where the log is not
-    ordered by time, an image may be older by one than necessary.
+    The last item lies at or after the last image; there is none if that precedes ``first_s``. Where
+    the log is not ordered by time, an image may be older by one than necessary.
     """
     latest: dict[int, Pair] = {}
     number, time_s = 0, -math.inf
@@ -66,7 +68,9 @@ def shots(
 
 
 def columns_for(number: int, aspect: float, width_px: int, height_px: int) -> tuple[int, int]:
-    """Return the number of columns that maximizes the size of ``number`` images of this aspect ratio, and their width."""
+    """Return the number of columns that maximizes the size of ``number`` images of this aspect
+    ratio, and their width.
+    """
     best = (1, 1)
     for columns in range(1, number + 1):
         rows = math.ceil(number / columns)

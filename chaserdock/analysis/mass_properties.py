@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identified mass properties as shown in report and viewer: beside the scenario's stated values and, where recorded, the true ones."""
+"""Identified mass properties as shown in report and viewer: beside the scenario's stated values
+and, where recorded, the true ones.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from chaserdock_protocol.scenario import FlightScenario
 NAMES = ("mass", "centre x", "centre y", "centre z", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 UNITS = ("kg", "mm", "mm", "mm", *["kg m²"] * 6)
 SCALE = np.array([1.0, 1e3, 1e3, 1e3, *[1.0] * 6])
-"""Names, units, and factors from SI of mass, centre of mass (TRF) and inertia about it (TRF axes), in the order of a covariance."""
+"""Names, units, and factors from SI of mass, centre of mass (TRF) and inertia about it (TRF axes),
+in the order of a covariance.
+"""
 _ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -39,7 +43,8 @@ def true_values(drawn: DrawnBody) -> Array:
 
 @dataclass(frozen=True)
 class PropertyRow:
-    """One quantity: value and standard deviation of target and stack, the stated value and, if known, the true one, as text.
+    """One quantity: value and standard deviation of target and stack, the stated value and, if
+    known, the true one, as text.
 
     ``off``: the true error of the target in standard deviations.
     """
@@ -60,7 +65,11 @@ def property_rows(
     stack, stack_sigma = values_of(estimate.stack)
     rows = []
     for k, name in enumerate(NAMES):
-        off = missing if true is None or not sigma[k] else f"{(target[k] - true[k]) / sigma[k]:+.1f} sigma"
+        off = (
+            missing
+            if true is None or not sigma[k]
+            else f"{(target[k] - true[k]) / sigma[k]:+.1f} sigma"
+        )
         rows.append(
             PropertyRow(
                 f"{name}, {UNITS[k]}",
@@ -68,7 +77,9 @@ def property_rows(
                 f"{stated[k] * SCALE[k]:.4g}",
                 missing if true is None else f"{true[k] * SCALE[k]:.4g}",
                 off,
-                _with_sigma(stack[k] * SCALE[k], stack_sigma[k] * SCALE[k]) if estimate.chasers else missing,
+                _with_sigma(stack[k] * SCALE[k], stack_sigma[k] * SCALE[k])
+                if estimate.chasers
+                else missing,
             )
         )
     return rows

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Style of the figures, and their export to files or inline SVG.
 
-The colours are distinguishable for colour-blind readers (Okabe and Ito, 2008) on white and on dark backgrounds. Text
-stays text. In an inline SVG the colours are CSS variables, so that a figure follows the theme of the page.
+The colours are distinguishable for colour-blind readers (Okabe and Ito, 2008) on white and on dark
+backgrounds. Text stays text. In an inline SVG the colours are CSS variables, so that a figure
+follows the theme of the page.
 """
 
 from __future__ import annotations
@@ -95,8 +96,12 @@ def dashes(number: int) -> Any:
     return ("-", (0, (5, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))[number % 4]
 
 
-def new_figure(rows: int, columns: int = 1, height: float = 2.3, **options: Any) -> tuple[Figure, list[Axes]]:
-    """Create a figure of the page's width; return it and its axes row by row. ``height`` of one row in inches."""
+def new_figure(
+    rows: int, columns: int = 1, height: float = 2.3, **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """Create a figure of the page's width; return it and its axes row by row. ``height`` of one row
+    in inches.
+    """
     figure = Figure(figsize=(9.6, 0.35 + height * rows))
     axes: Any = figure.subplots(rows, columns, squeeze=False, **options)
     return figure, list(axes.ravel())
@@ -120,18 +125,26 @@ def limit_line(axes: Axes, value: float, label: str) -> None:
 def legend_above(axes: Axes, columns: int = 8) -> None:
     """Place the legend in one row above the right end of the axes."""
     axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, handlelength=1.4
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=columns,
+        borderaxespad=0.1,
+        handlelength=1.4,
     )
 
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure in the format of the path's suffix; equal figures give equal SVG files."""
     with styled(path.stem):
-        figure.savefig(path, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None)
+        figure.savefig(
+            path, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None
+        )
 
 
 def to_inline_svg(figure: Figure, name: str, title: str) -> str:
-    """Return an ``svg`` element for a page: ids unique to ``name``, colours as CSS variables, no external references."""
+    """Return an ``svg`` element for a page: ids unique to ``name``, colours as CSS variables, no
+    external references.
+    """
     out = io.StringIO()
     with styled(name):
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
@@ -146,5 +159,7 @@ def to_inline_svg(figure: Figure, name: str, title: str) -> str:
     text = text.replace("url(#", f"url(#{name}-").replace('xlink:href="#', f'href="#{name}-')
     for hexadecimal, variable in _VARIABLES.items():
         text = text.replace(hexadecimal, f"var(--{variable})")
-    text = re.sub(r"font(-family)?: ([^;\"]*)'DejaVu Sans'[^;\"]*", r"font\1: \2var(--figure-font)", text)
+    text = re.sub(
+        r"font(-family)?: ([^;\"]*)'DejaVu Sans'[^;\"]*", r"font\1: \2var(--figure-font)", text
+    )
     return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)

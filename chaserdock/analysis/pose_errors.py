@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of an estimated pose against the true one, and their normalized square. Arrays of any leading shape (...)."""
+"""Errors of an estimated pose against the true one, and their normalized square. Arrays of any
+leading shape (...).
+"""
 
 from __future__ import annotations
 
@@ -13,24 +15,32 @@ POSE = (0, 1, 2, 6, 7, 8)
 
 
 def pose_covariance(covariance: ArrayLike) -> Array:
-    """Return the covariance (6, 6) of position and attitude in the row-major one (144,) or (12, 12) of ``TargetEstimate``."""
+    """Return the covariance (6, 6) of position and attitude in the row-major one (144,) or (12, 12)
+    of ``TargetEstimate``.
+    """
     return np.reshape(covariance, (12, 12))[np.ix_(POSE, POSE)]
 
 
 def relative_pose(
     own_position_m: Array, own_q: Array, position_m: Array, q_wxyz: Array
 ) -> tuple[Array, Array]:
-    """Return the pose of a body, (..., 3) m and (..., 4), in the frame of another one; all poses in the same frame."""
+    """Return the pose of a body, (..., 3) m and (..., 4), in the frame of another one; all poses in
+    the same frame.
+    """
     place = rotations.rotate_inverse(q_wxyz, np.subtract(own_position_m, position_m))
     return place, rotations.multiply(rotations.conjugate(q_wxyz), own_q)
 
 
 def pose_error(true_position_m: Array, true_q: Array, position_m: Array, q_wxyz: Array) -> Array:
-    """Return true minus estimated pose (..., 6): m, and rotation vector in the axes of the body, rad."""
+    """Return true minus estimated pose (..., 6): m, and rotation vector in the axes of the body,
+    rad.
+    """
     turn = rotations.log(rotations.multiply(rotations.conjugate(q_wxyz), true_q))
     return np.concatenate([np.subtract(true_position_m, position_m), turn], axis=-1)
 
 
 def normalized_square(error: Array, covariance: Array) -> Array:
-    """Return the squares (...) of errors (..., n) normalized by their covariances (..., n, n): n on average if consistent."""
+    """Return the squares (...) of errors (..., n) normalized by their covariances (..., n, n): n on
+    average if consistent.
+    """
     return np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0])

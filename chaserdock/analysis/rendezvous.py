@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Criteria of published rendezvous and docking tasks, evaluated on ground truth at every tick: ``success.speed_limit``,
-``approach_cone``, ``arrival``, ``abort_clear_m``. WRF, in an orbit the Hill frame; distances between centres."""
+"""Criteria of published rendezvous and docking tasks, evaluated on ground truth at every tick:
+``success.speed_limit``, ``approach_cone``, ``arrival``, ``abort_clear_m``. WRF, in an orbit the
+Hill frame; distances between centres."""
 
 from __future__ import annotations
 
@@ -20,16 +21,23 @@ RendezvousResult = dict[str, float | None]
 
 
 def rendezvous_of(flight: RecordedFlight, chaser: int) -> RendezvousResult | None:
-    """Return what a chaser's flight has to do with the criteria, as plain values for JSON; None without any of them.
+    """Return what a chaser's flight has to do with the criteria, as plain values for JSON; None
+    without any of them.
 
-    ``speed_margin_m_s``: least distance from the speed limit; ``cone_angle_rad``: largest angle from the cone's axis; ``arrived_s``,
-    ``arrived_speed_m_s``: at the arrival; ``abort_s``: begin of the first abort; ``abort_clear_m``: from then on, the least half edge
-    of a cube about the target with the chaser's centre on its surface. None where a flight has no such part.
+    ``speed_margin_m_s``: least distance from the speed limit; ``cone_angle_rad``: largest angle
+    from the cone's axis; ``arrived_s``, ``arrived_speed_m_s``: at the arrival; ``abort_s``: begin
+    of the first abort; ``abort_clear_m``: from then on, the least half edge of a cube about the
+    target with the chaser's centre on its surface. None where a flight has no such part.
     """
     success = flight.scenario.success
     if all(
         c is None
-        for c in (success.speed_limit, success.approach_cone, success.arrival, success.abort_clear_m)
+        for c in (
+            success.speed_limit,
+            success.approach_cone,
+            success.arrival,
+            success.abort_clear_m,
+        )
     ):
         return None
     own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
@@ -50,7 +58,11 @@ def rendezvous_of(flight: RecordedFlight, chaser: int) -> RendezvousResult | Non
 
 def _first_abort_s(flight: RecordedFlight, chaser: int) -> float | None:
     history = flight.references.get(chaser)
-    return next((at_s for at_s, phase in history.phases if phase == "abort"), None) if history else None
+    return (
+        next((at_s for at_s, phase in history.phases if phase == "abort"), None)
+        if history
+        else None
+    )
 
 
 def _speed_margin(limit: SpeedLimit | None, offset: Array, speed: Array) -> float | None:
@@ -73,7 +85,9 @@ def _largest_angle(cone: ConeLimit | None, offset: Array) -> float | None:
     return float(np.arctan2(across, along).max()) if inside.any() else None
 
 
-def _arrival(arrival: Arrival | None, time_s: Array, offset: Array, speed: Array) -> RendezvousResult:
+def _arrival(
+    arrival: Arrival | None, time_s: Array, offset: Array, speed: Array
+) -> RendezvousResult:
     if arrival is None:
         return {"arrived_s": None, "arrived_speed_m_s": None}
     near = np.linalg.norm(offset, axis=1) <= arrival.distance_m
@@ -93,7 +107,11 @@ def rendezvous_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
 
 def _failures(i: int, found: RendezvousResult, s: Scenario) -> Iterator[str]:
     success = s.success
-    margin, angle, clear = found["speed_margin_m_s"], found["cone_angle_rad"], found["abort_clear_m"]
+    margin, angle, clear = (
+        found["speed_margin_m_s"],
+        found["cone_angle_rad"],
+        found["abort_clear_m"],
+    )
     if success.speed_limit is not None and margin is not None and margin < 0.0:
         yield f"chaser {i} exceeded the speed limit of success.speed_limit by {-margin:.4g} m/s"
     cone = success.approach_cone

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of the report's 3-D replay: the decimated flight, faces, and small camera images.
 
-The replay is our own canvas script (page/replay.js, 12 kB) because the export of viser 1.1 (``StateSerializer.as_html``),
-although it opens offline from ``file://``, was measured to fit the report less well. For docking-contact (70 s at 10 Hz)
-it adds 1.2 MB, 0.8 MB of it the client; our data add 0.16 MB (camera images excluded). It needs WebAssembly and thus a page policy
-with ``unsafe-eval``; with the policy of the report it does not start. It contains no GUI elements: no table and camera
-images that follow the time line, and no seeking from the list of events.
+The replay is our own canvas script (page/replay.js, 12 kB) because the export of viser 1.1
+(``StateSerializer.as_html``), although it opens offline from ``file://``, was measured to fit the
+report less well. For docking-contact (70 s at 10 Hz) it adds 1.2 MB, 0.8 MB of it the client; our
+data add 0.16 MB (camera images excluded). It needs WebAssembly and thus a page policy with
+``unsafe-eval``; with the policy of the report it does not start. It contains no GUI elements: no
+table and camera images that follow the time line, and no seeking from the list of events.
 """
 
 from __future__ import annotations
@@ -56,9 +57,11 @@ def _thinned(track: Track, rows: NDArray[Any]) -> dict[str, Any]:
 
 
 def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) -> dict[str, Any]:
-    """Return plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases, outcomes of images.
+    """Return plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases,
+    outcomes of images.
 
-    The rows of the bodies are those of ``times``, at most 1200, evenly spaced; a lost body has fewer.
+    The rows of the bodies are those of ``times``, at most 1200, evenly spaced; a lost body has
+    fewer.
     """
     target = flight.truth["target"]
     rows = np.arange(0, len(target.time_s), max(1, -(-len(target.time_s) // _MOST_SAMPLES)))
@@ -78,8 +81,12 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
             {
                 "id": i,
                 **_thinned(own, mine),
-                "phase": [[round(t, 3), name] for t, name in (reference.phases if reference else [])],
-                "outcome": [[round(t, 3), o] for t, _, o in outcomes.intervals()] if outcomes else [],
+                "phase": [
+                    [round(t, 3), name] for t, name in (reference.phases if reference else [])
+                ],
+                "outcome": [[round(t, 3), o] for t, _, o in outcomes.intervals()]
+                if outcomes
+                else [],
                 "error_mm": [float(f"{1e3 * e:.3g}") for e in position[mine]],
             }
         )
@@ -101,7 +108,8 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
 
 
 def small_images(log: Path, flight: RecordedFlight) -> dict[str, Any]:
-    """Return camera images with detections as data URLs, at most 120 per chaser: ``times`` (s) and ``chasers`` by number.
+    """Return camera images with detections as data URLs, at most 120 per chaser: ``times`` (s) and
+    ``chasers`` by number.
 
     A missing or unreadable image is an empty string.
     """

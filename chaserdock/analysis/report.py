@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-contained HTML report of a recorded flight: result, tables, 3-D replay, figures, events, scenario, versions.
+"""Self-contained HTML report of a recorded flight: result, tables, 3-D replay, figures, events,
+scenario, versions.
 
-The page opens from a file without a network; its Content-Security-Policy forbids requests. It names the parts that an
-incomplete log lacks.
+The page opens from a file without a network; its Content-Security-Policy forbids requests. It names
+the parts that an incomplete log lacks.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ _DASH = "–"  # noqa: RUF001
 
 
 def write_report(log: Path, out: Path | None = None) -> Path:
-    """Write the report of a log (or run folder), by default ``report.html`` beside the log; return its path.
+    """Write the report of a log (or run folder), by default ``report.html`` beside the log; return
+    its path.
 
     Raise LogError for an unreadable log and ChaserdockError for a path that is not writable.
     """
@@ -66,9 +68,7 @@ def report_of(log: Path) -> str:
         # "</" would end the script element.
         text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
         code = (PAGE_FILES / "replay.js").read_text(encoding="utf-8")
-        script = (
-            f'<script type="application/json" id="replay-data">{text}</script>\n<script>\n{code}</script>'
-        )
+        script = f'<script type="application/json" id="replay-data">{text}</script>\n<script>\n{code}</script>'
     else:
         missing.insert(0, "3-D replay: the log holds no ground truth of the target.")
     body = [
@@ -96,7 +96,9 @@ def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int =
         return _DASH
     scaled = value * factor
     # "#" keeps trailing zeros; a trailing decimal point is removed. Large numbers without exponent.
-    text = f"{scaled:.0f}" if 10**digits <= abs(scaled) < 1e9 else f"{scaled:#.{digits}g}".rstrip(".")
+    text = (
+        f"{scaled:.0f}" if 10**digits <= abs(scaled) < 1e9 else f"{scaled:#.{digits}g}".rstrip(".")
+    )
     return f"{text} {unit}".rstrip()
 
 
@@ -115,7 +117,12 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
         if result["success"]
         else '<span class="verdict bad">not successful</span>'
     )
-    where = [("figures", "Figures"), ("events", "Events"), ("scenario", "Scenario"), ("versions", "Versions")]
+    where = [
+        ("figures", "Figures"),
+        ("events", "Events"),
+        ("scenario", "Scenario"),
+        ("versions", "Versions"),
+    ]
     if "target" in flight.truth:
         where.insert(0, ("replay-section", "Replay"))
     links = "".join(f'<a href="#{anchor}">{name}</a>' for anchor, name in where)
@@ -282,7 +289,9 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
 
 
 def _identified(flight: RecordedFlight) -> str:
-    """Return a table of the identified mass properties at the end, beside the stated and the true ones."""
+    """Return a table of the identified mass properties at the end, beside the stated and the true
+    ones.
+    """
     if flight.identified is None:
         return ""
     drawn = next((b for b in flight.drawn if b.body == "target"), None)
@@ -302,7 +311,9 @@ def _identified(flight: RecordedFlight) -> str:
 
 
 def _drawn(flight: RecordedFlight) -> str:
-    """Return a table of the true bodies and sensors beside the nominal values of the flight software."""
+    """Return a table of the true bodies and sensors beside the nominal values of the flight
+    software.
+    """
     stated = {"target": flight.scenario.target.mass_kg} | {
         f"chaser/{i}": flight.scenario.chaser.mass_kg for i in range(len(flight.scenario.chasers))
     }
@@ -383,9 +394,7 @@ def _events(result: dict[str, Any], seekable: bool) -> str:
         time_s = event["time_s"]
         label = f"{time_s:.2f} s"
         if seekable:
-            label = (
-                f'<button type="button" data-time="{time_s:.3f}" title="show in the replay">{label}</button>'
-            )
+            label = f'<button type="button" data-time="{time_s:.3f}" title="show in the replay">{label}</button>'
         rows.append(f'<tr><td>{label}</td><td class="text">{escape(event["what"])}</td></tr>')
     return f'<h2 id="events">Events</h2><div class="wide"><table><tbody>{"".join(rows)}</tbody></table></div>'
 
@@ -393,7 +402,9 @@ def _events(result: dict[str, Any], seekable: bool) -> str:
 def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
     scenario = json.dumps(flight.scenario.model_dump(mode="json"), indent=2, ensure_ascii=False)
     versions = [
-        (k.removeprefix("version."), v) for k, v in sorted(flight.run.items()) if k.startswith("version.")
+        (k.removeprefix("version."), v)
+        for k, v in sorted(flight.run.items())
+        if k.startswith("version.")
     ]
     run = [(k, v) for k, v in sorted(flight.run.items()) if not k.startswith("version.")]
     messages = [(key, str(m["count"]), str(m["lost"])) for key, m in result["messages"].items()]

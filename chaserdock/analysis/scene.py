@@ -29,10 +29,11 @@ _FACET_M = 0.02
 
 @dataclass(frozen=True)
 class Face:
-    """A flat quadrangle ``corners_m`` (4, 3) in body axes with outward ``normal``; ``decals`` are painted on it in order.
+    """A flat quadrangle ``corners_m`` (4, 3) in body axes with outward ``normal``; ``decals`` are
+    painted on it in order.
 
-    A triangle has its last corner twice. ``lift_m``: by how much nearer than it is the face counts when faces are ordered by
-    depth: a thin part on a larger face must not be hidden by it.
+    A triangle has its last corner twice. ``lift_m``: by how much nearer than it is the face counts
+    when faces are ordered by depth: a thin part on a larger face must not be hidden by it.
     """
 
     corners_m: Array
@@ -44,7 +45,9 @@ class Face:
 
 @dataclass(frozen=True)
 class Scene:
-    """Faces of the target (TRF) and of a chaser (CRF), and the far corners (4, 3) of the camera frustum in CRF."""
+    """Faces of the target (TRF) and of a chaser (CRF), and the far corners (4, 3) of the camera
+    frustum in CRF.
+    """
 
     target: tuple[Face, ...]
     chaser: tuple[Face, ...]
@@ -53,7 +56,9 @@ class Scene:
 
 
 def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey], ...]:
-    """Return the quadrangles (4, 3) in TRF of a marker: white border, black square, and the white cells row by row."""
+    """Return the quadrangles (4, 3) in TRF of a marker: white border, black square, and the white
+    cells row by row.
+    """
     table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, model.dictionary))
     n = table.markerSize + 2
     cells = np.asarray(cv2.aruco.generateImageMarker(table, marker.id, n, borderBits=1)) > 0
@@ -75,19 +80,27 @@ def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey
 
 
 def box_faces(box: Box, model: TargetModel | None = None) -> list[Face]:
-    """Return the six faces of a box in its parent axes; with a ``model``, including the markers on them."""
+    """Return the six faces of a box in its parent axes; with a ``model``, including the markers on
+    them.
+    """
     out = []
     for index in range(6):
         q = rotations.multiply(box.q_wxyz, face_rotation(index))
         width, height, depth = face_extent(box.size_m, index)
-        flat = [[x * width / 2, y * height / 2, depth] for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
+        flat = [
+            [x * width / 2, y * height / 2, depth] for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))
+        ]
         normal = rotations.rotate(q, (0.0, 0.0, 1.0))
         # White borders may extend under neighbouring markers: all borders come first.
         borders: list[tuple[Array, Grey]] = []
         prints: list[tuple[Array, Grey]] = []
         for marker in model.markers if model else ():
             offset = np.array(marker.position_trf_m) - box.position_m
-            if model and abs(offset @ normal - depth) < 1e-6 and marker.normal_trf() @ normal > 0.999:
+            if (
+                model
+                and abs(offset @ normal - depth) < 1e-6
+                and marker.normal_trf() @ normal > 0.999
+            ):
                 border, *printed = marker_decals(model, marker)
                 borders.append(border)
                 prints += printed
@@ -97,7 +110,9 @@ def box_faces(box: Box, model: TargetModel | None = None) -> list[Face]:
 
 
 def _divided(triangles: Array) -> Array:
-    """Divide triangles (N, 3, 3) at the middle of their longest edge until none is longer than _LONGEST_EDGE_M."""
+    """Divide triangles (N, 3, 3) at the middle of their longest edge until none is longer than
+    _LONGEST_EDGE_M.
+    """
     done = []
     while len(triangles):
         edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
@@ -106,10 +121,14 @@ def _divided(triangles: Array) -> Array:
         # Turn each of the others so that its longest edge is between its first two corners.
         first = edges[~short].argmax(axis=1)[:, None]
         a, b, c = np.moveaxis(
-            np.take_along_axis(triangles[~short], ((first + np.arange(3)) % 3)[..., None], axis=1), 1, 0
+            np.take_along_axis(triangles[~short], ((first + np.arange(3)) % 3)[..., None], axis=1),
+            1,
+            0,
         )
         middle = 0.5 * (a + b)
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        triangles = np.concatenate(
+            [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)]
+        )
     return np.concatenate(done)
 
 
@@ -129,7 +148,9 @@ def mesh_faces(mesh: TriangleMesh) -> list[Face]:
         for three, normal, area in zip(corners, normals, doubled_areas, strict=True):
             if area > 0.0:
                 broad = plate and abs(normal[thin]) > 0.9 * area
-                out.append(Face(three[[0, 1, 2, 2]], normal / area, grey, lift_m=_LIFT_M if broad else 0.0))
+                out.append(
+                    Face(three[[0, 1, 2, 2]], normal / area, grey, lift_m=_LIFT_M if broad else 0.0)
+                )
     return out
 
 
@@ -150,18 +171,31 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
     body = scenario.chaser
     front = body.size_m[0] / 2.0
     chaser = (
-        mesh_faces(satellite(body.mesh, _FACET_M)) if body.mesh else box_faces(Box(body.size_m, shade=0.42))
+        mesh_faces(satellite(body.mesh, _FACET_M))
+        if body.mesh
+        else box_faces(Box(body.size_m, shade=0.42))
     )
     mesh = scenario.target.nominal_mesh(_FACET_M)
     target = (
-        [face for box in model.boxes for face in box_faces(box, model)] if mesh is None else mesh_faces(mesh)
+        [face for box in model.boxes for face in box_faces(box, model)]
+        if mesh is None
+        else mesh_faces(mesh)
     )
     if body.probe_reach_m > front:
         chaser += _probe(front, body.probe_reach_m)
     camera = scenario.camera_model()
-    edges = ((0, 0), (camera.width_px, 0), (camera.width_px, camera.height_px), (0, camera.height_px))
+    edges = (
+        (0, 0),
+        (camera.width_px, 0),
+        (camera.width_px, camera.height_px),
+        (0, camera.height_px),
+    )
     rays = [
-        [(u - camera.cx_px) / camera.fx_px * view_m, (v - camera.cy_px) / camera.fy_px * view_m, view_m]
+        [
+            (u - camera.cx_px) / camera.fx_px * view_m,
+            (v - camera.cy_px) / camera.fy_px * view_m,
+            view_m,
+        ]
         for u, v in edges
     ]
     origin = np.array(camera.position_crf_m)

@@ -24,7 +24,8 @@ _AXES = ((80, 80, 255), (90, 220, 90), (255, 160, 60))
 
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
-    """Return a BGR mosaic of each chaser's last image exposed up to ``at_s``, each ``width_px`` wide.
+    """Return a BGR mosaic of each chaser's last image exposed up to ``at_s``, each ``width_px``
+    wide.
 
     Raise LogError for an unreadable log or one without an image up to then.
     """
@@ -50,7 +51,9 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
 def annotated_image(
     scenario: FlightScenario, image: Image, sighting: Sighting | None, width_px: int
 ) -> NDArray[np.uint8]:
-    """Return the image as BGR, ``width_px`` wide, with the sighting's markers and pose. Raise LogError for a bad image."""
+    """Return the image as BGR, ``width_px`` wide, with the sighting's markers and pose. Raise
+    LogError for a bad image.
+    """
     try:
         grey = decode_image(image)
     except BadImage as error:
@@ -61,7 +64,9 @@ def annotated_image(
     gamma = np.array([255 * (v / 255) ** 0.6 for v in range(256)]).astype(np.uint8)
     canvas: Any = cv2.cvtColor(cv2.LUT(grey, gamma), cv2.COLOR_GRAY2BGR)
     scale = width_px / image.width_px
-    canvas = cv2.resize(canvas, (width_px, round(image.height_px * scale)), interpolation=cv2.INTER_AREA)
+    canvas = cv2.resize(
+        canvas, (width_px, round(image.height_px * scale)), interpolation=cv2.INTER_AREA
+    )
     if sighting is not None and sighting.sim_time_ns == image.sim_time_ns:
         corners = (np.reshape(sighting.corners_px, (-1, 4, 2)) + 0.5) * scale - 0.5
         for square in corners:
@@ -76,7 +81,9 @@ def annotated_image(
     return np.asarray(canvas, dtype=np.uint8)
 
 
-def _draw_axes(canvas: NDArray[np.uint8], scenario: FlightScenario, sighting: Sighting, scale: float) -> None:
+def _draw_axes(
+    canvas: NDArray[np.uint8], scenario: FlightScenario, sighting: Sighting, scale: float
+) -> None:
     """Draw the measured target frame: x red, y green, z blue, 8 cm each."""
     best = sighting.solutions[0]
     points = np.vstack([np.zeros(3), 0.08 * np.eye(3)])
@@ -91,7 +98,9 @@ def _draw_axes(canvas: NDArray[np.uint8], scenario: FlightScenario, sighting: Si
 
 
 def seen_text(sighting: Sighting | None) -> str:
-    """Return by what a sighting found the target, a number of markers or its shape, or that it did not."""
+    """Return by what a sighting found the target, a number of markers or its shape, or that it did
+    not.
+    """
     count = len(sighting.marker_ids) if sighting else 0
     if count:
         return f"{count} marker{'s' if count > 1 else ''}"

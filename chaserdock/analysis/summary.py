@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluation of a flight on ground truth: ``summary.json``. SI units and radians; keys as in docs/summary.md."""
+"""Evaluation of a flight on ground truth: ``summary.json``. SI units and radians; keys as in
+docs/summary.md.
+"""
 
 from __future__ import annotations
 
@@ -45,11 +47,14 @@ def summarize(log: Path) -> dict[str, Any]:
     return summary_of(load_flight(log))
 
 
-def true_reference(flight: RecordedFlight, chaser: int, rows: slice, target: Track) -> tuple[Array, Array]:
-    """Return the reference positions (K, 3) WRF and attitudes (K, 4) of a chaser at these rows of the target's truth.
+def true_reference(
+    flight: RecordedFlight, chaser: int, rows: slice, target: Track
+) -> tuple[Array, Array]:
+    """Return the reference positions (K, 3) WRF and attitudes (K, 4) of a chaser at these rows of
+    the target's truth.
 
-    They are the commanded offset on the *true* target: estimation errors count as tracking errors. Before the first
-    command the offset is the scenario's.
+    They are the commanded offset on the *true* target: estimation errors count as tracking errors.
+    Before the first command the offset is the scenario's.
     """
     c = flight.scenario.chasers[chaser]
     offsets = commanded_offsets(flight, chaser, np.array(c.position_m), target.time_s[rows])
@@ -61,7 +66,9 @@ def true_reference(flight: RecordedFlight, chaser: int, rows: slice, target: Tra
 
 
 def commanded_offsets(flight: RecordedFlight, chaser: int, before: Array, time_s: Array) -> Array:
-    """Return the commanded offsets (K, 3) TRF of a chaser at the times (K,); ``before`` (3,) until the first command."""
+    """Return the commanded offsets (K, 3) TRF of a chaser at the times (K,); ``before`` (3,) until
+    the first command.
+    """
     history = flight.references.get(chaser)
     if history is None:
         return np.broadcast_to(before, (len(time_s), 3))
@@ -75,7 +82,9 @@ def blocks(number: int) -> Iterator[slice]:
 
 
 def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, Array]:
-    """Return times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from its true reference."""
+    """Return times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from
+    its true reference.
+    """
     own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
     n = min(len(target.time_s), len(own.time_s))
     position, angle = np.empty(n), np.empty(n)
@@ -86,8 +95,11 @@ def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, 
     return target.time_s[:n], position, angle
 
 
-def tracking_components(flight: RecordedFlight, chaser: int, step: int) -> tuple[Array, Array, Array]:
-    """Return times (K,), position errors (K, 3) m, TRF, and orientation errors (K, 3) rad, CRF, of every ``step``-th tick.
+def tracking_components(
+    flight: RecordedFlight, chaser: int, step: int
+) -> tuple[Array, Array, Array]:
+    """Return times (K,), position errors (K, 3) m, TRF, and orientation errors (K, 3) rad, CRF, of
+    every ``step``-th tick.
 
     Own pose relative to the true reference; the orientation error is a rotation vector.
     """
@@ -100,7 +112,9 @@ def tracking_components(flight: RecordedFlight, chaser: int, step: int) -> tuple
 
 
 def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows of the estimate (K,) with a known target, and the rows of its truth at the same times."""
+    """Return the rows of the estimate (K,) with a known target, and the rows of its truth at the
+    same times.
+    """
     none = np.zeros(0, dtype=np.intp)
     truth, known = flight.truth.get("target"), np.flatnonzero(flight.estimate_known)
     if truth is None or not len(known):
@@ -110,7 +124,9 @@ def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[n
 
 
 def rows_at_equal_times(time_s: Array, other_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows (K,) of ascending times that occur in both, in the first and in the second (not empty)."""
+    """Return the rows (K,) of ascending times that occur in both, in the first and in the second
+    (not empty).
+    """
     at_ns, other_ns = nanoseconds(time_s), nanoseconds(other_s)
     row = rows_since(other_ns, at_ns)
     both = np.flatnonzero((row >= 0) & (other_ns[row] == at_ns))
@@ -128,14 +144,19 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
         i, j = a[rows], b[rows]
         pose = pose_error(truth.position_m[j], truth.q_wxyz[j], e.position_m[i], e.q_wxyz[i])
         _store_pose_errors(errors, rows, pose, flight.pose_covariance(i))
-        errors["velocity_m_s"][rows] = np.linalg.norm(truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1)
-        errors["omega_rad_s"][rows] = np.linalg.norm(truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1)
+        errors["velocity_m_s"][rows] = np.linalg.norm(
+            truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1
+        )
+        errors["omega_rad_s"][rows] = np.linalg.norm(
+            truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1
+        )
     return {"time_s": e.time_s[a], **errors}
 
 
 def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
-    """Return errors of a chaser's estimated pose relative to the target: ``time_s``, ``position_m``, ``orientation_rad``,
-    ``nees``, each (K,); no rows without truth, or if the estimator does not publish that pose."""
+    """Return errors of a chaser's estimated pose relative to the target: ``time_s``,
+    ``position_m``, ``orientation_rad``, ``nees``, each (K,); no rows without truth, or if the
+    estimator does not publish that pose."""
     own, target = flight.truth.get(f"chaser/{chaser}"), flight.truth.get("target")
     history = flight.relative.get(chaser)
     if own is None or target is None or history is None:
@@ -145,14 +166,20 @@ def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
     errors = {name: np.empty(len(a)) for name in _POSE_ERRORS}
     for rows in blocks(len(a)):
         i, j = a[rows], b[rows]
-        true = relative_pose(own.position_m[j], own.q_wxyz[j], target.position_m[j], target.q_wxyz[j])
+        true = relative_pose(
+            own.position_m[j], own.q_wxyz[j], target.position_m[j], target.q_wxyz[j]
+        )
         pose = pose_error(*true, history.position_m[i], history.q_wxyz[i])
         _store_pose_errors(errors, rows, pose, history.covariance(i))
     return {"time_s": history.time_s[a], **errors}
 
 
-def _store_pose_errors(errors: dict[str, Array], rows: slice, pose: Array, covariance: Array) -> None:
-    """Store what ``_POSE_ERRORS`` names, of pose errors (K, 6) with covariances (K, 6, 6), in these rows."""
+def _store_pose_errors(
+    errors: dict[str, Array], rows: slice, pose: Array, covariance: Array
+) -> None:
+    """Store what ``_POSE_ERRORS`` names, of pose errors (K, 6) with covariances (K, 6, 6), in these
+    rows.
+    """
     errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
     errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
     errors["nees"][rows] = normalized_square(pose, covariance)
@@ -191,10 +218,11 @@ def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
 
 
 def dock_time(flight: RecordedFlight, chaser: int) -> float | None:
-    """Return the time (s) from which on a chaser stays within the docking tolerances; None if it is not docked.
+    """Return the time (s) from which on a chaser stays within the docking tolerances; None if it is
+    not docked.
 
-    Docked: the reference is at the docking distance, and at the end the chaser has been within the scenario's position
-    and angle tolerances of it for at least ``docked_time_s``.
+    Docked: the reference is at the docking distance, and at the end the chaser has been within the
+    scenario's position and angle tolerances of it for at least ``docked_time_s``.
     """
     approach = flight.scenario.approach
     time_s, position, angle = tracking_errors(flight, chaser)
@@ -212,7 +240,9 @@ def dock_time(flight: RecordedFlight, chaser: int) -> float | None:
 def _unanswered(flight: RecordedFlight) -> int:
     """Return the number of expected commands that never arrived (0 in lock-step)."""
     return max(
-        0, flight.expected_commands - sum(n for key, n in flight.counts.items() if key.endswith("/actuators"))
+        0,
+        flight.expected_commands
+        - sum(n for key, n in flight.counts.items() if key.endswith("/actuators")),
     )
 
 
@@ -236,7 +266,9 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             "docked": docked_s is not None,
             "dock_time_s": docked_s,
             "reached_time_s": reached_time(flight, i),
-            "min_distance_target_m": float(flight.truth[name].distance_to(flight.truth["target"]).min()),
+            "min_distance_target_m": float(
+                flight.truth[name].distance_to(flight.truth["target"]).min()
+            ),
             "impulse_N_s": flight.absolute_impulse_N_s[name],
             "thruster_impulse_N_s": flight.thruster_impulse_N_s[name],
             "propellant_kg": flight.propellant_kg[name],
@@ -314,7 +346,9 @@ def _events(flight: RecordedFlight) -> list[dict[str, Any]]:
     events = [(e.sim_time_ns, f"{e.process}: {e.what} {e.detail}".strip()) for e in flight.events]
     for r in flight.replies:
         outcome = "accepted" if r.accepted else "refused"
-        events.append((r.sim_time_ns, f"command {r.command} chaser {r.chaser}: {outcome}: {r.reason}"))
+        events.append(
+            (r.sim_time_ns, f"command {r.command} chaser {r.chaser}: {outcome}: {r.reason}")
+        )
     return [{"time_s": t / 1e9, "what": what} for t, what in sorted(events)]
 
 
@@ -333,7 +367,11 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
     if result["collisions"] > s.success.max_collisions:
         out.append(f"{result['collisions']} collisions, at most {s.success.max_collisions} allowed")
     nearest = result["min_distance_chasers_m"]
-    if s.success.keep_distances and nearest is not None and nearest < s.limits.min_distance_chasers_m:
+    if (
+        s.success.keep_distances
+        and nearest is not None
+        and nearest < s.limits.min_distance_chasers_m
+    ):
         out.append(
             f"two chasers came within {nearest:.3f} m; the limit is {s.limits.min_distance_chasers_m:g} m"
         )
@@ -341,15 +379,22 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         distance = c["min_distance_target_m"]
         limit = nearest_allowed_m(s, int(i))
         if s.success.keep_distances and distance < limit:
-            out.append(f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m")
+            out.append(
+                f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m"
+            )
         if int(i) in s.success.docked and not c["docked"]:
             out.append(f"chaser {i} is not docked")
         out += not_reached(s, int(i), c["reached_time_s"])
         position, angle = (c["steady"][k] for k in ("position_mse_m2", "orientation_mse_rad2"))
         what = f"chaser {i}: steady"
-        out += _exceeded(f"{what} position RMS", _root(position), s.success.steady_position_rms_m, "m")
         out += _exceeded(
-            f"{what} orientation RMS", _degrees(_root(angle)), s.success.steady_orientation_rms_deg, "deg"
+            f"{what} position RMS", _root(position), s.success.steady_position_rms_m, "m"
+        )
+        out += _exceeded(
+            f"{what} orientation RMS",
+            _degrees(_root(angle)),
+            s.success.steady_orientation_rms_deg,
+            "deg",
         )
     out += capture_failures(result, s)
     out += overloads(result, s)
@@ -361,19 +406,29 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
 def _estimate_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
     """Yield a message for each estimated pose relative to the target that exceeds its limits.
 
-    An estimator that publishes none takes the odometry of the chasers as exact, and is judged by the target's pose.
+    An estimator that publishes none takes the odometry of the chasers as exact, and is judged by
+    the target's pose.
     """
     relative = {
-        f"chaser {i}: largest {{}} error of its estimated pose relative to the target": c["relative_estimate"]
+        f"chaser {i}: largest {{}} error of its estimated pose relative to the target": c[
+            "relative_estimate"
+        ]
         for i, c in result["chasers"].items()
         if "relative_estimate" in c
     }
     for what, estimate in (
         relative or {"largest {} error of the estimate": result["target_estimate"]}
     ).items():
-        position, angle = estimate["max_position_error_m"], _degrees(estimate["max_orientation_error_rad"])
-        yield from _exceeded(what.format("position"), position, s.success.max_estimate_position_m, "m")
-        yield from _exceeded(what.format("orientation"), angle, s.success.max_estimate_orientation_deg, "deg")
+        position, angle = (
+            estimate["max_position_error_m"],
+            _degrees(estimate["max_orientation_error_rad"]),
+        )
+        yield from _exceeded(
+            what.format("position"), position, s.success.max_estimate_position_m, "m"
+        )
+        yield from _exceeded(
+            what.format("orientation"), angle, s.success.max_estimate_orientation_deg, "deg"
+        )
 
 
 def _root(mean_square: float | None) -> float | None:

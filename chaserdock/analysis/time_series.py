@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from .columns import Columns
 
 ImageOutcome = Literal["used", "rejected", "not seen", "bad image", "not processed"]
-"""Outcome of an image: its sighting was used or rejected by the filter; the target was not detected; the image was unreadable;
-or the log holds no sighting of it."""
+"""Outcome of an image: its sighting was used or rejected by the filter; the target was not
+detected; the image was unreadable; or the log holds no sighting of it."""
 OUTCOMES: tuple[ImageOutcome, ...] = get_args(ImageOutcome)
 _OUTCOME_OF_STATUS: dict[str, ImageOutcome] = {"seen": "used", "nothing": "not seen"}
 
@@ -34,7 +34,9 @@ class ImageOutcomes:
     code: NDArray[np.intp]
 
     def intervals(self, gap_s: float = np.inf) -> Iterator[tuple[float, float, ImageOutcome]]:
-        """Yield first and last exposure (s) of consecutive images with equal outcome; a gap over ``gap_s`` splits them."""
+        """Yield first and last exposure (s) of consecutive images with equal outcome; a gap over
+        ``gap_s`` splits them.
+        """
         if not len(self.code):
             return
         breaks = np.flatnonzero((np.diff(self.code) != 0) | (np.diff(self.time_s) > gap_s)) + 1
@@ -47,8 +49,9 @@ class ImageOutcomes:
 class ActuatorHistory:
     """Applied force and torque of a chaser in body axes.
 
-    ``force_N`` and ``torque_N_m`` (K, 3) are means over the intervals between ``edges_s`` (K + 1,). ``thruster_duty``
-    (K, J) is the share of an interval during which each thruster was open, with J = 0 without thrusters.
+    ``force_N`` and ``torque_N_m`` (K, 3) are means over the intervals between ``edges_s`` (K + 1,).
+    ``thruster_duty`` (K, J) is the share of an interval during which each thruster was open, with J
+    = 0 without thrusters.
     """
 
     edges_s: Array
@@ -59,7 +62,9 @@ class ActuatorHistory:
 
 @dataclass
 class Traces:
-    """Time series by chaser. ``latency``: rows of exposure time (s) and wall-clock seconds to the actuator command."""
+    """Time series by chaser. ``latency``: rows of exposure time (s) and wall-clock seconds to the
+    actuator command.
+    """
 
     inputs: dict[int, ActuatorHistory]
     latency: dict[int, Array]
@@ -104,7 +109,9 @@ class _Collector:
     sent: dict[tuple[int, int], int] = field(default_factory=dict)
     latency: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(2)))
     images: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
-    sightings: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
+    sightings: dict[int, array[int]] = field(
+        default_factory=lambda: defaultdict(lambda: array("q"))
+    )
     outcomes: dict[int, bytearray] = field(default_factory=lambda: defaultdict(bytearray))
     rejected: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
 
@@ -143,7 +150,9 @@ class _Collector:
 
 
 def load_traces(log: LogSource, chasers: Iterable[int], every: int = 1) -> Traces:
-    """Read the time series of a log, actuator values as means over ``every`` ticks. Raise LogError for an unreadable log."""
+    """Read the time series of a log, actuator values as means over ``every`` ticks. Raise LogError
+    for an unreadable log.
+    """
     numbers = list(chasers)
     keys = [topics.TARGET.key_of()]
     for i in numbers:

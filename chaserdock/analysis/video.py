@@ -55,10 +55,10 @@ def write_video(
 ) -> int:
     """Write the video of a log (or run folder); return the number of frames.
 
-    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds per second of video; ``part_s``:
-    simulated times of the first and last frame; ``quality``: of .webp, 0 to 100; ``report_progress`` receives the
-    simulated time of each frame. Raise LogError for an unreadable log or one without motion or image, ChaserdockError
-    for an invalid size or file.
+    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds per second of
+    video; ``part_s``: simulated times of the first and last frame; ``quality``: of .webp, 0 to 100;
+    ``report_progress`` receives the simulated time of each frame. Raise LogError for an unreadable
+    log or one without motion or image, ChaserdockError for an invalid size or file.
     """
     ending = out.suffix.lower()
     if ending not in _CODECS:
@@ -105,14 +105,18 @@ def frames(
     height_px: int,
     part_s: tuple[float, float] = (0.0, math.inf),
 ) -> Iterator[tuple[float, BgrImage]]:
-    """Yield simulated time (s) and video frame (height, width, 3), BGR, every ``every_s`` of simulated time in ``part_s``."""
+    """Yield simulated time (s) and video frame (height, width, 3), BGR, every ``every_s`` of
+    simulated time in ``part_s``.
+    """
     number = len(flight.scenario.chasers)
     camera = flight.scenario.camera
     aspect = camera.width_px / camera.height_px
     columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
     rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
     side_px = columns * shot_px
-    external = _ExternalView(flight, load_plumes(log, flight), width_px - side_px, height_px, part_s)
+    external = _ExternalView(
+        flight, load_plumes(log, flight), width_px - side_px, height_px, part_s
+    )
     for time_s, latest in shots(log, number, every_s, part_s[0]):
         if time_s > part_s[1] + 1e-9:
             return
@@ -139,7 +143,14 @@ def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: in
             status = "unreadable image"
     empty = np.full((height, width_px, 3), 24, dtype=np.uint8)
     cv2.putText(
-        empty, f"chaser {chaser}  {status}", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA
+        empty,
+        f"chaser {chaser}  {status}",
+        (8, 18),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.5,
+        _INK,
+        1,
+        cv2.LINE_AA,
     )
     return empty
 
@@ -182,7 +193,9 @@ class _ExternalView:
         # Distant chasers must not reduce the scale for all others.
         self.distance_m = 3.5 * min(reach, 3.0)
         self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
-        self.phases = {i: flight.references[i].phases if i in flight.references else [] for i in self.numbers}
+        self.phases = {
+            i: flight.references[i].phases if i in flight.references else [] for i in self.numbers
+        }
         self.seen = {
             i: set(nanoseconds(s.time_s[s.seen]).tolist())
             for i in self.numbers
@@ -201,7 +214,9 @@ class _ExternalView:
         plumes = {i: self._plumes_at(i, time_s) for i in chasers if i in self._plumes}
         rendered = self._rendered(look, at, chasers)
         background = self._background(look) if rendered is None else None
-        image = draw(self.scene, look, self.sun, at, chasers, paths, seeing, plumes, background, rendered)
+        image = draw(
+            self.scene, look, self.sun, at, chasers, paths, seeing, plumes, background, rendered
+        )
         self._close_up(image, at, chasers, plumes, seeing, time_s)
         self._draw_graph(image, time_s)
         self._write(image, time_s)
@@ -211,13 +226,17 @@ class _ExternalView:
         """Return stars and Earth as the simulated cameras see them; the view's direction is fixed."""
         if self._sky is None:
             disc = earth_disc(self.flight.scenario)
-            space = Background(look.pinhole(), np.zeros(2), self.size, None if disc is None else Earth(*disc))
+            space = Background(
+                look.pinhole(), np.zeros(2), self.size, None if disc is None else Earth(*disc)
+            )
             x, y, z = self.sun.tolist()
             grey = space.draw(look.attitude(), Light((x, y, z)))
             self._sky = np.repeat(grey[:, :, None], 3, axis=2)
         return self._sky
 
-    def _rendered(self, look: Viewpoint, at: BodyPose, chasers: dict[int, BodyPose]) -> RenderedBodies | None:
+    def _rendered(
+        self, look: Viewpoint, at: BodyPose, chasers: dict[int, BodyPose]
+    ) -> RenderedBodies | None:
         """Return the bodies as rendered; None for a target without a mesh, whose faces are drawn."""
         if self._mesh is None:
             return None
@@ -227,11 +246,16 @@ class _ExternalView:
         return self._renderers[size].render(look, at, chasers, tint)
 
     def _plumes_at(self, chaser: int, time_s: float) -> Array:
-        """Return nozzles and plume ends (K, 2, 3), CRF, of the thrusters that are open in the tick at a time."""
+        """Return nozzles and plume ends (K, 2, 3), CRF, of the thrusters that are open in the tick
+        at a time.
+        """
         history, thrusters = self._plumes[chaser], self.flight.scenario.chaser.thrusters
         row = min(_row(history.edges_s, time_s), len(history.thruster_duty) - 1)
         lines = [
-            (t.position_m, np.subtract(t.position_m, np.multiply(t.direction, _PLUME_M * (0.4 + 0.6 * duty))))
+            (
+                t.position_m,
+                np.subtract(t.position_m, np.multiply(t.direction, _PLUME_M * (0.4 + 0.6 * duty))),
+            )
             for t, duty in zip(thrusters, history.thruster_duty[row], strict=True)
             if duty > 0.02
         ]
@@ -246,7 +270,9 @@ class _ExternalView:
         seeing: frozenset[int],
         time_s: float,
     ) -> None:
-        """Draw an enlarged view between the target and the chaser that is docking into the upper right corner."""
+        """Draw an enlarged view between the target and the chaser that is docking into the upper
+        right corner.
+        """
         close = {
             i: position - at[0]
             for i, (position, _) in chasers.items()
@@ -269,11 +295,18 @@ class _ExternalView:
         x = self.size[0] - w - _MARGIN_PX
         image[_MARGIN_PX : _MARGIN_PX + h, x : x + w] = view
         cv2.rectangle(
-            image, (x, _MARGIN_PX), (x + w - 1, _MARGIN_PX + h - 1), tint(nearest).tolist(), 1, cv2.LINE_AA
+            image,
+            (x, _MARGIN_PX),
+            (x + w - 1, _MARGIN_PX + h - 1),
+            tint(nearest).tolist(),
+            1,
+            cv2.LINE_AA,
         )
 
     def _draw_graph(self, image: BgrImage, time_s: float) -> None:
-        """Draw distances to the target and closing speeds since the begin of the video, lower right corner."""
+        """Draw distances to the target and closing speeds since the begin of the video, lower right
+        corner.
+        """
         width, height = round(0.38 * self.size[0]), round(0.15 * self.size[1])
         if width < 160 or height < 40:
             return
@@ -282,12 +315,25 @@ class _ExternalView:
             y0 = self.size[1] - (2 - place) * (height + _MARGIN_PX)
             cv2.line(image, (x0, y0 + height), (x0 + width, y0 + height), _DIM, 1)
             label = f"{graph.label}, up to {graph.high:.3g}"
-            cv2.putText(image, label, (x0 + 4, y0 + 10), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)
+            cv2.putText(
+                image,
+                label,
+                (x0 + 4, y0 + 10),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.42,
+                _INK,
+                1,
+                cv2.LINE_AA,
+            )
             for i, (times_s, values) in graph.series.items():
                 until = times_s <= time_s + 1e-6
                 x = x0 + (times_s[until] - self._begin_s) / self._span_s * width
                 share = np.clip((values[until] - graph.low) / (graph.high - graph.low), 0.0, 1.0)
-                points = np.stack([x, y0 + height - share * (height - 14)], axis=1).round().astype(np.int32)
+                points = (
+                    np.stack([x, y0 + height - share * (height - 14)], axis=1)
+                    .round()
+                    .astype(np.int32)
+                )
                 cv2.polylines(image, [points], False, tint(i).tolist(), 1, cv2.LINE_AA)
 
     def _write(self, image: BgrImage, time_s: float) -> None:
@@ -316,11 +362,16 @@ class _ExternalView:
 
 
 def wrapped(text: str, width_px: int, size: float) -> list[str]:
-    """Return the text in lines that are at most ``width_px`` wide as cv2.putText writes them; a longer word is not broken."""
+    """Return the text in lines that are at most ``width_px`` wide as cv2.putText writes them; a
+    longer word is not broken.
+    """
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".lstrip()
-        if lines[-1] and cv2.getTextSize(longer, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] > width_px:
+        if (
+            lines[-1]
+            and cv2.getTextSize(longer, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] > width_px
+        ):
             lines.append(word)
         else:
             lines[-1] = longer
@@ -341,7 +392,9 @@ def load_plumes(log: Path, flight: RecordedFlight) -> dict[int, ActuatorHistory]
 
 @dataclass(frozen=True)
 class _Graph:
-    """Values of each chaser over the part of the flight that is shown (``series``: times (K,) s and values (K,)), and their scale."""
+    """Values of each chaser over the part of the flight that is shown (``series``: times (K,) s and
+    values (K,)), and their scale.
+    """
 
     label: str
     series: dict[int, tuple[Array, Array]]
@@ -351,7 +404,9 @@ class _Graph:
 
 def _graph(label: str, series: dict[int, tuple[Array, Array]]) -> _Graph:
     """Return a graph whose scale leaves out the extreme hundredths of the values."""
-    known = np.concatenate([values for _, values in series.values() if len(values)] or [np.zeros(1)])
+    known = np.concatenate(
+        [values for _, values in series.values() if len(values)] or [np.zeros(1)]
+    )
     low, high = min(0.0, float(np.percentile(known, 1))), max(1e-3, float(np.percentile(known, 99)))
     return _Graph(label, series, low, high)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration of camera matrix and distortion from images of a board, with OpenCV.
 
-Outlier images are excluded and named: those with an RMS error above three times the median and above half a pixel. This
-does not compensate for a board that is not flat.
+Outlier images are excluded and named: those with an RMS error above three times the median and
+above half a pixel. This does not compensate for a board that is not flat.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ class TooFew(Exception):
 
 @dataclass(frozen=True)
 class Board:
-    """``points_m`` (n, 3): inner corners; ``charuco``: OpenCV's board, or None for a chessboard of ``size`` corners."""
+    """``points_m`` (n, 3): inner corners; ``charuco``: OpenCV's board, or None for a chessboard of
+    ``size`` corners.
+    """
 
     points_m: NDArray[np.float32]
     size: tuple[int, int]
@@ -43,8 +45,9 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibration:
-    """``matrix`` (3, 3), ``distortion`` (5,) k1, k2, p1, p2, k3; ``sigma`` (4,): one standard deviation of fx, fy,
-    cx, cy, pixels; ``rms_px``: by used image; ``excluded``: reason by image."""
+    """``matrix`` (3, 3), ``distortion`` (5,) k1, k2, p1, p2, k3; ``sigma`` (4,): one standard
+    deviation of fx, fy, cx, cy, pixels; ``rms_px``: by used image; ``excluded``: reason by image.
+    """
 
     width_px: int
     height_px: int
@@ -57,10 +60,14 @@ class Calibration:
 
 
 def board_of(text: str, square_m: float, marker_m: float, dictionary: str) -> Board:
-    """Parse a board such as ``charuco 8x6`` (squares) or ``chessboard 9x6`` (inner corners). Raise BadBoard."""
+    """Parse a board such as ``charuco 8x6`` (squares) or ``chessboard 9x6`` (inner corners). Raise
+    BadBoard.
+    """
     parsed = re.fullmatch(r"(charuco|chessboard)\s+(\d+)x(\d+)", text.strip())
     if parsed is None or min(int(parsed[2]), int(parsed[3])) < 3:
-        raise BadBoard(f"--board {text}: must be like 'charuco 8x6' or 'chessboard 9x6', 3 or more each way")
+        raise BadBoard(
+            f"--board {text}: must be like 'charuco 8x6' or 'chessboard 9x6', 3 or more each way"
+        )
     size = (int(parsed[2]), int(parsed[3]))
     if not square_m > 0.0:
         raise BadBoard(f"--square {square_m}: must be positive")
@@ -74,14 +81,22 @@ def board_of(text: str, square_m: float, marker_m: float, dictionary: str) -> Bo
     except ValueError as error:
         raise BadBoard(f"--dictionary: {error}") from None
     if size[0] * size[1] // 2 > len(table.bytesList):
-        raise BadBoard(f"--board {text}: needs {size[0] * size[1] // 2} markers, {dictionary} has fewer")
+        raise BadBoard(
+            f"--board {text}: needs {size[0] * size[1] // 2} markers, {dictionary} has fewer"
+        )
     charuco = cv2.aruco.CharucoBoard(size, square_m, marker_m, table)
     return Board(np.asarray(charuco.getChessboardCorners(), dtype=np.float32), size, charuco)
 
 
 def calibrate_folder(folder: Path, board: Board) -> Calibration:
-    """Calibrate with all images in a folder. Raise BadBoard without images, TooFew with too few usable ones."""
-    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
+    """Calibrate with all images in a folder. Raise BadBoard without images, TooFew with too few
+    usable ones.
+    """
+    paths = (
+        sorted(p for p in folder.glob("*") if p.suffix.lower() in _SUFFIXES)
+        if folder.is_dir()
+        else []
+    )
     if not paths:
         raise BadBoard(f"{folder}: contains no images ({', '.join(_SUFFIXES)})")
     images: dict[str, NDArray[np.uint8] | None] = {}
@@ -136,7 +151,9 @@ def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Cali
     )
 
 
-def find_board(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def find_board(
+    image: NDArray[np.uint8], board: Board
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Detect corners: return them in board axes (n, 3), metres, and in the image (n, 2), pixels."""
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32)
     if board.charuco is None:
@@ -146,7 +163,9 @@ def find_board(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float
     px, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(image)
     if ids is None or px is None:
         return nothing
-    return board.points_m[np.asarray(ids, dtype=np.intp).ravel()], np.asarray(px, np.float32).reshape(-1, 2)
+    return board.points_m[np.asarray(ids, dtype=np.intp).ravel()], np.asarray(
+        px, np.float32
+    ).reshape(-1, 2)
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:

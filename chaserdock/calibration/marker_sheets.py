@@ -34,7 +34,9 @@ _STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fontty
 
 @dataclass
 class Sheet:
-    """``rectangles`` (x, y, width, height), black; ``lines`` (x0, y0, x1, y1); ``texts`` (x, y of the baseline, text)."""
+    """``rectangles`` (x, y, width, height), black; ``lines`` (x0, y0, x1, y1); ``texts`` (x, y of
+    the baseline, text).
+    """
 
     size_mm: tuple[float, float]
     rectangles: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -42,8 +44,11 @@ class Sheet:
     texts: list[tuple[float, float, str]] = field(default_factory=list)
 
 
-def write_sheets(model: TargetModel, out: Path, size_mm: tuple[float, float]) -> tuple[int, list[Path]]:
-    """Write one PDF, or one SVG per sheet (numbered if several); return the number of sheets and the files.
+def write_sheets(
+    model: TargetModel, out: Path, size_mm: tuple[float, float]
+) -> tuple[int, list[Path]]:
+    """Write one PDF, or one SVG per sheet (numbered if several); return the number of sheets and
+    the files.
 
     Raise ValueError for a marker that does not fit on a sheet or is not in its dictionary.
     """
@@ -63,8 +68,8 @@ def write_sheets(model: TargetModel, out: Path, size_mm: tuple[float, float]) ->
 
 
 def lay_out(model: TargetModel, size_mm: tuple[float, float]) -> list[Sheet]:
-    """Place all markers in rows, large ones first, each with its white border up to the next marker or the edge of its
-    face. Raise ValueError as ``write_sheets`` does."""
+    """Place all markers in rows, large ones first, each with its white border up to the next marker
+    or the edge of its face. Raise ValueError as ``write_sheets`` does."""
     width, height = size_mm
     sheets: list[Sheet] = []
     x = y = row = 0.0
@@ -87,15 +92,20 @@ def lay_out(model: TargetModel, size_mm: tuple[float, float]) -> list[Sheet]:
         foot = height - _EDGE_MM
         sheet.lines.append((_EDGE_MM, foot, _EDGE_MM + 100.0, foot))
         sheet.lines += [
-            (_EDGE_MM + k, foot - 2.0, _EDGE_MM + k, foot) for k in np.arange(0.0, 101.0, 10.0).tolist()
+            (_EDGE_MM + k, foot - 2.0, _EDGE_MM + k, foot)
+            for k in np.arange(0.0, 101.0, 10.0).tolist()
         ]
         about = f"100 mm.  {model.name}, {model.dictionary}, sheet {number} of {len(sheets)}"
         sheet.texts.append((_EDGE_MM + 104.0, foot, about))
     return sheets
 
 
-def _place(sheet: Sheet, dictionary: str, marker: Marker, at: tuple[float, float], margin: float) -> None:
-    """Add a marker with a white ``margin`` ``at`` (x, y), crop marks at its corners, and its id below."""
+def _place(
+    sheet: Sheet, dictionary: str, marker: Marker, at: tuple[float, float], margin: float
+) -> None:
+    """Add a marker with a white ``margin`` ``at`` (x, y), crop marks at its corners, and its id
+    below.
+    """
     cells = marker_bits(dictionary, marker.id)
     cell = 1000.0 * marker.side_m / len(cells)
     x, y = at
@@ -111,11 +121,15 @@ def _place(sheet: Sheet, dictionary: str, marker: Marker, at: tuple[float, float
         for cy, sy in ((y, -1.0), (y + side, 1.0)):
             sheet.lines.append((cx + sx * 0.5, cy, cx + sx * _MARK_MM, cy))
             sheet.lines.append((cx, cy + sy * 0.5, cx, cy + sy * _MARK_MM))
-    sheet.texts.append((x + 1.0, y + side + _TEXT_MM, f"{marker.id}   {1000.0 * marker.side_m:g} mm"))
+    sheet.texts.append(
+        (x + 1.0, y + side + _TEXT_MM, f"{marker.id}   {1000.0 * marker.side_m:g} mm")
+    )
 
 
 def marker_bits(dictionary: str, marker_id: int) -> NDArray[np.int64]:
-    """Return the cells (n, n) of a marker with its black border, row 0 on top: 1 white, 0 black. Raise ValueError."""
+    """Return the cells (n, n) of a marker with its black border, row 0 on top: 1 white, 0 black.
+    Raise ValueError.
+    """
     table = dictionary_of(dictionary)
     if not 0 <= marker_id < len(table.bytesList):
         raise ValueError(f"{dictionary} has no marker {marker_id}")
@@ -124,13 +138,17 @@ def marker_bits(dictionary: str, marker_id: int) -> NDArray[np.int64]:
 
 
 def _figure_of(sheet: Sheet) -> Figure:
-    """Return the sheet as a matplotlib figure of its size: one unit of the transform is one millimetre of paper."""
+    """Return the sheet as a matplotlib figure of its size: one unit of the transform is one
+    millimetre of paper.
+    """
     width, height = (length / _MM_PER_INCH for length in sheet.size_mm)
     figure = Figure(figsize=(width, height), facecolor="none")
     per_inch = 1.0 / _MM_PER_INCH
     on_paper = Affine2D().scale(per_inch, -per_inch).translate(0.0, height) + figure.dpi_scale_trans
     unit = MplPath.unit_rectangle()
-    cells = [unit.transformed(Affine2D().scale(a, b).translate(x, y)) for x, y, a, b in sheet.rectangles]
+    cells = [
+        unit.transformed(Affine2D().scale(a, b).translate(x, y)) for x, y, a, b in sheet.rectangles
+    ]
     # One path for all cells: a renderer leaves no seams between adjacent parts of one path.
     squares = PathPatch(
         MplPath.make_compound_path(*cells), facecolor="black", linewidth=0.0, antialiased=False

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Campaign file and the runs it defines.
 
-A campaign is a scenario, values shared by all runs, and varied parameters: a grid (every combination of ``values``) or a
-random sample (each parameter drawn from its distribution). Equal files give equal runs with equal names.
+A campaign is a scenario, values shared by all runs, and varied parameters: a grid (every
+combination of ``values``) or a random sample (each parameter drawn from its distribution). Equal
+files give equal runs with equal names.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class Variation(Section):
-    """Variation of one parameter: ``values``, or in a sample ``uniform`` [low, high] or ``normal`` [mean, sigma]."""
+    """Variation of one parameter: ``values``, or in a sample ``uniform`` [low, high] or ``normal``
+    [mean, sigma].
+    """
 
     values: tuple[Any, ...] | None = None
     uniform: tuple[Number, Number] | None = None
@@ -42,12 +45,16 @@ class Variation(Section):
         if self.values is not None and not self.values:
             raise ValueError("values must not be empty")
         if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
-            raise ValueError(f"uniform must be [low, high] with low < high, not {list(self.uniform)}")
+            raise ValueError(
+                f"uniform must be [low, high] with low < high, not {list(self.uniform)}"
+            )
         return self
 
 
 class CampaignFile(Section):
-    """Content of a campaign file. ``seeds``: number of seeds (0, 1, ...) or list of seeds for every combination."""
+    """Content of a campaign file. ``seeds``: number of seeds (0, 1, ...) or list of seeds for every
+    combination.
+    """
 
     name: Name
     scenario: str
@@ -66,14 +73,18 @@ class CampaignFile(Section):
             raise ValueError("seeds must be one or more different numbers")
         for name, v in self.vary.items():
             if self.method == "grid" and v.values is None:
-                raise ValueError(f'vary.{name}: a grid needs values; a distribution needs method = "random"')
+                raise ValueError(
+                    f'vary.{name}: a grid needs values; a distribution needs method = "random"'
+                )
         if "seed" in self.vary or "seed" in self.set:
             raise ValueError("seed: use seeds instead")
         return self
 
 
 class Run(msgspec.Struct, frozen=True):
-    """One run. ``name`` is a digest of the resolved scenario; ``varied`` holds the values that differ between runs."""
+    """One run. ``name`` is a digest of the resolved scenario; ``varied`` holds the values that
+    differ between runs.
+    """
 
     index: int
     name: str
@@ -92,7 +103,9 @@ class Campaign(msgspec.Struct, frozen=True):
 
 
 def load_campaign(path: Path) -> Campaign:
-    """Read a campaign file and validate every run's scenario; raise ScenarioError with one line per fault."""
+    """Read a campaign file and validate every run's scenario; raise ScenarioError with one line per
+    fault.
+    """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
         file = CampaignFile.model_validate(values)
@@ -111,7 +124,12 @@ def load_campaign(path: Path) -> Campaign:
 
 
 def make_run(
-    index: int, scenario: Path, seed: int, varied: dict[str, Any], overrides: tuple[str, ...], salt: str = ""
+    index: int,
+    scenario: Path,
+    seed: int,
+    varied: dict[str, Any],
+    overrides: tuple[str, ...],
+    salt: str = "",
 ) -> tuple[Run, Scenario]:
     """Return a run and its resolved scenario; ``salt`` also enters the name. Raise ScenarioError."""
     overrides = (*overrides, f"seed={seed}")
@@ -125,7 +143,9 @@ def _combinations(file: CampaignFile) -> list[dict[str, Any]]:
         axes = [v.values or () for v in file.vary.values()]
         return [dict(zip(file.vary, point, strict=True)) for point in itertools.product(*axes)]
     rng = np.random.default_rng(file.sample_seed)
-    return [{name: _draw(v, rng) for name, v in file.vary.items()} for _ in range(file.samples or 0)]
+    return [
+        {name: _draw(v, rng) for name, v in file.vary.items()} for _ in range(file.samples or 0)
+    ]
 
 
 def _draw(v: Variation, rng: np.random.Generator) -> Any:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report of a campaign: one HTML file with pass rate, causes, sensitivities and a link to every failure."""
+"""Report of a campaign: one HTML file with pass rate, causes, sensitivities and a link to every
+failure.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,19 @@ from .table import RunRow, causes, metrics_of, numbers_of, rank_correlation, rer
 
 _SHOWN = (
     ("steady_position_mse_m2", "steady position RMS, mm", lambda v: math.sqrt(v) * 1e3),
-    ("steady_orientation_mse_rad2", "steady orientation RMS, deg", lambda v: math.degrees(math.sqrt(v))),
+    (
+        "steady_orientation_mse_rad2",
+        "steady orientation RMS, deg",
+        lambda v: math.degrees(math.sqrt(v)),
+    ),
     ("estimate_max_position_error_m", "largest estimate error, mm", lambda v: v * 1e3),
 )
 
 
 def page(campaign: Campaign, rows: list[RunRow], folder: Path) -> str:
-    """Return the report as HTML; links to logs are relative to ``folder``. Raise ValueError without any run."""
+    """Return the report as HTML; links to logs are relative to ``folder``. Raise ValueError without
+    any run.
+    """
     passed, finished = sum(bool(r["success"]) for r in rows), len(rows)
     low, high = wilson(passed, finished)
     missing = len(campaign.runs) - finished
@@ -72,7 +80,9 @@ def _figure(parameters: list[str], rows: list[RunRow]) -> str:
     shown = [m for m in _SHOWN if m[0] in metrics_of(rows)]
     with styled():
         figure = Figure(figsize=(3.2 * len(parameters) + 0.6, 2.5 * len(shown) + 0.4))
-        axes: Any = figure.subplots(len(shown), len(parameters), squeeze=False, sharex="col", sharey="row")
+        axes: Any = figure.subplots(
+            len(shown), len(parameters), squeeze=False, sharex="col", sharey="row"
+        )
         for row, (metric, label, scale) in enumerate(shown):
             axes[row][0].set_ylabel(label)
             axes[row][0].set_yscale("log")
@@ -84,7 +94,9 @@ def _figure(parameters: list[str], rows: list[RunRow]) -> str:
                         if r["success"] is good and math.isfinite(r[metric])
                     ]
                     if points:
-                        ax.scatter(*zip(*points, strict=True), s=14, c=colour, marker=marker, linewidths=1)
+                        ax.scatter(
+                            *zip(*points, strict=True), s=14, c=colour, marker=marker, linewidths=1
+                        )
         for ax, parameter in zip(axes[-1], parameters, strict=True):
             ax.set_xlabel(parameter)
     return to_inline_svg(figure, "sensitivity", "results by parameter")

@@ -22,9 +22,15 @@ AFTER_ACTIVE_RUNS = "stopping after the active runs"
 
 
 def direct(
-    file: Path, out: Path | None, jobs: int | None, cluster: str | None, keep: Keep, only: int | None
+    file: Path,
+    out: Path | None,
+    jobs: int | None,
+    cluster: str | None,
+    keep: Keep,
+    only: int | None,
 ) -> int:
-    """Fly the campaign of ``file``; return the exit status: 0 when every run has ended, whatever its outcome.
+    """Fly the campaign of ``file``; return the exit status: 0 when every run has ended, whatever
+    its outcome.
 
     Raise ScenarioError for an invalid file, CampaignError when the campaign cannot continue.
     """
@@ -50,7 +56,10 @@ def direct(
     )
     if len(rows) < len(campaign.runs):
         remaining = len(campaign.runs) - len(rows)
-        print(f"chaserdock: stopped, {remaining} runs remain; repeat the command to resume", file=sys.stderr)
+        print(
+            f"chaserdock: stopped, {remaining} runs remain; repeat the command to resume",
+            file=sys.stderr,
+        )
         return STOPPED
     return DONE
 
@@ -78,8 +87,14 @@ class CampaignProgress:
             self._finished_before = finished - 1
         per_run_s = (time.monotonic() - self._start_s) / (finished - self._finished_before)
         passed = result.status == 0
-        outcome = "passed" if passed else f"FAILED: {result.last_words.removeprefix('chaserdock: ')}"
-        left = f", about {per_run_s * (total - finished) / 60:.0f} min left" if finished < total else ""
+        outcome = (
+            "passed" if passed else f"FAILED: {result.last_words.removeprefix('chaserdock: ')}"
+        )
+        left = (
+            f", about {per_run_s * (total - finished) / 60:.0f} min left"
+            if finished < total
+            else ""
+        )
         varied = ", ".join(f"{name}={value}" for name, value in run.varied.items())
         label = f"run {run.index}" + (f" ({varied})" if varied else "")
         print(f"{finished}/{total} {label}: {outcome}{left}", flush=True)

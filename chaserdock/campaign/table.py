@@ -18,7 +18,8 @@ _FIXED = ("run", "index", "seed", "success", "cause", "failures", "digest", "log
 
 
 def row_of(run: Run, result: FinishedRun) -> RunRow:
-    """Return a run as a row of plain values: varied values (``vary.NAME``), outcome and results in SI units.
+    """Return a run as a row of plain values: varied values (``vary.NAME``), outcome and results in
+    SI units.
 
     No value depends on the speed of the machine: equal campaigns give equal tables.
     """
@@ -47,7 +48,11 @@ def row_of(run: Run, result: FinishedRun) -> RunRow:
         ("position_mse_m2", ("position_mse_m2",), max),
         ("orientation_mse_rad2", ("orientation_mse_rad2",), max),
         ("relative_estimate_position_rms_m", ("relative_estimate", "position_rms_m"), max),
-        ("relative_estimate_orientation_rms_rad", ("relative_estimate", "orientation_rms_rad"), max),
+        (
+            "relative_estimate_orientation_rms_rad",
+            ("relative_estimate", "orientation_rms_rad"),
+            max,
+        ),
         ("min_distance_target_m", ("min_distance_target_m",), min),
         ("impulse_N_s", ("impulse_N_s",), sum),
     ):
@@ -86,11 +91,15 @@ def rows_of(finished: list[tuple[Run, FinishedRun]]) -> list[RunRow]:
 def metrics_of(rows: list[RunRow]) -> list[str]:
     """Return the names of the columns with numerical results."""
     names = [c for c in (rows[0] if rows else {}) if c not in _FIXED and not c.startswith("vary.")]
-    return [c for c in names if any(isinstance(r[c], int | float) and math.isfinite(r[c]) for r in rows)]
+    return [
+        c for c in names if any(isinstance(r[c], int | float) and math.isfinite(r[c]) for r in rows)
+    ]
 
 
 def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the Wilson score interval (low, high) of a pass rate. Raise ValueError for impossible counts."""
+    """Return the Wilson score interval (low, high) of a pass rate. Raise ValueError for impossible
+    counts.
+    """
     from scipy.stats import binomtest
 
     if total < 1 or not 0 <= passed <= total:
@@ -102,12 +111,15 @@ def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, fl
 def causes(rows: list[RunRow]) -> list[tuple[str, int]]:
     """Return the causes of failures and their numbers of runs, most frequent first."""
     return sorted(
-        Counter(r["cause"] for r in rows if not r["success"]).items(), key=lambda item: (-item[1], item[0])
+        Counter(r["cause"] for r in rows if not r["success"]).items(),
+        key=lambda item: (-item[1], item[0]),
     )
 
 
 def rank_correlation(x: list[float], y: list[float]) -> float:
-    """Return Spearman's rank correlation of the finite pairs; NaN for fewer than three or a constant column."""
+    """Return Spearman's rank correlation of the finite pairs; NaN for fewer than three or a
+    constant column.
+    """
     from scipy.stats import spearmanr
 
     pairs = [(a, b) for a, b in zip(x, y, strict=True) if math.isfinite(a) and math.isfinite(b)]

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Execution of runs: one ``chaserdock run`` process each, on this machine or on the workers of a Dask cluster.
+"""Execution of runs: one ``chaserdock run`` process each, on this machine or on the workers of a
+Dask cluster.
 
-A finished run leaves ``runs/NAME/result.json``, written atomically. A later call skips the runs that have one.
+A finished run leaves ``runs/NAME/result.json``, written atomically. A later call skips the runs
+that have one.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ class CampaignError(ChaserdockError):
 
 
 class FinishedRun(msgspec.Struct, frozen=True):
-    """Outcome of a run: exit status, summary (None without one), last output line, path of a kept log."""
+    """Outcome of a run: exit status, summary (None without one), last output line, path of a kept
+    log.
+    """
 
     name: str
     status: int
@@ -75,15 +79,17 @@ def write_result(folder: Path, run: Run, result: FinishedRun) -> None:
 def fly(run: Run, keep: Keep, logs: Path) -> FinishedRun:
     """Fly one run in a temporary folder; move its log to ``logs`` if ``keep`` says so.
 
-    Also runs on Dask workers, so that arguments and result are plain values. Where ``logs`` is not writable (no shared
-    disk), a kept log stays on the worker's machine and the result names host and path.
+    Also runs on Dask workers, so that arguments and result are plain values. Where ``logs`` is not
+    writable (no shared disk), a kept log stays on the worker's machine and the result names host
+    and path.
     """
     folder = Path(tempfile.mkdtemp(prefix=f"chaserdock-{run.name}-"))
     try:
         out = folder / "run"
         sets = [item for override in run.overrides for item in ("--set", override)]
         program = [sys.executable, "-m", "chaserdock", "run", str(run.scenario)]
-        # A session of its own: Ctrl-C in the terminal reaches this process only, which lets the run finish.
+        # A session of its own: Ctrl-C in the terminal reaches this process only, which lets the run
+        # finish.
         done = subprocess.run(
             [*program, "--out", str(out), "--quiet", *sets],
             capture_output=True,
@@ -116,12 +122,18 @@ def _move_log(log: Path, folder: Path) -> str:
 def fly_locally(
     runs: list[Run], keep: Keep, folder: Path, jobs: int, stop: threading.Event
 ) -> Iterator[tuple[Run, FinishedRun]]:
-    """Fly ``jobs`` runs at a time on this machine; yield each as it ends. Start none after ``stop``."""
+    """Fly ``jobs`` runs at a time on this machine; yield each as it ends. Start none after
+    ``stop``.
+    """
     waiting = iter(runs)
     with ThreadPoolExecutor(jobs) as pool:
         active: dict[Any, Run] = {}
         while True:
-            while len(active) < jobs and not stop.is_set() and (run := next(waiting, None)) is not None:
+            while (
+                len(active) < jobs
+                and not stop.is_set()
+                and (run := next(waiting, None)) is not None
+            ):
                 active[pool.submit(fly, run, keep, folder / "runs")] = run
             if not active:
                 return
@@ -146,8 +158,11 @@ def fly_on_cluster(
     with client:
         by_key = {}
         for run in runs:
-            # pure=False: Dask must not reuse a result. retries=1: the run of a lost worker is flown again.
-            future = client.submit(fly, run, keep, folder / "runs", key=f"{run.name}", pure=False, retries=1)
+            # pure=False: Dask must not reuse a result. retries=1: the run of a lost worker is flown
+            # again.
+            future = client.submit(
+                fly, run, keep, folder / "runs", key=f"{run.name}", pure=False, retries=1
+            )
             by_key[future.key] = (run, future)
         for future in as_completed([f for _, f in by_key.values()]):
             run = by_key[future.key][0]
@@ -170,10 +185,13 @@ def fly_campaign(
 ) -> list[tuple[Run, FinishedRun]]:
     """Fly the runs without a result; return all finished runs in the campaign's order.
 
-    ``report_progress`` receives the number of finished runs, the number of runs, and the run that has just ended.
+    ``report_progress`` receives the number of finished runs, the number of runs, and the run that
+    has just ended.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    results = {r.name: earlier for r in campaign.runs if (earlier := read_result(folder, r)) is not None}
+    results = {
+        r.name: earlier for r in campaign.runs if (earlier := read_result(folder, r)) is not None
+    }
     remaining = [r for r in campaign.runs if r.name not in results]
     flights = (
         fly_locally(remaining, keep, folder, jobs, stop)

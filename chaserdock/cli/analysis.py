@@ -21,7 +21,9 @@ class FigureFormat(StrEnum):
 
 
 def summary(log: LogArg, as_json: JsonOpt = False) -> None:
-    """Judge a recorded flight again and print its summary. Status 0 only if the flight is a success."""
+    """Judge a recorded flight again and print its summary. Status 0 only if the flight is a
+    success.
+    """
     from chaserdock.analysis.summary import summarize, text_of
 
     result = summarize(log)
@@ -35,7 +37,9 @@ def report(
         Path | None, typer.Option(help="page to write; report.html beside the log by default")
     ] = None,
 ) -> None:
-    """Write a self-contained page about a recorded flight: verdict, tables, 3-D replay, figures, events, scenario."""
+    """Write a self-contained page about a recorded flight: verdict, tables, 3-D replay, figures,
+    events, scenario.
+    """
     from chaserdock.analysis.report import write_report
 
     print(write_report(log, out))
@@ -44,9 +48,13 @@ def report(
 def figures(
     log: LogArg,
     out: Annotated[Path, typer.Option(help="folder to write to")],
-    format: Annotated[FigureFormat, typer.Option("--format", help="file format")] = FigureFormat.svg,
+    format: Annotated[
+        FigureFormat, typer.Option("--format", help="file format")
+    ] = FigureFormat.svg,
 ) -> None:
-    """Draw figures of a recorded flight, one file each: trajectories, errors, distances, inputs, estimate, cameras."""
+    """Draw figures of a recorded flight, one file each: trajectories, errors, distances, inputs,
+    estimate, cameras.
+    """
     from chaserdock.analysis.figures import write_figures
 
     files, missing = write_figures(log, out, format.value)
@@ -71,11 +79,15 @@ def video(
     ] = 0.0,
     to_s: Annotated[
         float | None,
-        typer.Option("--to", min=0.0, help="simulated time of the last frame, seconds; the end by default"),
+        typer.Option(
+            "--to", min=0.0, help="simulated time of the last frame, seconds; the end by default"
+        ),
     ] = None,
     quality: Annotated[int, typer.Option(min=0, max=100, help=".webp: image quality")] = 60,
 ) -> None:
-    """Render a recorded flight as a video: an outside view beside the camera images with their detections."""
+    """Render a recorded flight as a video: an outside view beside the camera images with their
+    detections.
+    """
     from chaserdock.analysis.video import write_video
 
     window_s = (from_s, float("inf") if to_s is None else to_s)
@@ -87,7 +99,9 @@ def snapshot(
     log: LogArg,
     at: Annotated[float, typer.Option(min=0.0, help="simulated time, seconds")],
     out: Annotated[Path, typer.Option(help="image to write: .png or .jpg")],
-    width: Annotated[int, typer.Option(min=64, max=4096, help="width of each camera image, pixels")] = 640,
+    width: Annotated[
+        int, typer.Option(min=64, max=4096, help="width of each camera image, pixels")
+    ] = 640,
 ) -> None:
     """Draw what every camera saw at one time of a recorded flight, with detections."""
     import cv2

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that reproduce and compare: replays, flights, the paper's results, conformance with the protocol."""
+"""Commands that reproduce and compare: replays, flights, the paper's results, conformance with the
+protocol.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from .options import JsonOpt, LogArg, SetOpt, fail, print_result
 
 ToleranceOpt = Annotated[
     float,
-    typer.Option(min=0.0, help="largest difference of numbers that count as equal (for another CPU type)"),
+    typer.Option(
+        min=0.0, help="largest difference of numbers that count as equal (for another CPU type)"
+    ),
 ]
 
 
@@ -31,7 +35,9 @@ def replay(
     tolerance: ToleranceOpt = 0.0,
     as_json: JsonOpt = False,
 ) -> None:
-    """Feed recorded inputs to the present code and compare its outputs with the log. Status 1 when they differ."""
+    """Feed recorded inputs to the present code and compare its outputs with the log. Status 1 when
+    they differ.
+    """
     from chaserdock_protocol.process import SINGLE_THREADED
 
     os.environ |= SINGLE_THREADED  # as in flight; must precede the import of NumPy
@@ -76,10 +82,11 @@ def reproduce(
         Path, typer.Option(help="folder for results and page; a second call resumes there")
     ] = Path("runs/reproduce"),
 ) -> None:
-    """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and .html.
+    """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and
+    .html.
 
-    The paper's chain needs its solver, OpEn: the extra chaserdock[open] and Rust's cargo. Without them the page lacks that
-    chain, and the status is 1.
+    The paper's chain needs its solver, OpEn: the extra chaserdock[open] and Rust's cargo. Without
+    them the page lacks that chain, and the status is 1.
     """
     from chaserdock_protocol.process import SINGLE_THREADED
 
@@ -98,7 +105,9 @@ def study(
     ],
     out: Annotated[Path, typer.Option(help="results are appended to this file")],
 ) -> None:
-    """Fly a file of cases in one process: with perfect knowledge of the target, or with images and an estimator."""
+    """Fly a file of cases in one process: with perfect knowledge of the target, or with images and
+    an estimator.
+    """
     if not cases.is_file():
         raise fail(f"{cases}: no such file")
     from chaserdock.evaluation.study import main as fly_cases
@@ -107,19 +116,26 @@ def study(
 
 
 def check(
-    process: Annotated[str, typer.Argument(help="process that it replaces: controller, or chaser/N")],
+    process: Annotated[
+        str, typer.Argument(help="process that it replaces: controller, or chaser/N")
+    ],
     log: LogArg,
     command: Annotated[
-        list[str], typer.Argument(help="after --: its command line, with {endpoint} and {namespace}")
+        list[str],
+        typer.Argument(help="after --: its command line, with {endpoint} and {namespace}"),
     ],
     ticks: Annotated[int, typer.Option(min=1, help="ticks of the log to play")] = 100,
-    join_timeout: Annotated[float, typer.Option(min=0.1, help="seconds that joining may take")] = 60.0,
+    join_timeout: Annotated[
+        float, typer.Option(min=0.1, help="seconds that joining may take")
+    ] = 60.0,
     timeout: Annotated[
         float, typer.Option(min=0.1, help="seconds that a reply, or exiting, may take")
     ] = 10.0,
     as_json: JsonOpt = False,
 ) -> None:
-    """Run a process against a lock-step log and check its messages. Status 0 if it conforms to the protocol, else 1."""
+    """Run a process against a lock-step log and check its messages. Status 0 if it conforms to the
+    protocol, else 1.
+    """
     import msgspec
 
     from chaserdock.conformance.harness import check as run

@@ -37,7 +37,10 @@ def _show_progress(label: str, total: int, quiet: bool) -> Callable[[int], None]
     if quiet or not sys.stderr.isatty():
         return lambda done: None
     return lambda done: print(
-        f"\r{label} {done} of {total}", end="\n" if done == total else "", file=sys.stderr, flush=True
+        f"\r{label} {done} of {total}",
+        end="\n" if done == total else "",
+        file=sys.stderr,
+        flush=True,
     )
 
 
@@ -53,17 +56,23 @@ def dataset(
     ] = 0,
     range_m: Annotated[
         tuple[float, float],
-        typer.Option("--range", metavar="LEAST MOST", help="distance of the target, m, log-uniform"),
+        typer.Option(
+            "--range", metavar="LEAST MOST", help="distance of the target, m, log-uniform"
+        ),
     ] = (1.0, 3.0),
     offset: Annotated[
         float,
         typer.Option(
-            min=0.0, max=1.0, help="largest distance of the target from the middle, share of half the image"
+            min=0.0,
+            max=1.0,
+            help="largest distance of the target from the middle, share of half the image",
         ),
     ] = 0.2,
     phase: Annotated[
         tuple[float, float],
-        typer.Option(metavar="LEAST MOST", help="angle at the target between sun and camera, degrees"),
+        typer.Option(
+            metavar="LEAST MOST", help="angle at the target between sun and camera, degrees"
+        ),
     ] = (0.0, 120.0),
     validation: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="share of the images for validation")
@@ -71,7 +80,9 @@ def dataset(
     overrides: SetOpt = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
 ) -> None:
-    """Export images of random views of a scenario's target with pose labels, in the SPEED+ and BOP formats."""
+    """Export images of random views of a scenario's target with pose labels, in the SPEED+ and BOP
+    formats.
+    """
     from chaserdock_protocol.scenario import load_scenario
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
@@ -82,7 +93,9 @@ def dataset(
     limits = ViewLimits(range_m, offset, phase)
     sets = (EXACT_CAMERA, f"seed={seed}", *(overrides or ()))
     loaded = load_scenario(find_scenario(scenario), sets)
-    layouts: tuple[Layout, ...] = ("bop", "speed+") if layout is LayoutOption.both else (layout.value,)
+    layouts: tuple[Layout, ...] = (
+        ("bop", "speed+") if layout is LayoutOption.both else (layout.value,)
+    )
     progress = _show_progress("image", images, quiet)
     export_dataset(loaded, out, images, limits, layouts, validation, progress)
     print(f"{out}: {images} images of {loaded.target.model}, {' and '.join(layouts)}, seed {seed}")
@@ -100,7 +113,8 @@ def perception(
     folder: Annotated[
         Path,
         typer.Argument(
-            metavar="DATASET", help="folder of `chaserdock dataset`, or one in the SPEED+ or BOP format"
+            metavar="DATASET",
+            help="folder of `chaserdock dataset`, or one in the SPEED+ or BOP format",
         ),
     ],
     name: Annotated[
@@ -117,7 +131,9 @@ def perception(
             autocompletion=complete_scenario,
         ),
     ] = None,
-    split: Annotated[SplitOption, typer.Option(help="part of the dataset")] = SplitOption.validation,
+    split: Annotated[
+        SplitOption, typer.Option(help="part of the dataset")
+    ] = SplitOption.validation,
     images: Annotated[int | None, typer.Option(min=1, help="use the first images only")] = None,
     as_json: JsonOpt = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
@@ -141,11 +157,18 @@ def perception(
     progress = _show_progress("image", len(chosen), quiet or as_json)
     figures = score_perception(method, chosen, data.camera, data.shape, progress)
     used = name or flight.perception.name
-    facts = {"dataset": str(folder), "format": data.layout, "split": split.value, "perception": used}
+    facts = {
+        "dataset": str(folder),
+        "format": data.layout,
+        "split": split.value,
+        "perception": used,
+    }
     # JSON has no NaN: figures without a single pose are null.
     values = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in figures.items()}
     print_result(
-        as_json, facts | values, _table(f"{used} on {folder} ({data.layout}, {split.value})", figures)
+        as_json,
+        facts | values,
+        _table(f"{used} on {folder} ({data.layout}, {split.value})", figures),
     )
 
 
@@ -168,7 +191,8 @@ def _table(title: str, f: dict[str, float]) -> list[str]:
     for label, key, factor in rows:
         if f"{key}_mean" in f:
             lines.append(
-                f"{label:24}" + "".join(f"{factor * f[f'{key}_{q}']:12.3f}" for q in ("mean", "p50", "p95"))
+                f"{label:24}"
+                + "".join(f"{factor * f[f'{key}_{q}']:12.3f}" for q in ("mean", "p50", "p95"))
             )
     if f"{add}_right_share" in f:
         lines.append(

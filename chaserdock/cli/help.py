@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command and group classes: grouped help that loads nothing but typer, and one check that every number is finite."""
+"""Command and group classes: grouped help that loads nothing but typer, and one check that every
+number is finite.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
 
 
 class FiniteCommand(TyperCommand):
-    """A command that rejects NaN and infinity, which pass typer's range checks, in every numeric option."""
+    """A command that rejects NaN and infinity, which pass typer's range checks, in every numeric
+    option.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         for param in self.params:
@@ -27,9 +31,11 @@ class FiniteCommand(TyperCommand):
 
 
 class GroupedHelp(TyperGroup):
-    """Print ``COMMAND … --help`` before typer prepares to parse values (which loads pydantic), commands by panel.
+    """Print ``COMMAND … --help`` before typer prepares to parse values (which loads pydantic),
+    commands by panel.
 
-    ``panel_order``: panels in the order of the help; others follow (typer lists groups after commands).
+    ``panel_order``: panels in the order of the help; others follow (typer lists groups after
+    commands).
     """
 
     panel_order: ClassVar[tuple[str, ...]] = ()

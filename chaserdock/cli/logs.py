@@ -20,7 +20,9 @@ app = command_group("log", "Inspect, repair, export and play a log.")
 
 LogFilesArg = Annotated[
     list[Path],
-    typer.Argument(metavar="LOG", help="folder of a run, its mission.mcap, or the files of a rotated log"),
+    typer.Argument(
+        metavar="LOG", help="folder of a run, its mission.mcap, or the files of a rotated log"
+    ),
 ]
 FolderOpt = Annotated[Path, typer.Option("--out", help="folder to write into")]
 
@@ -38,13 +40,17 @@ def _source(log: list[Path]) -> Path | list[Path]:
 
 
 def info(log: LogFilesArg, as_json: JsonOpt = False) -> None:
-    """Check all of a log and print what it holds. Status 1 when it is incomplete (cut off, messages lost or rejected)."""
+    """Check all of a log and print what it holds. Status 1 when it is incomplete (cut off, messages
+    lost or rejected).
+    """
     import msgspec
 
     from chaserdock.logs.info import info_lines, info_of
 
     result = info_of(_source(log))
-    print_result(as_json, {"whole": result.whole, **msgspec.to_builtins(result)}, info_lines(result))
+    print_result(
+        as_json, {"whole": result.whole, **msgspec.to_builtins(result)}, info_lines(result)
+    )
     raise typer.Exit(0 if result.whole else 1)
 
 
@@ -53,7 +59,9 @@ def recover(
     out: Annotated[Path, typer.Option(help="file to write the readable messages to")],
     as_json: JsonOpt = False,
 ) -> None:
-    """Copy the readable messages of a damaged log to a new one. Status 1 when messages in its middle are lost."""
+    """Copy the readable messages of a damaged log to a new one. Status 1 when messages in its
+    middle are lost.
+    """
     import msgspec
 
     from chaserdock.logs.recover import recover as recover_log
@@ -105,7 +113,9 @@ def tracks(
     ] = 0.0,
     to_s: Annotated[
         float | None,
-        typer.Option("--to", min=0.0, help="simulated time of the last point, seconds; the end by default"),
+        typer.Option(
+            "--to", min=0.0, help="simulated time of the last point, seconds; the end by default"
+        ),
     ] = None,
 ) -> None:
     """Write trajectories as TUM files: truth of all bodies, target estimate, odometry, references."""
@@ -120,20 +130,25 @@ def tracks(
 def play(
     log: LogFilesArg,
     speed: Annotated[
-        float | None, typer.Option(min=0.01, help="simulated over wall time; as fast as possible by default")
+        float | None,
+        typer.Option(min=0.01, help="simulated over wall time; as fast as possible by default"),
     ] = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for a recorder")] = 60.0,
     *,
     link: LinkOptions,
 ) -> None:
-    """Publish a log's messages again, unchanged, in place of a world, once `chaserdock record` has joined."""
+    """Publish a log's messages again, unchanged, in place of a world, once `chaserdock record` has
+    joined.
+    """
     from chaserdock_protocol.process import StopSignal
 
     from chaserdock.logs.player import play as publish
 
     # Made at its first use, when the session is open: until then Ctrl-C ends the wait for a router.
     signal = cache(lambda: StopSignal(watch_parent=False))
-    count = publish(_source(log), link.link("world", timeout), speed, timeout, stopped=lambda: signal()())
+    count = publish(
+        _source(log), link.link("world", timeout), speed, timeout, stopped=lambda: signal()()
+    )
     print(f"{count} messages sent")
     raise typer.Exit(STOPPED if signal()() else DONE)
 

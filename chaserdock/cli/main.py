@@ -28,8 +28,8 @@ from .setup import calibrate, compose, keys, markers
 from .simulate import simulate
 
 _GC_THRESHOLD = 100_000
-"""Objects between two garbage collections. Imports make several 100,000 objects that stay: with Python's default, 700, collecting
-among them is an eighth of the start of a process."""
+"""Objects between two garbage collections. Imports make several 100,000 objects that stay: with
+Python's default, 700, collecting among them is an eighth of the start of a process."""
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Fly": (run, campaign, simulate),
@@ -77,7 +77,9 @@ for panel, members in GROUPS.items():
 def program(
     version: Annotated[
         bool,
-        typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit."),
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version and exit."
+        ),
     ] = False,
 ) -> None:
     """Vision-based docking of several satellites with a tumbling target."""
@@ -96,7 +98,9 @@ def main() -> None:
         sys.exit(FAILED)
     finally:
         _flush_output()
-        gc.freeze()  # or Python searches all modules for garbage once more before it exits: a fifth of a short command's time
+        # or Python searches all modules for garbage once more before it exits: a fifth of a short
+        # command's time
+        gc.freeze()
 
 
 _PLAIN_TEXTS = {
@@ -118,7 +122,9 @@ def _report_usage_error(error: Any) -> int:
     text = " ".join(error.format_message().split())
     for pydantic_text, plain_text in _PLAIN_TEXTS.items():
         text = text.replace(pydantic_text, plain_text)
-    return fail(f"{name}: {text.rstrip('.')}; see `chaserdock {name} --help`" if name else text).exit_code
+    return fail(
+        f"{name}: {text.rstrip('.')}; see `chaserdock {name} --help`" if name else text
+    ).exit_code
 
 
 def _flush_output() -> None:

@@ -14,14 +14,23 @@ from .options import JsonOpt, fail
 if TYPE_CHECKING:
     from chaserdock_protocol.scenario.mesh_files import MeshFile
 
-app = command_group("mesh", "Check mesh files of targets, and write the shipped satellites as files.")
+app = command_group(
+    "mesh", "Check mesh files of targets, and write the shipped satellites as files."
+)
 
 
 def export(
-    name: Annotated[str, typer.Argument(help="shipped satellite: geo_servicer, cubesat_12u, chaser_body")],
-    out: Annotated[Path, typer.Option(help="file to write: .glb, or .obj with its materials beside it")],
+    name: Annotated[
+        str, typer.Argument(help="shipped satellite: geo_servicer, cubesat_12u, chaser_body")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="file to write: .glb, or .obj with its materials beside it")
+    ],
     tolerance_mm: Annotated[
-        float, typer.Option(min=0.01, max=20.0, help="largest deviation of facets from curved surfaces, mm")
+        float,
+        typer.Option(
+            min=0.01, max=20.0, help="largest deviation of facets from curved surfaces, mm"
+        ),
     ] = 0.2,
 ) -> None:
     """Write a shipped satellite as a mesh file."""
@@ -44,11 +53,16 @@ def export(
 def check(
     file: Annotated[Path, typer.Argument(help="mesh file: .glb, .gltf, .obj, .stl or .ply")],
     scale: Annotated[
-        float, typer.Option(min=1e-9, max=1e9, help="factor from the file's unit of length to m (mesh_scale)")
+        float,
+        typer.Option(
+            min=1e-9, max=1e9, help="factor from the file's unit of length to m (mesh_scale)"
+        ),
     ] = 1.0,
     as_json: JsonOpt = False,
 ) -> None:
-    """Check whether a mesh file can fly as a target, and print what becomes of it. Status 2 when it cannot."""
+    """Check whether a mesh file can fly as a target, and print what becomes of it. Status 2 when it
+    cannot.
+    """
     import json
 
     from chaserdock_protocol.scenario.mesh_files import read_mesh

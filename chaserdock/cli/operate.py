@@ -64,12 +64,21 @@ def command(
     timeout: ReplyTimeoutOpt = 5.0,
     as_json: JsonOpt = False,
 ) -> None:
-    """Send a command to a chaser of a running mission. Status 1 when refused, 2 when there is no reply."""
+    """Send a command to a chaser of a running mission. Status 1 when refused, 2 when there is no
+    reply.
+    """
     from chaserdock.launch.operator import send_command
 
     _print_reply(
         send_command(
-            link.link(timeout_s=timeout), what.value, number, offset, timeout, thruster, operator, before
+            link.link(timeout_s=timeout),
+            what.value,
+            number,
+            offset,
+            timeout,
+            thruster,
+            operator,
+            before,
         ),
         as_json,
     )
@@ -98,7 +107,8 @@ def thruster_fault(
     timeout: ReplyTimeoutOpt = 5.0,
     as_json: JsonOpt = False,
 ) -> None:
-    """Inject a thruster failure into a running mission. Status 1 when refused, 2 when there is no reply.
+    """Inject a thruster failure into a running mission. Status 1 when refused, 2 when there is no
+    reply.
 
     The scenario must allow it with chaser.thruster_faults_by_command. The chaser is not informed.
     """
@@ -114,7 +124,11 @@ def thruster_fault(
 
 def _print_reply(reply: CommandReply, as_json: bool) -> None:
     """Print a reply and exit with status 0 or 1."""
-    value = {"accepted": reply.accepted, "reason": reply.reason, "sim_time_s": reply.sim_time_ns / 1e9}
+    value = {
+        "accepted": reply.accepted,
+        "reason": reply.reason,
+        "sim_time_s": reply.sim_time_ns / 1e9,
+    }
     print_result(as_json, value, [f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}"])
     raise typer.Exit(0 if reply.accepted else 1)
 
@@ -126,7 +140,9 @@ def status(
     duration: Annotated[float, typer.Option(min=0.1, max=3600.0, help="seconds to listen")] = 3.0,
     as_json: JsonOpt = False,
 ) -> None:
-    """Show the processes on a mission's network, the tick, and each chaser's phase. Status 2 without any process."""
+    """Show the processes on a mission's network, the tick, and each chaser's phase. Status 2
+    without any process.
+    """
     from rich.console import Console
 
     from chaserdock.launch.status import observe, table_of
@@ -148,10 +164,14 @@ def view(
         ),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="address to serve the page on; anyone who has its URL can command the mission")
+        str,
+        typer.Option(
+            help="address to serve the page on; anyone who has its URL can command the mission"
+        ),
     ] = "127.0.0.1",
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="port; the first free one from 8080 by default")
+        int | None,
+        typer.Option(min=1, max=65535, help="port; the first free one from 8080 by default"),
     ] = None,
     dark: Annotated[bool, typer.Option("--dark", help="start with dark colours")] = False,
     truth: Annotated[bool, typer.Option(help="show ground truth where it is readable")] = True,

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands share, the network link they describe, and how commands report errors and results.
+"""Options that several commands share, the network link they describe, and how commands report
+errors and results.
 
 Heavy imports wait until a command needs them, so that ``--help`` is quick.
 """
@@ -58,13 +59,17 @@ def complete_scenario(incomplete: str) -> list[str]:
 
 ScenarioArg = Annotated[
     str,
-    typer.Argument(help="scenario file, or name of a shipped scenario", autocompletion=complete_scenario),
+    typer.Argument(
+        help="scenario file, or name of a shipped scenario", autocompletion=complete_scenario
+    ),
 ]
 SetOpt = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="override a scenario value (TOML); repeatable"),
 ]
-SeedOpt = Annotated[int | None, typer.Option(min=0, max=2**32 - 1, help="seed of all random numbers")]
+SeedOpt = Annotated[
+    int | None, typer.Option(min=0, max=2**32 - 1, help="seed of all random numbers")
+]
 ModeOpt = Annotated[
     ModeOption,
     typer.Option(
@@ -83,7 +88,9 @@ KeysOpt = Annotated[
 JoinTimeoutOpt = Annotated[
     float | None,
     typer.Option(
-        "--timeout", min=0.1, help="seconds to wait for a router and for a world; unlimited by default"
+        "--timeout",
+        min=0.1,
+        help="seconds to wait for a router and for a world; unlimited by default",
     ),
 ]
 StallOpt = Annotated[
@@ -94,17 +101,22 @@ StallOpt = Annotated[
         help="seconds without progress after which a lock-step mission ends, or without the world after which a process ends",
     ),
 ]
-ReplyTimeoutOpt = Annotated[float, typer.Option(min=0.1, max=3600.0, help="seconds to wait for the reply")]
+ReplyTimeoutOpt = Annotated[
+    float, typer.Option(min=0.1, max=3600.0, help="seconds to wait for the reply")
+]
 OperatorOpt = Annotated[str, typer.Option(help="name of the operator, for the log")]
 ChaserArg = Annotated[int, typer.Argument(min=0, max=255, help="chaser number, from 0")]
-QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="print the verdict only, no progress")]
+QuietOpt = Annotated[
+    bool, typer.Option("--quiet", "-q", help="print the verdict only, no progress")
+]
 JsonLinesOpt = Annotated[
     bool, typer.Option("--json", help="print JSON lines on standard output (docs/cli.md)")
 ]
 JsonOpt = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 WatchOpt = Annotated[bool, typer.Option("--watch-parent", hidden=True)]
 OutOpt = Annotated[
-    Path | None, typer.Option("--out", help="folder for log and summary; a new folder in runs/ by default")
+    Path | None,
+    typer.Option("--out", help="folder for log and summary; a new folder in runs/ by default"),
 ]
 LogArg = Annotated[Path, typer.Argument(help="folder of a run, or its mission.mcap")]
 
@@ -167,11 +179,13 @@ def check_config(config: Path | None) -> None:
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """The network options of a command, declared by the annotations; ``with_link_options`` adds them to a command."""
+    """The network options of a command, declared by the annotations; ``with_link_options`` adds
+    them to a command.
+    """
 
-    namespace: Annotated[str, typer.Option(help="Zenoh namespace; isolates missions on one network")] = (
-        "chaserdock"
-    )
+    namespace: Annotated[
+        str, typer.Option(help="Zenoh namespace; isolates missions on one network")
+    ] = "chaserdock"
     connect: Annotated[
         list[str] | None,
         typer.Option(
@@ -181,28 +195,40 @@ class LinkOptions:
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            "--listen", "-l", metavar="ENDPOINT", help="listen on, e.g. tcp/0.0.0.0:7447; repeatable"
+            "--listen",
+            "-l",
+            metavar="ENDPOINT",
+            help="listen on, e.g. tcp/0.0.0.0:7447; repeatable",
         ),
     ] = None
-    net_mode: Annotated[NetMode, typer.Option("--net-mode", "-m", help="Zenoh session mode")] = NetMode.peer
+    net_mode: Annotated[NetMode, typer.Option("--net-mode", "-m", help="Zenoh session mode")] = (
+        NetMode.peer
+    )
     config: Annotated[
-        Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")
+        Path | None,
+        typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file"),
     ] = None
     keys: KeysOpt = None
     run: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="folder of a mission that `chaserdock run` flies: connect to that mission"
+            metavar="DIR",
+            help="folder of a mission that `chaserdock run` flies: connect to that mission",
         ),
     ] = None
     lease: Annotated[
-        float, typer.Option(min=0.1, max=86_400.0, help="seconds after which a silent peer counts as lost")
+        float,
+        typer.Option(
+            min=0.1, max=86_400.0, help="seconds after which a silent peer counts as lost"
+        ),
     ] = 60.0
 
     def link(self, process: str = "operator", timeout_s: float | None = None) -> Link:
-        """Return the link of ``process``; with ``keys``, to a router over TLS. The world listens on the default endpoint.
+        """Return the link of ``process``; with ``keys``, to a router over TLS. The world listens on
+        the default endpoint.
 
-        ``timeout_s``: wall time after which a client that no router accepts gives up; unlimited by default.
+        ``timeout_s``: wall time after which a client that no router accepts gives up; unlimited by
+        default.
         """
         from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
 
@@ -250,10 +276,14 @@ class LinkOptions:
         from chaserdock.launch.mission_address import read_address
 
         if self.connect is not None or self.namespace != LinkOptions.namespace:
-            raise fail("--run excludes --connect and --namespace; it takes both from the mission's folder")
+            raise fail(
+                "--run excludes --connect and --namespace; it takes both from the mission's folder"
+            )
         address = read_address(folder)
         keys = self.keys if self.keys is not None or address.keys is None else Path(address.keys)
-        return replace(self, run=None, namespace=address.namespace, connect=[address.endpoint], keys=keys)
+        return replace(
+            self, run=None, namespace=address.namespace, connect=[address.endpoint], keys=keys
+        )
 
     def router_link(self) -> Link:
         """Return the link of the router."""
@@ -265,13 +295,16 @@ class LinkOptions:
         endpoints = tuple(
             self.listen or [DEFAULT_ENDPOINT.replace("tcp/", "tcp/" if tls is None else "tls/")]
         )
-        return Link(self.namespace, (), endpoints, "router", self.config, round(self.lease * 1000), tls)
+        return Link(
+            self.namespace, (), endpoints, "router", self.config, round(self.lease * 1000), tls
+        )
 
 
 def with_link_options(
     *without: str, joins_run: bool = False, **defaults: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace a command's parameter ``link`` by the fields of LinkOptions, but ``without`` some, or with other defaults.
+    """Replace a command's parameter ``link`` by the fields of LinkOptions, but ``without`` some, or
+    with other defaults.
 
     ``joins_run``: with the option ``--run``.
     """
@@ -306,7 +339,9 @@ def with_link_options(
 
 
 def tls_of(keys: Path, process: str) -> Tls:
-    """Return the TLS files of a process, in the mission's folder ``keys`` or in the folder of the process."""
+    """Return the TLS files of a process, in the mission's folder ``keys`` or in the folder of the
+    process.
+    """
     from chaserdock_protocol.transport import Tls
     from chaserdock_protocol.transport.access_control import common_name
 

@@ -46,7 +46,9 @@ def world(
     mode: ModeOpt = ModeOption.lockstep,
     seed: SeedOpt = None,
     overrides: SetOpt = None,
-    recorder: Annotated[bool, typer.Option(help="wait for a recorder before the first tick")] = True,
+    recorder: Annotated[
+        bool, typer.Option(help="wait for a recorder before the first tick")
+    ] = True,
     *,
     link: LinkOptions,
     timeout: Annotated[
@@ -57,7 +59,8 @@ def world(
         ),
     ] = None,
     rejoin_timeout: Annotated[
-        float, typer.Option(min=0.0, help="lock-step: seconds to wait after all processes were lost")
+        float,
+        typer.Option(min=0.0, help="lock-step: seconds to wait after all processes were lost"),
     ] = 0.0,
     stall_s: StallOpt = DEFAULT_STALL_S,
     watch_parent: WatchOpt = False,
@@ -127,26 +130,34 @@ def controller(
 @with_link_options()
 def record(
     out: OutOpt = None,
-    by_run: Annotated[bool, typer.Option(help="write into a folder of this run inside OUT")] = False,
+    by_run: Annotated[
+        bool, typer.Option(help="write into a folder of this run inside OUT")
+    ] = False,
     *,
     link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
     stall_s: StallOpt = DEFAULT_STALL_S,
     rotate_size: Annotated[
         float | None,
-        typer.Option(min=1, max=1e9, help="start a new file (mission-0000.mcap …) after this many megabytes"),
+        typer.Option(
+            min=1, max=1e9, help="start a new file (mission-0000.mcap …) after this many megabytes"
+        ),
     ] = None,
     rotate_time: Annotated[
         float | None, typer.Option(min=1, help="start a new file after this many simulated seconds")
     ] = None,
-    viewer: Annotated[bool, typer.Option(help="write the layer that rerun and Foxglove read, too")] = True,
+    viewer: Annotated[
+        bool, typer.Option(help="write the layer that rerun and Foxglove read, too")
+    ] = True,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Record every message into OUT/mission.mcap."""
     from chaserdock_protocol.process import ProcessOptions, Rotation
 
     folder = (
-        (out or Path("runs")) if by_run else out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
+        (out or Path("runs"))
+        if by_run
+        else out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
     )
     options = ProcessOptions(
         link=link.link("recorder", timeout),
@@ -167,10 +178,13 @@ def ros2(
     link: LinkOptions,
     ros_connect: Annotated[
         list[str] | None,
-        typer.Option(help="Zenoh endpoint of ROS 2's router (rmw_zenohd); tcp/127.0.0.1:7447 by default"),
+        typer.Option(
+            help="Zenoh endpoint of ROS 2's router (rmw_zenohd); tcp/127.0.0.1:7447 by default"
+        ),
     ] = None,
     ros_listen: Annotated[
-        list[str] | None, typer.Option(help="be ROS 2's router, in place of rmw_zenohd, at this endpoint")
+        list[str] | None,
+        typer.Option(help="be ROS 2's router, in place of rmw_zenohd, at this endpoint"),
     ] = None,
     ros_domain: Annotated[
         int, typer.Option(min=0, max=232, envvar="ROS_DOMAIN_ID", help="domain of ROS 2")
@@ -187,7 +201,9 @@ def ros2(
     stall_s: StallOpt = DEFAULT_STALL_S,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """Show a mission to ROS 2 (rmw_zenoh_cpp; Jazzy, Kilted) and serve its operator commands. Needs chaserdock[ros2], no ROS."""
+    """Show a mission to ROS 2 (rmw_zenoh_cpp; Jazzy, Kilted) and serve its operator commands. Needs
+    chaserdock[ros2], no ROS.
+    """
     from chaserdock_protocol.process import ProcessOptions, RosLink
 
     from .options import check_endpoints
@@ -211,14 +227,19 @@ def router(
     *,
     link: LinkOptions,
     until: Annotated[
-        str | None, typer.Option(metavar="PROCESS", help="exit when this process has joined and left")
+        str | None,
+        typer.Option(metavar="PROCESS", help="exit when this process has joined and left"),
     ] = None,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """Run the router that a mission's processes connect to; with --keys it enforces each process' access rights."""
+    """Run the router that a mission's processes connect to; with --keys it enforces each process'
+    access rights.
+    """
     from chaserdock_protocol.process import ProcessOptions
     from chaserdock_protocol.topics import is_process_name
 
     if until is not None and not is_process_name(until):
         raise fail(f"--until {until}: must be a process, e.g. operator or chaser/0")
-    start_process("router", ProcessOptions(link=link.router_link(), until=until, watch_parent=watch_parent))
+    start_process(
+        "router", ProcessOptions(link=link.router_link(), until=until, watch_parent=watch_parent)
+    )

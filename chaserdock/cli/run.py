@@ -41,7 +41,9 @@ def run(
     overrides: SetOpt = None,
     quiet: QuietOpt = False,
     as_json: JsonLinesOpt = False,
-    view: Annotated[bool, typer.Option("--view", help="serve the live viewer, too (see `view`)")] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="serve the live viewer, too (see `view`)")
+    ] = False,
     keys: KeysOpt = None,
     stall_s: StallOpt = DEFAULT_STALL_S,
     port: Annotated[
@@ -56,10 +58,18 @@ def run(
         str | None, typer.Option(help="Zenoh namespace of the mission; a unique one by default")
     ] = None,
 ) -> None:
-    """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the flight is a success."""
+    """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the
+    flight is a success.
+    """
     from chaserdock.launch.launcher import fly_mission, print_outcome
     from chaserdock.launch.signals import stop_on_signals
-    from chaserdock.viewer.address import DEFAULT_HOST, TOKEN_VARIABLE, free_port, page_token, url_of
+    from chaserdock.viewer.address import (
+        DEFAULT_HOST,
+        TOKEN_VARIABLE,
+        free_port,
+        page_token,
+        url_of,
+    )
 
     show = show_of(quiet, as_json)
     with errors_as_json(as_json), stop_on_signals() as stop:
@@ -87,7 +97,9 @@ def run(
 
 
 def announce_viewer(port: int, url: str) -> threading.Thread:
-    """Print the address of the viewer as soon as it answers, on a thread that does not outlive the program."""
+    """Print the address of the viewer as soon as it answers, on a thread that does not outlive the
+    program.
+    """
     from chaserdock.launch.container import is_listening
     from chaserdock.viewer.address import DEFAULT_HOST
 
@@ -113,12 +125,16 @@ def judge(
     quiet: QuietOpt = False,
     as_json: JsonLinesOpt = False,
 ) -> None:
-    """Watch a mission that other machines fly, wait for its log and judge it. Status 0 only if it is a success."""
+    """Watch a mission that other machines fly, wait for its log and judge it. Status 0 only if it
+    is a success.
+    """
     from chaserdock.launch.judge import judge_mission
 
     show = show_of(quiet, as_json)
     with errors_as_json(as_json):
-        raise typer.Exit(judge_mission(out, link.link(timeout_s=timeout), timeout, world_timeout, show))
+        raise typer.Exit(
+            judge_mission(out, link.link(timeout_s=timeout), timeout, world_timeout, show)
+        )
 
 
 class KeepLogs(StrEnum):
@@ -135,15 +151,22 @@ def campaign(
         Path | None, typer.Option(help="folder for table and report; campaigns/NAME by default")
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="concurrent runs on this machine; its CPU cores by default")
+        int | None,
+        typer.Option(min=1, help="concurrent runs on this machine; its CPU cores by default"),
     ] = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, e.g. tcp://host:8786")
     ] = None,
-    keep_logs: Annotated[KeepLogs, typer.Option(help="runs whose logs are kept")] = KeepLogs.failures,
-    only: Annotated[int | None, typer.Option(min=0, help="fly this run only, and print its result")] = None,
+    keep_logs: Annotated[
+        KeepLogs, typer.Option(help="runs whose logs are kept")
+    ] = KeepLogs.failures,
+    only: Annotated[
+        int | None, typer.Option(min=0, help="fly this run only, and print its result")
+    ] = None,
 ) -> None:
-    """Fly many runs of a scenario; a stopped campaign resumes. Status 0 when all runs have finished."""
+    """Fly many runs of a scenario; a stopped campaign resumes. Status 0 when all runs have
+    finished.
+    """
     from chaserdock.campaign.scheduler import direct
 
     if only is not None and (cluster is not None or jobs is not None):

@@ -86,7 +86,9 @@ def list_scenarios(as_json: JsonOpt = False) -> None:
 
 
 def validate(
-    files: Annotated[list[str], typer.Argument(help="scenario files, or names of shipped scenarios")],
+    files: Annotated[
+        list[str], typer.Argument(help="scenario files, or names of shipped scenarios")
+    ],
 ) -> None:
     """Check scenario files. Status 2 if one is not valid, with one line per error."""
     from chaserdock_protocol.scenario import load_scenario
@@ -130,7 +132,9 @@ def schema() -> None:
 
 
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="name of the scenario, or path of its file")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="name of the scenario, or path of its file")
+    ],
 ) -> None:
     """Write a short commented scenario file that can be run, and changed."""
     import tomllib

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that prepare a mission: marker sheets, camera calibration, and keys (``chaserdock keys …``)."""
+"""Commands that prepare a mission: marker sheets, camera calibration, and keys (``chaserdock keys
+…``).
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,12 @@ class Paper(StrEnum):
 
 
 def markers(
-    target: Annotated[str, typer.Argument(help="target file (.toml), or a shipped target: paper, servicer")],
-    out: Annotated[Path, typer.Option(help="file to write: .pdf, or .svg (one file per page, numbered)")],
+    target: Annotated[
+        str, typer.Argument(help="target file (.toml), or a shipped target: paper, servicer")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="file to write: .pdf, or .svg (one file per page, numbered)")
+    ],
     paper: Annotated[Paper, typer.Option(help="sheet size")] = Paper.a4,
 ) -> None:
     """Write a target's markers as sheets to print at true scale, with cutting marks and ids."""
@@ -47,9 +53,12 @@ def calibrate(
     folder: Annotated[Path, typer.Argument(help="folder of images (.png, .jpg) of one board")],
     out: Annotated[Path, typer.Option(help="calibration file to write: .yaml, .json or .xml")],
     board: Annotated[
-        str, typer.Option(help="chessboard COLUMNSxROWS inner corners, or charuco COLUMNSxROWS squares")
+        str,
+        typer.Option(help="chessboard COLUMNSxROWS inner corners, or charuco COLUMNSxROWS squares"),
     ] = "charuco 8x6",
-    square: Annotated[float, typer.Option(min=0.0001, max=100.0, help="edge of a square, metres")] = 0.03,
+    square: Annotated[
+        float, typer.Option(min=0.0001, max=100.0, help="edge of a square, metres")
+    ] = 0.03,
     marker: Annotated[
         float, typer.Option(min=0.0001, max=100.0, help="charuco: edge of a marker, metres")
     ] = 0.022,
@@ -94,7 +103,10 @@ def compose(
     chasers: Annotated[int, typer.Option(min=1, max=16, help="number of chaser services")] = 4,
     standby: Annotated[bool, typer.Option("--standby", help="with a standby controller")] = False,
     view: Annotated[
-        bool, typer.Option("--view", help="with the viewer, which `docker compose --profile view up` starts")
+        bool,
+        typer.Option(
+            "--view", help="with the viewer, which `docker compose --profile view up` starts"
+        ),
     ] = False,
 ) -> None:
     """Print the Docker Compose file of a mission: a service per process, with access control."""
@@ -112,18 +124,25 @@ def group() -> None:
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(help="folder to write to, one folder per process inside")],
+    folder: Annotated[
+        Path, typer.Argument(help="folder to write to, one folder per process inside")
+    ],
     host: Annotated[
         list[str] | None, typer.Option(help="name or address of the router's host; repeatable")
     ] = None,
     chasers: Annotated[int, typer.Option(min=1, max=256, help="number of chasers")] = 16,
     days: Annotated[int, typer.Option(min=1, max=3650, help="validity, days")] = 90,
     shared: Annotated[
-        bool, typer.Option(help="make keys readable by every user (for volumes that one process mounts)")
+        bool,
+        typer.Option(help="make keys readable by every user (for volumes that one process mounts)"),
     ] = False,
-    renew: Annotated[bool, typer.Option(help="keep valid keys, replace missing or expired ones")] = False,
+    renew: Annotated[
+        bool, typer.Option(help="keep valid keys, replace missing or expired ones")
+    ] = False,
 ) -> None:
-    """Make a mission's keys: FOLDER/NAME holds all that process NAME needs. Existing keys are not overwritten."""
+    """Make a mission's keys: FOLDER/NAME holds all that process NAME needs. Existing keys are not
+    overwritten.
+    """
     from datetime import UTC, datetime
 
     from chaserdock.launch.keys import init_keys, names, remove_keys, why_not_usable
@@ -136,7 +155,9 @@ def init(
         remove_keys(folder, chasers)
     hosts = ("localhost", "127.0.0.1", *(host or ()))
     init_keys(folder, chasers, hosts, days, now, shared=shared)
-    print(f"{folder}: keys of {', '.join(names(chasers))}; router at {', '.join(hosts)}; {days} days")
+    print(
+        f"{folder}: keys of {', '.join(names(chasers))}; router at {', '.join(hosts)}; {days} days"
+    )
 
 
 add_command(keys, init)

@@ -43,27 +43,45 @@ def simulate(
         ModeOption | None, typer.Option(help="fly all seeds in this mode; drawn by default")
     ] = None,
     images: Annotated[
-        bool, typer.Option("--images", help="render images instead of drawing measurements (slower)")
+        bool,
+        typer.Option("--images", help="render images instead of drawing measurements (slower)"),
     ] = False,
     shrinking: Annotated[
         bool,
         typer.Option(
-            "--shrink/--no-shrink", help="reduce seeds that fail to the simplest scenario that fails"
+            "--shrink/--no-shrink",
+            help="reduce seeds that fail to the simplest scenario that fails",
         ),
     ] = True,
     stop: Annotated[
         bool, typer.Option("--stop", help="end at the first violation of the first seed that fails")
     ] = False,
     out: Annotated[
-        Path, typer.Option(help="folder for scenarios that fail, and for the log of a flight without --seeds")
+        Path,
+        typer.Option(
+            help="folder for scenarios that fail, and for the log of a flight without --seeds"
+        ),
     ] = Path("simulations"),
 ) -> None:
-    """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if all of them hold."""
-    from chaserdock.simulation.campaign import Swarm, UnflownSeed, consistency, fly_seeds, inconsistency
+    """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if
+    all of them hold.
+    """
+    from chaserdock.simulation.campaign import (
+        Swarm,
+        UnflownSeed,
+        consistency,
+        fly_seeds,
+        inconsistency,
+    )
 
     _check_writable(out)
     if seeds is None:
-        given = {"--jobs": jobs > 1, "--images": images, "--no-shrink": not shrinking, "--stop": stop}
+        given = {
+            "--jobs": jobs > 1,
+            "--images": images,
+            "--no-shrink": not shrinking,
+            "--stop": stop,
+        }
         if unused := [option for option, is_given in given.items() if is_given]:
             raise fail(f"{', '.join(unused)}: only with --seeds")
         raise typer.Exit(_fly_one(scenario, out, mode))
@@ -136,7 +154,9 @@ def _fly_one(scenario: str, out: Path, mode: Any) -> int:
         case["simulation"] = {"mode": mode.value}
     folder = out / path.stem
     if (folder / "run").exists():
-        raise fail(f"{folder / 'run'} exists already; a log is never overwritten, choose another --out")
+        raise fail(
+            f"{folder / 'run'} exists already; a log is never overwritten, choose another --out"
+        )
     result = fly_case(case, 0, folder)
     for violation in result.violations:
         print(violation)

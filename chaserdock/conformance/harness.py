@@ -15,7 +15,14 @@ from dataclasses import dataclass
 
 import msgspec
 from chaserdock_protocol import codec, topics
-from chaserdock_protocol.messages import JoinReply, JoinRequest, Message, MissionEnd, Presence, encoding_of
+from chaserdock_protocol.messages import (
+    JoinReply,
+    JoinRequest,
+    Message,
+    MissionEnd,
+    Presence,
+    encoding_of,
+)
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.log import LogSource
 from chaserdock_protocol.topics import Topic
@@ -37,7 +44,9 @@ _END_S = 5.0
 
 @dataclass(frozen=True)
 class Checked:
-    """Result of a check: ``findings`` is empty if the process conforms; ``ticks`` of the log were played."""
+    """Result of a check: ``findings`` is empty if the process conforms; ``ticks`` of the log were
+    played.
+    """
 
     findings: list[Finding]
     ticks: int
@@ -49,9 +58,9 @@ def check(
 ) -> Checked:
     """Run ``command`` as ``process`` against the first ``ticks`` of a log.
 
-    ``{endpoint}`` and ``{namespace}`` in the command are replaced. Wall-clock timeouts: ``start_s`` to join and discover
-    the partners, ``patience_s`` per tick and to end. Raise LogError, ScenarioError, TransportError, or CheckError when
-    the command or the log is unusable.
+    ``{endpoint}`` and ``{namespace}`` in the command are replaced. Wall-clock timeouts: ``start_s``
+    to join and discover the partners, ``patience_s`` per tick and to end. Raise LogError,
+    ScenarioError, TransportError, or CheckError when the command or the log is unusable.
     """
     recorded = read_turns(log, process, ticks)
     namespace = f"check-{uuid.uuid4().hex[:12]}"
@@ -59,7 +68,10 @@ def check(
     try:
         ledger = Ledger(process, recorded.scenario)
         stand = TestStand(node, ledger, recorded.scenario_json)
-        filled = [word.replace("{endpoint}", endpoint).replace("{namespace}", namespace) for word in command]
+        filled = [
+            word.replace("{endpoint}", endpoint).replace("{namespace}", namespace)
+            for word in command
+        ]
         child = _start(filled)
         try:
             played = stand.fly(child, recorded.turns, start_s, patience_s)
@@ -73,7 +85,10 @@ def check(
 def _start(command: list[str]) -> subprocess.Popen[bytes]:
     try:
         return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, env={**os.environ, **SINGLE_THREADED}, start_new_session=True
+            command,
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, **SINGLE_THREADED},
+            start_new_session=True,
         )
     except OSError as error:
         raise CheckError(f"{command[0]}: cannot be run: {error.strerror or error}") from None
@@ -92,7 +107,9 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 
 class TestStand:
-    """Plays the messages of a log to one process and records its messages. Single-threaded except for the callbacks."""
+    """Plays the messages of a log to one process and records its messages. Single-threaded except
+    for the callbacks.
+    """
 
     def __init__(self, node: Node, ledger: Ledger, scenario_json: str) -> None:
         self._node, self._ledger, self._scenario_json = node, ledger, scenario_json
@@ -102,7 +119,11 @@ class TestStand:
         self._numbers: Counter[str] = Counter()
         self._alive: set[str] = set()
         self._was_alive = False
-        present = {"world", "controller", *(f"chaser/{i}" for i in range(len(ledger.scenario.chasers)))}
+        present = {
+            "world",
+            "controller",
+            *(f"chaser/{i}" for i in range(len(ledger.scenario.chasers))),
+        }
         self._partners = presence.required_peers(ledger.process, present) - {ledger.process}
         self._instances = {name: unique_id() for name in sorted(self._partners)}
         self._presence_sent_s = 0.0
@@ -113,7 +134,11 @@ class TestStand:
         node.declare_liveliness()
 
     def fly(
-        self, child: subprocess.Popen[bytes], turns: list[RecordedTick], start_s: float, patience_s: float
+        self,
+        child: subprocess.Popen[bytes],
+        turns: list[RecordedTick],
+        start_s: float,
+        patience_s: float,
     ) -> int:
         """Run the whole check; return the number of ticks played."""
         ledger = self._ledger
@@ -124,7 +149,10 @@ class TestStand:
         played = self._play(child, turns, patience_s)
         last = turns[played - 1].tick
         end = MissionEnd(
-            tick=last.tick + 1, sim_time_ns=last.sim_time_ns, reason="end of the check", complete=True
+            tick=last.tick + 1,
+            sim_time_ns=last.sim_time_ns,
+            reason="end of the check",
+            complete=True,
         )
         if child.poll() is None:
             self._publish(topics.END, end)
@@ -132,13 +160,17 @@ class TestStand:
             # The liveliness token disappears with the session, after all messages have arrived.
             self._wait(lambda: ledger.process not in self._alive, None, min(patience_s, _END_S))
             if not ended:
-                ledger.report(ledger.process, f"does not end within {patience_s:g} s of the mission's end")
+                ledger.report(
+                    ledger.process, f"does not end within {patience_s:g} s of the mission's end"
+                )
             elif child.returncode != 0:
                 ledger.report(ledger.process, f"ended with status {child.returncode}")
         ledger.finish()
         return played
 
-    def _play(self, child: subprocess.Popen[bytes], turns: list[RecordedTick], patience_s: float) -> int:
+    def _play(
+        self, child: subprocess.Popen[bytes], turns: list[RecordedTick], patience_s: float
+    ) -> int:
         ledger, silent = self._ledger, 0
         first = () if ledger.role == "controller" else (topics.ACTUATORS,)
         for k, recorded in enumerate(turns):
@@ -154,17 +186,20 @@ class TestStand:
             if not self._wait(lambda: not ledger.due(), child, patience_s):
                 if child.poll() is not None:
                     ledger.report(
-                        ledger.process, f"ended before the mission's end, with status {child.returncode}"
+                        ledger.process,
+                        f"ended before the mission's end, with status {child.returncode}",
                     )
                     return k + 1
                 ledger.miss(patience_s)
                 silent += 1
                 if silent == SILENT_TICKS:
-                    ledger.report(ledger.process, f"stopped after {SILENT_TICKS} ticks without an answer")
+                    ledger.report(
+                        ledger.process, f"stopped after {SILENT_TICKS} ticks without an answer"
+                    )
                     return k + 1
         return len(turns)
 
-    # -- joining up ---------------------------------------------------------------------------------------
+    # -- joining up --------------------------------------------------------------------------------
 
     def _joins(self, request: JoinRequest, reply: Callable[[JoinReply], None]) -> None:
         """Answer a join request, on Zenoh's thread."""
@@ -178,7 +213,11 @@ class TestStand:
 
     def _has_joined(self) -> bool:
         ledger = self._ledger
-        return ledger.instance is not None and ledger.process in self._alive and not self._undiscovered()
+        return (
+            ledger.instance is not None
+            and ledger.process in self._alive
+            and not self._undiscovered()
+        )
 
     def _undiscovered(self) -> list[str]:
         heard = self._ledger.heard
@@ -193,7 +232,9 @@ class TestStand:
             refused = self._node.counts.rejected
             detail = "; ".join(key for key in refused if key.startswith(topics.JOIN_KEY))
             ledger.report(
-                topics.JOIN_KEY, f"{name} did not join{'' if ended else f' within {start_s:g} s'}", detail
+                topics.JOIN_KEY,
+                f"{name} did not join{'' if ended else f' within {start_s:g} s'}",
+                detail,
             )
             return
         if not self._was_alive:
@@ -201,9 +242,11 @@ class TestStand:
         if not ledger.present:
             ledger.report(topics.PRESENCE.key_of(name), "no presence published")
         elif unheard := self._undiscovered():
-            ledger.report(topics.PRESENCE.key_of(name), "has not discovered its partners", ", ".join(unheard))
+            ledger.report(
+                topics.PRESENCE.key_of(name), "has not discovered its partners", ", ".join(unheard)
+            )
 
-    # -- the network --------------------------------------------------------------------------------------
+    # -- the network -------------------------------------------------------------------------------
 
     def _publish(self, topic: Topic, message: Message, place: str | None = None) -> None:
         key = topic.key_of(place)
@@ -215,8 +258,12 @@ class TestStand:
         self._sent[raw.key, raw.encoding, raw.payload] += 1
         self._node.publish_raw(raw)
 
-    def _wait(self, done: Callable[[], bool], child: subprocess.Popen[bytes] | None, seconds: float) -> bool:
-        """Process messages and publish the partners' presence until ``done``; return False if the child ends or on timeout."""
+    def _wait(
+        self, done: Callable[[], bool], child: subprocess.Popen[bytes] | None, seconds: float
+    ) -> bool:
+        """Process messages and publish the partners' presence until ``done``; return False if the
+        child ends or on timeout.
+        """
         deadline = time.monotonic() + seconds
         ended = False
         while not done():
@@ -265,7 +312,9 @@ class TestStand:
             (self._alive.add if alive else self._alive.discard)(name)
             self._was_alive |= alive and name == ledger.process
             if alive and name not in (ledger.process, "world"):
-                ledger.report(topics.LIVE_KEY.format(process=name), "another process' liveliness token")
+                ledger.report(
+                    topics.LIVE_KEY.format(process=name), "another process' liveliness token"
+                )
 
     def _publish_presence(self) -> None:
         ledger = self._ledger
@@ -274,4 +323,6 @@ class TestStand:
             others[ledger.process] = ledger.instance
         for name, instance in self._instances.items():
             heard = {other: i for other, i in others.items() if other != name}
-            self._publish(topics.PRESENCE, Presence(process=name, instance=instance, heard=heard), name)
+            self._publish(
+                topics.PRESENCE, Presence(process=name, instance=instance, heard=heard), name
+            )

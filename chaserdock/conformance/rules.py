@@ -11,7 +11,14 @@ from chaserdock_agents.chaser.command_gate import refusal
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.lease_holder import LeaseHolder
-from chaserdock_protocol.messages import ActuatorCommand, Farewell, Lease, Message, Presence, WrenchCommand
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    Farewell,
+    Lease,
+    Message,
+    Presence,
+    WrenchCommand,
+)
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.topics import Role, Topic
 from chaserdock_protocol.transport import RawSample
@@ -36,15 +43,23 @@ class Finding:
         """Format as one line."""
         when = f"at tick {self.tick}" if self.tick >= 0 else "before the first tick"
         often = f"{self.times} times, first " if self.times > 1 else ""
-        return f"{self.where}: {self.what}{f': {self.detail}' if self.detail else ''} ({often}{when})"
+        return (
+            f"{self.where}: {self.what}{f': {self.detail}' if self.detail else ''} ({often}{when})"
+        )
 
 
-def duties_of(role: Role, chaser: int | None, turn: RecordedTick, thrusters: bool) -> dict[str, Topic]:
+def duties_of(
+    role: Role, chaser: int | None, turn: RecordedTick, thrusters: bool
+) -> dict[str, Topic]:
     """Return the required answers of a process to a tick, by key."""
     tick = turn.tick
     if role == "controller":
         wrenches = {topics.WRENCH.key_of(i): topics.WRENCH for i in tick.chasers}
-        return {**wrenches, topics.TARGET.key_of(): topics.TARGET, topics.SOLVER.key_of(): topics.SOLVER}
+        return {
+            **wrenches,
+            topics.TARGET.key_of(): topics.TARGET,
+            topics.SOLVER.key_of(): topics.SOLVER,
+        }
     own = [
         topics.LEASE,
         topics.ACTUATORS,
@@ -93,12 +108,20 @@ class Ledger:
     def open(self, turn: RecordedTick) -> None:
         """Start a tick, whose answers become due."""
         self._tick, self._turn = turn.tick.tick, turn
-        self._duties = duties_of(self.role, self.chaser, turn, self.scenario.chaser.actuation == "thrusters")
+        self._duties = duties_of(
+            self.role, self.chaser, turn, self.scenario.chaser.actuation == "thrusters"
+        )
         self._came = set()
 
     def due(self, *excluded: Topic) -> list[str]:
-        """Return the keys without an answer to the present tick, except those of ``excluded`` topics."""
-        return [key for key, topic in self._duties.items() if key not in self._came and topic not in excluded]
+        """Return the keys without an answer to the present tick, except those of ``excluded``
+        topics.
+        """
+        return [
+            key
+            for key, topic in self._duties.items()
+            if key not in self._came and topic not in excluded
+        ]
 
     def add(self, raw: RawSample) -> None:
         """Check a message of the process."""
@@ -152,7 +175,9 @@ class Ledger:
             self._unheard[key] = message.seq
         due = self._next.get(key, self._unheard.get(key, 0))
         if message.seq != due:
-            self.report(key, "seq does not count from 0 without gaps", f"{message.seq} instead of {due}")
+            self.report(
+                key, "seq does not count from 0 without gaps", f"{message.seq} instead of {due}"
+            )
         self._next[key] = message.seq + 1
 
     def _presence(self, key: str, message: Presence) -> None:
@@ -160,7 +185,9 @@ class Ledger:
             self.report(key, "publishes another process' presence", repr(message.process))
         if self.instance is not None and message.instance != self.instance:
             self.report(
-                key, "another instance than it joined as", f"{message.instance!r}, not {self.instance!r}"
+                key,
+                "another instance than it joined as",
+                f"{message.instance!r}, not {self.instance!r}",
             )
         self.present, self.heard = True, dict(message.heard)
 
@@ -174,8 +201,12 @@ class Ledger:
         if turn is None:
             self.report(key, "answered before the first tick", f"tick {message.tick}")
             return
-        if message.tick != turn.tick.tick and (key in self._duties or message.tick > turn.tick.tick):
-            self.report(key, "another tick than the open one", f"{message.tick}, not {turn.tick.tick}")
+        if message.tick != turn.tick.tick and (
+            key in self._duties or message.tick > turn.tick.tick
+        ):
+            self.report(
+                key, "another tick than the open one", f"{message.tick}, not {turn.tick.tick}"
+            )
             return
         place = getattr(message, "chaser", None)
         if place is not None and topic.key_of(place) != key:
@@ -186,8 +217,13 @@ class Ledger:
         if topic not in _OWN_TIME and message.sim_time_ns != time_ns:
             self.report(key, "wrong sim_time_ns", f"{message.sim_time_ns}, not {time_ns}")
         due_ns = timing.effective_ns(message.tick)
-        if isinstance(message, WrenchCommand | ActuatorCommand) and message.effective_time_ns != due_ns:
-            self.report(key, "wrong effective_time_ns", f"{message.effective_time_ns}, not {due_ns}")
+        if (
+            isinstance(message, WrenchCommand | ActuatorCommand)
+            and message.effective_time_ns != due_ns
+        ):
+            self.report(
+                key, "wrong effective_time_ns", f"{message.effective_time_ns}, not {due_ns}"
+            )
         if isinstance(message, WrenchCommand):
             self._check_authority(key, message, turn)
             body, before = self.scenario.chaser, message.tick - 1

@@ -24,7 +24,8 @@ class CheckError(ChaserdockError):
 
 @dataclass
 class RecordedTick:
-    """One recorded tick: the world's messages in ``opening``, the answers of the other processes in ``answers``.
+    """One recorded tick: the world's messages in ``opening``, the answers of the other processes in
+    ``answers``.
 
     ``exposure_ns``: the time of the process' own image, None without one.
     """
@@ -36,7 +37,9 @@ class RecordedTick:
 
 
 def with_instance(turn: RecordedTick, process: str, instance: str) -> RecordedTick:
-    """Return the tick with ``instance`` as the instance of controller ``process``, also in the leases that it holds."""
+    """Return the tick with ``instance`` as the instance of controller ``process``, also in the
+    leases that it holds.
+    """
 
     def renamed(raw: RawSample) -> RawSample:
         found = topics.topic_of_key(raw.key)
@@ -45,14 +48,18 @@ def with_instance(turn: RecordedTick, process: str, instance: str) -> RecordedTi
         message = codec.decode(found[0].kind, raw.payload)
         match message:
             case Tick(controllers=controllers) if process in controllers:
-                message = msgspec.structs.replace(message, controllers={**controllers, process: instance})
+                message = msgspec.structs.replace(
+                    message, controllers={**controllers, process: instance}
+                )
             case Lease(holder=holder) if holder == process:
                 message = msgspec.structs.replace(message, instance=instance)
         return msgspec.structs.replace(raw, payload=codec.encode(message))
 
     if process not in turn.tick.controllers:
         return turn
-    tick = msgspec.structs.replace(turn.tick, controllers={**turn.tick.controllers, process: instance})
+    tick = msgspec.structs.replace(
+        turn.tick, controllers={**turn.tick.controllers, process: instance}
+    )
     opening, answers = ([renamed(raw) for raw in raws] for raws in (turn.opening, turn.answers))
     return replace(turn, tick=tick, opening=opening, answers=answers)
 
@@ -67,7 +74,9 @@ class Recorded:
 
 
 def role_of(process: str, chasers: int) -> tuple[Role, int | None]:
-    """Return role and chaser number of a process. Raise CheckError unless it is part of the mission."""
+    """Return role and chaser number of a process. Raise CheckError unless it is part of the
+    mission.
+    """
     if process == "controller":
         return "controller", None
     if process.startswith("chaser/") and topics.is_process_name(process):
@@ -85,11 +94,14 @@ def input_topics(role: Role) -> list[Topic]:
         for t in topics.TOPICS
         if role in t.readers and t.writer not in ("any", role) and t.rate in ("tick", "image")
     ]
-    return sorted(inputs, key=lambda t: (t.writer != "world", t is not topics.TICK, topics.TOPICS.index(t)))
+    return sorted(
+        inputs, key=lambda t: (t.writer != "world", t is not topics.TICK, topics.TOPICS.index(t))
+    )
 
 
 def read_turns(log: LogSource, process: str, most: int) -> Recorded:
-    """Read the first ``most`` ticks of a log, up to the first one without an expected answer of ``process``.
+    """Read the first ``most`` ticks of a log, up to the first one without an expected answer of
+    ``process``.
 
     Raise LogError, ScenarioError, or CheckError when there is nothing to play.
     """
@@ -103,7 +115,9 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
     keys = [
         topic.key_of(place)
         for topic in inputs
-        for place in (_places(number, len(scenario.chasers)) if "{chaser}" in topic.key else (None,))
+        for place in (
+            _places(number, len(scenario.chasers)) if "{chaser}" in topic.key else (None,)
+        )
     ]
     turns: dict[int, RecordedTick] = {}
     waiting: dict[int, list[tuple[int, RawSample, int | None]]] = {}

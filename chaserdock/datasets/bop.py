@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layout of BOP datasets (T. Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", 2018; docs of bop_toolkit), grey.
+"""The layout of BOP datasets (T. Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation",
+2018; docs of bop_toolkit), grey.
 
-Lengths are in millimetres, rotations row-wise from the model to the camera. A scene per split; there are no depth images.
+Lengths are in millimetres, rotations row-wise from the model to the camera. A scene per split;
+there are no depth images.
 """
 
 from __future__ import annotations
@@ -29,10 +31,13 @@ _IMAGE_FOLDERS = ("gray", "rgb")
 
 
 class BopWriter:
-    """Writes a dataset into ``folder``: ``camera.json``, ``models``, ``models_eval``, ``train`` and ``val``. Raises OSError, and
-    DatasetError for a camera with lens distortion, which the format does not have."""
+    """Writes a dataset into ``folder``: ``camera.json``, ``models``, ``models_eval``, ``train`` and
+    ``val``. Raises OSError, and DatasetError for a camera with lens distortion, which the format
+    does not have."""
 
-    def __init__(self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape) -> None:
+    def __init__(
+        self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape
+    ) -> None:
         check_camera(camera)
         self._folder, self._camera = folder, camera
         write_models(mesh, shape, folder / "models")
@@ -60,7 +65,10 @@ class BopWriter:
         for name, mask in (("mask", image.mask), ("mask_visib", image.visible)):
             cv2.imwrite(str(scene / name / f"{number:06d}_000000.png"), 255 * mask.astype(np.uint8))
         key, rows, label = str(number), self._scenes[split], image.view.label
-        rows["scene_camera"][key] = {"cam_K": self._camera.matrix().ravel().tolist(), "depth_scale": 1.0}
+        rows["scene_camera"][key] = {
+            "cam_K": self._camera.matrix().ravel().tolist(),
+            "depth_scale": 1.0,
+        }
         rows["scene_gt"][key] = [
             {
                 "cam_R_m2c": rotations.to_matrix(label.q_irf_trf_wxyz).ravel().tolist(),
@@ -98,7 +106,9 @@ def _info(image: ViewImage) -> dict[str, Any]:
 
 
 def _box(mask: NDArray[np.bool_], margin_px: tuple[int, int]) -> list[int]:
-    """Return left, top, width and height of a mask on a canvas with a margin around the image; -1 for an empty one."""
+    """Return left, top, width and height of a mask on a canvas with a margin around the image; -1
+    for an empty one.
+    """
     columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
     if not len(columns):
         return [-1, -1, -1, -1]
@@ -114,7 +124,9 @@ def read_bop(folder: Path) -> LabelledDataset:
     models = folder / "models"
     shape = read_models(models) if models.is_dir() else None
     general = read_object(folder / "camera.json")
-    size = tuple(int(numbers(folder / "camera.json", general, key, ())) for key in ("width", "height"))
+    size = tuple(
+        int(numbers(folder / "camera.json", general, key, ())) for key in ("width", "height")
+    )
     images: list[LabelledImage] = []
     matrices: list[Array] = []
     for name in ("train", "val", "test"):
@@ -129,7 +141,9 @@ def read_bop(folder: Path) -> LabelledDataset:
         )
     first = matrices[0]
     if any(not np.allclose(m, first, rtol=1e-9, atol=1e-9) for m in matrices):
-        raise DatasetError(f"{folder}: cam_K differs between images; a perception is made for one camera")
+        raise DatasetError(
+            f"{folder}: cam_K differs between images; a perception is made for one camera"
+        )
     fx, fy, cx, cy = (float(first[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     try:
         camera = Camera(size[0], size[1], fx, fy, cx, cy)
@@ -143,10 +157,20 @@ def _read_scene(scene: Path, split: Split) -> list[tuple[LabelledImage, Array]]:
     found = []
     for key, rows in labels.items():
         place = f"{scene / 'scene_gt.json'}: image {key}"
-        if not key.isdigit() or not isinstance(rows, list) or len(rows) != 1 or not isinstance(rows[0], dict):
-            raise DatasetError(f"{place}: must have one object with cam_R_m2c, cam_t_m2c and obj_id")
+        if (
+            not key.isdigit()
+            or not isinstance(rows, list)
+            or len(rows) != 1
+            or not isinstance(rows[0], dict)
+        ):
+            raise DatasetError(
+                f"{place}: must have one object with cam_R_m2c, cam_t_m2c and obj_id"
+            )
         rotation = numbers(place, rows[0], "cam_R_m2c", (3, 3))
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0.0:
+        if (
+            not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+            or np.linalg.det(rotation) < 0.0
+        ):
             raise DatasetError(f"{place}: cam_R_m2c must be a rotation, row-wise")
         position = 1e-3 * numbers(place, rows[0], "cam_t_m2c", (3,))
         camera = cameras.get(key)

@@ -22,10 +22,11 @@ from .types import DatasetError, LabelledImage, PoseLabel, TargetShape, read_gre
 
 
 def perception_of(name: str | None, flight: FlightScenario, camera: Camera) -> PerceptionMethod:
-    """Return a perception for the camera of a dataset: by its name in a scenario, or a class ``MODULE:NAME``.
+    """Return a perception for the camera of a dataset: by its name in a scenario, or a class
+    ``MODULE:NAME``.
 
-    None is the perception of the flight scenario. Raises DatasetError for a class that cannot be made, PluginError for an unknown
-    name.
+    None is the perception of the flight scenario. Raises DatasetError for a class that cannot be
+    made, PluginError for an unknown name.
     """
     if name is not None and ":" in name:
         return _of_class(name, flight, camera)
@@ -34,9 +35,13 @@ def perception_of(name: str | None, flight: FlightScenario, camera: Camera) -> P
         updated["perception"] = PerceptionSection(name=name)
     used = name or flight.perception.name
     if used == "statistical":
-        raise DatasetError(f"--perception {used}: needs no images, it draws measurements; give another one")
+        raise DatasetError(
+            f"--perception {used}: needs no images, it draws measurements; give another one"
+        )
     if used in get_args(Method) and not flight.target_model().markers:
-        raise DatasetError(f"--perception {used}: needs markers; the target {flight.target.model!r} has none")
+        raise DatasetError(
+            f"--perception {used}: needs markers; the target {flight.target.model!r} has none"
+        )
     return make_perception(flight.model_copy(update=updated), single_images=True)
 
 
@@ -45,7 +50,9 @@ def _of_class(name: str, flight: FlightScenario, camera: Camera) -> PerceptionMe
         factory: Callable[..., PerceptionMethod] = pkgutil.resolve_name(name)
         return factory(camera, flight.target_model())
     except Exception as error:  # a user's module may raise anything
-        raise DatasetError(f"--perception {name}: cannot be made: {type(error).__name__}: {error}") from error
+        raise DatasetError(
+            f"--perception {name}: cannot be made: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _section_of(camera: Camera) -> FlightCamera:
@@ -65,9 +72,11 @@ def score_perception(
     shape: TargetShape | None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> dict[str, float]:
-    """Return the figures of `summarize` and the CPU time per image of the best solution of a perception in every image.
+    """Return the figures of `summarize` and the CPU time per image of the best solution of a
+    perception in every image.
 
-    A perception with memory must have ``reset()``, which is called before each image. Raises DatasetError.
+    A perception with memory must have ``reset()``, which is called before each image. Raises
+    DatasetError.
     """
     reset: Callable[[], None] = getattr(perception, "reset", lambda: None)
     points = None if shape is None else TargetShape(

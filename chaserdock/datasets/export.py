@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export a dataset: images of random views with their labels, and what flight software knows, which a perception is made from."""
+"""Export a dataset: images of random views with their labels, and what flight software knows, which
+a perception is made from.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +34,11 @@ def export_dataset(
     validation_share: float = 0.2,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Write ``images`` images with labels into a new ``folder``, the last ones, a share of ``validation_share``, for validation.
+    """Write ``images`` images with labels into a new ``folder``, the last ones, a share of
+    ``validation_share``, for validation.
 
-    Raises DatasetError for a folder that exists and is not empty or cannot be written, and for a camera with errors.
+    Raises DatasetError for a folder that exists and is not empty or cannot be written, and for a
+    camera with errors.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: exists already; give a new folder")

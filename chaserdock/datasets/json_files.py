@@ -45,8 +45,12 @@ def read_list(path: Path) -> list[Any]:
     return values
 
 
-def numbers(place: Path | str, values: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> Array:
-    """Return ``key`` of an object as finite numbers of ``shape``, from a flat list too. Raises DatasetError."""
+def numbers(
+    place: Path | str, values: Mapping[str, Any], key: str, shape: tuple[int, ...]
+) -> Array:
+    """Return ``key`` of an object as finite numbers of ``shape``, from a flat list too. Raises
+    DatasetError.
+    """
     count = int(np.prod(shape, dtype=np.int64))
     try:
         array = np.asarray(values[key], dtype=float)
@@ -55,5 +59,7 @@ def numbers(place: Path | str, values: Mapping[str, Any], key: str, shape: tuple
     except (TypeError, ValueError):
         array = np.full(0, np.nan)
     if array.size != count or not np.isfinite(array).all():
-        raise DatasetError(f"{place}: {key} must be {count} finite number{'s' if count > 1 else ''}")
+        raise DatasetError(
+            f"{place}: {key} must be {count} finite number{'s' if count > 1 else ''}"
+        )
     return array.reshape(shape)

@@ -18,7 +18,9 @@ OBJECT = 1
 
 
 def write_models(mesh: TriangleMesh, shape: TargetShape, folder: Path) -> None:
-    """Write the model of the target, without markers, and its entry in ``models_info.json`` into a new folder. Raises OSError."""
+    """Write the model of the target, without markers, and its entry in ``models_info.json`` into a
+    new folder. Raises OSError.
+    """
     folder.mkdir(parents=True)
     _write_ply(mesh, folder / f"obj_{OBJECT:06d}.ply")
     write_json(folder / "models_info.json", {str(OBJECT): _info(shape)})
@@ -26,7 +28,10 @@ def write_models(mesh: TriangleMesh, shape: TargetShape, folder: Path) -> None:
 
 def _write_ply(mesh: TriangleMesh, path: Path) -> None:
     soup = triangle_soup(mesh)
-    rows = np.round(np.concatenate([1e3 * soup.corners_m, soup.normals], axis=2).reshape(-1, 6), 6) + 0.0
+    rows = (
+        np.round(np.concatenate([1e3 * soup.corners_m, soup.normals], axis=2).reshape(-1, 6), 6)
+        + 0.0
+    )
     vertices, index = np.unique(rows, axis=0, return_inverse=True)
     triangles = index.reshape(-1, 3)
     head = [
@@ -43,7 +48,9 @@ def _info(shape: TargetShape) -> dict[str, Any]:
     low, high = 1e3 * shape.points_m.min(axis=0), 1e3 * shape.points_m.max(axis=0)
     info: dict[str, Any] = {"diameter": round(1e3 * shape.diameter_m, 6)}
     info |= {f"min_{axis}": round(v, 6) for axis, v in zip("xyz", low.tolist(), strict=True)}
-    info |= {f"size_{axis}": round(v, 6) for axis, v in zip("xyz", (high - low).tolist(), strict=True)}
+    info |= {
+        f"size_{axis}": round(v, 6) for axis, v in zip("xyz", (high - low).tolist(), strict=True)
+    }
     if len(shape.symmetries):
         transforms = np.zeros((len(shape.symmetries), 4, 4))
         transforms[:, :3, :3], transforms[:, 3, 3] = shape.symmetries, 1.0
@@ -58,7 +65,9 @@ def read_models(folder: Path) -> TargetShape:
     info_file = folder / "models_info.json"
     infos = read_object(info_file)
     if len(infos) != 1:
-        raise DatasetError(f"{info_file}: has {len(infos)} objects; a dataset of one target has one")
+        raise DatasetError(
+            f"{info_file}: has {len(infos)} objects; a dataset of one target has one"
+        )
     key, info = next(iter(infos.items()))
     if not key.isdigit() or not isinstance(info, dict):
         raise DatasetError(f"{info_file}: must map the number of an object to its properties")
@@ -71,6 +80,8 @@ def read_models(folder: Path) -> TargetShape:
     if len(points) < 4 or not np.isfinite(points).all():
         raise DatasetError(f"{file}: must have 4 or more finite vertices")
     rows = info.get("symmetries_discrete") or []
-    symmetries = numbers(info_file, {"symmetries_discrete": rows}, "symmetries_discrete", (len(rows), 4, 4))
+    symmetries = numbers(
+        info_file, {"symmetries_discrete": rows}, "symmetries_discrete", (len(rows), 4, 4)
+    )
     continuous = bool(info.get("symmetries_continuous"))
     return TargetShape(points, diameter_of(points), symmetries[:, :3, :3], continuous)

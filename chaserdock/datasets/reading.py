@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find and read a dataset: a folder that `export_dataset` wrote, or one in the layout of SPEED+ or BOP."""
+"""Find and read a dataset: a folder that `export_dataset` wrote, or one in the layout of SPEED+ or
+BOP.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,16 @@ from .types import DatasetError, LabelledDataset
 
 
 def read_dataset(folder: Path) -> tuple[LabelledDataset, FlightScenario | None]:
-    """Return a dataset, and what its flight software knows; None for a dataset from elsewhere. Raises DatasetError."""
+    """Return a dataset, and what its flight software knows; None for a dataset from elsewhere.
+    Raises DatasetError.
+    """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such folder")
     root, own = folder, folder / DESCRIPTION
     if own.is_file():
-        folder = next((folder / name for name in FOLDERS.values() if (folder / name).is_dir()), folder)
+        folder = next(
+            (folder / name for name in FOLDERS.values() if (folder / name).is_dir()), folder
+        )
     elif folder.name in FOLDERS.values() and (root.parent / DESCRIPTION).is_file():
         own = root.parent / DESCRIPTION
     if (folder / "synthetic").is_dir():
@@ -39,5 +45,7 @@ def read_dataset(folder: Path) -> tuple[LabelledDataset, FlightScenario | None]:
 def _flight(file: Path) -> FlightScenario:
     values = read_object(file)
     if "flight_scenario" not in values:
-        raise DatasetError(f"{file}: flight_scenario is missing; it is not the description of a dataset")
+        raise DatasetError(
+            f"{file}: flight_scenario is missing; it is not the description of a dataset"
+        )
     return flight_scenario_from_json(json.dumps(values["flight_scenario"]), str(file))

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scores of poses: the SPEED score of both ESA challenges, and ADD and ADD-S.
 
-With e_q the angle between attitudes, rad, and e_t the error of the position over the range, the score of an image is e_q + e_t
-(M. Kisantal et al., "Satellite Pose Estimation Challenge: Dataset, Competition Design and Results", 2020). The challenge of 2021
-sets e_q below 0.169 degrees and e_t below 2.173 mm per m to zero, each by itself (T. H. Park et al., "Satellite Pose Estimation
-Competition 2021: Results and Analyses", 2023). ADD is the mean distance of the model's points between two poses, ADD-S that to the
-closest point (S. Hinterstoisser et al., 2012).
+With e_q the angle between attitudes, rad, and e_t the error of the position over the range, the
+score of an image is e_q + e_t (M. Kisantal et al., "Satellite Pose Estimation Challenge: Dataset,
+Competition Design and Results", 2020). The challenge of 2021 sets e_q below 0.169 degrees and e_t
+below 2.173 mm per m to zero, each by itself (T. H. Park et al., "Satellite Pose Estimation
+Competition 2021: Results and Analyses", 2023). ADD is the mean distance of the model's points
+between two poses, ADD-S that to the closest point (S. Hinterstoisser et al., 2012).
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ ADD_SHARE = 0.1
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of one pose: of the attitude, rad; of the position, m and over the range; ADD, or ADD-S of a symmetric target, m."""
+    """Errors of one pose: of the attitude, rad; of the position, m and over the range; ADD, or
+    ADD-S of a symmetric target, m.
+    """
 
     attitude_rad: float
     position_m: float
@@ -61,14 +64,19 @@ def pose_errors(estimate: PoseLabel, truth: PoseLabel, shape: TargetShape | None
 
 def add_m(estimate: PoseLabel, truth: PoseLabel, shape: TargetShape) -> float:
     """Return ADD, or ADD-S of a symmetric target, m."""
-    a, b = (rotations.rotate(p.q_irf_trf_wxyz, shape.points_m) + p.position_irf_m for p in (estimate, truth))
+    a, b = (
+        rotations.rotate(p.q_irf_trf_wxyz, shape.points_m) + p.position_irf_m
+        for p in (estimate, truth)
+    )
     if shape.symmetric:
         return float(np.mean(KDTree(a).query(b)[0]))
     return float(np.mean(np.linalg.norm(a - b, axis=1)))
 
 
 def summarize(errors: Sequence[PoseErrors | None], shape: TargetShape | None) -> dict[str, float]:
-    """Return the figures of a dataset: scores over all images, where None is an image without a pose, and errors of the poses."""
+    """Return the figures of a dataset: scores over all images, where None is an image without a
+    pose, and errors of the poses.
+    """
     found = [e for e in errors if e is not None]
     missed = len(errors) - len(found)
     figures: dict[str, float] = {"images": len(errors), "with_pose": len(found)}
@@ -85,7 +93,9 @@ def summarize(errors: Sequence[PoseErrors | None], shape: TargetShape | None) ->
         adds = [e.add_m for e in found if e.add_m is not None]
         name = "add_s" if shape.symmetric else "add"
         columns[f"{name}_m"] = adds
-        figures[f"{name}_right_share"] = sum(a < ADD_SHARE * shape.diameter_m for a in adds) / len(errors)
+        figures[f"{name}_right_share"] = sum(a < ADD_SHARE * shape.diameter_m for a in adds) / len(
+            errors
+        )
         figures["diameter_m"] = shape.diameter_m
     for name, values in columns.items():
         figures |= _distribution(name, np.array(values))
@@ -96,4 +106,8 @@ def _distribution(name: str, values: Array) -> dict[str, float]:
     if not len(values):
         return {f"{name}_{key}": math.nan for key in ("mean", "p50", "p95")}
     p50, p95 = np.percentile(values, (50, 95))
-    return {f"{name}_mean": float(values.mean()), f"{name}_p50": float(p50), f"{name}_p95": float(p95)}
+    return {
+        f"{name}_mean": float(values.mean()),
+        f"{name}_p50": float(p50),
+        f"{name}_p95": float(p95),
+    }

@@ -19,8 +19,8 @@ _MOST_POINTS = 2000
 
 
 def shape_of(mesh: TriangleMesh, symmetric: bool = True) -> TargetShape:
-    """Return the shape of a target. Its candidates for symmetries are the rotations of a cube in TRF; ``symmetric``: False for a
-    target with markers, which has none."""
+    """Return the shape of a target. Its candidates for symmetries are the rotations of a cube in
+    TRF; ``symmetric``: False for a target with markers, which has none."""
     vertices = np.concatenate([part.vertices_m for part in mesh.parts])
     diameter_m = diameter_of(vertices)
     turns = _symmetries(mesh, _SAME_SHARE * diameter_m) if symmetric else np.zeros((0, 3, 3))
@@ -42,7 +42,9 @@ def sampled(points: Array) -> Array:
 
 
 def _symmetries(mesh: TriangleMesh, tolerance_m: float) -> Array:
-    """Return the rotations (k, 3, 3) of a cube, other than the identity, that map the vertices of each material onto each other."""
+    """Return the rotations (k, 3, 3) of a cube, other than the identity, that map the vertices of
+    each material onto each other.
+    """
     by_material: dict[Material, list[Array]] = defaultdict(list)
     for part in mesh.parts:
         by_material[part.material].append(part.vertices_m)

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layout of SPEED+ (T. H. Park et al., "SPEED+: Next-Generation Dataset for Spacecraft Pose Estimation across Domain Gap", 2022).
+"""The layout of SPEED+ (T. H. Park et al., "SPEED+: Next-Generation Dataset for Spacecraft Pose
+Estimation across Domain Gap", 2022).
 
-``camera.json`` has camera matrix and distortion as OpenCV defines them. A label has the name of its image, ``q_vbs2tango_true``:
-rotation of the target's axes to those of the camera (scalar first, with which x_camera = R(q) x_target + r), and
-``r_Vo2To_vbs_true``: position of the target's origin in the camera, m.
+``camera.json`` has camera matrix and distortion as OpenCV defines them. A label has the name of its
+image, ``q_vbs2tango_true``: rotation of the target's axes to those of the camera (scalar first,
+with which x_camera = R(q) x_target + r), and ``r_Vo2To_vbs_true``: position of the target's origin
+in the camera, m.
 """
 
 from __future__ import annotations
@@ -25,16 +27,20 @@ from .views import ViewImage
 
 _DOMAIN = "synthetic"
 _PIXEL_M = 5.86e-6
-"""Pixel pitch stated in ``camera.json``, that of the SPEED+ camera: the focal length in metres has no other meaning."""
+"""Pixel pitch stated in ``camera.json``, that of the SPEED+ camera: the focal length in metres has
+no other meaning.
+"""
 _Q, _R = "q_vbs2tango_true", "r_Vo2To_vbs_true"
 _SPLITS: tuple[Split, ...] = ("train", "validation")
 
 
 class SpeedPlusWriter:
-    """Writes a dataset into ``folder``: ``camera.json`` and ``synthetic/`` with images, masks and labels; and, what SPEED+ does not
-    have, ``models`` as in BOP, for ADD. Raises OSError."""
+    """Writes a dataset into ``folder``: ``camera.json`` and ``synthetic/`` with images, masks and
+    labels; and, what SPEED+ does not have, ``models`` as in BOP, for ADD. Raises OSError."""
 
-    def __init__(self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape) -> None:
+    def __init__(
+        self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape
+    ) -> None:
         self._domain = folder / _DOMAIN
         for name in ("images", "masks"):
             (self._domain / name).mkdir(parents=True)
@@ -49,7 +55,11 @@ class SpeedPlusWriter:
         cv2.imwrite(str(self._domain / "masks" / name), 255 * image.visible.astype(np.uint8))
         q = label.q_irf_trf_wxyz
         self._labels[split].append(
-            {"filename": name, _Q: (q if q[0] >= 0.0 else -q).tolist(), _R: label.position_irf_m.tolist()}
+            {
+                "filename": name,
+                _Q: (q if q[0] >= 0.0 else -q).tolist(),
+                _R: label.position_irf_m.tolist(),
+            }
         )
 
     def close(self) -> None:
@@ -75,16 +85,22 @@ def _camera_values(camera: Camera) -> dict[str, Any]:
 
 
 def read_speed_plus(folder: Path) -> LabelledDataset:
-    """Return a dataset in the layout of SPEED+, with the labels of its synthetic images. Raises DatasetError."""
+    """Return a dataset in the layout of SPEED+, with the labels of its synthetic images. Raises
+    DatasetError.
+    """
     camera = _read_camera(folder / "camera.json")
     domain = folder / _DOMAIN
     images: list[LabelledImage] = []
     for split in _SPLITS:
         file = domain / f"{split}.json"
         if file.is_file():
-            images += [_labelled(file, domain, split, k, row) for k, row in enumerate(read_list(file))]
+            images += [
+                _labelled(file, domain, split, k, row) for k, row in enumerate(read_list(file))
+            ]
     if not images:
-        raise DatasetError(f"{domain}: has no labels; expected train.json or validation.json with labels")
+        raise DatasetError(
+            f"{domain}: has no labels; expected train.json or validation.json with labels"
+        )
     models = folder / "models"
     shape = read_models(models) if models.is_dir() else None
     return LabelledDataset("speed+", camera, tuple(images), shape)
@@ -94,7 +110,9 @@ def _read_camera(file: Path) -> Camera:
     values = read_object(file)
     width, height = (int(numbers(file, values, key, ())) for key in ("Nu", "Nv"))
     matrix = numbers(file, values, "cameraMatrix", (3, 3))
-    coefficients = numbers(file, values, "distCoeffs", (5,)) if "distCoeffs" in values else np.zeros(5)
+    coefficients = (
+        numbers(file, values, "distCoeffs", (5,)) if "distCoeffs" in values else np.zeros(5)
+    )
     fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     distortion = tuple(coefficients.tolist()) if coefficients.any() else ()
     try:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Datasets in memory: labelled images, the target's points, and the errors of reading and writing them."""
+"""Datasets in memory: labelled images, the target's points, and the errors of reading and writing
+them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ Layout = Literal["speed+", "bop"]
 
 
 class DatasetError(ChaserdockError):
-    """A dataset that cannot be made, read or scored: one line with the file, the fault and what is valid."""
+    """A dataset that cannot be made, read or scored: one line with the file, the fault and what is
+    valid.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +45,9 @@ class LabelledImage:
 
 @dataclass(frozen=True, eq=False)
 class TargetShape:
-    """Vertices (n, 3), m, TRF, of the target as it is in the images, its diameter, m, and the rotations (k, 3, 3) other than the
-    identity that leave it unchanged. ``continuous``: whether it has an axis of symmetry, too."""
+    """Vertices (n, 3), m, TRF, of the target as it is in the images, its diameter, m, and the
+    rotations (k, 3, 3) other than the identity that leave it unchanged. ``continuous``: whether it
+    has an axis of symmetry, too."""
 
     points_m: Array
     diameter_m: float
@@ -69,7 +74,9 @@ class LabelledDataset:
 
 
 def read_grey(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """Return the grey image (h, w) of a file. Raises DatasetError if it cannot be read or is not of the camera's size."""
+    """Return the grey image (h, w) of a file. Raises DatasetError if it cannot be read or is not of
+    the camera's size.
+    """
     pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if pixels is None:
         reason = "no such file" if not path.is_file() else "not an image"

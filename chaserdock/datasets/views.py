@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random views of a target, and their images and masks by the world's renderer.
 
-Sun and Earth stay where the scenario has them; the camera's attitude in WRF is drawn, which moves both relative to camera and
-target. A view depends on the seed and its number only, so that a longer dataset begins with the shorter one.
+Sun and Earth stay where the scenario has them; the camera's attitude in WRF is drawn, which moves
+both relative to camera and target. A view depends on the seed and its number only, so that a longer
+dataset begins with the shorter one.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ _FULL_LIGHT = Light(sun=0.0, ambient=1.0)
 class ViewLimits:
     """Limits of random views.
 
-    ``range_m``: least and largest distance of TRF's origin, log-uniform. ``offset_share``: largest distance of TRF's origin from
-    the middle of the image, as a share of half its width and height, uniform. ``phase_deg``: least and largest angle at the
-    target between sun and camera, uniform on that part of the sphere. Attitudes are uniform.
+    ``range_m``: least and largest distance of TRF's origin, log-uniform. ``offset_share``: largest
+    distance of TRF's origin from the middle of the image, as a share of half its width and height,
+    uniform. ``phase_deg``: least and largest angle at the target between sun and camera, uniform on
+    that part of the sphere. Attitudes are uniform.
     """
 
     range_m: tuple[float, float] = (1.0, 3.0)
@@ -71,9 +73,10 @@ class TargetView:
 
 @dataclass(frozen=True, eq=False)
 class ViewImage:
-    """Image (h, w) of a view; ``mask`` (h, w): pixels that the target covers by half; ``visible`` (h, w): without those behind the
-    chaser's own probe; ``silhouette``: the mask on a canvas that reaches ``margin_px`` (2,) columns and rows beyond the image, so
-    that it is not cut off there."""
+    """Image (h, w) of a view; ``mask`` (h, w): pixels that the target covers by half; ``visible``
+    (h, w): without those behind the chaser's own probe; ``silhouette``: the mask on a canvas that
+    reaches ``margin_px`` (2,) columns and rows beyond the image, so that it is not cut off there.
+    """
 
     view: TargetView
     pixels: NDArray[np.uint8]
@@ -83,7 +86,9 @@ class ViewImage:
     margin_px: tuple[int, int]
 
 
-def draw_view(limits: ViewLimits, camera: Camera, to_sun_w: Array, seed: int, number: int) -> TargetView:
+def draw_view(
+    limits: ViewLimits, camera: Camera, to_sun_w: Array, seed: int, number: int
+) -> TargetView:
     """Draw view ``number``; ``to_sun_w`` (3,): unit vector in WRF."""
     rng = np.random.default_rng([seed, number, _STREAM])
     low, high = limits.range_m
@@ -100,7 +105,8 @@ def draw_view(limits: ViewLimits, camera: Camera, to_sun_w: Array, seed: int, nu
     across = np.cross(to_camera, np.eye(3)[int(np.argmin(np.abs(to_camera)))])
     across = rotations.rotate(rotations.exp(azimuth * to_camera), across / np.linalg.norm(across))
     to_sun = math.cos(phase) * to_camera + math.sin(phase) * across
-    # Any rotation that turns the drawn direction of the sun to that in WRF, and a drawn roll about it.
+    # Any rotation that turns the drawn direction of the sun to that in WRF, and a drawn roll about
+    # it.
     q_w_irf = rotations.multiply(rotations.exp(roll * to_sun_w), _between(to_sun, to_sun_w))
     return TargetView(PoseLabel(position, q_irf_trf), q_w_irf)
 
@@ -114,9 +120,11 @@ def _between(a: Array, b: Array) -> Array:
 
 
 class ViewRenderer:
-    """Renders random views of the target of a scenario by the camera of chaser 0, with the scenario's light and effects.
+    """Renders random views of the target of a scenario by the camera of chaser 0, with the
+    scenario's light and effects.
 
-    The camera has no errors against its calibration. Raises DatasetError for a scenario whose camera has.
+    The camera has no errors against its calibration. Raises DatasetError for a scenario whose
+    camera has.
     """
 
     def __init__(self, scenario: Scenario, limits: ViewLimits) -> None:
@@ -155,7 +163,9 @@ class ViewRenderer:
         """Return target and chaser 0, the target at WRF's origin with the scenario's rates."""
         still, q_w_irf = np.zeros(3), view.q_w_irf_wxyz
         q_w_trf = rotations.multiply(q_w_irf, view.label.q_irf_trf_wxyz)
-        q_w_crf = rotations.multiply(q_w_irf, rotations.conjugate(np.array(self.camera.q_crf_irf_wxyz)))
+        q_w_crf = rotations.multiply(
+            q_w_irf, rotations.conjugate(np.array(self.camera.q_crf_irf_wxyz))
+        )
         eye = -rotations.rotate(q_w_irf, view.label.position_irf_m)
         own = eye - rotations.rotate(q_w_crf, np.array(self.camera.position_crf_m))
         omega = np.array(self._scenario.target.omega_rad_s)
@@ -166,7 +176,8 @@ class ViewRenderer:
 
 
 class _Coverage:
-    """Masks of a target: a white one, in light from everywhere, in front of the stars of one attitude of the camera.
+    """Masks of a target: a white one, in light from everywhere, in front of the stars of one
+    attitude of the camera.
 
     ``own``: a box, in the axes of the chaser, that is drawn in black.
     """
@@ -203,7 +214,9 @@ def target_mesh(scenario: Scenario) -> TriangleMesh:
 
 
 def _padded(camera: Camera, margin_px: tuple[int, int]) -> Camera:
-    """Return the camera without distortion whose image reaches ``margin_px`` columns and rows further on every side."""
+    """Return the camera without distortion whose image reaches ``margin_px`` columns and rows
+    further on every side.
+    """
     x, y = margin_px
     return replace(
         camera,

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Aborts at random moments of a rendezvous, without the flight: the guidance of the controller on a profile that is tracked up to
-the errors of navigation, then two orbits of nonlinear relative motion with J2 after the abort's burn."""
+"""Aborts at random moments of a rendezvous, without the flight: the guidance of the controller on a
+profile that is tracked up to the errors of navigation, then two orbits of nonlinear relative motion
+with J2 after the abort's burn."""
 
 from __future__ import annotations
 
@@ -23,22 +24,26 @@ from chaserdock_protocol.scenario import Scenario, flight_scenario
 STEP_S = 10.0
 _POSITION_SHARE, _POSITION_M = 8e-4, 2e-3
 _VELOCITY_SHARE, _VELOCITY_M_S = 3e-6, 4e-4
-"""Errors by distance: those of the joint filter in `v-bar` after 30 s are 0.16 m and 0.7 to 1.6 mm/s at 200 m, 0.08 m and 0.6 to
-0.9 mm/s at 100 m, and shrink further."""
+"""Errors by distance: those of the joint filter in `v-bar` after 30 s are 0.16 m and 0.7 to 1.6
+mm/s at 200 m, 0.08 m and 0.6 to 0.9 mm/s at 100 m, and shrink further."""
 _BURN_ERROR = 0.03
 
 
 def navigation_covariance(distance_m: float) -> Array:
-    """Return the covariance (6, 6) of the estimated relative position and velocity at a distance from the target."""
+    """Return the covariance (6, 6) of the estimated relative position and velocity at a distance
+    from the target.
+    """
     position_m = math.hypot(_POSITION_M, _POSITION_SHARE * distance_m)
     velocity_m_s = math.hypot(_VELOCITY_M_S, _VELOCITY_SHARE * distance_m)
     return np.diag([position_m**2] * 3 + [velocity_m_s**2] * 3)
 
 
 def profile(scenario: Scenario) -> tuple[EscapePlanner, Array, Array]:
-    """Return the guidance's planner of aborts, and the profile of chaser 0: times (K,), states (K, 6) relative to the target, WRF.
+    """Return the guidance's planner of aborts, and the profile of chaser 0: times (K,), states (K,
+    6) relative to the target, WRF.
 
-    It ends where the chaser waits at the entry of its corridor. Raises ValueError for a refused command.
+    It ends where the chaser waits at the entry of its corridor. Raises ValueError for a refused
+    command.
     """
     machine = PhaseMachine(flight_scenario(scenario))
     target = scenario.target
@@ -71,8 +76,9 @@ def profile(scenario: Scenario) -> tuple[EscapePlanner, Array, Array]:
 
 @dataclass(frozen=True)
 class AbortOutcome:
-    """Of the aborts: ``certified``, those with the required margin; ``entered``, those whose true coast entered the keep-out.
-    ``nearest_m``: smallest distance of all; ``delta_v_m_s``: mean and largest burn."""
+    """Of the aborts: ``certified``, those with the required margin; ``entered``, those whose true
+    coast entered the keep-out. ``nearest_m``: smallest distance of all; ``delta_v_m_s``: mean and
+    largest burn."""
 
     aborts: int
     certified: int
@@ -84,10 +90,11 @@ class AbortOutcome:
 
 
 def study(scenario: Scenario, aborts: int, seed: int) -> AbortOutcome:
-    """Abort at random moments of a scenario's rendezvous, with random errors of navigation and burn.
+    """Abort at random moments of a scenario's rendezvous, with random errors of navigation and
+    burn.
 
-    The true state differs from the one that guidance aborts from by an error of the covariance that guidance receives, and the
-    burn by 3 % in size.
+    The true state differs from the one that guidance aborts from by an error of the covariance that
+    guidance receives, and the burn by 3 % in size.
     """
     if scenario.orbit is None:
         raise ValueError("the study needs an orbit")
@@ -111,7 +118,13 @@ def study(scenario: Scenario, aborts: int, seed: int) -> AbortOutcome:
         entered += nearest_m < keep_out_m
         nearest = min(nearest, nearest_m)
     return AbortOutcome(
-        aborts, certified, entered, nearest, float(np.mean(impulses)), max(impulses), float(times[-1])
+        aborts,
+        certified,
+        entered,
+        nearest,
+        float(np.mean(impulses)),
+        max(impulses),
+        float(times[-1]),
     )
 
 
@@ -128,14 +141,20 @@ def _frames(scenario: Scenario, duration_s: float) -> list[HillFrame]:
 
 
 def _fly(state: Array, burn_m_s2: Array, burn_s: float, frames: Sequence[HillFrame]) -> float:
-    """Return the smallest distance from the target after a burn, in steps of RK4 of which the first ends with the burn."""
+    """Return the smallest distance from the target after a burn, in steps of RK4 of which the first
+    ends with the burn.
+    """
     y, nearest = state, math.inf
     # The burn takes seconds: one step in the first frame, and the coast begins there.
     for h, first, push in (
         (burn_s, 0, burn_m_s2),
         *((STEP_S, 2 * k, np.zeros(3)) for k in range((len(frames) - 1) // 2)),
     ):
-        inside = (frames[first], frames[first], frames[first]) if push.any() else frames[first : first + 3]
+        inside = (
+            (frames[first], frames[first], frames[first])
+            if push.any()
+            else frames[first : first + 3]
+        )
         a = _derivative(inside[0], y, push)
         b = _derivative(inside[1], y + 0.5 * h * a, push)
         c = _derivative(inside[1], y + 0.5 * h * b, push)
@@ -148,7 +167,9 @@ def _fly(state: Array, burn_m_s2: Array, burn_s: float, frames: Sequence[HillFra
 
 def _derivative(frame: HillFrame, y: Array, push_m_s2: Array) -> Array:
     x, z, w, u, v, s = y.tolist()
-    return np.concatenate([y[3:], np.add(relative_acceleration(frame, (x, z, w), (u, v, s)), push_m_s2)])
+    return np.concatenate(
+        [y[3:], np.add(relative_acceleration(frame, (x, z, w), (u, v, s)), push_m_s2)]
+    )
 
 
 def _nearest_on(begin: Array, end: Array) -> float:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeded detumbling flights that begin with latched chasers, and what a frozen attitude would need at the least."""
+"""Seeded detumbling flights that begin with latched chasers, and what a frozen attitude would need
+at the least.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ COMMAND_AT_S = 5.0
 
 
 def stack_scenario(seed: int, chasers: Sequence[int], changes: Sequence[str] = ()) -> Scenario:
-    """Return ``detumble`` with these of its chasers, renumbered, and a tumble of 5 to 10 degrees/s drawn from the seed.
+    """Return ``detumble`` with these of its chasers, renumbered, and a tumble of 5 to 10 degrees/s
+    drawn from the seed.
 
     ``changes`` as of ``run --set``.
     """
@@ -77,7 +80,9 @@ def with_load_limits(scenario: Scenario, force_N: float, torque_N_m: float) -> S
     """Return a scenario with these load limits at every port."""
     limits = {"force_limit_N": force_N, "torque_limit_N_m": torque_N_m}
     ports = tuple(port.model_copy(update=limits) for port in scenario.docking.ports)
-    return scenario.model_copy(update={"docking": scenario.docking.model_copy(update={"ports": ports})})
+    return scenario.model_copy(
+        update={"docking": scenario.docking.model_copy(update={"ports": ports})}
+    )
 
 
 def _random_vector(rng: np.random.Generator, length: float) -> list[float]:
@@ -86,9 +91,11 @@ def _random_vector(rng: np.random.Generator, length: float) -> list[float]:
 
 
 class StackMission(InProcessMission):
-    """A mission that begins with all chasers latched, with seeded errors at their ports, and verified.
+    """A mission that begins with all chasers latched, with seeded errors at their ports, and
+    verified.
 
-    ``silent_from_s``: from then on there is no controller, and each chaser damps the stack by itself.
+    ``silent_from_s``: from then on there is no controller, and each chaser damps the stack by
+    itself.
     """
 
     def __init__(
@@ -112,12 +119,16 @@ class StackMission(InProcessMission):
     def _control(self, inputs: TickInputs) -> TickOutputs | None:
         return None if inputs.time_ns / 1e9 >= self._silent_from_s else super()._control(inputs)
 
-    def uncommanded(self, odometry: Mapping[int, Odometry], time_ns: int) -> dict[int, ActuatorCommand]:
+    def uncommanded(
+        self, odometry: Mapping[int, Odometry], time_ns: int
+    ) -> dict[int, ActuatorCommand]:
         """Return the commands of latched chasers that damp the stack, each by itself."""
         effective_ns = self.scenario.timing.effective_ns(self.tick)
         commands = {}
         for i, damping in self._damping.items():
-            command, thrusts_N = damping_command(damping, odometry[i], effective_ns, self.scenario.chaser)
+            command, thrusts_N = damping_command(
+                damping, odometry[i], effective_ns, self.scenario.chaser
+            )
             commands[i] = self.thrusters[i].add_pulses(command, thrusts_N)
         return commands
 
@@ -131,7 +142,11 @@ class StackMission(InProcessMission):
             q = rotations.multiply(rotations.conjugate(target.q_wxyz), own.q_wxyz)
             mounted[i] = MountedChaser(place, q)
         body = self.true_body(mounted)
-        return body, mounted, stack_motion(body, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+        return (
+            body,
+            mounted,
+            stack_motion(body, target.velocity_m_s, target.q_wxyz, target.omega_rad_s),
+        )
 
     def true_body(self, mounted: dict[int, MountedChaser]) -> TargetBody:
         """Return the true mass properties of the target with the mounted chasers."""
@@ -160,7 +175,9 @@ def _impulse(record: TickRecord) -> float:
 def least_time(
     scenario: Scenario, body: TargetBody, mounted: dict[int, MountedChaser], motion: StackMotion
 ) -> MinimumTime | None:
-    """Return the shortest time in which the plume-free thrusters stop a stack whose attitude is frozen, and its impulse."""
+    """Return the shortest time in which the plume-free thrusters stop a stack whose attitude is
+    frozen, and its impulse.
+    """
     thrusters = scenario.chaser.thrusters
     free = np.concatenate([*plume_free_thrusters(scenario, mounted.keys()).values()])
     limits = np.where(free, np.tile(thrusts_max(thrusters), len(mounted)), 0.0)
@@ -169,9 +186,10 @@ def least_time(
 
 @dataclass(frozen=True)
 class DetumbleOutcome:
-    """One flight. ``time_s`` from the command until the stack stays below the limits, None if it does not; ``impulse_N_s`` of
-    all thrusters until then, and ``held_N_s`` from then to the end, ``held_s`` long. ``least``: at the command. ``peak_*``: largest
-    loads at a port in any physics step after the command."""
+    """One flight. ``time_s`` from the command until the stack stays below the limits, None if it
+    does not; ``impulse_N_s`` of all thrusters until then, and ``held_N_s`` from then to the end,
+    ``held_s`` long. ``least``: at the command. ``peak_*``: largest loads at a port in any physics
+    step after the command."""
 
     seed: int
     chasers: int
@@ -195,7 +213,8 @@ def fly_stack(
     limits: RestLimits | None = None,
     silent_after_s: float = math.inf,
 ) -> DetumbleOutcome:
-    """Fly a stack from ``COMMAND_AT_S`` on for ``duration_s``; ``limits``: of rest, without any the scenario's.
+    """Fly a stack from ``COMMAND_AT_S`` on for ``duration_s``; ``limits``: of rest, without any the
+    scenario's.
 
     ``silent_after_s`` after the command the controller falls silent.
     """

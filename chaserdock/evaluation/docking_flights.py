@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeded docking flights of ``docking-contact``: random starts and target rates, flown until verified or aborted."""
+"""Seeded docking flights of ``docking-contact``: random starts and target rates, flown until
+verified or aborted.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def docking_scenario(
     failure: Failure | None = None,
     changes: tuple[str, ...] = (),
 ) -> Scenario:
-    """Return ``docking-contact`` with a start and target rates drawn from the seed; ``changes`` as of ``run --set``."""
+    """Return ``docking-contact`` with a start and target rates drawn from the seed; ``changes`` as
+    of ``run --set``.
+    """
     rng = np.random.default_rng([seed, 0xD0C])
     paper_omega, paper_velocity = math.hypot(0.015, 0.045, 0.03), math.hypot(0.015, 0.0075, 0.03)
 
@@ -74,9 +78,11 @@ def docking_scenario(
 
 
 class ConservationMission(InProcessMission):
-    """Measures the momentum of chaser 0 and target from shortly before contact to 0.5 s after the latch has closed.
+    """Measures the momentum of chaser 0 and target from shortly before contact to 0.5 s after the
+    latch has closed.
 
-    The impulse of the actuators is subtracted step by step; ``linear_error`` and ``angular_error`` are relative.
+    The impulse of the actuators is subtracted step by step; ``linear_error`` and ``angular_error``
+    are relative.
     """
 
     def __init__(self, scenario: Scenario, perception: PerceptionModel) -> None:
@@ -113,7 +119,9 @@ class ConservationMission(InProcessMission):
         impulse = rotations.rotate(own.q_wxyz, delivered[:3])
         moment = np.cross(own.position_m - centre, impulse)
         self._impulse = self._impulse + impulse
-        self._angular_impulse = self._angular_impulse + rotations.rotate(own.q_wxyz, delivered[3:]) + moment
+        self._angular_impulse = (
+            self._angular_impulse + rotations.rotate(own.q_wxyz, delivered[3:]) + moment
+        )
         if self._steps_left is not None:
             self._steps_left -= 1
             if self._steps_left == 0:
@@ -140,7 +148,8 @@ class ConservationMission(InProcessMission):
 
 
 def momentum(physics: Physics, masses: dict[str, tuple[float, Array]]) -> tuple[Array, Array]:
-    """Return momentum (3,), N s, and angular momentum (3,) about the common centre of mass, N m s, in WRF axes.
+    """Return momentum (3,), N s, and angular momentum (3,) about the common centre of mass, N m s,
+    in WRF axes.
 
     ``masses``: mass and principal inertia (3,) of every body by name.
     """
@@ -160,9 +169,10 @@ def momentum(physics: Physics, masses: dict[str, tuple[float, Array]]) -> tuple[
 class DockingOutcome:
     """How one flight ended.
 
-    ``touch``: the one at which the latch closed. ``contacts``: pairs of bodies that collided. ``peak_m``: the largest
-    distance from the reference on the true target between the thruster's ``failure`` and capture. ``thruster_events``:
-    (time in s, text). ``verified_again``: whether a second approach after an abort was.
+    ``touch``: the one at which the latch closed. ``contacts``: pairs of bodies that collided.
+    ``peak_m``: the largest distance from the reference on the true target between the thruster's
+    ``failure`` and capture. ``thruster_events``: (time in s, text). ``verified_again``: whether a
+    second approach after an abort was.
     """
 
     seed: int
@@ -182,12 +192,16 @@ class DockingOutcome:
     verified_s: float | None = None
 
     def detection_delay_s(self) -> float | None:
-        """Return the time from the thruster's failure to its correct diagnosis; None if there was none."""
+        """Return the time from the thruster's failure to its correct diagnosis; None if there was
+        none.
+        """
         if self.failure is None:
             return None
         kind, thruster, at_s = self.failure
         diagnosis = f"thruster {thruster} {kind.replace('_', ' ')}: detected"
-        return next((t - at_s for t, text in self.thruster_events if text.startswith(diagnosis)), None)
+        return next(
+            (t - at_s for t, text in self.thruster_events if text.startswith(diagnosis)), None
+        )
 
     def false_alarms(self) -> int:
         """Return the number of wrong thruster diagnoses."""
@@ -201,16 +215,16 @@ class DockingOutcome:
             kind, thruster, at_s = self.failure
             delay_s = self.detection_delay_s()
             detected = "not detected" if delay_s is None else f"detected after {delay_s:.2f} s"
-            text += (
-                f"; thruster {thruster} {kind} at {at_s:.2f} s, {detected}, peak {self.peak_m * 1e3:.1f} mm"
-            )
+            text += f"; thruster {thruster} {kind} at {at_s:.2f} s, {detected}, peak {self.peak_m * 1e3:.1f} mm"
         if (t := self.touch) is not None:
             text += f"; {t.lateral_m * 1e3:.2f} mm, {math.degrees(t.angle_rad):.3f} deg, {t.closing_m_s * 1e3:.2f} mm/s"
         if self.linear_error is not None and self.angular_error is not None:
             text += f"; momentum errors {self.linear_error:.1e}, {self.angular_error:.1e}"
         if self.opened_s is not None:
             text += f" after {self.opened_s:.1f} s"
-            text += "" if self.verified_again is None else f", verified again: {self.verified_again}"
+            text += (
+                "" if self.verified_again is None else f", verified again: {self.verified_again}"
+            )
         return text + "".join(f"; {at_s:.2f} s: {event}" for at_s, event in self.thruster_events)
 
 
@@ -221,8 +235,14 @@ def cause_of(flight: InProcessMission, verified: bool) -> str:
     retreats = flight.retreats(0)
     kind = retreats[-1].split(": ")[1] if retreats else ""
     if verified:
-        return "verified at the first attempt" if not retreats else f"verified after a retreat: {kind}"
-    return f"not verified, last retreat: {kind}" if retreats else f"not verified, phase {flight.phase(0)}"
+        return (
+            "verified at the first attempt" if not retreats else f"verified after a retreat: {kind}"
+        )
+    return (
+        f"not verified, last retreat: {kind}"
+        if retreats
+        else f"not verified, phase {flight.phase(0)}"
+    )
 
 
 def order(command: Literal["approach", "abort"]) -> OperatorCommand:
@@ -282,8 +302,12 @@ def offset_error_m(flight: InProcessMission) -> float:
 def abort(
     seed: int, scenario: Scenario, perception_of: Callable[[Scenario], PerceptionModel], again: bool
 ) -> DockingOutcome:
-    """Fly an approach that is aborted at a random time and, with ``again``, a second one until it is verified."""
-    abort_at_s = APPROACH_AT_S + float(np.random.default_rng([seed, 0xAB0]).uniform(0.0, ABORT_WITHIN_S))
+    """Fly an approach that is aborted at a random time and, with ``again``, a second one until it
+    is verified.
+    """
+    abort_at_s = APPROACH_AT_S + float(
+        np.random.default_rng([seed, 0xAB0]).uniform(0.0, ABORT_WITHIN_S)
+    )
     with InProcessMission(scenario, perception_of(scenario)) as flight:
         _step_until(flight, (), lambda: flight.time_s >= APPROACH_AT_S)
         _step_until(flight, (order("approach"),), lambda: flight.time_s >= abort_at_s)

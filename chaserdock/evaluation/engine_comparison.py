@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The same motion on each physics engine (``world.engine``), and how far apart the bodies are.
 
-The cases are open loop: loads do not depend on the states, so that differences of the engines are not hidden by control.
+The cases are open loop: loads do not depend on the states, so that differences of the engines are
+not hidden by control.
 """
 
 from __future__ import annotations
@@ -49,9 +50,10 @@ class EngineCase:
 class EngineFlight:
     """A case on one engine: states and port loads at each tick.
 
-    ``latched_ticks``: first tick at which a latch was closed. ``step_s``: processor time per physics step. ``momentum_error``,
-    ``angular_momentum_error``: relative change from the begin to the end, the largest of the isolated groups; the latter about
-    the common centre of mass of a group.
+    ``latched_ticks``: first tick at which a latch was closed. ``step_s``: processor time per
+    physics step. ``momentum_error``, ``angular_momentum_error``: relative change from the begin to
+    the end, the largest of the isolated groups; the latter about the common centre of mass of a
+    group.
     """
 
     states: tuple[States, ...]
@@ -64,7 +66,9 @@ class EngineFlight:
 
 @dataclass(frozen=True)
 class EngineDifference:
-    """Largest differences of two flights: of any body's position (m), attitude (rad), and of any port's force (N) and torque (N m)."""
+    """Largest differences of two flights: of any body's position (m), attitude (rad), and of any
+    port's force (N) and torque (N m).
+    """
 
     position_m: float
     angle_rad: float
@@ -73,7 +77,9 @@ class EngineDifference:
 
 
 def free_case(seed: int = 0) -> EngineCase:
-    """Four chasers and a target with errors of mass, inertia and centre of mass, all tumbling, without loads."""
+    """Four chasers and a target with errors of mass, inertia and centre of mass, all tumbling,
+    without loads.
+    """
     scenario = _scenario(
         _TUMBLE, "truth.preset=mismatch", "truth.chaser={force_N=0.0, torque_N_m=0.0}", seed=seed
     )
@@ -86,7 +92,9 @@ def free_case(seed: int = 0) -> EngineCase:
 
 
 def thruster_case(seed: int = 0) -> EngineCase:
-    """As ``free_case``, with disturbances and pulses of three random thrusters of each chaser in every tick."""
+    """As ``free_case``, with disturbances and pulses of three random thrusters of each chaser in
+    every tick.
+    """
     scenario = _scenario(_TUMBLE, "truth.preset=mismatch", seed=seed)
 
     def start(physics: Physics) -> Advance:
@@ -98,20 +106,28 @@ def thruster_case(seed: int = 0) -> EngineCase:
 
 
 def capture_case(seed: int = 0) -> EngineCase:
-    """Chaser 0 drifts into the port of the tumbling target at 1 cm/s and latches; no loads. The others are far away."""
+    """Chaser 0 drifts into the port of the tumbling target at 1 cm/s and latches; no loads. The
+    others are far away.
+    """
     scenario = _scenario(_TUMBLE, seed=seed)
 
     def start(physics: Physics) -> Advance:
         _spread(physics, np.random.default_rng(seed))
-        physics.place("chaser/0", before_port(scenario, physics.state(TARGET), 0, _GAP_M, _CLOSING_M_S))
+        physics.place(
+            "chaser/0", before_port(scenario, physics.state(TARGET), 0, _GAP_M, _CLOSING_M_S)
+        )
         physics.command_latch(0, "arm", 0)
         return lambda step: _ignore(physics.advance(step - physics.step_count, {}))
 
-    return EngineCase(scenario, start, ((TARGET, "chaser/0"), ("chaser/1",), ("chaser/2",), ("chaser/3",)))
+    return EngineCase(
+        scenario, start, ((TARGET, "chaser/0"), ("chaser/1",), ("chaser/2",), ("chaser/3",))
+    )
 
 
 def stack_case(seed: int = 0) -> EngineCase:
-    """Three latched chasers fire random thrusters; the fourth is far away. With errors as ``thruster_case``."""
+    """Three latched chasers fire random thrusters; the fourth is far away. With errors as
+    ``thruster_case``.
+    """
     scenario = _scenario(_TUMBLE, "truth.preset=mismatch", seed=seed)
 
     def start(physics: Physics) -> Advance:
@@ -168,7 +184,9 @@ def difference(a: EngineFlight, b: EngineFlight) -> EngineDifference:
         for name, state in first.items():
             other = second[name]
             position_m = max(position_m, float(np.linalg.norm(state.position_m - other.position_m)))
-            turn = rotations.log(rotations.multiply(rotations.conjugate(state.q_wxyz), other.q_wxyz))
+            turn = rotations.log(
+                rotations.multiply(rotations.conjugate(state.q_wxyz), other.q_wxyz)
+            )
             angle_rad = max(angle_rad, float(np.linalg.norm(turn)))
     for first, second in zip(a.loads, b.loads, strict=True):
         for name, load in first.items():
@@ -181,7 +199,9 @@ def difference(a: EngineFlight, b: EngineFlight) -> EngineDifference:
 def before_port(
     scenario: Scenario, target: BodyState, chaser: int, gap_m: float, closing_m_s: float
 ) -> BodyState:
-    """Return the state of a chaser in line with its port, its tip ``gap_m`` before it, closing in on it in the target's frame."""
+    """Return the state of a chaser in line with its port, its tip ``gap_m`` before it, closing in
+    on it in the target's frame.
+    """
     port = next(p for p in scenario.docking.ports if p.chaser == chaser)
     axis, q_off = np.array(port.axis), np.asarray(scenario.chasers[chaser].q_wxyz)
     offset = np.array(port.position_m) + (gap_m + scenario.chaser.probe_reach_m) * axis
@@ -199,11 +219,15 @@ def _scenario(*overrides: str, seed: int) -> Scenario:
 
 
 def _spread(physics: Physics, rng: np.random.Generator) -> None:
-    """Place the chasers so far apart that nothing touches, with random attitudes, velocities and rates."""
+    """Place the chasers so far apart that nothing touches, with random attitudes, velocities and
+    rates.
+    """
     for i, name in enumerate(name for name in physics.bodies if name != TARGET):
         position = _FAR_M * np.array([np.cos(2.0 * i), np.sin(2.0 * i), 0.0])
         q = rotations.exp(rng.uniform(-1.0, 1.0, 3))
-        physics.place(name, BodyState(position, rng.uniform(-0.05, 0.05, 3), q, rng.uniform(-0.2, 0.2, 3)))
+        physics.place(
+            name, BodyState(position, rng.uniform(-0.05, 0.05, 3), q, rng.uniform(-0.2, 0.2, 3))
+        )
 
 
 def _firing(scenario: Scenario, physics: Physics, rng: np.random.Generator) -> Advance:
@@ -216,7 +240,9 @@ def _firing(scenario: Scenario, physics: Physics, rng: np.random.Generator) -> A
         for i in chasers:
             pulses = []
             for thruster in rng.choice(len(scenario.chaser.thrusters), 3, replace=False).tolist():
-                opens, closes = (round(float(s) / hz * 1e9) for s in sorted(rng.uniform(begin, step, 2)))
+                opens, closes = (
+                    round(float(s) / hz * 1e9) for s in sorted(rng.uniform(begin, step, 2))
+                )
                 pulses.append(ThrusterPulse(thruster=thruster, open_ns=opens, close_ns=closes))
             command = ActuatorCommand(
                 chaser=i,
@@ -233,7 +259,9 @@ def _firing(scenario: Scenario, physics: Physics, rng: np.random.Generator) -> A
 
 
 def _momenta(case: EngineCase, physics: Physics) -> list[Array]:
-    """Return momentum, N s, and angular momentum about the centre of mass, N m s, (2, 3), WRF, of each isolated group."""
+    """Return momentum, N s, and angular momentum about the centre of mass, N m s, (2, 3), WRF, of
+    each isolated group.
+    """
     found = []
     for group in case.isolated:
         masses, places, velocities, spins = [], [], [], []

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole in-process mission as arrays: states, tracking errors, commands, and what the actuators delivered."""
+"""A whole in-process mission as arrays: states, tracking errors, commands, and what the actuators
+delivered.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,12 @@ from .perception import PerceptionModel
 class FlightRecord:
     """A flight of N chasers over K - 1 ticks.
 
-    ``time_s`` (K,): every tick and the end. ``states`` (K, N, 13): p, v (WRF), q_wxyz,
-    omega (body). ``position_error_m``, ``orientation_error_rad`` (K, N): from the reference pose on the true target.
-    ``target_distance_m`` (K, N): between the centres of chaser and target.
-    ``solve_s``: wall-clock seconds of every controller tick. ``commands``: by tick, then chaser. Per chaser (N,):
-    ``absolute_impulse_N_s`` (integral of the force components' magnitudes), ``thruster_impulse_N_s``, ``propellant_kg``.
-    ``thruster_events``: (time in s, chaser, text).
+    ``time_s`` (K,): every tick and the end. ``states`` (K, N, 13): p, v (WRF), q_wxyz, omega
+    (body). ``position_error_m``, ``orientation_error_rad`` (K, N): from the reference pose on the
+    true target. ``target_distance_m`` (K, N): between the centres of chaser and target.
+    ``solve_s``: wall-clock seconds of every controller tick. ``commands``: by tick, then chaser.
+    Per chaser (N,): ``absolute_impulse_N_s`` (integral of the force components' magnitudes),
+    ``thruster_impulse_N_s``, ``propellant_kg``. ``thruster_events``: (time in s, chaser, text).
     """
 
     time_s: Array
@@ -68,7 +70,9 @@ def record_flight(
         ticks = list(mission.ticks())
         final = mission.states()
         errors = [_rows(mission, t.tracking_errors) for t in ticks]
-        errors.append(_rows(mission, {i: mission.tracking_error(i, final) for i in mission.chasers}))
+        errors.append(
+            _rows(mission, {i: mission.tracking_error(i, final) for i in mission.chasers})
+        )
         events = mission.thruster_events
         end_s = mission.time_s
     names = [f"chaser/{i}" for i in mission.chasers]
@@ -94,13 +98,17 @@ def record_flight(
 
 
 def failed_solves(outputs: TickOutputs) -> int:
-    """Return the number of chasers whose problem was not solved; 1 when there was no solution at all."""
+    """Return the number of chasers whose problem was not solved; 1 when there was no solution at
+    all.
+    """
     if outputs.solver is None or not outputs.solver.status:
         return 1
     return outputs.solver.status.count("failed")
 
 
-def _rows(mission: InProcessMission, errors: dict[int, tuple[float, float]]) -> list[tuple[float, float]]:
+def _rows(
+    mission: InProcessMission, errors: dict[int, tuple[float, float]]
+) -> list[tuple[float, float]]:
     return [errors[i] for i in mission.chasers]
 
 

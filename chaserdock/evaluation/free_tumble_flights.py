@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free tumbles seen by chasers that keep their places: what vision alone tells of the target's mass properties. Fast.
+"""Free tumbles seen by chasers that keep their places: what vision alone tells of the target's mass
+properties. Fast.
 
-The chasers move with the target as if they were fixed to it, and the filter gets the impulses that this takes, so that no
-controller is involved. Sightings are those of rendered images, or with statistical perception drawn ones, to which ``ViewErrors``
-adds what images have and drawn ones lack: errors that persist with the view, as the filter expects them.
+The chasers move with the target as if they were fixed to it, and the filter gets the impulses that
+this takes, so that no controller is involved. Sightings are those of rendered images, or with
+statistical perception drawn ones, to which ``ViewErrors`` adds what images have and drawn ones
+lack: errors that persist with the view, as the filter expects them.
 """
 
 from __future__ import annotations
@@ -17,7 +19,11 @@ import numpy as np
 from chaserdock_controller.estimation.composite_body import stated_properties
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
 from chaserdock_controller.estimation.joint.estimator import JointInputs
-from chaserdock_controller.estimation.mass_properties import inertia_ratios, properties_of, with_shape
+from chaserdock_controller.estimation.mass_properties import (
+    inertia_ratios,
+    properties_of,
+    with_shape,
+)
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -39,7 +45,9 @@ from .rigid_control import wrong_knowledge
 
 
 class ViewErrors:
-    """Errors of the sightings of one chaser that persist with the view: a Gauss-Markov process with the figures of the filter."""
+    """Errors of the sightings of one chaser that persist with the view: a Gauss-Markov process with
+    the figures of the filter.
+    """
 
     def __init__(self, parameters: JointParameters, seed: int, chaser: int) -> None:
         self._parameters = parameters
@@ -59,16 +67,19 @@ class ViewErrors:
             )
             q = rotations.multiply(np.array(s.q_wxyz), rotations.exp(error[3:]))
             position = np.array(s.position_m) + error[:3]
-            solutions.append(msgspec.structs.replace(s, position_m=vector(position), q_wxyz=vector(q)))
+            solutions.append(
+                msgspec.structs.replace(s, position_m=vector(position), q_wxyz=vector(q))
+            )
         return msgspec.structs.replace(sighting, solutions=tuple(solutions))
 
 
 @dataclass(frozen=True)
 class TumbleOutcome:
-    """One tumble. ``ratio_error``: largest error of an element of the inertia over its trace, as a share of the largest moment over
-    the trace; ``stated_error``: that of the stated inertia. ``centre_m``: error of the centre of mass. ``ratio_nees`` and
-    ``centre_nees``: normalized squared errors (5 and 3 degrees of freedom). ``nees``: mean of those of the relative poses (6) after
-    the first 10 s."""
+    """One tumble. ``ratio_error``: largest error of an element of the inertia over its trace, as a
+    share of the largest moment over the trace; ``stated_error``: that of the stated inertia.
+    ``centre_m``: error of the centre of mass. ``ratio_nees`` and ``centre_nees``: normalized
+    squared errors (5 and 3 degrees of freedom). ``nees``: mean of those of the relative poses (6)
+    after the first 10 s."""
 
     seed: int
     rate_deg_s: float
@@ -83,7 +94,9 @@ class TumbleOutcome:
 def tumble_scenario(
     seed: int, chasers: Sequence[int], rate_deg_s: float, changes: Sequence[str] = ()
 ) -> Scenario:
-    """Return ``stack_scenario`` with a tumble of this rate, of which mass, inertia and centre are stated wrong."""
+    """Return ``stack_scenario`` with a tumble of this rate, of which mass, inertia and centre are
+    stated wrong.
+    """
     scenario = stack_scenario(seed, chasers, [*wrong_knowledge(seed), *changes])
     omega = np.array(scenario.target.omega_rad_s)
     omega *= math.radians(rate_deg_s) / float(np.linalg.norm(omega))
@@ -92,7 +105,9 @@ def tumble_scenario(
 
 
 def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
-    """Let the chasers of a scenario watch its free target for ``duration_s`` from their nominal places in TRF."""
+    """Let the chasers of a scenario watch its free target for ``duration_s`` from their nominal
+    places in TRF.
+    """
     flight, timing = flight_scenario(scenario), scenario.timing
     body = body_of_plant(target_plant(scenario))
     start = scenario.target
@@ -100,8 +115,14 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     period_s, ticks = 1.0 / scenario.time.rate_hz, round(duration_s * scenario.time.rate_hz)
     qs, omegas, _ = free_rotation(q0, omega0, body.inertia_kg_m2, period_s, ticks)
     centre = np.array(start.position_m) + rotations.rotate(q0, body.centre_trf_m)
-    velocity = np.array(start.velocity_m_s) + rotations.rotate(q0, np.cross(omega0, body.centre_trf_m))
-    camera, sensor, estimator = RenderedImages(scenario), OdometrySensor(scenario), estimator_of(flight)
+    velocity = np.array(start.velocity_m_s) + rotations.rotate(
+        q0, np.cross(omega0, body.centre_trf_m)
+    )
+    camera, sensor, estimator = (
+        RenderedImages(scenario),
+        OdometrySensor(scenario),
+        estimator_of(flight),
+    )
     if not isinstance(estimator, JointEstimator):
         raise ValueError('needs estimator.name = "joint"')
     chasers, before, nees = range(len(scenario.chasers)), None, []
@@ -163,14 +184,22 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
 
 
 def _impulse(scenario: Scenario, before: BodyState, after: BodyState) -> Array:
-    """Return the impulse (6,), body axes, that changes the rates of a chaser of the nominal mass properties so."""
+    """Return the impulse (6,), body axes, that changes the rates of a chaser of the nominal mass
+    properties so.
+    """
     body = scenario.chaser
     push = rotations.rotate_inverse(before.q_wxyz, after.velocity_m_s - before.velocity_m_s)
-    spin = [rotations.rotate(s.q_wxyz, np.array(body.inertia) * s.omega_rad_s) for s in (before, after)]
-    return np.concatenate([body.mass_kg * push, rotations.rotate_inverse(before.q_wxyz, spin[1] - spin[0])])
+    spin = [
+        rotations.rotate(s.q_wxyz, np.array(body.inertia) * s.omega_rad_s) for s in (before, after)
+    ]
+    return np.concatenate(
+        [body.mass_kg * push, rotations.rotate_inverse(before.q_wxyz, spin[1] - spin[0])]
+    )
 
 
-def _nees(position_m: Array, q_wxyz: Array, covariance: Array, target: BodyState, own: BodyState) -> float:
+def _nees(
+    position_m: Array, q_wxyz: Array, covariance: Array, target: BodyState, own: BodyState
+) -> float:
     """Return the normalized squared error of a chaser's estimated pose relative to the target."""
     true = relative_pose(own.position_m, own.q_wxyz, target.position_m, target.q_wxyz)
     return float(normalized_square(pose_error(*true, position_m, q_wxyz), covariance))

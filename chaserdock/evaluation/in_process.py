@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mission in one process: physics, sensors and actuators of the world, the chasers' code, and the controller core.
+"""A mission in one process: physics, sensors and actuators of the world, the chasers' code, and the
+controller core.
 
-They are called in the order and with the latencies of a lock-step mission, so that the bodies of a scenario move exactly
-as with ``chaserdock run`` (tests/missions/test_in_process.py). All sensor and actuator errors of the scenario apply. Left
-out is what a network and separate processes add: injected message faults, process failures, leases, access control.
+They are called in the order and with the latencies of a lock-step mission, so that the bodies of a
+scenario move exactly as with ``chaserdock run`` (tests/missions/test_in_process.py). All sensor and
+actuator errors of the scenario apply. Left out is what a network and separate processes add:
+injected message faults, process failures, leases, access control.
 """
 
 from __future__ import annotations
@@ -47,10 +49,12 @@ from .perfect_knowledge import PerfectEstimator
 
 @dataclass(frozen=True)
 class TickRecord:
-    """One tick: true states at its begin, what was sensed, decided and commanded, and what the actuators delivered.
+    """One tick: true states at its begin, what was sensed, decided and commanded, and what the
+    actuators delivered.
 
-    ``outputs`` is None while a delayed controller is busy. ``tracking_errors``: distance (m) and angle (rad) of each chaser
-    from its reference pose on the true target. ``loads``: at each port, since the tick before.
+    ``outputs`` is None while a delayed controller is busy. ``tracking_errors``: distance (m) and
+    angle (rad) of each chaser from its reference pose on the true target. ``loads``: at each port,
+    since the tick before.
     """
 
     tick: int
@@ -72,13 +76,15 @@ class TickRecord:
 class InProcessMission:
     """A mission in flight, one ``step`` per tick.
 
-    ``perception`` maps the true states to a sighting; None gives the controller perfect knowledge of the target's motion,
-    which must be prescribed. ``actuator_gain``: delivered over commanded wrench. ``solve_delay_s`` maps the wall-clock
-    seconds of a solve to the time from a tick to its command's effect, in place of the scenario's latency; the controller
-    does not know of it and skips the ticks that pass meanwhile. Both need ideal actuation, else ValueError.
+    ``perception`` maps the true states to a sighting; None gives the controller perfect knowledge
+    of the target's motion, which must be prescribed. ``actuator_gain``: delivered over commanded
+    wrench. ``solve_delay_s`` maps the wall-clock seconds of a solve to the time from a tick to its
+    command's effect, in place of the scenario's latency; the controller does not know of it and
+    skips the ticks that pass meanwhile. Both need ideal actuation, else ValueError.
 
-    ``contacts``: pairs of bodies that touched so far, except a probe's tip on the target; ``touches``: those of the tips;
-    ``events`` of the controller: (time in s, level, text); ``thruster_events`` of the chasers: (time in s, chaser, text).
+    ``contacts``: pairs of bodies that touched so far, except a probe's tip on the target;
+    ``touches``: those of the tips; ``events`` of the controller: (time in s, level, text);
+    ``thruster_events`` of the chasers: (time in s, chaser, text).
     """
 
     def __init__(
@@ -102,7 +108,8 @@ class InProcessMission:
         self.actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in self.chasers}
         self.thrusters = {} if ideal else {i: ThrusterController(flight, i) for i in self.chasers}
         self._reports = {
-            i: FailureReports(faults_of(scenario, f"chaser/{i}").reported_failures) for i in self.chasers
+            i: FailureReports(faults_of(scenario, f"chaser/{i}").reported_failures)
+            for i in self.chasers
         }
         self.tick = 0
         self.contacts: set[tuple[str, str]] = set()
@@ -119,7 +126,11 @@ class InProcessMission:
     def retreats(self, chaser: int) -> list[str]:
         """Return why a chaser retreated, in order: phase and reason."""
         begin = f"chaser {chaser}: retreat ("
-        return [text.removeprefix(begin).rstrip(")") for _, _, text in self.events if text.startswith(begin)]
+        return [
+            text.removeprefix(begin).rstrip(")")
+            for _, _, text in self.events
+            if text.startswith(begin)
+        ]
 
     def __enter__(self) -> Self:
         return self
@@ -152,10 +163,15 @@ class InProcessMission:
         """Fly one tick, with these operator commands."""
         timing, states = self.scenario.timing, self.states()
         time_ns = timing.tick_time_ns(self.tick)
-        docking = {x.chaser: docking_status(x, self.tick, time_ns) for x in self.physics.latches.values()}
+        docking = {
+            x.chaser: docking_status(x, self.tick, time_ns) for x in self.physics.latches.values()
+        }
         for latch in self.physics.latches.values():
             self.touches += latch.take_touches()
-        loads = {x.chaser: self.physics.port_loads[name].take() for name, x in self.physics.latches.items()}
+        loads = {
+            x.chaser: self.physics.port_loads[name].take()
+            for name, x in self.physics.latches.items()
+        }
         odometry = {i: self.measure(i, time_ns, states) for i in self.chasers}
         reports = {}
         for i, thrusters in self.thrusters.items():
@@ -169,7 +185,9 @@ class InProcessMission:
         outputs = None
         if time_ns >= self._busy_until_ns:
             validated = {i: self._validated(o) for i, o in odometry.items()}
-            inputs = TickInputs(self.tick, time_ns, validated, sightings, commands, reports, docking)
+            inputs = TickInputs(
+                self.tick, time_ns, validated, sightings, commands, reports, docking
+            )
             outputs = self._control(inputs)
         errors = {i: self.tracking_error(i, states, outputs) for i in self.chasers}
         actuator_commands, delivered = self._act(outputs, odometry, time_ns)
@@ -190,7 +208,9 @@ class InProcessMission:
 
     def measure(self, chaser: int, time_ns: int, states: States) -> Odometry:
         """Return a chaser's odometry; to be overridden where it fails."""
-        return odometry_of(self._odometry_sensor, chaser, states[f"chaser/{chaser}"], self.tick, time_ns)
+        return odometry_of(
+            self._odometry_sensor, chaser, states[f"chaser/{chaser}"], self.tick, time_ns
+        )
 
     def _validated(self, odometry: Odometry) -> Odometry:
         doubtful = odometry.chaser in self.controller.doubtful
@@ -228,8 +248,12 @@ class InProcessMission:
         self.advance(end)
         return commands, {i: self.take_delivered(i) for i in self.chasers}
 
-    def uncommanded(self, odometry: Mapping[int, Odometry], time_ns: int) -> dict[int, ActuatorCommand]:
-        """Return what the chasers do without a controller's commands; to be overridden where it is silent."""
+    def uncommanded(
+        self, odometry: Mapping[int, Odometry], time_ns: int
+    ) -> dict[int, ActuatorCommand]:
+        """Return what the chasers do without a controller's commands; to be overridden where it is
+        silent.
+        """
         return {}
 
     def _actuator_commands(self, outputs: TickOutputs, time_ns: int) -> dict[int, ActuatorCommand]:
@@ -272,9 +296,11 @@ class InProcessMission:
     def tracking_error(
         self, chaser: int, states: States, outputs: TickOutputs | None = None
     ) -> tuple[float, float]:
-        """Return distance (m) and angle (rad) of a chaser from its reference pose on the true target now.
+        """Return distance (m) and angle (rad) of a chaser from its reference pose on the true
+        target now.
 
-        The reference is the one of ``outputs`` or, where there is none, the guidance's with the nominal attitude.
+        The reference is the one of ``outputs`` or, where there is none, the guidance's with the
+        nominal attitude.
         """
         reference = outputs.references.get(chaser) if outputs is not None else None
         if outputs is not None and reference is not None:

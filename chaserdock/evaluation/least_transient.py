@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lower bound of the transient tracking error: the optimum under the actuators' limits, for any controller."""
+"""Lower bound of the transient tracking error: the optimum under the actuators' limits, for any
+controller.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,17 @@ def least_square_integral(
 ) -> float:
     """Return the least integral of |p - p_ref|^2 over the references' time, m^2 s.
 
-    A point mass starts at ``position_m`` with ``velocity_m_s`` (3,), WRF. ``references_m`` (3 K + 1, 3), WRF: p_ref at the
-    three Gauss points of each of K steps of ``step_s``, then at the end. The acceleration is constant in each step and
-    bounded by ``acceleration_max_m_s2`` along each body axis; ``q_wxyz`` (K, 4): body to world. This is a convex quadratic
-    program, solved with ipopt. Raises ValueError for shapes that do not match, RuntimeError if it is not solved.
+    A point mass starts at ``position_m`` with ``velocity_m_s`` (3,), WRF. ``references_m`` (3 K +
+    1, 3), WRF: p_ref at the three Gauss points of each of K steps of ``step_s``, then at the end.
+    The acceleration is constant in each step and bounded by ``acceleration_max_m_s2`` along each
+    body axis; ``q_wxyz`` (K, 4): body to world. This is a convex quadratic program, solved with
+    ipopt. Raises ValueError for shapes that do not match, RuntimeError if it is not solved.
     """
     steps = len(q_wxyz)
     if references_m.shape != (3 * steps + 1, 3):
-        raise ValueError(f"references_m must have shape {(3 * steps + 1, 3)}, not {references_m.shape}")
+        raise ValueError(
+            f"references_m must have shape {(3 * steps + 1, 3)}, not {references_m.shape}"
+        )
     p, v = ca.MX.sym("p", 3, steps + 1), ca.MX.sym("v", 3, steps + 1)
     u = ca.MX.sym("u", 3, steps)  # in body axes
     axes = [np.array(rotate(q_wxyz, np.tile(e, (steps, 1)))).T for e in np.eye(3)]
@@ -57,7 +62,9 @@ def least_square_integral(
     bound[-3 * steps :] = acceleration_max_m_s2
     solution = solver(lbx=-bound, ubx=bound, lbg=0, ubg=0)
     if not solver.stats()["success"]:
-        raise RuntimeError(f"the quadratic program was not solved: {solver.stats()['return_status']}")
+        raise RuntimeError(
+            f"the quadratic program was not solved: {solver.stats()['return_status']}"
+        )
     return float(solution["f"])
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the chasers see of the target in an in-process mission: rendered images, or a statistical measurement model."""
+"""What the chasers see of the target in an in-process mission: rendered images, or a statistical
+measurement model.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +27,16 @@ _LEAST_SIGMA = 1e-4
 
 
 class RenderedImages:
-    """Render each chaser's image, with the scenario's camera errors and effects, and run its perception on it.
+    """Render each chaser's image, with the scenario's camera errors and effects, and run its
+    perception on it.
 
-    With statistical perception no image is rendered. ``on_image`` sees every image, and returns the one that perception gets.
+    With statistical perception no image is rendered. ``on_image`` sees every image, and returns the
+    one that perception gets.
     """
 
-    def __init__(self, scenario: Scenario, on_image: Callable[[Image], Image] = lambda image: image) -> None:
+    def __init__(
+        self, scenario: Scenario, on_image: Callable[[Image], Image] = lambda image: image
+    ) -> None:
         self._ticks_per_image = scenario.timing.ticks_per_image
         self._cameras = make_cameras(scenario)
         self._perceptions = [make_perception(scenario) for _ in scenario.chasers]
@@ -47,7 +53,9 @@ class RenderedImages:
 
     def see(self, chaser: int, image: Image) -> Sighting:
         """Return the sighting in a chaser's image."""
-        predicted = prediction_from(self._last.get(chaser), self._expected.get(chaser), image.sim_time_ns)
+        predicted = prediction_from(
+            self._last.get(chaser), self._expected.get(chaser), image.sim_time_ns
+        )
         self._last[chaser] = look(self._perceptions[chaser], self._on_image(image), predicted)
         return self._last[chaser]
 
@@ -68,9 +76,11 @@ def measurement_model(
     attitude_sigma_rad: float = 0.0,
     dropout: float = 0.0,
 ) -> PerceptionModel:
-    """Return a perception that measures the target's true pose with white noise of these sigmas per axis.
+    """Return a perception that measures the target's true pose with white noise of these sigmas per
+    axis.
 
-    ``dropout``: the share of images without a detection. Each camera has the errors that the world gives it.
+    ``dropout``: the share of images without a detection. Each camera has the errors that the world
+    gives it.
     """
     rng = np.random.default_rng([seed, 0xE1E])
     nominal = scenario.camera_model()
@@ -86,7 +96,9 @@ def measurement_model(
         # With a longer focal length than calibrated, the target seems nearer.
         position = position * [1.0, 1.0, nominal.fx_px / camera.fx_px]
         position = position + rng.normal(0.0, position_sigma_m, 3)
-        q_world = rotations.multiply(target.q_wxyz, rotations.exp(rng.normal(0.0, attitude_sigma_rad, 3)))
+        q_world = rotations.multiply(
+            target.q_wxyz, rotations.exp(rng.normal(0.0, attitude_sigma_rad, 3))
+        )
         solution = PoseSolution(
             position_m=vector(position),
             q_wxyz=vector(rotations.multiply(rotations.conjugate(attitude), q_world)),

@@ -1,12 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An estimator that knows a prescribed target exactly, so that the errors that remain are the controller's."""
+"""An estimator that knows a prescribed target exactly, so that the errors that remain are the
+controller's.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from chaserdock_controller.estimation.types import EstimatorEvent, Matrix3, Measurement, Shock, TargetState
+from chaserdock_controller.estimation.types import (
+    EstimatorEvent,
+    Matrix3,
+    Measurement,
+    Shock,
+    TargetState,
+)
 from chaserdock_controller.guidance.reference import predict_target
 from chaserdock_protocol.scenario.bodies import Target
 
@@ -33,10 +41,20 @@ class PerfectEstimator:
     def estimate_at(self, time_ns: int) -> TargetState:
         """Return the state at any time, with a variance of 1e-12 (SI units) of every number."""
         position, q = self._start
-        positions, attitudes = predict_target(position, self._velocity, q, self._omega, [time_ns / 1e9])
+        positions, attitudes = predict_target(
+            position, self._velocity, q, self._omega, [time_ns / 1e9]
+        )
         covariance = _VARIANCE * np.eye(12)
         return TargetState(
-            time_ns, positions[0], self._velocity, attitudes[0], self._omega, covariance, "tracking", 0, ()
+            time_ns,
+            positions[0],
+            self._velocity,
+            attitudes[0],
+            self._omega,
+            covariance,
+            "tracking",
+            0,
+            (),
         )
 
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:

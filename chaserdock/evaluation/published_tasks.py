@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published rendezvous and docking tasks with their own dynamics and criteria, for many samples at once.
+"""Published rendezvous and docking tasks with their own dynamics and criteria, for many samples at
+once.
 
-ARCH-COMP: N. Chan and S. Mitra, Verifying Safety of an Autonomous Spacecraft Rendezvous Mission, ARCH17; a benchmark of the
-category of affine dynamics since ARCH-COMP18. Its controller is part of the benchmark.
+ARCH-COMP: N. Chan and S. Mitra, Verifying Safety of an Autonomous Spacecraft Rendezvous Mission,
+ARCH17; a benchmark of the category of affine dynamics since ARCH-COMP18. Its controller is part of
+the benchmark.
 
-AFRL: the docking task of the packages safe-autonomy-sims and K. Dunlap et al., Run Time Assured Reinforcement Learning for Safe
-Satellite Docking, Journal of Aerospace Information Systems 20(1), 2023, with three deputies. It is flown here by the guidance law in
-``afrl_force``, which is ours.
+AFRL: the docking task of the packages safe-autonomy-sims and K. Dunlap et al., Run Time Assured
+Reinforcement Learning for Safe Satellite Docking, Journal of Aerospace Information Systems 20(1),
+2023, with three deputies. It is flown here by the guidance law in ``afrl_force``, which is ours.
 
-``afrl_starts`` and ``arch_start`` draw the starts of the shipped scenarios of both tasks, which the flight software flies.
+``afrl_starts`` and ``arch_start`` draw the starts of the shipped scenarios of both tasks, which the
+flight software flies.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from chaserdock.simulation.mission import simulate
 
 from .transfers import load_shipped
 
-# -- ARCH-COMP: metres and minutes, in the orbit's plane ---------------------------------------------------------
+# -- ARCH-COMP: metres and minutes, in the orbit's plane -------------------------------------------
 
 ARCH_CENTRE, ARCH_HALF = np.array([-900.0, -400.0, 0.0, 0.0]), np.array([25.0, 25.0, 0.0, 0.0])
 """Initial set: a box of positions (m), at rest."""
@@ -67,8 +70,9 @@ _ARCH_ABORT = np.array(
 
 @dataclass(frozen=True)
 class ArchOutcome:
-    """Of the samples: ``attempts``, how many came within 100 m; numbers of samples that violate each property. ``cone_margin_m``,
-    ``speed_margin_m_s``, ``clearance_m``: smallest margins; the clearance is from the target's box after the abort."""
+    """Of the samples: ``attempts``, how many came within 100 m; numbers of samples that violate
+    each property. ``cone_margin_m``, ``speed_margin_m_s``, ``clearance_m``: smallest margins; the
+    clearance is from the target's box after the abort."""
 
     samples: int
     attempts: int
@@ -84,10 +88,14 @@ class ArchOutcome:
         return self.outside_cone + self.too_fast + self.hit
 
 
-def arch_comp(samples: int, seed: int, abort_min: tuple[float, float], step_min: float = 0.05) -> ArchOutcome:
-    """Fly random samples of the initial set for 300 minutes; each aborts at a random time in ``abort_min``, minutes.
+def arch_comp(
+    samples: int, seed: int, abort_min: tuple[float, float], step_min: float = 0.05
+) -> ArchOutcome:
+    """Fly random samples of the initial set for 300 minutes; each aborts at a random time in
+    ``abort_min``, minutes.
 
-    An attempt is the part within the octagon of 100 m about the target. The states are exact at the steps of ``step_min``.
+    An attempt is the part within the octagon of 100 m about the target. The states are exact at the
+    steps of ``step_min``.
     """
     rng = np.random.default_rng([seed, 0xA7C4])
     x = ARCH_CENTRE + rng.uniform(-1.0, 1.0, (samples, 4)) * ARCH_HALF
@@ -109,8 +117,9 @@ def arch_comp(samples: int, seed: int, abort_min: tuple[float, float], step_min:
 def _arch_margins(
     x: Array, aborts: Array, transitions: list[Array], step_min: float
 ) -> tuple[Array, Array, Array]:
-    """Return the smallest margins (S,) of cone, speed and box of flights from states (S, 4); infinity where a property is not
-    asked for. An attempt lasts until the abort, and the box counts from then on."""
+    """Return the smallest margins (S,) of cone, speed and box of flights from states (S, 4);
+    infinity where a property is not asked for. An attempt lasts until the abort, and the box counts
+    from then on."""
     cone, speed, box = (np.full(len(x), math.inf) for _ in range(3))
     slope, cosine = math.tan(math.radians(ARCH_CONE_DEG)), math.cos(math.radians(ARCH_CONE_DEG))
     mode = np.zeros(len(x), dtype=np.intp)
@@ -136,7 +145,9 @@ def _arch_margins(
 
 
 def _expm(matrix: Array) -> Array:
-    """Return the exponential of a matrix (4, 4): a Taylor series of the scaled matrix, then squared."""
+    """Return the exponential of a matrix (4, 4): a Taylor series of the scaled matrix, then
+    squared.
+    """
     scaled, squarings = matrix / 2.0**12, 12
     term, total = np.eye(len(matrix)), np.eye(len(matrix))
     for k in range(1, 9):
@@ -147,23 +158,28 @@ def _expm(matrix: Array) -> Array:
     return total
 
 
-# -- AFRL: three deputies, metres and seconds --------------------------------------------------------------------
+# -- AFRL: three deputies, metres and seconds ------------------------------------------------------
 
 AFRL_RATE_RAD_S, AFRL_MASS_KG, AFRL_FORCE_N = 0.001027, 12.0, 1.0
 AFRL_DOCKED_M, AFRL_DOCKED_M_S, AFRL_SLOPE = 0.5, 0.2, 2.0
 AFRL_START_M, AFRL_TIMEOUT_S, AFRL_STEP_S = (100.0, 150.0), 2000.0, 1.0
 AFRL_DEPUTIES, AFRL_APART_M = 3, 1.0
-"""Number of deputies, and the distance that they keep from one another while they fly; the task states none."""
+"""Number of deputies, and the distance that they keep from one another while they fly; the task
+states none.
+"""
 _START_SHARE = 0.8
-"""Largest speed at the start as a share of the limit; the package draws up to 0.8 m/s, beyond its own limit of 0.4 m/s at 100 m."""
+"""Largest speed at the start as a share of the limit; the package draws up to 0.8 m/s, beyond its
+own limit of 0.4 m/s at 100 m.
+"""
 _STAGGER_S = 260.0
 """Deputies come in one after the other: the later ones wait at their start for this long each."""
 
 
 @dataclass(frozen=True)
 class AfrlOutcome:
-    """Of the episodes: ``docked``, all three deputies within the radius below the speed limit and no limit violated before.
-    ``speed_margin_m_s``: smallest distance from the limit; ``apart_m``: smallest distance of two deputies before they docked."""
+    """Of the episodes: ``docked``, all three deputies within the radius below the speed limit and
+    no limit violated before. ``speed_margin_m_s``: smallest distance from the limit; ``apart_m``:
+    smallest distance of two deputies before they docked."""
 
     episodes: int
     docked: int
@@ -182,9 +198,11 @@ def afrl_speed_limit(distance_m: Array) -> Array:
 
 
 def afrl_force(x: Array, waits: NDArray[np.bool_]) -> Array:
-    """Return forces (..., 3), N, at states (..., 6): follow a velocity towards the target at a share of the speed limit.
+    """Return forces (..., 3), N, at states (..., 6): follow a velocity towards the target at a
+    share of the speed limit.
 
-    Those that wait hold their place. The force cancels the relative motion of Clohessy and Wiltshire.
+    Those that wait hold their place. The force cancels the relative motion of Clohessy and
+    Wiltshire.
     """
     position, velocity = x[..., :3], x[..., 3:]
     distance = np.linalg.norm(position, axis=-1, keepdims=True)
@@ -219,7 +237,8 @@ def _smallest_gap(x: Array, docked: NDArray[np.bool_]) -> Array:
 def afrl_docking(episodes: int, seed: int) -> AfrlOutcome:
     """Fly episodes with a control step of 1 s and the force held.
 
-    Each starts at a random place, with a speed of at most `_START_SHARE` of the limit there, in a random direction.
+    Each starts at a random place, with a speed of at most `_START_SHARE` of the limit there, in a
+    random direction.
     """
     x = _afrl_starts(episodes, np.random.default_rng([seed, 0xAF71]))
     step = cw_transition(AFRL_RATE_RAD_S, AFRL_STEP_S)
@@ -263,10 +282,12 @@ def afrl_docking(episodes: int, seed: int) -> AfrlOutcome:
     )
 
 
-# -- The scenarios ------------------------------------------------------------------------------------------------
+# -- The scenarios ---------------------------------------------------------------------------------
 
 _APART_DEG = 60.0
-"""Least angle between the directions from which deputies start, as they dock where they come from; the task states none."""
+"""Least angle between the directions from which deputies start, as they dock where they come from;
+the task states none.
+"""
 _HOLD_M = 2.5
 """Distance of the hold point before the docking."""
 _ARCH_HOLD_M = 116.0
@@ -284,7 +305,9 @@ def _directions(rng: np.random.Generator) -> Array:
 
 
 def afrl_starts(seed: int) -> tuple[str, ...]:
-    """Return overrides of ``afrl-docking``: starts with distances and speeds as in ``afrl_docking``, and directions apart."""
+    """Return overrides of ``afrl-docking``: starts with distances and speeds as in
+    ``afrl_docking``, and directions apart.
+    """
     rng = np.random.default_rng([seed, 0xAF72])
     along, heading = _directions(rng), rng.normal(size=(AFRL_DEPUTIES, 3))
     heading /= np.linalg.norm(heading, axis=1, keepdims=True)
@@ -301,8 +324,9 @@ def afrl_starts(seed: int) -> tuple[str, ...]:
 
 
 def arch_start(seed: int) -> tuple[str, ...]:
-    """Return overrides of ``arch-comp-rendezvous``: a start in the task's initial set and, with an odd seed, an abort at a random
-    moment after the hold point, before which the chaser need not come nearer than that."""
+    """Return overrides of ``arch-comp-rendezvous``: a start in the task's initial set and, with an
+    odd seed, an abort at a random moment after the hold point, before which the chaser need not
+    come nearer than that."""
     rng = np.random.default_rng([seed, 0xA7C5])
     start = (ARCH_CENTRE + rng.uniform(-1.0, 1.0, 4) * ARCH_HALF)[:2]
     overrides = (f"seed={seed}", f"chasers.0.position_m={_toml([*start, 0.0])}")

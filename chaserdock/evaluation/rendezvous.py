@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole rendezvous in one process, from far range to the verified latch: hold points, hand-over to the markers, contact."""
+"""A whole rendezvous in one process, from far range to the verified latch: hold points, hand-over
+to the markers, contact.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,9 @@ _AFTER_CAPTURE_S, _AFTER_COMMAND_S = 1.0, 1.0
 
 @dataclass(frozen=True)
 class HoldPoint:
-    """Tracking of a hold point over the last `HOLD_S` before ``until_s``: RMS of the distance from the reference pose on the true
-    target, largest angle, and RMS of the error of the estimated relative position; ``range_m``: distance from the target."""
+    """Tracking of a hold point over the last `HOLD_S` before ``until_s``: RMS of the distance from
+    the reference pose on the true target, largest angle, and RMS of the error of the estimated
+    relative position; ``range_m``: distance from the target."""
 
     until_s: float
     range_m: float
@@ -37,9 +40,9 @@ class HoldPoint:
 
 @dataclass(frozen=True)
 class HandOver:
-    """The first markers: at ``range_m``. ``step_m`` and ``step_deg``: change of the estimate's error by the tick that uses them;
-    ``step_sigmas``: its largest component over the estimate's standard deviation before; ``error_sigmas`` as well for the error
-    before the step."""
+    """The first markers: at ``range_m``. ``step_m`` and ``step_deg``: change of the estimate's
+    error by the tick that uses them; ``step_sigmas``: its largest component over the estimate's
+    standard deviation before; ``error_sigmas`` as well for the error before the step."""
 
     time_s: float
     range_m: float
@@ -51,8 +54,9 @@ class HandOver:
 
 @dataclass
 class RendezvousOutcome:
-    """One flight. ``verified_s``: None unless the latch was verified. ``delta_v_m_s``: impulse, summed over axes, over mass.
-    ``keep_out_margin_m``: least distance from the target before the port's corridor, less ``limits.min_distance_target_m``."""
+    """One flight. ``verified_s``: None unless the latch was verified. ``delta_v_m_s``: impulse,
+    summed over axes, over mass. ``keep_out_margin_m``: least distance from the target before the
+    port's corridor, less ``limits.min_distance_target_m``."""
 
     verified_s: float | None = None
     phase: str = ""
@@ -70,7 +74,9 @@ class RendezvousOutcome:
 
 
 def estimate_error(estimate: RelativeEstimate, states: States) -> Array:
-    """Return the error (6,) of an estimated relative pose: position in TRF axes (m), rotation vector in CRF axes (rad)."""
+    """Return the error (6,) of an estimated relative pose: position in TRF axes (m), rotation
+    vector in CRF axes (rad).
+    """
     own, target = states[f"chaser/{estimate.chaser}"], states[TARGET]
     position = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
     q = rotations.multiply(rotations.conjugate(target.q_wxyz), own.q_wxyz)
@@ -113,10 +119,19 @@ class _Recorder:
         return next((r for r in relative if r.chaser == 0), None)
 
     def _note_hand_over(
-        self, record: TickRecord, range_m: float, estimate: RelativeEstimate | None, error: Array | None
+        self,
+        record: TickRecord,
+        range_m: float,
+        estimate: RelativeEstimate | None,
+        error: Array | None,
     ) -> None:
         seen = any(s.marker_ids for s in record.sightings)
-        if self.outcome.hand_over is None and seen and self._before is not None and error is not None:
+        if (
+            self.outcome.hand_over is None
+            and seen
+            and self._before is not None
+            and error is not None
+        ):
             before, sigmas = self._before
             step = error - before
             self.outcome.hand_over = HandOver(
@@ -155,20 +170,28 @@ def rendezvous(
     perception: PerceptionModel,
     report: Callable[[TickRecord, InProcessMission], None] = lambda record, flight: None,
 ) -> RendezvousOutcome:
-    """Fly chaser 0 of a scenario until its latch is verified, or to the end; ``report`` is called after each tick."""
+    """Fly chaser 0 of a scenario until its latch is verified, or to the end; ``report`` is called
+    after each tick.
+    """
     recorder = _Recorder(scenario)
     out = recorder.outcome
     with InProcessMission(scenario, perception) as flight:
         while flight.tick < scenario.ticks:
             record = flight.step()
-            recorder.note(record, flight.phase(0), flight.controller.guidance.machine.in_corridor(0))
+            recorder.note(
+                record, flight.phase(0), flight.controller.guidance.machine.in_corridor(0)
+            )
             report(record, flight)
             if out.phase == "verified" and out.verified_s is None:
                 out.verified_s = record.time_s
             if out.verified_s is not None and record.time_s >= out.verified_s + _AFTER_CAPTURE_S:
                 break
         closed = next((t for t in flight.touches if t.latched), None)
-        out.events, out.contacts, out.propellant_kg = flight.events, flight.contacts, flight.propellant_kg
+        out.events, out.contacts, out.propellant_kg = (
+            flight.events,
+            flight.contacts,
+            flight.propellant_kg,
+        )
     if closed is not None:
         out.contact_lateral_m, out.contact_closing_m_s = closed.lateral_m, closed.closing_m_s
         out.contact_angle_deg = math.degrees(closed.angle_rad)
@@ -176,7 +199,8 @@ def rendezvous(
 
 
 def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
-    """Return the part of a scenario that begins with command ``index`` of its timeline and ends before the next command but one.
+    """Return the part of a scenario that begins with command ``index`` of its timeline and ends
+    before the next command but one.
 
     It starts at rest at the place before, and waits there for ``wait_s``.
     """

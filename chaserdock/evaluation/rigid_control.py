@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's identification and detumbling in closed loop with a rigid stack: fast, for statistics over many tumbles.
+"""The controller's identification and detumbling in closed loop with a rigid stack: fast, for
+statistics over many tumbles.
 
-Odometry, thrusters and their errors are those of the simulator. The physics engine and the images are left out: the pose of the
-target, by which the places of the chasers are first known, has a constant error drawn with ``_POSE_M`` and ``_POSE_RAD``.
-``detumble_flights.fly_stack`` flies the same with both.
+Odometry, thrusters and their errors are those of the simulator. The physics engine and the images
+are left out: the pose of the target, by which the places of the chasers are first known, has a
+constant error drawn with ``_POSE_M`` and ``_POSE_RAD``. ``detumble_flights.fly_stack`` flies the
+same with both.
 """
 
 from __future__ import annotations
@@ -38,9 +40,10 @@ _SILENT_REST_S = 10.0
 
 @dataclass(frozen=True)
 class StackFlight:
-    """One flight. ``time_s`` until the stack stays below the limits (None: it does not), ``impulse_N_s`` until then, and
-    ``held_N_s`` from then to the end. ``least``: with a frozen attitude. Errors of the identified target: mass (share), centre (m),
-    worst inertia (share of the largest moment); ``nees`` per degree of freedom of the stack's mass properties (None if the
+    """One flight. ``time_s`` until the stack stays below the limits (None: it does not),
+    ``impulse_N_s`` until then, and ``held_N_s`` from then to the end. ``least``: with a frozen
+    attitude. Errors of the identified target: mass (share), centre (m), worst inertia (share of the
+    largest moment); ``nees`` per degree of freedom of the stack's mass properties (None if the
     controller fell silent). ``peak_*``: largest loads at a port at 960 Hz."""
 
     seed: int
@@ -62,7 +65,8 @@ class StackFlight:
 
 
 class ControlledStack:
-    """A rigid stack and its controller, one ``step`` per tick. ``lost``: chasers that are dead: no odometry, no thrust.
+    """A rigid stack and its controller, one ``step`` per tick. ``lost``: chasers that are dead: no
+    odometry, no thrust.
 
     ``reported``: thrusters that their chasers report as failed and have shut off, by chaser.
     """
@@ -100,7 +104,10 @@ class ControlledStack:
             impulses={},
             last_commands={},
             thruster_impulses={i: given for i, given in self._given.items() if i in odometry},
-            ahead={i: ((1.0, self._coming[i]),) if i in self._coming and seconds else () for i in odometry},
+            ahead={
+                i: ((1.0, self._coming[i]),) if i in self._coming and seconds else ()
+                for i in odometry
+            },
             input_limits={},
             isolated=dict(self.reported),
             events=(),
@@ -117,7 +124,15 @@ class ControlledStack:
             rotations.rotate(stack.q_wxyz, stack.omega_rad_s), arm
         )
         target = TargetState(
-            now_ns, position, velocity, q, stack.omega_rad_s, 1e-6 * np.eye(12), "tracking", len(odometry), ()
+            now_ns,
+            position,
+            velocity,
+            q,
+            stack.omega_rad_s,
+            1e-6 * np.eye(12),
+            "tracking",
+            len(odometry),
+            (),
         )
         return TargetEstimation(
             target=target,
@@ -142,7 +157,9 @@ class ControlledStack:
         commands: Mapping[int, Array] = {}
         state = self.control.state(observation, estimation)
         if task is not None and state is not None:
-            directs = self.control.commands(state, set(observation.odometry), self._shut(), task, observation)
+            directs = self.control.commands(
+                state, set(observation.odometry), self._shut(), task, observation
+            )
             commands = {i: d.thrusts_N for i, d in directs.items() if d.thrusts_N is not None}
         return self._fly({i: commands.get(i, self._none()) for i in observation.odometry})
 
@@ -159,7 +176,9 @@ class ControlledStack:
     def _shut(self) -> dict[int, tuple[int, ...]]:
         """Return the thrusters whose shut-off valve is closed."""
         found, reported = self.identification.failed, self.reported
-        return {i: (*found.get(i, ()), *reported.get(i, ())) for i in found.keys() | reported.keys()}
+        return {
+            i: (*found.get(i, ()), *reported.get(i, ())) for i in found.keys() | reported.keys()
+        }
 
     def _none(self) -> Array:
         return np.zeros(len(self.scenario.chaser.thrusters))
@@ -176,8 +195,9 @@ class ControlledStack:
 
 @dataclass(frozen=True)
 class FlightEvents:
-    """What happens in a flight, in seconds after the command to stop. ``loss``: time and chaser that dies. ``reported``: chaser and
-    thruster that it reports as failed from the start. ``silent_from_s``: from then on the chasers are without a controller."""
+    """What happens in a flight, in seconds after the command to stop. ``loss``: time and chaser
+    that dies. ``reported``: chaser and thruster that it reports as failed from the start.
+    ``silent_from_s``: from then on the chasers are without a controller."""
 
     loss: tuple[float, int] | None = None
     reported: tuple[int, int] | None = None
@@ -185,10 +205,17 @@ class FlightEvents:
 
 
 def fly_controlled(
-    scenario: Scenario, duration_s: float, identify_s: float = 0.0, events: FlightEvents | None = None
+    scenario: Scenario,
+    duration_s: float,
+    identify_s: float = 0.0,
+    events: FlightEvents | None = None,
 ) -> StackFlight:
     """Stop a stack from the first tick on, after ``identify_s`` of identifying pulses."""
-    flight, rate_hz, events = ControlledStack(scenario), scenario.time.rate_hz, events or FlightEvents()
+    flight, rate_hz, events = (
+        ControlledStack(scenario),
+        scenario.time.rate_hz,
+        events or FlightEvents(),
+    )
     if events.reported is not None:
         flight.reported = {events.reported[0]: (events.reported[1],)}
     true = flight.state()
@@ -237,8 +264,9 @@ def fly_controlled(
 
 
 class _Tasks:
-    """The task of every tick: nothing while the filter settles, identifying pulses until the command at tick ``begin``, then to
-    stop, and to hold once the stack has been at rest for half a second."""
+    """The task of every tick: nothing while the filter settles, identifying pulses until the
+    command at tick ``begin``, then to stop, and to hold once the stack has been at rest for half a
+    second."""
 
     def __init__(self, begin: int, rate_hz: int) -> None:
         self._begin, self._rest_ticks, self._holding = begin, 0.5 * rate_hz, 0
@@ -246,7 +274,11 @@ class _Tasks:
     def at(self, tick: int, control: DetumbleControl, state: StackState | None) -> StackTask | None:
         if tick < self._begin or state is None:
             return (
-                None if tick < _SETTLE_TICKS else StackTask.IDENTIFY if tick < self._begin else StackTask.STOP
+                None
+                if tick < _SETTLE_TICKS
+                else StackTask.IDENTIFY
+                if tick < self._begin
+                else StackTask.STOP
             )
         control.follow(state)
         rests = control.is_stopped(state) or (self._holding and not control.moves_again(state))
@@ -280,7 +312,9 @@ class _FlightLog:
 
 
 def identification_errors(flight: ControlledStack | None) -> dict[str, float | None]:
-    """Return the errors of the identified mass properties, by field of ``StackFlight``; all None without a flight."""
+    """Return the errors of the identified mass properties, by field of ``StackFlight``; all None
+    without a flight.
+    """
     if flight is None:
         return dict.fromkeys(("mass_share", "centre_m", "inertia_share", "nees"))
     found, true = flight.identification.target, properties_of(flight.stack.target)
@@ -300,8 +334,9 @@ def identification_errors(flight: ControlledStack | None) -> dict[str, float | N
 
 
 def optimum_share(scenario: Scenario, seconds: float, guesses: int, programmes: int = 20) -> float:
-    """Return the least impulse found that stops a stack in ``seconds``, over that of the programme with a frozen attitude: planned
-    at once with the true stack, from so many random guesses, each with so many linear programmes."""
+    """Return the least impulse found that stops a stack in ``seconds``, over that of the programme
+    with a frozen attitude: planned at once with the true stack, from so many random guesses, each
+    with so many linear programmes."""
     flight = ControlledStack(scenario)
     state = flight.state()
     problem = flight.control.problem(state, set(state.chasers), {})
@@ -316,12 +351,19 @@ def optimum_share(scenario: Scenario, seconds: float, guesses: int, programmes: 
     return min(plans) / least.impulse_N_s
 
 
-_MASS, _MOMENTS, _PRODUCTS, _CENTRE = "150.0", "16.73,20.29,22.98", "-2.41,1.95,-1.41", "[0.06,-0.05,0.04]"
+_MASS, _MOMENTS, _PRODUCTS, _CENTRE = (
+    "150.0",
+    "16.73,20.29,22.98",
+    "-2.41,1.95,-1.41",
+    "[0.06,-0.05,0.04]",
+)
 """Mass properties of the target in ``wrong_knowledge``: kg, kg m² and m, TRF axes."""
 
 
 def right_knowledge() -> list[str]:
-    """Return scenario overrides after those of ``wrong_knowledge`` by which the controllers' stated mass properties are right."""
+    """Return scenario overrides after those of ``wrong_knowledge`` by which the controllers' stated
+    mass properties are right.
+    """
     return [
         f"target.mass_kg={_MASS}",
         f"target.inertia_kg_m2=[{_MOMENTS}]",
@@ -334,8 +376,9 @@ def right_knowledge() -> list[str]:
 
 
 def wrong_knowledge(seed: int, share: float = 0.3, errors: bool = True) -> list[str]:
-    """Return scenario overrides of ``detumble``: the controllers' stated mass and inertia are wrong by ``share``, the stated
-    inertia is that of a ball, and its centre of mass the middle of the body; thrusts and pulses have errors with ``errors``."""
+    """Return scenario overrides of ``detumble``: the controllers' stated mass and inertia are wrong
+    by ``share``, the stated inertia is that of a ball, and its centre of mass the middle of the
+    body; thrusts and pulses have errors with ``errors``."""
     rng = np.random.default_rng([seed, 0xBAD])
     mass, inertia = (1.0 + share * rng.choice([-1.0, 1.0]) for _ in range(2))
     true = f"mass_kg={_MASS},inertia_kg_m2=[{_MOMENTS},{_PRODUCTS}],centre_of_mass_m={_CENTRE}"
@@ -352,5 +395,7 @@ def wrong_knowledge(seed: int, share: float = 0.3, errors: bool = True) -> list[
         "detumble.identification.enabled=true",
     ]
     return out + (
-        ["truth.chaser.thrust_share=0.03", "truth.chaser.pulse_scatter_share=0.02"] if errors else []
+        ["truth.chaser.thrust_share=0.03", "truth.chaser.pulse_scatter_share=0.02"]
+        if errors
+        else []
     )

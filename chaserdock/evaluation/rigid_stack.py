@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stack of target and latched chasers as one rigid body, damped by its chasers without a controller.
+"""A stack of target and latched chasers as one rigid body, damped by its chasers without a
+controller.
 
-Joints, contacts and images of the physics engine, which a silent controller does not need, are left out. Thrusters and sensors
-are those of the simulator; ``tests/chaserdock/test_silent_controller.py`` compares both.
+Joints, contacts and images of the physics engine, which a silent controller does not need, are left
+out. Thrusters and sensors are those of the simulator;
+``tests/chaserdock/test_silent_controller.py`` compares both.
 """
 
 from __future__ import annotations
@@ -38,8 +40,9 @@ _LOAD_HZ = 960
 
 @dataclass(frozen=True)
 class SilentOutcome:
-    """A flight without controller: time until the stack stays below the limits (None: it does not), the impulse of all
-    thrusters until then, that after it in ``held_s``, and the motion at the end."""
+    """A flight without controller: time until the stack stays below the limits (None: it does not),
+    the impulse of all thrusters until then, that after it in ``held_s``, and the motion at the end.
+    """
 
     time_s: float | None
     impulse_N_s: float
@@ -51,8 +54,9 @@ class SilentOutcome:
 
 @dataclass(frozen=True, eq=False)
 class StackStep:
-    """One tick of a stack: impulse of all thrusters (N s), and by chaser the impulses (n,) that its thrusters should have given,
-    and the impulse (6,), body axes, that they should give until the next command acts; the largest force and torque at any port."""
+    """One tick of a stack: impulse of all thrusters (N s), and by chaser the impulses (n,) that its
+    thrusters should have given, and the impulse (6,), body axes, that they should give until the
+    next command acts; the largest force and torque at any port."""
 
     used_N_s: float
     stated_N_s: Mapping[int, Array]
@@ -62,9 +66,11 @@ class StackStep:
 
 
 class RigidStack:
-    """All chasers of a scenario at their ports, with its true bodies and thrusters, and the target's start state.
+    """All chasers of a scenario at their ports, with its true bodies and thrusters, and the
+    target's start state.
 
-    One ``step`` per tick. ``port_errors``: whether the chasers are latched with seeded errors of a few millimetres.
+    One ``step`` per tick. ``port_errors``: whether the chasers are latched with seeded errors of a
+    few millimetres.
     """
 
     def __init__(self, scenario: Scenario, port_errors: bool = False) -> None:
@@ -78,7 +84,9 @@ class RigidStack:
         self.body = attach_plants(self.target, plants, self.mounted)
         self.q_wxyz = np.array(target.q_wxyz)
         self.omega_rad_s = np.array(target.omega_rad_s)
-        arm = rotations.rotate(self.q_wxyz, rotations.cross(self.omega_rad_s, self.body.centre_trf_m))
+        arm = rotations.rotate(
+            self.q_wxyz, rotations.cross(self.omega_rad_s, self.body.centre_trf_m)
+        )
         self.velocity_m_s = np.array(target.velocity_m_s) + arm
         self.centre_m = rotations.rotate(self.q_wxyz, self.body.centre_trf_m)
         self.tick = 0
@@ -87,7 +95,8 @@ class RigidStack:
         thrusters = scenario.chaser.thrusters
         self._full_N, self._own = thrusts_max(thrusters), wrench_matrix(thrusters)
         self._modulators = {
-            i: Modulator(thrusters, scenario.chaser.modulation, scenario.timing) for i in self.mounted
+            i: Modulator(thrusters, scenario.chaser.modulation, scenario.timing)
+            for i in self.mounted
         }
         self._errors = {i: actuation_errors(scenario, i) for i in self.mounted}
         self._valves, self._stated_valves = {}, {i: Valves(thrusters) for i in self.mounted}
@@ -116,7 +125,8 @@ class RigidStack:
         arm = mounted.position_m - self.body.centre_trf_m
         return BodyState(
             self.centre_m + rotations.rotate(self.q_wxyz, arm),
-            self.velocity_m_s + rotations.rotate(self.q_wxyz, rotations.cross(self.omega_rad_s, arm)),
+            self.velocity_m_s
+            + rotations.rotate(self.q_wxyz, rotations.cross(self.omega_rad_s, arm)),
             rotations.multiply(self.q_wxyz, mounted.q_wxyz),
             rotations.rotate_inverse(mounted.q_wxyz, self.omega_rad_s),
         )
@@ -135,7 +145,9 @@ class RigidStack:
     def step(
         self, thrusts_N: Mapping[int, Array], shut: Mapping[int, tuple[int, ...]] | None = None
     ) -> StackStep:
-        """Fly one tick with commanded thrusts (n,) by chaser; ``shut``: thrusters whose shut-off valve is closed."""
+        """Fly one tick with commanded thrusts (n,) by chaser; ``shut``: thrusters whose shut-off
+        valve is closed.
+        """
         timing = self.scenario.timing
         begin_ns, end_ns = timing.tick_time_ns(self.tick), timing.tick_time_ns(self.tick + 1)
         fine = self._load_steps
@@ -160,7 +172,9 @@ class RigidStack:
             for valves in (self._valves[i], self._stated_valves[i]):
                 valves.forget_before(begin_ns)
             opened[i] = given
-            impulses += given.reshape(_SUBSTEPS, -1, given.shape[1]).sum(axis=1) @ self._wrenches[i].T
+            impulses += (
+                given.reshape(_SUBSTEPS, -1, given.shape[1]).sum(axis=1) @ self._wrenches[i].T
+            )
             used_N_s += float(given.sum())
         peaks = self._peak_loads(opened, (end_ns - begin_ns) * 1e-9 / fine)
         for impulse in impulses:
@@ -169,13 +183,19 @@ class RigidStack:
         return StackStep(used_N_s, stated, coming, *peaks)
 
     def _peak_loads(self, given_N_s: Mapping[int, Array], step_s: float) -> tuple[float, float]:
-        """Return the largest force (N) and torque about the tip (N m) at any port under impulses (K, n) of every chaser's thrusters
-        in K steps; the mass and inertia of the chasers are the scenario's."""
+        """Return the largest force (N) and torque about the tip (N m) at any port under impulses
+        (K, n) of every chaser's thrusters in K steps; the mass and inertia of the chasers are the
+        scenario's."""
         count = len(self._full_N)
-        own = {i: (slice(k * count, (k + 1) * count), self._true_own[i]) for k, i in enumerate(self.mounted)}
+        own = {
+            i: (slice(k * count, (k + 1) * count), self._true_own[i])
+            for k, i in enumerate(self.mounted)
+        }
         wrenches = np.concatenate([self._wrenches[i] for i in self.mounted], axis=1)
         chaser = self.scenario.chaser
-        model = load_model(self.body, self.omega_rad_s, wrenches, self.mounted, own, chaser, self._tips_m, {})
+        model = load_model(
+            self.body, self.omega_rad_s, wrenches, self.mounted, own, chaser, self._tips_m, {}
+        )
         thrusts = np.concatenate([given_N_s[i] for i in self.mounted], axis=1) / step_s
         loads = model.constant[:, :, None] + model.by_thrust @ thrusts.T
         return (
@@ -184,7 +204,9 @@ class RigidStack:
         )
 
     def _width_ns(self, chaser: int, pulse: ThrusterPulse) -> int:
-        """Return how long a pulse opens its valve: as commanded, up to scatter, but not below the minimum on-time."""
+        """Return how long a pulse opens its valve: as commanded, up to scatter, but not below the
+        minimum on-time.
+        """
         errors, width = self._errors[chaser], pulse.close_ns - pulse.open_ns
         if not errors.scatter_share:
             return width
@@ -192,9 +214,13 @@ class RigidStack:
         return max(scattered, min(width, self._shortest_ns[pulse.thruster]))
 
     def _advance(self, impulse: Array, step_s: float) -> None:
-        """Advance by ``step_s`` with an impulse (6,), TRF axes, half of it before and half after a free rotation."""
+        """Advance by ``step_s`` with an impulse (6,), TRF axes, half of it before and half after a
+        free rotation.
+        """
         turn = np.linalg.solve(self.body.inertia_kg_m2, impulse[3:]) / 2.0
-        self.velocity_m_s = self.velocity_m_s + rotations.rotate(self.q_wxyz, impulse[:3]) / self.body.mass_kg
+        self.velocity_m_s = (
+            self.velocity_m_s + rotations.rotate(self.q_wxyz, impulse[:3]) / self.body.mass_kg
+        )
         self.centre_m = self.centre_m + step_s * self.velocity_m_s
         qs, omegas, _ = free_rotation(
             self.q_wxyz, self.omega_rad_s + turn, self.body.inertia_kg_m2, step_s, 2
@@ -202,14 +228,22 @@ class RigidStack:
         self.q_wxyz, self.omega_rad_s = qs[1], omegas[1] + turn
 
 
-def fly_silent(scenario: Scenario, duration_s: float = 120.0, rest_s: float = math.inf) -> SilentOutcome:
-    """Let all chasers damp the scenario's tumble without a controller, for ``duration_s`` or until ``rest_s`` after it stopped."""
+def fly_silent(
+    scenario: Scenario, duration_s: float = 120.0, rest_s: float = math.inf
+) -> SilentOutcome:
+    """Let all chasers damp the scenario's tumble without a controller, for ``duration_s`` or until
+    ``rest_s`` after it stopped.
+    """
     stack, limits = RigidStack(scenario), scenario.detumble
     impulses, at_rest, rate_hz = [], 0, scenario.time.rate_hz  # at_rest: number of ticks in a row
     for _ in range(round(duration_s * rate_hz)):
         impulses.append(stack.step(stack.damping()).used_N_s)
         speed, rate = stack.rates()
-        at_rest = at_rest + 1 if speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s else 0
+        at_rest = (
+            at_rest + 1
+            if speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s
+            else 0
+        )
         if at_rest and at_rest >= rest_s * rate_hz:
             break
     since = len(impulses) - at_rest

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``chaserdock study``: fly a file of cases in one process, one after the other, and append each result."""
+"""``chaserdock study``: fly a file of cases in one process, one after the other, and append each
+result.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ _FLOOR_S = 15.0
 def main(cases: Path, results: Path) -> int:
     """Fly every case of ``cases``, append to ``results``, and return 0.
 
-    Raises StudyError or ScenarioError at the first case that is not valid; earlier results are kept.
+    Raises StudyError or ScenarioError at the first case that is not valid; earlier results are
+    kept.
     """
     todo = read_lines(cases, StudyCase)
     for number, case in enumerate(todo, start=1):
@@ -46,7 +49,9 @@ def fly_case(case: StudyCase) -> StudyResult:
         delay = _measured
     elif fixed_s is not None:
         delay = lambda _: fixed_s  # noqa: E731
-    flight = record_flight(scenario, RenderedImages(scenario) if case.images else None, solve_delay_s=delay)
+    flight = record_flight(
+        scenario, RenderedImages(scenario) if case.images else None, solve_delay_s=delay
+    )
     position, angle = flight.position_error_m[:, 0] ** 2, flight.orientation_error_rad[:, 0] ** 2
     late = flight.time_s >= scenario.settling_s
     return StudyResult(
@@ -71,9 +76,13 @@ def _measured(took_s: float) -> float:
 def _check(case: StudyCase, scenario: Scenario) -> None:
     fixed_s = case.delay_s
     if fixed_s is not None and (case.delay_measured or not 0.0 <= fixed_s < math.inf):
-        raise StudyError(f"{case.name}: delay_s must be finite, not negative and not beside delay_measured")
+        raise StudyError(
+            f"{case.name}: delay_s must be finite, not negative and not beside delay_measured"
+        )
     if scenario.target.motion == "torque_free" and (case.floor or not case.images):
-        raise StudyError(f"{case.name}: target.motion must be constant_rates or static, not torque_free")
+        raise StudyError(
+            f"{case.name}: target.motion must be constant_rates or static, not torque_free"
+        )
     if (fixed_s is not None or case.delay_measured) and scenario.chaser.actuation != "ideal":
         raise StudyError(f'{case.name}: a delay needs chaser.actuation = "ideal"')
     if scenario.settling_s > scenario.duration_s:
@@ -83,7 +92,9 @@ def _check(case: StudyCase, scenario: Scenario) -> None:
 
 
 def position_error_floor(scenario: Scenario, flight: FlightRecord) -> float:
-    """Return the least integral (m^2 s) of chaser 0's squared position error, with the attitudes of ``flight``."""
+    """Return the least integral (m^2 s) of chaser 0's squared position error, with the attitudes of
+    ``flight``.
+    """
     step_s = 1.0 / scenario.time.rate_hz
     steps = min(len(flight.time_s) - 1, round(_FLOOR_S / step_s))
     target, offset = PerfectEstimator(scenario.target), np.array(scenario.chasers[0].position_m)

@@ -16,11 +16,13 @@ class StudyError(ChaserdockError):
 
 
 class StudyCase(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A scenario (path) with overrides, flown with perfect knowledge of the target, or with ``images`` and an estimator.
+    """A scenario (path) with overrides, flown with perfect knowledge of the target, or with
+    ``images`` and an estimator.
 
-    ``delay_s``: time from a tick to its command's effect, unknown to the controller, which skips the ticks meanwhile.
-    ``delay_measured``: the wall-clock time of each solve as delay. ``floor``: compute the lower bound of the squared
-    position error, too, for a chaser that turns as this one did.
+    ``delay_s``: time from a tick to its command's effect, unknown to the controller, which skips
+    the ticks meanwhile. ``delay_measured``: the wall-clock time of each solve as delay. ``floor``:
+    compute the lower bound of the squared position error, too, for a chaser that turns as this one
+    did.
     """
 
     name: str
@@ -33,9 +35,11 @@ class StudyCase(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class StudyResult(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Chaser 0's errors from its commanded reference pose: mean squares over the run, and after ``settling_s``.
+    """Chaser 0's errors from its commanded reference pose: mean squares over the run, and after
+    ``settling_s``.
 
-    ``min_distance_target_m``: least distance of its centre to the target's. ``failed_solves``: ticks without a plan.
+    ``min_distance_target_m``: least distance of its centre to the target's. ``failed_solves``:
+    ticks without a plan.
     """
 
     case: StudyCase

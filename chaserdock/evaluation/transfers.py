@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeded transfers around the target, ``collision-avoidance`` and ``swap``: variations, and figures of a flight."""
+"""Seeded transfers around the target, ``collision-avoidance`` and ``swap``: variations, and figures
+of a flight.
+"""
 
 from __future__ import annotations
 
@@ -35,16 +37,23 @@ def load_shipped(name: str, *overrides: str) -> Scenario:
 
 
 def avoidance(seed: int, full_images: bool = False) -> Scenario:
-    """Return ``collision-avoidance`` rotated and scattered by the seed; every fourth seed is exactly symmetric.
+    """Return ``collision-avoidance`` rotated and scattered by the seed; every fourth seed is
+    exactly symmetric.
 
-    Symmetric: chaser 0 at rest on an axis of TRF (another one each time), its goal exactly opposite, chaser 1 at right
-    angles to both; seeds above 11 with the whole scene rotated at random in WRF. Otherwise starts, goal and chaser 1's
-    place are scattered by up to 10 cm (the goal up to 5 cm), attitudes by 0.1 rad.
+    Symmetric: chaser 0 at rest on an axis of TRF (another one each time), its goal exactly
+    opposite, chaser 1 at right angles to both; seeds above 11 with the whole scene rotated at
+    random in WRF. Otherwise starts, goal and chaser 1's place are scattered by up to 10 cm (the
+    goal up to 5 cm), attitudes by 0.1 rad.
     """
-    rng, scenario = np.random.default_rng([seed, 0xA701]), load_shipped("collision-avoidance", f"seed={seed}")
+    rng, scenario = (
+        np.random.default_rng([seed, 0xA701]),
+        load_shipped("collision-avoidance", f"seed={seed}"),
+    )
     symmetric = seed % SYMMETRIC_EVERY == 0
     rotated = seed > 11 or not symmetric
-    attitude = rotations.normalize(rng.normal(size=4)) if rotated else np.array([1.0, 0.0, 0.0, 0.0])
+    attitude = (
+        rotations.normalize(rng.normal(size=4)) if rotated else np.array([1.0, 0.0, 0.0, 0.0])
+    )
     way = np.roll([1.0, 0.0, 0.0], seed // SYMMETRIC_EVERY if symmetric else 0)
     aside = np.roll([0.0, 1.0, 0.0], seed // SYMMETRIC_EVERY if symmetric else 0)
     places, scatter = [-way, -aside], np.zeros((2, 3))
@@ -56,9 +65,13 @@ def avoidance(seed: int, full_images: bool = False) -> Scenario:
         nominal.model_copy(
             update={
                 "position_m": tuple(place.tolist()),
-                "q_wxyz": tuple(facing_attitudes(nominal.position_m, nominal.q_wxyz, place)[0].tolist()),
+                "q_wxyz": tuple(
+                    facing_attitudes(nominal.position_m, nominal.q_wxyz, place)[0].tolist()
+                ),
                 "start_offset_m": tuple(offset.tolist()),
-                "start_rotation_rad": tuple([0.0] * 3 if symmetric else rng.uniform(-0.1, 0.1, 3).tolist()),
+                "start_rotation_rad": tuple(
+                    [0.0] * 3 if symmetric else rng.uniform(-0.1, 0.1, 3).tolist()
+                ),
             }
         )
         for place, offset in zip(places, scatter, strict=True)
@@ -76,11 +89,15 @@ def avoidance(seed: int, full_images: bool = False) -> Scenario:
 
 
 def swap(seed: int) -> Scenario:
-    """Return ``swap``; except for seed 0, starts are scattered by 5 cm (one sigma, each axis), the tumble axis is random."""
+    """Return ``swap``; except for seed 0, starts are scattered by 5 cm (one sigma, each axis), the
+    tumble axis is random.
+    """
     rng, scenario = np.random.default_rng([seed, 0x5A]), load_shipped("swap", f"seed={seed}")
     if seed == 0:
         return scenario
-    omega = rotations.rotate(rotations.normalize(rng.normal(size=4)), np.array(scenario.target.omega_rad_s))
+    omega = rotations.rotate(
+        rotations.normalize(rng.normal(size=4)), np.array(scenario.target.omega_rad_s)
+    )
     chasers = tuple(
         c.model_copy(update={"start_offset_m": tuple(rng.normal(0.0, 0.05, 3).tolist())})
         for c in scenario.chasers
@@ -92,7 +109,9 @@ def swap(seed: int) -> Scenario:
 CLUTTER_SHAPES_M = 0.02
 """Distance of the shapes of chasers from each other and from the target in clutter, m."""
 CLUTTER, DENSE_CLUTTER = (0.8, 1.4, 0.5), (0.7, 1.15, 0.42)
-"""Smallest and largest distance of places from the target, and least distance from each other, m, in `clutter`."""
+"""Smallest and largest distance of places from the target, and least distance from each other, m,
+in `clutter`.
+"""
 
 
 def clutter(
@@ -101,7 +120,9 @@ def clutter(
     places_m: tuple[float, float, float] = CLUTTER,
     duration_s: float = CLUTTER_S,
 ) -> Scenario:
-    """Return a scenario in which chasers at random places around the tumbling target fly to random places, all at once."""
+    """Return a scenario in which chasers at random places around the tumbling target fly to random
+    places, all at once.
+    """
     rng = np.random.default_rng([seed, 0xC107])
     base = load_shipped(
         "swap",
@@ -112,10 +133,14 @@ def clutter(
         *CLUTTER_TIMING,
     )
     nominal, entry, shape = base.chasers[0], base.timeline[0], box_table(base.chaser.boxes())
-    starts, attitudes = _places(rng, places_m, shape, [(nominal.position_m, nominal.q_wxyz)] * chasers)
+    starts, attitudes = _places(
+        rng, places_m, shape, [(nominal.position_m, nominal.q_wxyz)] * chasers
+    )
     goals, _ = _places(rng, places_m, shape, list(zip(starts, attitudes, strict=True)))
     made = [
-        nominal.model_copy(update={"position_m": tuple(place.tolist()), "q_wxyz": tuple(q.tolist())})
+        nominal.model_copy(
+            update={"position_m": tuple(place.tolist()), "q_wxyz": tuple(q.tolist())}
+        )
         for place, q in zip(starts, attitudes, strict=True)
     ]
     timeline = [
@@ -131,8 +156,9 @@ def _places(
     shape: Array,
     nominal: Sequence[tuple[ArrayLike, ArrayLike]],
 ) -> tuple[Array, Array]:
-    """Return random places (N, 3) and the attitudes (N, 4) in which chasers with ``nominal`` poses face the target there;
-    ``places_m`` as in `clutter`. The chasers' shapes (S, 15) do not come near each other."""
+    """Return random places (N, 3) and the attitudes (N, 4) in which chasers with ``nominal`` poses
+    face the target there; ``places_m`` as in `clutter`. The chasers' shapes (S, 15) do not come
+    near each other."""
     nearest_m, farthest_m, apart_m = places_m
     places, attitudes = np.zeros((0, 3)), np.zeros((0, 4))
     while len(places) < len(nominal):
@@ -142,17 +168,20 @@ def _places(
             continue
         q = facing_attitudes(*nominal[len(places)], place)[0]
         others = zip(places, attitudes, strict=True)
-        if all(distance_between(shape, (place, q), other) > 2.0 * CLUTTER_SHAPES_M for other in others):
+        if all(
+            distance_between(shape, (place, q), other) > 2.0 * CLUTTER_SHAPES_M for other in others
+        ):
             places, attitudes = np.vstack([places, place]), np.vstack([attitudes, q])
     return places, attitudes
 
 
 @dataclass
 class TransferOutcome:
-    """Figures of one flight: least true distances between centres; ``shapes_m``: least gap between the shapes of two bodies (probes
-    included), if the scenario limits it; ``reached_s``: when the last of the chasers with a goal
-    was there for good, from its command on (NaN if never); ``end_m``: the largest final distance from a goal; ``missed``:
-    chasers that are not at their goal at the end."""
+    """Figures of one flight: least true distances between centres; ``shapes_m``: least gap between
+    the shapes of two bodies (probes included), if the scenario limits it; ``reached_s``: when the
+    last of the chasers with a goal was there for good, from its command on (NaN if never);
+    ``end_m``: the largest final distance from a goal; ``missed``: chasers that are not at their
+    goal at the end."""
 
     seed: int
     to_target_m: float = math.inf
@@ -178,8 +207,9 @@ class TransferOutcome:
 def fly_transfer(
     seed: int, scenario: Scenario, perception: PerceptionModel | None, stay_s: float = math.inf
 ) -> TransferOutcome:
-    """Fly to the end, or until all chasers with a goal are there for ``stay_s``; distances and goals are checked on ground truth at
-    every tick. Without ``perception`` the target is known exactly."""
+    """Fly to the end, or until all chasers with a goal are there for ``stay_s``; distances and
+    goals are checked on ground truth at every tick. Without ``perception`` the target is known
+    exactly."""
     out = TransferOutcome(seed)
     goals = {i: g for i in range(len(scenario.chasers)) if (g := scenario.goal_of(i)) is not None}
     last_away_s: dict[int, float] = {}
@@ -212,7 +242,9 @@ def fly_transfer(
     step_s = 1.0 / scenario.time.rate_hz
     out.end_m = max(distances.values())
     out.missed = sum(d > scenario.success.reached_position_m for d in distances.values())
-    if all(last_away_s[i] < scenario.duration_s - sent_s - step_s for i, (sent_s, _) in goals.items()):
+    if all(
+        last_away_s[i] < scenario.duration_s - sent_s - step_s for i, (sent_s, _) in goals.items()
+    ):
         out.reached_s = max(last_away_s.values()) + step_s
     return out
 
@@ -227,11 +259,19 @@ def _note_distances(out: TransferOutcome, scenario: Scenario, states: States) ->
 
 
 def shape_gap_m(scenario: Scenario, states: States) -> float:
-    """Return the least gap between the shapes of two bodies, negative exactly if two overlap, at most their distance, m."""
-    shape, names = box_table(scenario.chaser.boxes()), [f"chaser/{i}" for i in range(len(scenario.chasers))]
+    """Return the least gap between the shapes of two bodies, negative exactly if two overlap, at
+    most their distance, m.
+    """
+    shape, names = (
+        box_table(scenario.chaser.boxes()),
+        [f"chaser/{i}" for i in range(len(scenario.chasers))],
+    )
     tables = [_placed(box_table(scenario.target_model().boxes), states[TARGET])]
     tables += [_placed(shape, states[name]) for name in names]
-    cuboids, owner = np.concatenate(tables), np.repeat(np.arange(len(tables)), [len(t) for t in tables])
+    cuboids, owner = (
+        np.concatenate(tables),
+        np.repeat(np.arange(len(tables)), [len(t) for t in tables]),
+    )
     one, other = np.nonzero(owner[:, None] < owner)
     return float(separations(cuboids[one], cuboids[other]).min())
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docker Compose file of a mission: a service per process, and a volume of keys that only this process mounts."""
+"""Docker Compose file of a mission: a service per process, and a volume of keys that only this
+process mounts.
+"""
 
 from __future__ import annotations
 
@@ -167,7 +169,8 @@ def default_scenario(chasers: int) -> str:
 
 
 def compose_file(chasers: int, *, standby: bool = False, view: bool = False) -> str:
-    """Return compose.yaml for up to ``chasers`` chasers, with a standby controller and the viewer (profile ``view``) on request.
+    """Return compose.yaml for up to ``chasers`` chasers, with a standby controller and the viewer
+    (profile ``view``) on request.
 
     Raises ValueError for a number of chasers outside 1 to ``MAX_CHASERS``.
     """

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Main process of a container: run ``chaserdock ARGUMENTS`` as one process of a mission in Docker Compose.
+"""Main process of a container: run ``chaserdock ARGUMENTS`` as one process of a mission in Docker
+Compose.
 
-``python -m chaserdock.launch.container ARGUMENTS``. With ``--exit-code-from`` Compose stops all containers as soon as one
-exits, so a finished process waits until the router has exited; the router exits after the judge. Environment: SCENARIO,
-SET (overrides separated by blanks), ROUTER (``host:port``), CHASERS (number of chaser services).
+``python -m chaserdock.launch.container ARGUMENTS``. With ``--exit-code-from`` Compose stops all
+containers as soon as one exits, so a finished process waits until the router has exited; the router
+exits after the judge. Environment: SCENARIO, SET (overrides separated by blanks), ROUTER
+(``host:port``), CHASERS (number of chaser services).
 """
 
 from __future__ import annotations
@@ -48,7 +50,10 @@ def with_overrides(arguments: list[str], overrides: str) -> list[str]:
     """Return the arguments of ``chaserdock``, for a world with the scenario overrides."""
     if arguments[:1] != ["world"]:
         return arguments
-    return [*arguments, *(part for override in shlex.split(overrides) for part in ("--set", override))]
+    return [
+        *arguments,
+        *(part for override in shlex.split(overrides) for part in ("--set", override)),
+    ]
 
 
 def count_chasers(scenario: str, overrides: str) -> int:
@@ -71,7 +76,9 @@ def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None
 
 
 def run(arguments: list[str], host: str, port: int) -> int:
-    """Run the program to its end, forward signals; return its status, or 0 when the router has gone for good."""
+    """Run the program to its end, forward signals; return its status, or 0 when the router has gone
+    for good.
+    """
     process: subprocess.Popen[bytes] | None = None
     stopping: int | None = None
 
@@ -96,7 +103,9 @@ def run(arguments: list[str], host: str, port: int) -> int:
             now_s = time.monotonic()
             linked_s = now_s if is_linked(port) else linked_s
             if now_s - linked_s > ROUTER_TIMEOUT_S:
-                log(f"{' '.join(arguments[:2])}: no router for {ROUTER_TIMEOUT_S:g} s, the mission is over")
+                log(
+                    f"{' '.join(arguments[:2])}: no router for {ROUTER_TIMEOUT_S:g} s, the mission is over"
+                )
                 process.terminate()
                 process.wait()
                 return 0
@@ -106,7 +115,9 @@ def run(arguments: list[str], host: str, port: int) -> int:
 
 
 def wait_for_router_exit(host: str, port: int, stopped: Callable[[], bool]) -> None:
-    """Return when three attempts in a row, a second apart, do not reach the router, or when ``stopped()``."""
+    """Return when three attempts in a row, a second apart, do not reach the router, or when
+    ``stopped()``.
+    """
     failures = 0
     while failures < 3 and not stopped():
         failures = 0 if is_listening(host, port) else failures + 1
@@ -124,8 +135,11 @@ def main() -> int:
     host, _, port = environment.get("ROUTER", "router:7447").rpartition(":")
     scenario, overrides = environment.get("SCENARIO", ""), environment.get("SET", "")
     if arguments[:1] in (["chaser"], ["judge"]):
-        # In a process of its own, because loading the scenario keeps tens of megabytes for the whole flight.
-        check = subprocess.run([sys.executable, "-m", "chaserdock.launch.container", "--check", *arguments])
+        # In a process of its own, because loading the scenario keeps tens of megabytes for the
+        # whole flight.
+        check = subprocess.run(
+            [sys.executable, "-m", "chaserdock.launch.container", "--check", *arguments]
+        )
         if check.returncode == _NOT_IN_SCENARIO:
             log(f"chaser/{arguments[1]}: not in {scenario}")
             stopped: list[int] = []
@@ -144,7 +158,9 @@ def _check(arguments: list[str], scenario: str, overrides: str, services: int) -
 
     try:
         if arguments[0] == "chaser":
-            return _NOT_IN_SCENARIO if int(arguments[1]) >= count_chasers(scenario, overrides) else 0
+            return (
+                _NOT_IN_SCENARIO if int(arguments[1]) >= count_chasers(scenario, overrides) else 0
+            )
         reason = too_many_chasers(scenario, overrides, services)
     except ChaserdockError as error:
         reason = str(error)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State of a running mission, from its messages: notices for the operator, and progress. No I/O; wall time is passed in."""
+"""State of a running mission, from its messages: notices for the operator, and progress. No I/O;
+wall time is passed in.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ class FlightState:
     target: TargetEstimate | None = None
     references: dict[int, Reference] = field(default_factory=dict[int, Reference])
     present: set[str] = field(default_factory=set[str])
-    _odometry: dict[tuple[int, int], Odometry] = field(default_factory=dict[tuple[int, int], Odometry])
+    _odometry: dict[tuple[int, int], Odometry] = field(
+        default_factory=dict[tuple[int, int], Odometry]
+    )
     _first_tick_s: float = 0.0
     _tick_times: deque[tuple[float, int]] = field(default_factory=deque[tuple[float, int]])
     _rejected: dict[str, int] = field(default_factory=dict[str, int])
@@ -57,7 +61,9 @@ class FlightState:
                     self.flying, self._first_tick_s = True, now_s
                 self.tick, self.time_ns = message.tick, message.sim_time_ns
                 self._tick_times.append((now_s, message.sim_time_ns))
-                while now_s - self._tick_times[0][0] > _SPEED_WINDOW_S and len(self._tick_times) > 2:
+                while (
+                    now_s - self._tick_times[0][0] > _SPEED_WINDOW_S and len(self._tick_times) > 2
+                ):
                     self._tick_times.popleft()
             case MissionEnd():
                 # The last tick begins one period before the end.
@@ -93,7 +99,9 @@ class FlightState:
         return [name for name in names if name not in self.present]
 
     def errors(self, chaser: int) -> tuple[float, float] | None:
-        """Return position (m) and orientation (rad) error of a chaser relative to its reference, from its odometry."""
+        """Return position (m) and orientation (rad) error of a chaser relative to its reference,
+        from its odometry.
+        """
         reference = self.references.get(chaser)
         odometry = self._odometry.get((chaser, reference.tick)) if reference is not None else None
         if odometry is None or reference is None:
@@ -112,13 +120,17 @@ class FlightState:
             speed=speed,
             speed_now=self._speed_now(now_s, speed),
             target=self.target.status if self.target is not None else "none",
-            chasers=tuple(self._chaser(i) for i in sorted(self.references) if self.errors(i) is not None),
+            chasers=tuple(
+                self._chaser(i) for i in sorted(self.references) if self.errors(i) is not None
+            ),
         )
 
     def remaining_s(self, progress: Progress) -> float | None:
         """Return the wall time to the end at the present speed, or None when it is unknown."""
         simulated_s = self.scenario.duration_s - progress.sim_time_s
-        return simulated_s / progress.speed_now if self.flying and progress.speed_now > 1e-6 else None
+        return (
+            simulated_s / progress.speed_now if self.flying and progress.speed_now > 1e-6 else None
+        )
 
     def _speed_now(self, now_s: float, speed: float) -> float:
         if not self._tick_times or now_s - self._tick_times[0][0] < 1.0:
@@ -140,7 +152,11 @@ class FlightState:
 
     def _warning(self, process: str, what: str, detail: str) -> EventNotice:
         return EventNotice(
-            sim_time_s=self.time_ns / 1e9, process=process, level="warning", what=what, detail=detail
+            sim_time_s=self.time_ns / 1e9,
+            process=process,
+            level="warning",
+            what=what,
+            detail=detail,
         )
 
     def _health(self, health: Health) -> list[EventNotice | CommandNotice]:
@@ -148,17 +164,23 @@ class FlightState:
         notices: list[EventNotice | CommandNotice] = []
         rejected = sum(health.rejected.values())
         if rejected > self._rejected.get(health.process, 0):
-            reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(health.rejected.items()))
+            reasons = ", ".join(
+                f"{reason}: {count}" for reason, count in sorted(health.rejected.items())
+            )
             notices.append(self._warning(health.process, f"{rejected} messages rejected", reasons))
         if health.lost > self._missing.get(health.process, 0):
-            notices.append(self._warning(health.process, f"{health.lost} messages missing", "gaps in seq"))
+            notices.append(
+                self._warning(health.process, f"{health.lost} messages missing", "gaps in seq")
+            )
         # A restarted process counts from zero.
         self._rejected[health.process], self._missing[health.process] = rejected, health.lost
         return notices
 
     def _solver(self, status: SolverStatus) -> list[EventNotice | CommandNotice]:
         """Report chasers without a plan, or whose plan enters a keep-out zone, when that begins."""
-        failed = {c: s for c, s in zip(status.chasers, status.status, strict=False) if s not in _SOLVED}
+        failed = {
+            c: s for c, s in zip(status.chasers, status.status, strict=False) if s not in _SOLVED
+        }
         notices: list[EventNotice | CommandNotice] = [
             self._warning("controller", f"chaser {c}: plan {s}", status.solver)
             for c, s in sorted(failed.items())

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON lines that ``--json`` prints while a mission flies: one object per line, distinguished by ``type``.
+"""JSON lines that ``--json`` prints while a mission flies: one object per line, distinguished by
+``type``.
 
 SI units and radians. docs/cli.md is generated from these types (``docs/make_cli.py``).
 """
@@ -15,7 +16,9 @@ from .mission_address import MissionAddress
 
 
 class ChaserProgress(Struct, frozen=True, kw_only=True):
-    """State of a chaser as the controller estimates it: errors are relative to its reference on the *estimated* target."""
+    """State of a chaser as the controller estimates it: errors are relative to its reference on the
+    *estimated* target.
+    """
 
     chaser: int
     phase: str
@@ -26,8 +29,9 @@ class ChaserProgress(Struct, frozen=True, kw_only=True):
 
 
 class Start(Struct, frozen=True, kw_only=True, tag_field="type", tag="start"):
-    """First line: the mission, the folder of its files, and where `chaserdock command` reaches it. ``duration_s`` is
-    simulated time. ``address`` has ``namespace``, ``endpoint`` and ``keys`` (folder, or null)."""
+    """First line: the mission, the folder of its files, and where `chaserdock command` reaches it.
+    ``duration_s`` is simulated time. ``address`` has ``namespace``, ``endpoint`` and ``keys``
+    (folder, or null)."""
 
     scenario: str
     seed: int
@@ -41,8 +45,9 @@ class Start(Struct, frozen=True, kw_only=True, tag_field="type", tag="start"):
 class Progress(Struct, frozen=True, kw_only=True, tag_field="type", tag="progress"):
     """Progress, every second of wall time from the first tick on, and at the end.
 
-    ``speed`` is simulated over wall time since the first tick, ``speed_now`` over the last seconds. ``target`` is the
-    status of the target estimate. ``chasers`` lists the chasers that have a reference.
+    ``speed`` is simulated over wall time since the first tick, ``speed_now`` over the last seconds.
+    ``target`` is the status of the target estimate. ``chasers`` lists the chasers that have a
+    reference.
     """
 
     sim_time_s: float
@@ -55,8 +60,8 @@ class Progress(Struct, frozen=True, kw_only=True, tag_field="type", tag="progres
 
 
 class EventNotice(Struct, frozen=True, kw_only=True, tag_field="type", tag="event"):
-    """An event that a process published, or that was detected: messages rejected or lost, no plan from the solver, a
-    process that exited."""
+    """An event that a process published, or that was detected: messages rejected or lost, no plan
+    from the solver, a process that exited."""
 
     sim_time_s: float
     process: str
@@ -77,7 +82,9 @@ class CommandNotice(Struct, frozen=True, kw_only=True, tag_field="type", tag="co
 
 
 class Result(Struct, frozen=True, kw_only=True, tag_field="type", tag="result"):
-    """Last line of a finished mission: the exit status, and ``summary`` as in summary.json (docs/summary.md)."""
+    """Last line of a finished mission: the exit status, and ``summary`` as in summary.json
+    (docs/summary.md).
+    """
 
     status: int
     folder: str
@@ -85,7 +92,9 @@ class Result(Struct, frozen=True, kw_only=True, tag_field="type", tag="result"):
 
 
 class Failed(Struct, frozen=True, kw_only=True, tag_field="type", tag="error"):
-    """Last line without a result: invalid input (``status`` 2), or a mission without a readable log."""
+    """Last line without a result: invalid input (``status`` 2), or a mission without a readable
+    log.
+    """
 
     status: int
     text: str

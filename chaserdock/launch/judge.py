@@ -32,11 +32,15 @@ class JudgeError(ChaserdockError):
     """The mission left no log."""
 
 
-def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_s: float, show: Show) -> int:
-    """Watch the mission on ``link`` to its end, judge the log in ``out/SCENARIO-RUN``, write report.html beside it.
+def judge_mission(
+    out: Path, link: Link, timeout_s: float | None, world_timeout_s: float, show: Show
+) -> int:
+    """Watch the mission on ``link`` to its end, judge the log in ``out/SCENARIO-RUN``, write
+    report.html beside it.
 
-    Returns the exit status. ``world_timeout_s``: wall time after which an absent world counts as lost. Raises JoinRefused
-    when there is no mission within ``timeout_s``, JudgeError when it left no log.
+    Returns the exit status. ``world_timeout_s``: wall time after which an absent world counts as
+    lost. Raises JoinRefused when there is no mission within ``timeout_s``, JudgeError when it left
+    no log.
     """
     node = Node("operator", "operator", link)
     try:
@@ -62,9 +66,14 @@ def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_
             return STOPPED
         log = folder / LOG_NAME
         if not log.exists():
-            raise JudgeError(f"{log}: no such log; {failure or 'does the recorder write to this folder?'}")
+            raise JudgeError(
+                f"{log}: no such log; {failure or 'does the recorder write to this folder?'}"
+            )
         if not _wait_for_end(log):
-            failure = failure or f"the recorder did not close its log within {LOG_CLOSED_S:g} s after the end"
+            failure = (
+                failure
+                or f"the recorder did not close its log within {LOG_CLOSED_S:g} s after the end"
+            )
         outcome = judge(Fleet(), folder, failure, reporter)
         print_outcome(outcome, show)
         _write_page(log)
@@ -73,7 +82,9 @@ def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_
         node.close()  # last, because the router may exit when this node leaves
 
 
-def _watch(node: Node, reporter: ProgressReporter, stop: StopSignal, world_timeout_s: float) -> str | None:
+def _watch(
+    node: Node, reporter: ProgressReporter, stop: StopSignal, world_timeout_s: float
+) -> str | None:
     """Show the flight until it ends; return why it failed, or None."""
     world_seen_s = time.monotonic()
 
@@ -109,7 +120,9 @@ def _write_page(log: Path) -> None:
 
 
 def _wait_for_end(log: Path) -> bool:
-    """Wait until a log has its footer, which the recorder writes last; return False when it does not appear."""
+    """Wait until a log has its footer, which the recorder writes last; return False when it does
+    not appear.
+    """
     deadline = time.monotonic() + LOG_CLOSED_S
     while time.monotonic() < deadline:
         with log.open("rb") as file:

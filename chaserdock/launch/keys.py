@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keys of a mission: its own certificate authority, and a key and a certificate per process.
 
-Elliptic curve P-256. The authority's private key is never written: no process can be added later, a new mission needs
-new keys. ``FOLDER/NAME/`` holds ``ca.pem``, ``cert.pem`` and ``key.pem``, all that the process NAME needs.
+Elliptic curve P-256. The authority's private key is never written: no process can be added later, a
+new mission needs new keys. ``FOLDER/NAME/`` holds ``ca.pem``, ``cert.pem`` and ``key.pem``, all
+that the process NAME needs.
 """
 
 from __future__ import annotations
@@ -33,15 +34,24 @@ def names(chasers: int) -> list[str]:
 
 
 def init_keys(
-    folder: Path, chasers: int, hosts: tuple[str, ...], days: int, now: datetime, *, shared: bool = False
+    folder: Path,
+    chasers: int,
+    hosts: tuple[str, ...],
+    days: int,
+    now: datetime,
+    *,
+    shared: bool = False,
 ) -> None:
-    """Make all keys of a mission in ``folder``; ``hosts`` are the names and addresses of its router.
+    """Make all keys of a mission in ``folder``; ``hosts`` are the names and addresses of its
+    router.
 
-    ``now``: UTC; certificates are valid from an hour before (clocks of hosts differ) for ``days``. Private keys are
-    readable by their owner only, or by every user when ``shared`` (a volume that only one process mounts).
-    Raises KeysError when the folder contains keys, or cannot be written.
+    ``now``: UTC; certificates are valid from an hour before (clocks of hosts differ) for ``days``.
+    Private keys are readable by their owner only, or by every user when ``shared`` (a volume that
+    only one process mounts). Raises KeysError when the folder contains keys, or cannot be written.
     """
-    existing = [name for name in names(chasers) if any((folder / name / f).exists() for f in _FILES)]
+    existing = [
+        name for name in names(chasers) if any((folder / name / f).exists() for f in _FILES)
+    ]
     if existing:
         raise KeysError(
             f"{folder} contains keys (of {', '.join(existing)}); they are never overwritten, "
@@ -49,7 +59,9 @@ def init_keys(
         )
     start, end = now - timedelta(hours=1), now + timedelta(days=days)
     authority_key = ec.generate_private_key(ec.SECP256R1())
-    authority = _certificate("chaserdock mission", authority_key, None, authority_key, start, end, ())
+    authority = _certificate(
+        "chaserdock mission", authority_key, None, authority_key, start, end, ()
+    )
     public = serialization.Encoding.PEM
     try:
         for name in names(chasers):
@@ -67,14 +79,20 @@ def init_keys(
 
 
 def why_not_usable(folder: Path, chasers: int, now: datetime) -> str | None:
-    """Return None when ``folder`` holds the keys of all processes, valid for an hour at least; else the reason."""
-    complete = [name for name in names(chasers) if all((folder / name / f).is_file() for f in _FILES)]
+    """Return None when ``folder`` holds the keys of all processes, valid for an hour at least; else
+    the reason.
+    """
+    complete = [
+        name for name in names(chasers) if all((folder / name / f).is_file() for f in _FILES)
+    ]
     if not complete:
         return "it contains no keys"
     if missing := sorted(set(names(chasers)) - set(complete)):
         return f"the keys of {', '.join(missing)} are missing"
     for name in complete:
-        end = x509.load_pem_x509_certificate((folder / name / "cert.pem").read_bytes()).not_valid_after_utc
+        end = x509.load_pem_x509_certificate(
+            (folder / name / "cert.pem").read_bytes()
+        ).not_valid_after_utc
         if end < now + timedelta(hours=1):
             return f"the keys of {name} expire at {end:%Y-%m-%d %H:%M} UTC"
     return None
@@ -115,7 +133,9 @@ def _certificate(
     end: datetime,
     hosts: tuple[str, ...],
 ) -> x509.Certificate:
-    """Make a certificate of ``name``, self-signed without an ``issuer`` (RFC 5280, sections 4.1 and 4.2)."""
+    """Make a certificate of ``name``, self-signed without an ``issuer`` (RFC 5280, sections 4.1 and
+    4.2).
+    """
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     is_authority = issuer is None
     usage = x509.KeyUsage(
@@ -141,13 +161,14 @@ def _certificate(
         .add_extension(usage, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()), critical=False
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()),
+            critical=False,
         )
     )
     if not is_authority:
         purpose = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
         alternatives = [_alternative(host) for host in hosts] or [x509.DNSName(name)]
-        builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False).add_extension(
-            x509.SubjectAlternativeName(alternatives), critical=False
-        )
+        builder = builder.add_extension(
+            x509.ExtendedKeyUsage([purpose]), critical=False
+        ).add_extension(x509.SubjectAlternativeName(alternatives), critical=False)
     return builder.sign(issuer_key, hashes.SHA256())

@@ -55,7 +55,9 @@ class RunError(ChaserdockError):
 
 @dataclass(frozen=True)
 class MissionOutcome:
-    """How a mission ended. ``summary`` is None when there is no readable log; ``failure`` then says why."""
+    """How a mission ended. ``summary`` is None when there is no readable log; ``failure`` then says
+    why.
+    """
 
     folder: Path
     status: int
@@ -76,11 +78,16 @@ class Child:
         if (status := self.process.poll()) is not None and status < 0:
             return f"{self.name}: killed (signal {-status})"
         lines = self.output.read_text(errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("chaserdock: ") if lines else f"{self.name}: exited without output"
+        return (
+            lines[-1].removeprefix("chaserdock: ")
+            if lines
+            else f"{self.name}: exited without output"
+        )
 
 
-# Of Zenoh's two receiving threads the second mostly wakes up without work: with one, seven processes on two cores need two
-# thirds of the time per tick (benchmarks/realtime.py). Not for a router, where one slow reader would block all others.
+# Of Zenoh's two receiving threads the second mostly wakes up without work: with one, seven
+# processes on two cores need two thirds of the time per tick (benchmarks/realtime.py). Not for a
+# router, where one slow reader would block all others.
 _ZENOH_THREADS = "(rx: (worker_threads: 1))"
 
 
@@ -93,7 +100,9 @@ class Fleet:
     cpu_s: dict[str, float] = field(default_factory=dict[str, float])
 
     def start(self, name: str, arguments: list[str], folder: Path) -> None:
-        """Start a process; it exits when this process ends for any reason (its standard input closes)."""
+        """Start a process; it exits when this process ends for any reason (its standard input
+        closes).
+        """
         output = folder / f"{name.replace('/', '-')}.txt"
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
         with output.open("wb") as out, deferred_signals():
@@ -103,11 +112,13 @@ class Fleet:
                 stdout=out,
                 stderr=subprocess.STDOUT,
                 env={**threads, **os.environ, **SINGLE_THREADED},
-                # The launcher forwards Ctrl-C. Not a new session: Linux would share the cores between sessions
-                # ("autogroup") whatever the processes' priorities, and the last one to wake up would wait longest.
+                # The launcher forwards Ctrl-C. Not a new session: Linux would share the cores
+                # between sessions ("autogroup") whatever the processes' priorities, and the last
+                # one to wake up would wait longest.
                 process_group=0,
             )
-            # Before a signal handler can raise an exception, after which ``end`` ends the processes of the list.
+            # Before a signal handler can raise an exception, after which ``end`` ends the processes
+            # of the list.
             self.children.append(Child(name, process, output))
 
     def running(self) -> list[Child]:
@@ -120,7 +131,9 @@ class Fleet:
         return child.name in topics.CONTROLLERS and any(c.process.poll() == 0 for c in others)
 
     def measure(self) -> None:
-        """Measure the CPU time of each process and their total memory (proportional set size where available)."""
+        """Measure the CPU time of each process and their total memory (proportional set size where
+        available).
+        """
         total = 0
         for child in self.running():
             try:
@@ -159,9 +172,14 @@ def free_port() -> int:
 
 
 def open_hub(
-    namespace: str, lease_ms: int, name: str = "operator", role: Role = "operator", port: int | None = None
+    namespace: str,
+    lease_ms: int,
+    name: str = "operator",
+    role: Role = "operator",
+    port: int | None = None,
 ) -> tuple[Node, str]:
-    """Open the launcher's node, which the processes connect to, on ``port`` or a free one; return it and its endpoint.
+    """Open the launcher's node, which the processes connect to, on ``port`` or a free one; return
+    it and its endpoint.
 
     Raises TransportError.
     """
@@ -191,10 +209,14 @@ def check_keys(keys: Path, chasers: int) -> None:
     from .keys import why_not_usable  # imports cryptography, which is slow
 
     if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
-        raise RunError(f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`")
+        raise RunError(
+            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`"
+        )
 
 
-def network_options(namespace: str, endpoint: str, lease_ms: int, keys: Path | None = None) -> list[str]:
+def network_options(
+    namespace: str, endpoint: str, lease_ms: int, keys: Path | None = None
+) -> list[str]:
     """Return the command-line options with which a process joins the mission."""
     secured = [] if keys is None else ["--keys", str(keys)]
     return ["-e", endpoint, "--namespace", namespace, "--lease", f"{lease_ms / 1000:g}", *secured]
@@ -205,7 +227,8 @@ def start_router(
 ) -> tuple[Node, str]:
     """Start a router on ``port`` that enforces the access rights of the mission's ``keys``.
 
-    Returns the launcher's node, a client of it, and the router's endpoint. Raises RunError when it does not start.
+    Returns the launcher's node, a client of it, and the router's endpoint. Raises RunError when it
+    does not start.
     """
     endpoint = f"tls/127.0.0.1:{port}"
     network = network_options(namespace, endpoint, lease_ms, keys)
@@ -248,14 +271,16 @@ def fly_mission(
     port: int | None = None,
     namespace: str | None = None,
 ) -> MissionOutcome:
-    """Fly a scenario; write log, summary and the processes' output to ``folder``, by default a new one in ``runs/``.
+    """Fly a scenario; write log, summary and the processes' output to ``folder``, by default a new
+    one in ``runs/``.
 
-    ``scenario_name``: a file, or the name of a shipped scenario. ``viewer_port``: serve the live viewer there until the end of
-    the flight. ``keys``: connect through a router, over TLS, with access rights. ``stall_s``: longest time (s) without
-    progress. ``port`` and ``namespace``: where other processes reach the mission, by default a free port and a unique name;
-    ``network.json`` in the folder contains them while the mission flies. ``stop_requested`` is polled. Installs no signal
-    handler; an exception ends all processes. Raises RunError, ScenarioError, MissingPackageError or TransportError
-    when the mission cannot start.
+    ``scenario_name``: a file, or the name of a shipped scenario. ``viewer_port``: serve the live
+    viewer there until the end of the flight. ``keys``: connect through a router, over TLS, with
+    access rights. ``stall_s``: longest time (s) without progress. ``port`` and ``namespace``: where
+    other processes reach the mission, by default a free port and a unique name; ``network.json`` in
+    the folder contains them while the mission flies. ``stop_requested`` is polled. Installs no
+    signal handler; an exception ends all processes. Raises RunError, ScenarioError,
+    MissingPackageError or TransportError when the mission cannot start.
     """
     path = find_scenario(str(scenario_name))
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
@@ -268,20 +293,25 @@ def fly_mission(
     if port is not None:
         check_port(port)
     if (folder / LOG_NAME).exists():
-        raise RunError(f"{folder} contains a mission.mcap; a log is never overwritten, choose another --out")
+        raise RunError(
+            f"{folder} contains a mission.mcap; a log is never overwritten, choose another --out"
+        )
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{folder}: cannot be created: {error.strerror or error}") from None
     namespace = namespace or f"run-{uuid.uuid4().hex[:12]}"
-    # After the lease a silent peer counts as lost; in lock-step the mission waits for a stopped process instead.
+    # After the lease a silent peer counts as lost; in lock-step the mission waits for a stopped
+    # process instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
     fleet, observers, hub = Fleet(), Fleet(), None
     reporter = ProgressReporter(scenario, show, emit)
     try:
         if keys is not None:
             keys = keys.resolve()
-            hub, endpoint = start_router(observers, output, namespace, lease_ms, keys, port or free_port())
+            hub, endpoint = start_router(
+                observers, output, namespace, lease_ms, keys, port or free_port()
+            )
         else:
             hub, endpoint = open_hub(namespace, lease_ms, port=port)
         address = MissionAddress(
@@ -349,7 +379,9 @@ def start_all(
     timeout = ["--timeout", str(_START_TIMEOUT_S)]
     sets = [item for override in overrides for item in ("--set", override)]
     listen = [] if "--keys" in network else ["-l", "tcp/127.0.0.1:0"]
-    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, *listen, *timeout], output)
+    fleet.start(
+        "world", ["world", str(path), "--mode", mode, *sets, *network, *listen, *timeout], output
+    )
     fleet.start("controller", ["controller", *network, *timeout], output)
     if scenario.controller.standby:
         fleet.start("standby", ["controller", "--standby", *network, *timeout], output)
@@ -406,7 +438,9 @@ def watch(
 
 
 def _premature_end(fleet: Fleet, reporter: ProgressReporter, stopping: bool) -> str | None:
-    """Return why the flight cannot continue, or None; report processes that it can continue without."""
+    """Return why the flight cannot continue, or None; report processes that it can continue
+    without.
+    """
     dead = [c for c in fleet.children if c.process.poll() not in (None, 0)]
     if dead and (dead[0].name == "world" or stopping or not reporter.flying):
         return STOPPED_BY_OPERATOR if stopping else dead[0].last_line()
@@ -419,11 +453,15 @@ def _failure_at_end(fleet: Fleet, end: MissionEnd) -> str | None:
     bad = [c for c in fleet.children if c.process.poll() != 0 and not fleet.is_replaced(c)]
     if not end.complete:
         # The world exits with status 1 because processes left it; their output says why.
-        return "; ".join([end.reason, *(f"{c.name}: {c.last_line()}" for c in bad if c.name != "world")])
+        return "; ".join(
+            [end.reason, *(f"{c.name}: {c.last_line()}" for c in bad if c.name != "world")]
+        )
     return bad[0].last_line() if bad else None
 
 
-def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter) -> MissionOutcome:
+def judge(
+    fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter
+) -> MissionOutcome:
     """Write summary.json from the log in ``folder``; return and report the outcome."""
     from chaserdock.analysis.summary import summarize
 
@@ -431,7 +469,9 @@ def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressRep
     try:
         summary = summarize(folder / LOG_NAME)
     except LogError as error:
-        outcome = MissionOutcome(folder, STOPPED if stopped else FAILED, None, failure or str(error))
+        outcome = MissionOutcome(
+            folder, STOPPED if stopped else FAILED, None, failure or str(error)
+        )
         reporter.report(Failed(status=outcome.status, text=outcome.failure or ""))
         return outcome
     if failure is not None:
@@ -442,11 +482,15 @@ def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressRep
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
     reporter.report(Result(status=status, folder=str(folder), summary=summary))
-    return MissionOutcome(folder, status, summary, summary["failures"][0] if summary["failures"] else None)
+    return MissionOutcome(
+        folder, status, summary, summary["failures"][0] if summary["failures"] else None
+    )
 
 
 def print_outcome(outcome: MissionOutcome, show: Show) -> None:
-    """Print the verdict: text on standard output unless that carries JSON lines, a failure on standard error."""
+    """Print the verdict: text on standard output unless that carries JSON lines, a failure on
+    standard error.
+    """
     from chaserdock.analysis.summary import text_of
 
     if outcome.summary is not None and show is not Show.json:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Network address of a mission that ``chaserdock run`` flies, in a file of its folder while the mission flies."""
+"""Network address of a mission that ``chaserdock run`` flies, in a file of its folder while the
+mission flies.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,18 @@ class AddressError(ChaserdockError):
 
 
 class MissionAddress(Struct, frozen=True, kw_only=True):
-    """Where other processes reach a mission: Zenoh endpoint and namespace, and the folder of its keys, if it has keys."""
+    """Where other processes reach a mission: Zenoh endpoint and namespace, and the folder of its
+    keys, if it has keys.
+    """
 
     namespace: str
     endpoint: str
     keys: str | None = None
 
     def options(self) -> str:
-        """Return the command-line options with which an operator's command or the viewer joins the mission."""
+        """Return the command-line options with which an operator's command or the viewer joins the
+        mission.
+        """
         keys = [] if self.keys is None else ["--keys", self.keys]
         return " ".join(["-e", self.endpoint, "--namespace", self.namespace, *keys])
 
@@ -46,7 +52,9 @@ def read_address(folder: Path) -> MissionAddress:
     except OSError as error:
         raise AddressError(f"--run {folder}: {ADDRESS_FILE}: {error.strerror or error}") from None
     except msgspec.DecodeError as error:
-        raise AddressError(f"{file}: {error}; it must be the file that `chaserdock run` wrote") from None
+        raise AddressError(
+            f"{file}: {error}; it must be the file that `chaserdock run` wrote"
+        ) from None
 
 
 def remove_address(folder: Path) -> None:

@@ -7,7 +7,12 @@ import time
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import CommandReply, OperatorCommand, ThrusterFaultCommand, ThrusterState
+from chaserdock_protocol.messages import (
+    CommandReply,
+    OperatorCommand,
+    ThrusterFaultCommand,
+    ThrusterState,
+)
 from chaserdock_protocol.transport import Link, Node
 from msgspec import Struct
 
@@ -26,14 +31,17 @@ def send_command(
     operator: str = "",
     before_s: float | None = None,
 ) -> CommandReply:
-    """Send a command to the controller and return its reply; the controller refuses it after simulated time ``before_s``.
+    """Send a command to the controller and return its reply; the controller refuses it after
+    simulated time ``before_s``.
 
     Raises OperatorError when there is no reply in time, TransportError.
     """
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z: required by goto, and by no other command")
     if (command in ("isolate", "restore")) != (thruster is not None):
-        raise OperatorError("--thruster N: required by isolate and restore, and by no other command")
+        raise OperatorError(
+            "--thruster N: required by isolate and restore, and by no other command"
+        )
     request = OperatorCommand(
         command=command,  # type: ignore[arg-type]
         chaser=chaser,
@@ -54,7 +62,9 @@ def send_thruster_fault(
     timeout_s: float,
     operator: str = "",
 ) -> CommandReply:
-    """Inject a thruster failure in the world and return its reply. Raises OperatorError, TransportError."""
+    """Inject a thruster failure in the world and return its reply. Raises OperatorError,
+    TransportError.
+    """
     if (kind == "weak") != (factor is not None):
         raise OperatorError("--factor: required by weak, and by no other kind")
     request = ThrusterFaultCommand(
@@ -63,7 +73,9 @@ def send_thruster_fault(
     return _request(link, topics.THRUSTER_FAULT_KEY, request, timeout_s, "world")
 
 
-def _request(link: Link, key: str, request: Struct, timeout_s: float, receiver: str) -> CommandReply:
+def _request(
+    link: Link, key: str, request: Struct, timeout_s: float, receiver: str
+) -> CommandReply:
     node = Node("operator", "operator", link)
     try:
         start_s = time.monotonic()

@@ -42,8 +42,8 @@ _SUBSCRIBED = (
 class Show(StrEnum):
     """How progress is shown.
 
-    ``text``: a live table on a terminal, otherwise a line every few seconds, on standard error. ``none``: not at all.
-    ``json``: JSON lines, on standard output by default.
+    ``text``: a live table on a terminal, otherwise a line every few seconds, on standard error.
+    ``none``: not at all. ``json``: JSON lines, on standard output by default.
     """
 
     text = "text"
@@ -131,7 +131,11 @@ class ProgressReporter:
             time_s = self.state.time_ns / 1e9
             self.report(
                 EventNotice(
-                    sim_time_s=time_s, process=process, level="warning", what="has exited", detail=text
+                    sim_time_s=time_s,
+                    process=process,
+                    level="warning",
+                    what="has exited",
+                    detail=text,
                 )
             )
 
@@ -205,7 +209,9 @@ class ProgressReporter:
 
 
 def headline(state: FlightState, progress: Progress) -> str:
-    """Return simulated time, speed, remaining wall time and the status of the target estimate as text."""
+    """Return simulated time, speed, remaining wall time and the status of the target estimate as
+    text.
+    """
     text = f"{progress.sim_time_s:6.1f} of {state.scenario.duration_s:g} s  {progress.speed_now:.2f} x real time  "
     remaining_s = state.remaining_s(progress)
     if remaining_s is not None and remaining_s < 360_000:

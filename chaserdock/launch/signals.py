@@ -21,7 +21,9 @@ def stop_on_signals(notice: str = "") -> Generator[threading.Event]:
             print(f"\nchaserdock: {notice}", file=sys.stderr)
         stop.set()
 
-    before = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield stop
     finally:
@@ -31,7 +33,8 @@ def stop_on_signals(notice: str = "") -> Generator[threading.Event]:
 
 @contextmanager
 def deferred_signals() -> Generator[None]:
-    """Call Python's handlers of SIGINT and SIGTERM, which may raise exceptions, only after the block.
+    """Call Python's handlers of SIGINT and SIGTERM, which may raise exceptions, only after the
+    block.
 
     Other threads than the main one receive no signals.
     """

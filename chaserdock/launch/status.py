@@ -8,7 +8,14 @@ from dataclasses import dataclass, field
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import Event, MissionEnd, Presence, Reference, TargetEstimate, Tick
+from chaserdock_protocol.messages import (
+    Event,
+    MissionEnd,
+    Presence,
+    Reference,
+    TargetEstimate,
+    Tick,
+)
 from chaserdock_protocol.process import print_status
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.session import find_world, ignore_foreign_publishers
@@ -53,7 +60,9 @@ class MissionStatus:
 
     @property
     def speed(self) -> float | None:
-        """Return simulated over wall time between the first and the last tick; None with fewer than two."""
+        """Return simulated over wall time between the first and the last tick; None with fewer than
+        two.
+        """
         if len(self.ticks) < 2 or self.received_s[-1] <= self.received_s[0]:
             return None
         simulated_s = (self.ticks[-1].sim_time_ns - self.ticks[0].sim_time_ns) / 1e9
@@ -81,7 +90,9 @@ class MissionStatus:
 
 
 def expected(name: str, tick: Tick | None) -> bool | None:
-    """Return whether a tick waits for this process; None where no tick ever does, or without a tick."""
+    """Return whether a tick waits for this process; None where no tick ever does, or without a
+    tick.
+    """
     if tick is None:
         return None
     if name in topics.CONTROLLERS:
@@ -91,7 +102,9 @@ def expected(name: str, tick: Tick | None) -> bool | None:
 
 
 def observe(link: Link, seconds: float) -> MissionStatus:
-    """Listen for ``seconds`` of wall time without joining the mission. Raises StatusError when there is no process."""
+    """Listen for ``seconds`` of wall time without joining the mission. Raises StatusError when
+    there is no process.
+    """
     status = MissionStatus()
     node = Node("operator", "operator", link)
     try:
@@ -111,7 +124,9 @@ def observe(link: Link, seconds: float) -> MissionStatus:
         node.watch_liveliness(changed)
         if world := find_world(node):
             ignore_foreign_publishers(
-                node, world, lambda detail, _: print_status("status", f"foreign publisher: {detail}")
+                node,
+                world,
+                lambda detail, _: print_status("status", f"foreign publisher: {detail}"),
             )
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
@@ -142,7 +157,9 @@ def table_of(status: MissionStatus) -> Table:
         table.add_column(column)
     for name in sorted(status.alive):
         presence, in_tick = status.presence.get(name), expected(name, tick)
-        phase = status.phases.get(int(name.partition("/")[2])) if name.startswith("chaser/") else None
+        phase = (
+            status.phases.get(int(name.partition("/")[2])) if name.startswith("chaser/") else None
+        )
         table.add_row(
             name,
             presence.instance if presence else "-",

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write tables of a log as Parquet or CSV files while reading it: memory does not grow with its length."""
+"""Write tables of a log as Parquet or CSV files while reading it: memory does not grow with its
+length.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ _ROWS, _IMAGE_ROWS = 4096, 64
 
 
 class _CsvFile:
-    """A CSV file with the interface of ``ParquetWriter``. Lists become JSON text, missing values empty cells."""
+    """A CSV file with the interface of ``ParquetWriter``. Lists become JSON text, missing values
+    empty cells.
+    """
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self._file = path.open("w", newline="", encoding="utf-8")
@@ -39,7 +43,9 @@ class _CsvFile:
 
 def _create_file(path: Path, schema: pa.Schema, format: TableFormat) -> Any:
     return (
-        pq.ParquetWriter(path, schema, compression="zstd") if format == "parquet" else _CsvFile(path, schema)
+        pq.ParquetWriter(path, schema, compression="zstd")
+        if format == "parquet"
+        else _CsvFile(path, schema)
     )
 
 
@@ -49,10 +55,14 @@ def _cell(value: Any) -> Any:
     return value.hex() if isinstance(value, bytes) else value
 
 
-def export(log: LogSource, folder: Path, format: TableFormat, images: bool = False) -> dict[str, int]:
-    """Write every topic of a log into ``folder``, which is created; return the number of rows by file name.
+def export(
+    log: LogSource, folder: Path, format: TableFormat, images: bool = False
+) -> dict[str, int]:
+    """Write every topic of a log into ``folder``, which is created; return the number of rows by
+    file name.
 
-    ``images``: include the bytes of the images. Raises LogError when the log or the files cannot be used.
+    ``images``: include the bytes of the images. Raises LogError when the log or the files cannot be
+    used.
     """
     tables: dict[str, TopicTable] = {}
     files: dict[str, Any] = {}
@@ -64,7 +74,9 @@ def export(log: LogSource, folder: Path, format: TableFormat, images: bool = Fal
             if name not in files:
                 if path.exists():
                     raise LogError(f"{path}: already exists; export into an empty folder")
-                files[name] = open_files.enter_context(closing(_create_file(path, chunk.schema, format)))
+                files[name] = open_files.enter_context(
+                    closing(_create_file(path, chunk.schema, format))
+                )
             files[name].write_table(chunk)
             rows[path.name] += chunk.num_rows
 

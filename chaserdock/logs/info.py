@@ -26,7 +26,9 @@ class FileInfo(msgspec.Struct):
 
 
 class KeyInfo(msgspec.Struct):
-    """One key: messages, their bytes, first and last simulated time, and gaps in their sequence numbers."""
+    """One key: messages, their bytes, first and last simulated time, and gaps in their sequence
+    numbers.
+    """
 
     key: str
     messages: int = 0
@@ -37,7 +39,9 @@ class KeyInfo(msgspec.Struct):
 
 
 class LogInfo(msgspec.Struct):
-    """A log. ``rejected``: invalid messages by key and reason. ``viewer``: messages of the viewer layer."""
+    """A log. ``rejected``: invalid messages by key and reason. ``viewer``: messages of the viewer
+    layer.
+    """
 
     scenario: str
     seed: int
@@ -53,7 +57,9 @@ class LogInfo(msgspec.Struct):
     def whole(self) -> bool:
         """Whether every file was closed, no message is missing and every message is valid."""
         lost = any(k.lost for k in self.keys)
-        return all(f.closed and not f.recovered for f in self.files) and not lost and not self.rejected
+        return (
+            all(f.closed and not f.recovered for f in self.files) and not lost and not self.rejected
+        )
 
 
 def info_of(log: LogSource) -> LogInfo:
@@ -81,7 +87,9 @@ def info_of(log: LogSource) -> LogInfo:
                 min(sent[0] or stored.publish_time, stored.publish_time),
                 max(sent[1], stored.publish_time),
             ]
-            seq = _seq_of(channel.topic, stored.data, channel.metadata.get("zenoh_encoding", ""), rejected)
+            seq = _seq_of(
+                channel.topic, stored.data, channel.metadata.get("zenoh_encoding", ""), rejected
+            )
             if seq is not None:
                 gaps.update(channel.topic, seq)
                 key.lost = gaps.lost[channel.topic]
@@ -114,14 +122,18 @@ def _seq_of(key: str, payload: bytes, encoding: str, rejected: Counter[str]) -> 
 
 def info_lines(info: LogInfo) -> list[str]:
     """Return the information as lines of text."""
-    run = ", ".join(f"{k} {v}" for k, v in info.run.items() if not k.startswith("version.") and k != "crc32")
+    run = ", ".join(
+        f"{k} {v}" for k, v in info.run.items() if not k.startswith("version.") and k != "crc32"
+    )
     lines = [
         f"{info.scenario}, seed {info.seed}; {run}; chaserdock {info.run.get('version.chaserdock', '?')}",
         f"{info.sim_time_s:.2f} s of simulated, {info.wall_time_s:.1f} s of wall time",
     ]
     for f in info.files:
         end = (
-            "closed, all checksums valid" if f.closed else f"cut off ({f.cut_bytes} bytes of a broken record)"
+            "closed, all checksums valid"
+            if f.closed
+            else f"cut off ({f.cut_bytes} bytes of a broken record)"
         )
         if not f.closed:
             end += "; `chaserdock log recover` makes a complete file of it"
@@ -129,7 +141,9 @@ def info_lines(info: LogInfo) -> list[str]:
             end += "; recovered"
         lines.append(f"{f.path}: {f.bytes / 1e6:.1f} MB, {end}")
     width = max((len(k.key) for k in info.keys), default=3)
-    lines.append(f"{'key':{width}} {'messages':>9} {'kB':>10} {'from s':>9} {'to s':>9} {'lost':>6}")
+    lines.append(
+        f"{'key':{width}} {'messages':>9} {'kB':>10} {'from s':>9} {'to s':>9} {'lost':>6}"
+    )
     for k in info.keys:
         lines.append(
             f"{k.key:{width}} {k.messages:9d} {k.bytes / 1e3:10.1f} {k.first_s:9.2f} {k.last_s:9.2f} {k.lost:6d}"

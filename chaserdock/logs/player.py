@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish a log again, byte for byte, in place of the world: to recorders, viewers and other subscribers."""
+"""Publish a log again, byte for byte, in place of the world: to recorders, viewers and other
+subscribers.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,13 @@ from collections.abc import Callable, Iterator
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence, ScenarioReply, ScenarioRequest
+from chaserdock_protocol.messages import (
+    JoinReply,
+    JoinRequest,
+    Presence,
+    ScenarioReply,
+    ScenarioRequest,
+)
 from chaserdock_protocol.recording.log import LogSource, read_scenario
 from chaserdock_protocol.recording.scan import VIEWER_PREFIX, log_files, stored_messages
 from chaserdock_protocol.scenario import flight_scenario_json, scenario_from_json
@@ -20,12 +28,17 @@ class PlayError(ChaserdockError):
 
 
 def stored_samples(log: LogSource) -> Iterator[tuple[int, RawSample]]:
-    """Iterate over simulated time (ns) and content of all messages but the recorder's and the viewers', in file order."""
+    """Iterate over simulated time (ns) and content of all messages but the recorder's and the
+    viewers', in file order.
+    """
     for path in log_files(log):
         for channel, stored in stored_messages(path):
             if not channel.topic.startswith((VIEWER_PREFIX, "recorder/")):
                 encoding = channel.metadata.get("zenoh_encoding", "")
-                yield stored.log_time, RawSample(channel.topic, encoding, stored.data, stored.publish_time)
+                yield (
+                    stored.log_time,
+                    RawSample(channel.topic, encoding, stored.data, stored.publish_time),
+                )
 
 
 def play(
@@ -38,8 +51,9 @@ def play(
 ) -> int:
     """Wait for a recorder, then publish all of a log; return the number of messages.
 
-    ``speed``: simulated over wall time, None for as fast as possible. ``on_sent`` is called with each message that was
-    published. Raises LogError, TransportError, or PlayError when no recorder joins within ``timeout_s``.
+    ``speed``: simulated over wall time, None for as fast as possible. ``on_sent`` is called with
+    each message that was published. Raises LogError, TransportError, or PlayError when no recorder
+    joins within ``timeout_s``.
     """
     text, run = read_scenario(log)
     scenario = scenario_from_json(text, f"{log}: scenario")

@@ -38,13 +38,17 @@ MessageT = TypeVar("MessageT", bound=Struct)
 
 
 def open_log(source: str | Path | Sequence[str | Path]) -> Log:
-    """Open a log: a file, the folder of a run, or the files of a rotated log. Raises LogError, ScenarioError."""
+    """Open a log: a file, the folder of a run, or the files of a rotated log. Raises LogError,
+    ScenarioError.
+    """
     paths = Path(source) if isinstance(source, str | Path) else [Path(s) for s in source]
     return Log(paths, *logged_scenario(paths))
 
 
 class Log:
-    """A log: its ``scenario``, its ``run`` data (run_id, mode, versions), its messages. Reads the files on each call."""
+    """A log: its ``scenario``, its ``run`` data (run_id, mode, versions), its messages. Reads the
+    files on each call.
+    """
 
     def __init__(self, source: LogSource, scenario: Scenario, run: dict[str, str]) -> None:
         self.source, self.scenario, self.run = source, scenario, run
@@ -55,10 +59,12 @@ class Log:
         return count_messages(self.source)
 
     def records(self, *names: str | Topic) -> Iterator[Record]:
-        """Iterate over messages with their keys, in file order; over all messages without ``names``.
+        """Iterate over messages with their keys, in file order; over all messages without
+        ``names``.
 
-        A name is a topic (``topics.TARGET``), its key in the topics table (``"chaser/{chaser}/sighting"``) or a
-        concrete key (``"chaser/0/sighting"``). Raises LogError for an unknown name, and where the log is damaged.
+        A name is a topic (``topics.TARGET``), its key in the topics table
+        (``"chaser/{chaser}/sighting"``) or a concrete key (``"chaser/0/sighting"``). Raises
+        LogError for an unknown name, and where the log is damaged.
         """
         return read_log(self.source, self._keys(names) if names else None)
 
@@ -67,7 +73,9 @@ class Log:
     @overload
     def messages(self, *names: str | Topic) -> Iterator[Any]: ...
     def messages(self, *names: Any) -> Iterator[Any]:
-        """Iterate over messages of a type (``messages.TargetEstimate``), or by names as in ``records``."""
+        """Iterate over messages of a type (``messages.TargetEstimate``), or by names as in
+        ``records``.
+        """
         if len(names) == 1 and isinstance(names[0], type):
             names = tuple(topic for topic in topics.TOPICS if topic.kind is names[0])
             if not names:
@@ -75,7 +83,9 @@ class Log:
         return (record.message for record in self.records(*names))
 
     def table(self, name: str | Topic) -> pyarrow.Table:
-        """Return a topic as one table, all chasers together; columns as in ``chaserdock.logs.tables``. Raises LogError."""
+        """Return a topic as one table, all chasers together; columns as in
+        ``chaserdock.logs.tables``. Raises LogError.
+        """
         from .tables import TopicTable
 
         table = TopicTable(topic_named(name))
@@ -101,7 +111,9 @@ class Log:
 
 
 def topic_named(name: str | Topic) -> Topic:
-    """Return a topic by itself, by its key in the topics table, or by a concrete key. Raises LogError."""
+    """Return a topic by itself, by its key in the topics table, or by a concrete key. Raises
+    LogError.
+    """
     if isinstance(name, Topic):
         return name
     for topic in topics.TOPICS:

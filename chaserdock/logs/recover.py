@@ -29,7 +29,8 @@ from mcap.records import Message as McapMessage
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 _HEAD = struct.Struct("<BQ")
-# A chunk's head: opcode and length, then 28 bytes of times, size and checksum, then the name of its compression.
+# A chunk's head: opcode and length, then 28 bytes of times, size and checksum, then the name of its
+# compression.
 _CHUNK_MARK, _MARK_OFFSET = b"\x04\x00\x00\x00zstd", _HEAD.size + 28
 
 
@@ -46,7 +47,8 @@ class Recovered(msgspec.Struct):
 def recover(log: Path, out: Path) -> Recovered:
     """Copy every message of ``log`` whose chunk has a valid checksum into the new log ``out``.
 
-    Raises LogError when ``log`` is no log or holds no whole message, or ``out`` exists or cannot be written.
+    Raises LogError when ``log`` is no log or holds no whole message, or ``out`` exists or cannot be
+    written.
     """
     try:
         with log.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -115,7 +117,9 @@ def _next_chunk(data: mmap.mmap, place: int) -> int:
 
 
 def _summary_declarations(data: mmap.mmap) -> tuple[dict[int, Channel], dict[int, Schema]]:
-    """Return channels and schemas that a closed log repeats in its summary: the chunk that declares them may be lost."""
+    """Return channels and schemas that a closed log repeats in its summary: the chunk that declares
+    them may be lost.
+    """
     channels: dict[int, Channel] = {}
     schemas: dict[int, Schema] = {}
     footer = len(data) - len(MCAP0_MAGIC) - 20 - _HEAD.size
@@ -124,7 +128,9 @@ def _summary_declarations(data: mmap.mmap) -> tuple[dict[int, Channel], dict[int
     place = struct.unpack_from("<Q", data, footer + _HEAD.size)[0]
     while 0 < place < footer:
         opcode, length = _HEAD.unpack_from(data, place)
-        stream = ReadDataStream(BytesIO(data[place + _HEAD.size : place + _HEAD.size + min(length, 1 << 24)]))
+        stream = ReadDataStream(
+            BytesIO(data[place + _HEAD.size : place + _HEAD.size + min(length, 1 << 24)])
+        )
         try:
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream)
@@ -146,7 +152,9 @@ def _copy(
     found: Recovered,
     source: str,
 ) -> None:
-    writer = Writer(target, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer = Writer(
+        target, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True
+    )
     writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')} recover")
     writer.add_metadata(RECOVERED, with_checksum({"from": source}))
     new_channels: dict[int, int] = {}
@@ -168,7 +176,9 @@ def _copy(
                     elif isinstance(record, Channel):
                         channels[record.id] = record
                     else:
-                        _copy_message(writer, record, channels, schemas, new_channels, new_schemas, found)
+                        _copy_message(
+                            writer, record, channels, schemas, new_channels, new_schemas, found
+                        )
         except DAMAGE:
             found.broken_records += 1
     writer.finish()
@@ -190,11 +200,17 @@ def _copy_message(
         return
     if channel.id not in new_channels:
         if schema.id not in new_schemas:
-            new_schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            new_schemas[schema.id] = writer.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
         new_channels[channel.id] = writer.register_channel(
             channel.topic, channel.message_encoding, new_schemas[schema.id], channel.metadata
         )
     writer.add_message(
-        new_channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+        new_channels[channel.id],
+        message.log_time,
+        message.data,
+        message.publish_time,
+        message.sequence,
     )
     found.messages += 1

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a log as a bag of ROS 2 (rosbag2 with MCAP storage): schemas and CDR of ROS 2, ``metadata.yaml``.
+"""Write a log as a bag of ROS 2 (rosbag2 with MCAP storage): schemas and CDR of ROS 2,
+``metadata.yaml``.
 
-Topics are those of the bridge, and the true states of the bodies under ``/truth/``. Needs the extra ``chaserdock[ros2]``.
+Topics are those of the bridge, and the true states of the bodies under ``/truth/``. Needs the extra
+``chaserdock[ros2]``.
 """
 
 from __future__ import annotations
@@ -20,12 +22,14 @@ BAG_VERSION = 9
 
 
 def export_bag(log: LogSource, folder: Path, images: bool = False) -> dict[str, int]:
-    """Write a log as the bag ``folder``, which must not exist, and return the number of messages by topic.
+    """Write a log as the bag ``folder``, which must not exist, and return the number of messages by
+    topic.
 
     ``images``: include images (decoded) and camera calibrations.
 
-    A message's time in the bag is its simulated time, that of an image its exposure; a bag is in order of arrival, as the log
-    is. Raises LogError when the log or the bag cannot be used, MissingPackageError without rosbags.
+    A message's time in the bag is its simulated time, that of an image its exposure; a bag is in
+    order of arrival, as the log is. Raises LogError when the log or the bag cannot be used,
+    MissingPackageError without rosbags.
     """
     require_extra("rosbags", "ros2")
     from chaserdock_agents.ros2.conversion import Converter, InvalidImage
@@ -49,7 +53,9 @@ def export_bag(log: LogSource, folder: Path, images: bool = False) -> dict[str, 
                     try:
                         converted = converter.convert(record.message)
                     except InvalidImage as error:
-                        raise LogError(f"{record.key}, tick {record.message.tick}: {error}") from None
+                        raise LogError(
+                            f"{record.key}, tick {record.message.tick}: {error}"
+                        ) from None
                     for ros in converted:
                         if ros.topic not in connections:
                             connections[ros.topic] = writer.add_connection(

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as tables: one row per message, nested fields flattened, the unit of every column in its metadata.
+"""Messages as tables: one row per message, nested fields flattened, the unit of every column in its
+metadata.
 
-Columns: ``key``, ``sent_ns`` (the sender's wall clock), ``time_s`` (simulated), then the message's fields. Vectors become
-``position_m_x`` …, quaternions ``q_w`` …; lists of numbers stay lists; dictionaries become JSON text. Lists of structures
-(the solutions of a sighting) become a table of their own, with ``key``, ``seq``, ``tick``, ``time_s`` and ``index``.
-The bytes of images are left out by default (``data_bytes`` is their number).
+Columns: ``key``, ``sent_ns`` (the sender's wall clock), ``time_s`` (simulated), then the message's
+fields. Vectors become ``position_m_x`` …, quaternions ``q_w`` …; lists of numbers stay lists;
+dictionaries become JSON text. Lists of structures (the solutions of a sighting) become a table of
+their own, with ``key``, ``seq``, ``tick``, ``time_s`` and ``index``. The bytes of images are left
+out by default (``data_bytes`` is their number).
 """
 
 from __future__ import annotations
@@ -95,7 +97,9 @@ def _plain(kind: inspect.Type) -> pa.DataType | None:
 
 
 def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], list[str]]:
-    """Return the columns of a structure, and the names of its fields that become tables of their own."""
+    """Return the columns of a structure, and the names of its fields that become tables of their
+    own.
+    """
     columns: list[Column] = []
     children: list[str] = []
     info: Any = inspect.type_info(kind)
@@ -107,13 +111,18 @@ def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], li
             case inspect.DictType():
                 columns.append((name, pa.string(), _json(name)))
             case inspect.TupleType(item_types=items) if len(items) in (3, 4):
-                axes, stem = ("xyz", name) if len(items) == 3 else ("wxyz", name.removesuffix("_wxyz"))
+                axes, stem = (
+                    ("xyz", name) if len(items) == 3 else ("wxyz", name.removesuffix("_wxyz"))
+                )
                 for k, axis in enumerate(axes):
                     columns.append((f"{stem}_{axis}", pa.float64(), _item(name, k)))
             case inspect.VarTupleType(item_type=inspect.StructType()):
                 children.append(name)
             case inspect.StructType(cls=part):
-                columns += [(f"{name}_{n}", t, _part(name, read)) for n, t, read in _columns(part, images)[0]]
+                columns += [
+                    (f"{name}_{n}", t, _part(name, read))
+                    for n, t, read in _columns(part, images)[0]
+                ]
             case inspect.BytesType() if not images:
                 columns.append(
                     (f"{name}_bytes", pa.int64(), lambda message, n=name: len(getattr(message, n)))

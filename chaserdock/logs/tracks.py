@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write trajectories of a log as TUM files: ``time_s x y z qx qy qz qw`` per line, in WRF; evo and others read them."""
+"""Write trajectories of a log as TUM files: ``time_s x y z qx qy qz qw`` per line, in WRF; evo and
+others read them.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,14 @@ def _track_of(record: Record) -> str | None:
             return None
 
 
-def write_tracks(log: LogSource, folder: Path, from_s: float = 0.0, to_s: float = math.inf) -> dict[str, int]:
-    """Write truth of all bodies, target estimate, odometry and references from ``from_s`` to ``to_s``.
+def write_tracks(
+    log: LogSource, folder: Path, from_s: float = 0.0, to_s: float = math.inf
+) -> dict[str, int]:
+    """Write truth of all bodies, target estimate, odometry and references from ``from_s`` to
+    ``to_s``.
 
-    Returns the number of points by file name. Raises LogError when the log or the files cannot be used.
+    Returns the number of points by file name. Raises LogError when the log or the files cannot be
+    used.
     """
     opened = open_log(log)
     wanted = (topics.TRUTH_BODY, topics.TARGET, topics.ODOMETRY, topics.REFERENCE)
@@ -49,7 +55,9 @@ def write_tracks(log: LogSource, folder: Path, from_s: float = 0.0, to_s: float 
                 files[name] = (folder / f"{name}.tum").open("x", encoding="ascii")
             w, x, y, z = record.message.q_wxyz
             values = " ".join(repr(v) for v in (*record.message.position_m, x, y, z, w))
-            files[name].write(f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d} {values}\n")
+            files[name].write(
+                f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d} {values}\n"
+            )
             points[f"{name}.tum"] = points.get(f"{name}.tum", 0) + 1
     except FileExistsError as error:
         raise LogError(f"{error.filename}: already exists; write into an empty folder") from None

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of two recorded flights: summaries, digests, first different message, deviations of the bodies."""
+"""Comparison of two recorded flights: summaries, digests, first different message, deviations of
+the bodies.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,15 @@ from chaserdock.analysis.summary import summary_of
 from .difference import Comparison, TopicDifference, difference_lines, first_difference
 
 # Prefixes of values that depend on the machine: shown, but not a difference between flights.
-_WALL = ("wall_time_s", "latency_s.", "solver.solve_s.", "peak_memory_bytes", "cpu_s", "messages.", "digest")
+_WALL = (
+    "wall_time_s",
+    "latency_s.",
+    "solver.solve_s.",
+    "peak_memory_bytes",
+    "cpu_s",
+    "messages.",
+    "digest",
+)
 
 
 class Deviation(msgspec.Struct):
@@ -31,9 +41,11 @@ class Deviation(msgspec.Struct):
 
 
 class RunComparison(msgspec.Struct):
-    """``summary``: keys whose values differ, both values. ``deviations``: by track; ``target estimate`` is the fused one.
+    """``summary``: keys whose values differ, both values. ``deviations``: by track; ``target
+    estimate`` is the fused one.
 
-    ``blas``: processes whose linear algebra libraries (recording.provenance.blas_in_use) are known and differ, both libraries.
+    ``blas``: processes whose linear algebra libraries (recording.provenance.blas_in_use) are known
+    and differ, both libraries.
     """
 
     digests: tuple[str, str]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of messages field by field: first and largest differences of two runs, or of a log and current code."""
+"""Comparison of messages field by field: first and largest differences of two runs, or of a log and
+current code.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class FieldDifference(msgspec.Struct):
 
 
 class TopicDifference(msgspec.Struct):
-    """Differences of one key. ``alone``: numbers of messages that only one side has; ``alone_time_s``: time of the first one."""
+    """Differences of one key. ``alone``: numbers of messages that only one side has;
+    ``alone_time_s``: time of the first one.
+    """
 
     key: str
     compared: int = 0
@@ -44,11 +48,16 @@ class TopicDifference(msgspec.Struct):
     def first_time_s(self) -> float | None:
         """Simulated time of the first difference, or None."""
         times = [f.first_time_s for f in self.fields.values()]
-        return min([*times, *([self.alone_time_s] if self.alone_time_s is not None else [])], default=None)
+        return min(
+            [*times, *([self.alone_time_s] if self.alone_time_s is not None else [])], default=None
+        )
 
 
-def field_differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, Any, Any, float | None]]:
-    """Yield different fields: name (shared by the items of a list), both values, and the difference of numbers.
+def field_differences(
+    a: Any, b: Any, name: str = ""
+) -> Iterator[tuple[str, Any, Any, float | None]]:
+    """Yield different fields: name (shared by the items of a list), both values, and the difference
+    of numbers.
 
     Transport and wall-clock fields (``seq``, ``wall_...``) are not compared.
     """
@@ -85,7 +94,8 @@ _MANY_WAITING, _BEHIND_TICKS = 20_000, 300
 
 
 class Comparison:
-    """Pairs the messages of two sides by key, tick and order within it, and collects their differences.
+    """Pairs the messages of two sides by key, tick and order within it, and collects their
+    differences.
 
     Numbers that differ by at most ``tolerance`` count as equal. Memory is bounded.
     """
@@ -181,7 +191,9 @@ def difference_lines(topics: list[TopicDifference], sides: tuple[str, str]) -> I
             if number:
                 yield f"  {number} only {side}; the first unpaired one is at {t.alone_time_s:.3f} s"
         for f in sorted(t.fields.values(), key=lambda f: (f.first_time_s, f.name)):
-            values = ", ".join(f"{side} {_format(x)}" for side, x in zip(sides, f.first, strict=True))
+            values = ", ".join(
+                f"{side} {_format(x)}" for side, x in zip(sides, f.first, strict=True)
+            )
             yield f"  {f.name}: {f.unequal} times, first at {f.first_time_s:.3f} s (tick {f.first_tick}): {values}"
             if f.largest is not None:
                 yield f"    largest difference {f.largest:.3g} at {f.largest_time_s:.3f} s"

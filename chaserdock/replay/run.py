@@ -35,7 +35,9 @@ class Replay(msgspec.Struct):
 
 
 def stage_of(name: str) -> Stage:
-    """Return the stage of that name (entry points, group ``chaserdock.replays``). Raise ReplayError."""
+    """Return the stage of that name (entry points, group ``chaserdock.replays``). Raise
+    ReplayError.
+    """
     stages = {e.name: e for e in entry_points(group="chaserdock.replays")}
     if name not in stages:
         raise ReplayError(f"--through {name}: must be one of {', '.join(sorted(stages))}")
@@ -48,8 +50,11 @@ def _places(topic: Topic, stage: Stage, chasers: int) -> Iterable[int | str | No
     return [stage.process] if "{process}" in topic.key else [None]
 
 
-def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolerance: float = 0.0) -> Replay:
-    """Replay a log through ``perception``, ``fusion`` or ``controller`` with ``overrides`` of its scenario.
+def replay(
+    log: LogSource, through: str, overrides: tuple[str, ...] = (), tolerance: float = 0.0
+) -> Replay:
+    """Replay a log through ``perception``, ``fusion`` or ``controller`` with ``overrides`` of its
+    scenario.
 
     Raise LogError, ScenarioError or ReplayError.
     """

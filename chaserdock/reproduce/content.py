@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Content of the page: prose and tables, filled in from the results. A missing result is shown as a dash."""
+"""Content of the page: prose and tables, filled in from the results. A missing result is shown as a
+dash.
+"""
 
 from __future__ import annotations
 
@@ -44,11 +46,16 @@ from .tables import (
 from .trends import trend_rows
 
 NONE = "-"
-UNITS: dict[Quantity, tuple[float, str]] = {"position": (1e2, "1e-2 m^2"), "orientation": (1e3, "1e-3 rad^2")}
+UNITS: dict[Quantity, tuple[float, str]] = {
+    "position": (1e2, "1e-2 m^2"),
+    "orientation": (1e3, "1e-3 rad^2"),
+}
 """Factor and name of the paper's units."""
 
 
-def sections(plan: ReproductionPlan, results: ReproductionResults, about: Provenance) -> list[PageSection]:
+def sections(
+    plan: ReproductionPlan, results: ReproductionResults, about: Provenance
+) -> list[PageSection]:
     """Return the whole page."""
     return [
         _result(plan, results, about),
@@ -78,7 +85,9 @@ def _result(plan: ReproductionPlan, results: ReproductionResults, about: Provena
         f'Three chains fly the nine rows of its table, with images. "{WRITTEN}": the paper\'s perception (EPnP), its moving '
         f'average of all estimates and its solver OpEn, in its settings. "{CODE}": the same with OpenCV\'s iterative PnP, '
         f'which the authors\' public code calls in place of EPnP. "{DEFAULT}": the default settings of chaserdock.',
-        Table(("chain", "position rows met", "orientation rows met", "failed flights"), tuple(rows)),
+        Table(
+            ("chain", "position rows met", "orientation rows met", "failed flights"), tuple(rows)
+        ),
         f"A row is met if the median ratio of our error to the paper's is between {BAND[0]:.2f} and {BAND[1]:.2f}: a smaller "
         "error is as much a difference as a larger one. OpenCV's EPnP has gross errors for coplanar points, as on the single "
         "face of the target that a chaser sees most of the time (tests/agents/test_perception.py).",
@@ -94,7 +103,9 @@ def _result(plan: ReproductionPlan, results: ReproductionResults, about: Provena
 
 def _met(results: ReproductionResults, column: str, quantity: Quantity) -> str:
     verdicts = [
-        verdict(spread(ratios).median) for row in ROWS if (ratios := _ratios(results, column, row, quantity))
+        verdict(spread(ratios).median)
+        for row in ROWS
+        if (ratios := _ratios(results, column, row, quantity))
     ]
     return f"{verdicts.count('met')} of {len(verdicts)}" if verdicts else NONE
 
@@ -112,7 +123,9 @@ def _table(results: ReproductionResults, quantity: Quantity) -> PageSection:
         cells = []
         for column in COLUMNS:
             ratios = _ratios(results, column, row, quantity)
-            cells.append(f"{_spread_text(ratios)} {verdict(spread(ratios).median)}" if ratios else NONE)
+            cells.append(
+                f"{_spread_text(ratios)} {verdict(spread(ratios).median)}" if ratios else NONE
+            )
         rows.append((row.label, f"{paper_value(row, quantity) * factor:.3g}", *cells))
     text = (
         f"Mean square error over two minutes. Ratio to the paper's: median (least to greatest) over the {len(DRAWS)} starts, "
@@ -124,12 +137,18 @@ def _table(results: ReproductionResults, quantity: Quantity) -> PageSection:
 
 def _spread_text(values: Sequence[float]) -> str:
     s = spread(values)
-    return f"{s.median:.3g}" if s.number == 1 else f"{s.median:.3g} ({s.least:.3g} to {s.greatest:.3g})"
+    return (
+        f"{s.median:.3g}"
+        if s.number == 1
+        else f"{s.median:.3g} ({s.least:.3g} to {s.greatest:.3g})"
+    )
 
 
 def _trends(results: ReproductionResults) -> PageSection:
     """Return the changes from the baseline row and the spike, with explanations."""
-    spike = [_spike_text(results.missions.get(f"{TRACKING}, {column}")) for column in (CODE, DEFAULT)]
+    spike = [
+        _spike_text(results.missions.get(f"{TRACKING}, {column}")) for column in (CODE, DEFAULT)
+    ]
     written = _spike_text(results.missions.get(f"{TRACKING}, {WRITTEN}"))
     rows = [
         *trend_rows(results),
@@ -149,8 +168,13 @@ def _spike_text(result: MissionResult | None) -> str:
         return NONE
     if result.estimate_max_rad is None or result.estimate_rms_rad is None:
         return "no estimate"
-    angle, ratio = math.degrees(result.estimate_max_rad), result.estimate_max_rad / result.estimate_rms_rad
-    return f"at most {angle:.3g} deg, {ratio:.1f} times the RMS, at {result.estimate_max_at_s:.0f} s"
+    angle, ratio = (
+        math.degrees(result.estimate_max_rad),
+        result.estimate_max_rad / result.estimate_rms_rad,
+    )
+    return (
+        f"at most {angle:.3g} deg, {ratio:.1f} times the RMS, at {result.estimate_max_at_s:.0f} s"
+    )
 
 
 def pitch_rad(time_s: float) -> float:
@@ -160,7 +184,9 @@ def pitch_rad(time_s: float) -> float:
 
 
 def _spike_explanation(written: str) -> str:
-    """Return how near the target's attitude comes to the singularity that the paper blames, and what EPnP does."""
+    """Return how near the target's attitude comes to the singularity that the paper blames, and
+    what EPnP does.
+    """
     times = np.arange(0.0, PAPER_S + 0.5, 0.5)
     pitch = np.abs([pitch_rad(t) for t in times])
     k = int(np.argmax(pitch))
@@ -176,7 +202,9 @@ def _missions(plan: ReproductionPlan, results: ReproductionResults) -> PageSecti
     rows = []
     for m in plan.missions:
         result = results.missions.get(m.name)
-        rows.append((m.scenario, m.column, *((NONE,) * 5 if result is None else _mission_cells(result))))
+        rows.append(
+            (m.scenario, m.column, *((NONE,) * 5 if result is None else _mission_cells(result)))
+        )
     header = (
         "mission",
         "chain",
@@ -198,7 +226,11 @@ def _missions(plan: ReproductionPlan, results: ReproductionResults) -> PageSecti
 def _mission_cells(r: MissionResult) -> tuple[str, ...]:
     events = [f"{i} docked at {t:.0f} s" for i, t in r.dock_time_s.items()]
     events += [f"{i} arrived at {t:.0f} s" for i, t in r.reached_time_s.items()]
-    position, angle, between = r.steady_position_rms_m, r.steady_orientation_rms_rad, r.min_distance_chasers_m
+    position, angle, between = (
+        r.steady_position_rms_m,
+        r.steady_orientation_rms_rad,
+        r.min_distance_chasers_m,
+    )
     return (
         NONE if position is None else f"{position * 1e3:.3g}",
         NONE if angle is None else f"{math.degrees(angle):.2g}",
@@ -215,7 +247,9 @@ def _start(results: ReproductionResults) -> PageSection:
     for name in ("nominal", *STARTS):
         errors = nominal if name == "nominal" else errors_by_name(results, f"start/{name}")
         if errors is not None:
-            rows.append((name, *(f"{errors.of(q) / paper_value(BASELINE, q):.2f}" for q in QUANTITIES)))
+            rows.append(
+                (name, *(f"{errors.of(q) / paper_value(BASELINE, q):.2f}" for q in QUANTITIES))
+            )
     names = [f"alone/{BASELINE.name}", *map(floor_name, DRAWS)]
     floors = [
         (name, r.floor_m2_s / PAPER_S)
@@ -229,7 +263,10 @@ def _start(results: ReproductionResults) -> PageSection:
         f"{len(DRAWS)} starts, seeded and equal in all rows, uniform about the nominal one: each component of the offset within "
         f"{OFFSET_BOUND_M:g} m, of the rotation vector within {ROTATION_BOUND_RAD:g} rad, of the target's initial rotation "
         f"within {ATTITUDE_BOUND_RAD:g} rad, of its velocities within {100 * RATE_BOUND:.0f} %.",
-        Table(("baseline row, controller alone", "position / paper", "orientation / paper"), tuple(rows)),
+        Table(
+            ("baseline row, controller alone", "position / paper", "orientation / paper"),
+            tuple(rows),
+        ),
     ]
     if floors:
         least = min(value for _, value in floors)

@@ -24,10 +24,11 @@ TITLE = "Reproduction of the paper's results"
 
 
 def reproduce(quick: bool, out: Path) -> int:
-    """Fly what has no result yet; write ``reproduction.md`` and ``.html`` into ``out``; return the exit status.
+    """Fly what has no result yet; write ``reproduction.md`` and ``.html`` into ``out``; return the
+    exit status.
 
-    Without the paper's solver its chain is left out, and the status is FAILED. Raise ReproductionError, StudyError or
-    ScenarioError when a flight is not possible.
+    Without the paper's solver its chain is left out, and the status is FAILED. Raise
+    ReproductionError, StudyError or ScenarioError when a flight is not possible.
     """
     return fly_plan(make_plan(quick, str(find_scenario(SCENARIO))), out.absolute())
 
@@ -58,7 +59,9 @@ def fly_plan(plan: ReproductionPlan, out: Path) -> int:
 
 
 def begun(out: Path) -> Provenance:
-    """Return where and when the first flight of this code into ``out`` began; later calls only resume it."""
+    """Return where and when the first flight of this code into ``out`` began; later calls only
+    resume it.
+    """
     path = out / f"provenance-{code_digest()}.json"
     if not path.exists():
         path.write_bytes(msgspec.json.encode(provenance()))

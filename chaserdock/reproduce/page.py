@@ -13,7 +13,9 @@ from chaserdock.html_page import html_page, table
 
 @dataclass(frozen=True)
 class Table:
-    """A table. The first column is text; the others are numbers, or ``text``. Raise ValueError for a row of another length."""
+    """A table. The first column is text; the others are numbers, or ``text``. Raise ValueError for
+    a row of another length.
+    """
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -22,7 +24,9 @@ class Table:
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row) != len(self.header):
-                raise ValueError(f"a row of {len(row)} cells under {len(self.header)} headings: {row}")
+                raise ValueError(
+                    f"a row of {len(row)} cells under {len(self.header)} headings: {row}"
+                )
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,8 @@ def html(title: str, sections: Sequence[PageSection]) -> str:
     for section in sections:
         body.append(f"<h2>{escape(section.title)}</h2>")
         body += [
-            table(p.header, p.rows, p.text) if isinstance(p, Table) else _paragraph(p) for p in section.parts
+            table(p.header, p.rows, p.text) if isinstance(p, Table) else _paragraph(p)
+            for p in section.parts
         ]
     return html_page(title, body)
 

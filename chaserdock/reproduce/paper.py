@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's results: Fourlas et al., IFAC 2023, table 2. Mean squares over two minutes, average of three runs."""
+"""The paper's results: Fourlas et al., IFAC 2023, table 2. Mean squares over two minutes, average
+of three runs.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ PAPER_S = 120.0
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of the paper's single-chaser table; ``failed`` of its three runs failed. ``name`` is a valid file name."""
+    """A row of the paper's single-chaser table; ``failed`` of its three runs failed. ``name`` is a
+    valid file name.
+    """
 
     name: str
     horizon_s: float

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plan of a reproduction: single-chaser flights of the paper's table, flights that explain, missions of several chasers."""
+"""Plan of a reproduction: single-chaser flights of the paper's table, flights that explain,
+missions of several chasers.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +21,23 @@ SCENARIO = "paper-single"
 """The scenario of every single-chaser flight: the paper's settings and its baseline row."""
 
 DRAWS = range(3)
-"""The paper flew every row three times. Ours differ by their dispersed start; equal draws have equal starts in all rows."""
+"""The paper flew every row three times. Ours differ by their dispersed start; equal draws have
+equal starts in all rows.
+"""
 
 NOMINAL_OFFSET_M = (0.85, 0.0, 0.0)
 NOMINAL_ROTATION_RAD = (0.42, 0.0, -0.3927)
-"""The start of ``paper-single``, from the reference pose: in TRF, and as a rotation vector in body axes."""
+"""The start of ``paper-single``, from the reference pose: in TRF, and as a rotation vector in body
+axes.
+"""
 
 OFFSET_BOUND_M = 0.05
 ROTATION_BOUND_RAD = 0.05
 ATTITUDE_BOUND_RAD = 0.2
 RATE_BOUND = 0.2
-"""Bounds of the dispersed starts, uniform about the nominal one: each component of the chaser's offset and of its rotation
-vector; each component of the rotation vector of the target's initial attitude; each component of the target's velocity
-and angular velocity, as a share of its value."""
+"""Bounds of the dispersed starts, uniform about the nominal one: each component of the chaser's
+offset and of its rotation vector; each component of the rotation vector of the target's initial
+attitude; each component of the target's velocity and angular velocity, as a share of its value."""
 
 OPEN = "controller.solver='open'"
 WRITTEN, CODE, DEFAULT = "as written", "as in the authors' code", "ours"
@@ -46,8 +52,9 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "time.latency_s=0.0333333333333333",
     ),
 }
-"""Overrides of ``paper-single``, whose controller has the paper's settings. The paper's chain: perception, combiner, and
-OpEn, with EPnP as the paper writes, or with the PnP of its authors' public code. Ours: the default settings."""
+"""Overrides of ``paper-single``, whose controller has the paper's settings. The paper's chain:
+perception, combiner, and OpEn, with EPnP as the paper writes, or with the PnP of its authors'
+public code. Ours: the default settings."""
 
 
 def dispersed_start(draw: int) -> tuple[str, ...]:
@@ -103,7 +110,9 @@ def table_name(column: str, row: PaperRow, draw: int) -> str:
 
 
 def draws_of(quick: bool, column: str, row: PaperRow) -> range:
-    """Return the starts from which a row is flown: ours from one beyond the baseline row; EPnP in that row only."""
+    """Return the starts from which a row is flown: ours from one beyond the baseline row; EPnP in
+    that row only.
+    """
     draws = DRAWS[:1] if quick else DRAWS
     if row == BASELINE or column == CODE:
         return draws
@@ -129,7 +138,10 @@ STARTS: dict[str, str] = {
     "turned by 0.65 rad": "chasers.0.start_rotation_rad=[0.4748, 0.0, -0.4439]",
 }
 """Starts that differ from the nominal one in one respect."""
-DELAYS_S: dict[str, tuple[float, ...]] = {"T=0.5": (0.1, 0.3, 0.5, 1.0), "T=10": (0.1, 0.3, 0.5, 0.7, 1.0)}
+DELAYS_S: dict[str, tuple[float, ...]] = {
+    "T=0.5": (0.1, 0.3, 0.5, 1.0),
+    "T=10": (0.1, 0.3, 0.5, 0.7, 1.0),
+}
 """Delays of the command with which the rows with failed runs are flown."""
 
 
@@ -147,19 +159,28 @@ def _table(quick: bool, scenario: str, length: str) -> list[StudyCase]:
 
 
 def _explanations(scenario: str, length: str) -> list[StudyCase]:
-    """Return the flights of the paper's controller alone, on perfect knowledge from the nominal start, and lower bounds."""
+    """Return the flights of the paper's controller alone, on perfect knowledge from the nominal
+    start, and lower bounds.
+    """
     out = []
 
     def add(name: str, *overrides: str, floor: bool = False, delay_s: float | None = None) -> None:
         sets = (*overrides, length)
-        out.append(StudyCase(name=name, scenario=scenario, overrides=sets, floor=floor, delay_s=delay_s))
+        out.append(
+            StudyCase(name=name, scenario=scenario, overrides=sets, floor=floor, delay_s=delay_s)
+        )
 
     for draw in DRAWS:
         add(floor_name(draw), *dispersed_start(draw), floor=True)
     for row in ROWS:
         add(f"alone/{row.name}", *row.overrides, OPEN, floor=row == BASELINE)
         if row.name in STAGE_WEIGHTS:
-            add(f"weights/{row.name}", *row.overrides, *_stage_weights(STAGE_WEIGHTS[row.name]), OPEN)
+            add(
+                f"weights/{row.name}",
+                *row.overrides,
+                *_stage_weights(STAGE_WEIGHTS[row.name]),
+                OPEN,
+            )
         for delay_s in DELAYS_S.get(row.name, ()):
             add(f"delay/{row.name}/{delay_s:g}", *row.overrides, OPEN, delay_s=delay_s)
     for name, start in STARTS.items():
@@ -182,7 +203,9 @@ _PAPER_SETTINGS = (
 
 
 def _missions() -> list[Mission]:
-    """Return the paper's missions of several chasers: ours as shipped; EPnP only where the paper reports a spike."""
+    """Return the paper's missions of several chasers: ours as shipped; EPnP only where the paper
+    reports a spike.
+    """
     out = [Mission(TRACKING, WRITTEN, (*_PAPER_SETTINGS, *COLUMNS[WRITTEN]))]
     for scenario in MISSIONS:
         out.append(Mission(scenario, CODE, (*_PAPER_SETTINGS, *COLUMNS[CODE])))
@@ -191,7 +214,9 @@ def _missions() -> list[Mission]:
 
 
 def make_plan(quick: bool, scenario: str) -> ReproductionPlan:
-    """Return the whole plan; ``scenario`` is the path of ``paper-single``. A quick plan has one short flight per row."""
+    """Return the whole plan; ``scenario`` is the path of ``paper-single``. A quick plan has one
+    short flight per row.
+    """
     duration_s = QUICK_S if quick else PAPER_S
     length = f"duration_s={duration_s}"
     cases = (*_explanations(scenario, length), *_table(quick, scenario, length))

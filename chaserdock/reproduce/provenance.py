@@ -16,7 +16,9 @@ _FOLDER = Path(__file__).resolve().parent
 
 
 class Provenance(Struct, frozen=True, kw_only=True):
-    """Date (UTC), commit and machine of flights. ``commit`` ends with ``-dirty`` where tracked files were changed."""
+    """Date (UTC), commit and machine of flights. ``commit`` ends with ``-dirty`` where tracked
+    files were changed.
+    """
 
     date: str
     commit: str
@@ -28,11 +30,15 @@ class Provenance(Struct, frozen=True, kw_only=True):
 
 def provenance() -> Provenance:
     """Return date, commit and machine of this process."""
-    return Provenance(date=f"{datetime.now(UTC):%Y-%m-%d}", commit=commit_of(_FOLDER), machine=_machine())
+    return Provenance(
+        date=f"{datetime.now(UTC):%Y-%m-%d}", commit=commit_of(_FOLDER), machine=_machine()
+    )
 
 
 def commit_of(folder: Path) -> str:
-    """Return the commit of the working copy that tracks ``folder``; without one, the package's version."""
+    """Return the commit of the working copy that tracks ``folder``; without one, the package's
+    version.
+    """
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]
@@ -51,7 +57,9 @@ def _machine() -> str:
     cpu = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        cpu = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+        cpu = next(
+            line.partition(":")[2].strip() for line in lines if line.startswith("model name")
+        )
     except (OSError, StopIteration):
         pass  # not Linux, or a CPU without a model name
     return f"{cpu} ({os.cpu_count()} logical CPUs), {platform.system()}, Python {platform.python_version()}"

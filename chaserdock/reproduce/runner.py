@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Execution of a plan: every flight in this process, one after the other. Each result is kept at once as a line of JSON."""
+"""Execution of a plan: every flight in this process, one after the other. Each result is kept at
+once as a line of JSON.
+"""
 
 from __future__ import annotations
 
@@ -43,10 +45,12 @@ class ReproductionError(ChaserdockError):
 
 
 class MissionResult(Struct, frozen=True, kw_only=True):
-    """Results of a mission, on ground truth. Steady RMS: of the worst chaser, None without a steady interval.
+    """Results of a mission, on ground truth. Steady RMS: of the worst chaser, None without a steady
+    interval.
 
-    ``dock_time_s``, ``reached_time_s``: by chaser. ``estimate_rms_rad``, ``estimate_max_rad``, ``estimate_max_at_s``: attitude
-    error of the target estimate after settling, and the time of its maximum; None without an estimate.
+    ``dock_time_s``, ``reached_time_s``: by chaser. ``estimate_rms_rad``, ``estimate_max_rad``,
+    ``estimate_max_at_s``: attitude error of the target estimate after settling, and the time of its
+    maximum; None without an estimate.
     """
 
     mission: Mission
@@ -71,7 +75,9 @@ class ReproductionResults:
 
 @cache
 def code_digest() -> str:
-    """Return a digest of the code that flies and of its scenarios, so that results of another version are not reused."""
+    """Return a digest of the code that flies and of its scenarios, so that results of another
+    version are not reused.
+    """
     digest = hashlib.sha256()
     own = Path(__file__).resolve().parent
     for package in _PACKAGES:
@@ -89,8 +95,12 @@ def code_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def fly(plan: ReproductionPlan, folder: Path, stop: threading.Event, report: Callable[[str], None]) -> None:
-    """Fly what has no result in ``folder`` yet, until ``stop``. Raise ReproductionError, StudyError or ScenarioError."""
+def fly(
+    plan: ReproductionPlan, folder: Path, stop: threading.Event, report: Callable[[str], None]
+) -> None:
+    """Fly what has no result in ``folder`` yet, until ``stop``. Raise ReproductionError, StudyError
+    or ScenarioError.
+    """
     results = results_of(plan, folder)
     cases = [c for c in plan.cases if c.name not in results.cases]
     missions = [m for m in plan.missions if m.name not in results.missions]
@@ -113,7 +123,9 @@ def fly_mission(mission: Mission) -> MissionResult:
         folder = Path(place) / "run"
         flight = simulate(find_scenario(mission.scenario), folder, mission.overrides)
         for name, error in flight.crashes.items():
-            raise ReproductionError(f"{mission.name}: {name} crashed: {error.strip().splitlines()[-1]}")
+            raise ReproductionError(
+                f"{mission.name}: {name} crashed: {error.strip().splitlines()[-1]}"
+            )
         recorded = load_flight(folder / LOG_NAME)
     summary, errors = summary_of(recorded), estimate_errors(recorded)
     chasers = summary["chasers"]
@@ -122,7 +134,9 @@ def fly_mission(mission: Mission) -> MissionResult:
     return MissionResult(
         mission=mission,
         steady_position_rms_m=_worst(c["steady"]["position_mse_m2"] for c in chasers.values()),
-        steady_orientation_rms_rad=_worst(c["steady"]["orientation_mse_rad2"] for c in chasers.values()),
+        steady_orientation_rms_rad=_worst(
+            c["steady"]["orientation_mse_rad2"] for c in chasers.values()
+        ),
         min_distance_target_m=min(c["min_distance_target_m"] for c in chasers.values()),
         min_distance_chasers_m=summary["min_distance_chasers_m"],
         dock_time_s={i: c["dock_time_s"] for i, c in chasers.items() if c["docked"]},
@@ -142,7 +156,9 @@ def _worst(mean_squares: Iterator[float | None]) -> float | None:
 
 
 def results_of(plan: ReproductionPlan, folder: Path) -> ReproductionResults:
-    """Return what is finished of ``plan`` with this code; a result of the same name with other settings does not count."""
+    """Return what is finished of ``plan`` with this code; a result of the same name with other
+    settings does not count.
+    """
     cases = {r.case: r for r in _read(_cases_file(folder), StudyResult)}
     missions = {r.mission: r for r in _read(_missions_file(folder), MissionResult)}
     return ReproductionResults(
@@ -168,7 +184,9 @@ _Kind = TypeVar("_Kind", bound=Struct)
 
 
 def _read(path: Path, kind: type[_Kind]) -> list[_Kind]:
-    """Return the lines of a file, none if it does not exist. Drop the last line of an interrupted flight."""
+    """Return the lines of a file, none if it does not exist. Drop the last line of an interrupted
+    flight.
+    """
     if not path.exists():
         return []
     text = path.read_text(encoding="utf-8")

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values of the tables: errors of a flight, spread over the starts, two-sided verdicts, changes from the baseline."""
+"""Values of the tables: errors of a flight, spread over the starts, two-sided verdicts, changes
+from the baseline.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ TREND_BAND = (0.5, 2.0)
 MIN_DISTANCE_M = 0.35
 """The paper's d_min."""
 LOST_M = math.hypot(*NOMINAL_OFFSET_M)
-"""A chaser whose steady RMS distance from its reference pose exceeds this, the start's, has not come nearer."""
+"""A chaser whose steady RMS distance from its reference pose exceeds this, the start's, has not
+come nearer.
+"""
 Quantity = Literal["position", "orientation"]
 QUANTITIES: tuple[Quantity, Quantity] = ("position", "orientation")
 
@@ -60,9 +64,11 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def verdict(ratio: float, band: tuple[float, float] = BAND) -> str:
-    """Judge a measured value by its ratio to the paper's: "met" within ``band``, else "smaller" or "larger".
+    """Judge a measured value by its ratio to the paper's: "met" within ``band``, else "smaller" or
+    "larger".
 
-    A negative ratio is a change in the opposite direction. Raise ValueError unless 0 < band[0] <= 1 <= band[1].
+    A negative ratio is a change in the opposite direction. Raise ValueError unless 0 < band[0] <= 1
+    <= band[1].
     """
     low, high = band
     if not 0.0 < low <= 1.0 <= high:
@@ -77,7 +83,8 @@ def verdict(ratio: float, band: tuple[float, float] = BAND) -> str:
 
 
 def over_two_minutes(whole: float, steady: float, flown_s: float) -> float:
-    """Return the mean over the paper's two minutes of a flight of ``flown_s``, extrapolated with its steady state.
+    """Return the mean over the paper's two minutes of a flight of ``flown_s``, extrapolated with
+    its steady state.
 
     Raise ValueError unless 0 < flown_s <= two minutes.
     """
@@ -87,12 +94,17 @@ def over_two_minutes(whole: float, steady: float, flown_s: float) -> float:
 
 
 def errors_of(r: StudyResult) -> Errors:
-    """Return the errors of a flight; it failed if the chaser came closer than d_min or did not come nearer."""
+    """Return the errors of a flight; it failed if the chaser came closer than d_min or did not come
+    nearer.
+    """
     return Errors(
         position=over_two_minutes(r.position_mse_m2, r.steady_position_mse_m2, r.duration_s),
-        orientation=over_two_minutes(r.orientation_mse_rad2, r.steady_orientation_mse_rad2, r.duration_s),
+        orientation=over_two_minutes(
+            r.orientation_mse_rad2, r.steady_orientation_mse_rad2, r.duration_s
+        ),
         steady_position=r.steady_position_mse_m2,
-        failed=r.min_distance_target_m < MIN_DISTANCE_M or not r.steady_position_mse_m2 <= LOST_M**2,
+        failed=r.min_distance_target_m < MIN_DISTANCE_M
+        or not r.steady_position_mse_m2 <= LOST_M**2,
     )
 
 
@@ -118,13 +130,17 @@ def paper_change(row: PaperRow, quantity: Quantity) -> float:
     return paper_value(row, quantity) / paper_value(BASELINE, quantity) - 1.0
 
 
-def changes(results: ReproductionResults, column: str, row: PaperRow, quantity: Quantity) -> list[float]:
+def changes(
+    results: ReproductionResults, column: str, row: PaperRow, quantity: Quantity
+) -> list[float]:
     """Return the changes of a row from the baseline row of the same start, as shares."""
     runs, base = cell(results, column, row), cell(results, column, BASELINE)
     return [runs[d].of(quantity) / base[d].of(quantity) - 1.0 for d in runs if d in base]
 
 
 def comes_out(values: Sequence[float], paper: float) -> bool:
-    """Return whether changes have the paper's direction from every start, and about its size in the median."""
+    """Return whether changes have the paper's direction from every start, and about its size in the
+    median.
+    """
     same = min(values) * max(values) > 0.0
     return same and verdict(spread(values).median / paper, TREND_BAND) == "met"

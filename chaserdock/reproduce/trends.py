@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's trends: changes of a row from the baseline row, beside ours, with what measurements say about the difference."""
+"""The paper's trends: changes of a row from the baseline row, beside ours, with what measurements
+say about the difference.
+"""
 
 from __future__ import annotations
 
@@ -22,16 +24,22 @@ NONE = "-"
 
 
 def trend_rows(results: ReproductionResults) -> list[tuple[str, ...]]:
-    """Return a row for every row of the paper's table but the baseline: paper, chains, controller alone, explanation."""
+    """Return a row for every row of the paper's table but the baseline: paper, chains, controller
+    alone, explanation.
+    """
     out = []
     for row in ROWS[1:]:
         paper = "; ".join(change_text(paper_change(row, q)) for q in QUANTITIES)
         chains = [_chain_text(results, column, row) for column in (CODE, DEFAULT)]
         alone = [_alone_change(results, f"alone/{row.name}", q) for q in QUANTITIES]
-        alone_text = NONE if None in alone else "; ".join(change_text(x) for x in alone if x is not None)
+        alone_text = (
+            NONE if None in alone else "; ".join(change_text(x) for x in alone if x is not None)
+        )
         why = explanation(results, row)
         same = next((label for label, *_, earlier in out if earlier == why), None)
-        out.append((row.label, paper, *chains, alone_text, why if same is None else f"As for {same}."))
+        out.append(
+            (row.label, paper, *chains, alone_text, why if same is None else f"As for {same}.")
+        )
     return out
 
 
@@ -58,9 +66,13 @@ def _alone_change(results: ReproductionResults, name: str, quantity: Quantity) -
 
 
 def explanation(results: ReproductionResults, row: PaperRow) -> str:
-    """Return what was measured about a trend that does not come out in both errors of the paper's chain."""
+    """Return what was measured about a trend that does not come out in both errors of the paper's
+    chain.
+    """
     values = [changes(results, CODE, row, q) for q in QUANTITIES]
-    if all(v and comes_out(v, paper_change(row, q)) for v, q in zip(values, QUANTITIES, strict=True)):
+    if all(
+        v and comes_out(v, paper_change(row, q)) for v, q in zip(values, QUANTITIES, strict=True)
+    ):
         return "It comes out."
     texts = []
     if row.name in DELAYS_S:
@@ -73,7 +85,9 @@ def explanation(results: ReproductionResults, row: PaperRow) -> str:
 
 
 def _by_delay(results: ReproductionResults, row: PaperRow) -> str:
-    """Find the delay of the command that brings the position error of the controller alone to the paper's."""
+    """Find the delay of the command that brings the position error of the controller alone to the
+    paper's.
+    """
     solved = results.cases.get(f"alone/{row.name}")
     flown = [(d, errors_by_name(results, f"delay/{row.name}/{d:g}")) for d in DELAYS_S[row.name]]
     known = [(d, e.position) for d, e in flown if e is not None]

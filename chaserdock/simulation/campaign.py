@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly many seeds, on several processes if asked to; shrink what fails, and check consistency over all of them."""
+"""Fly many seeds, on several processes if asked to; shrink what fails, and check consistency over
+all of them.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ from .shrinking import shrink
 from .swarm import Case, SimulationResult, draw_case, fly_case
 
 NEES_LIMITS = (1.5, 12.0)
-"""Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights without lying sensors."""
+"""Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights
+without lying sensors.
+"""
 LEAST_NEES_FLIGHTS = 20
 _NOT_DOCKED = "ends in phase "
 """Begin of the text on a chaser that should have docked, or should be safe."""
@@ -36,7 +40,9 @@ _NOT_DOCKED = "ends in phase "
 
 @dataclass(frozen=True)
 class Swarm:
-    """What to fly: a scenario by name or path; with rendered images; in one mode only; until a violation only."""
+    """What to fly: a scenario by name or path; with rendered images; in one mode only; until a
+    violation only.
+    """
 
     scenario: str
     images: bool = False
@@ -57,7 +63,9 @@ def _load(swarm: Swarm) -> tuple[str, Scenario]:
     path = find_scenario(swarm.scenario)
     scenario = load_scenario(path)
     if not (swarm.images or scenario.target_model().markers):
-        raise ScenarioError(f"{path}: the target has no markers to draw measurements of; use --images")
+        raise ScenarioError(
+            f"{path}: the target has no markers to draw measurements of; use --images"
+        )
     return (str(path.resolve()) if path == Path(swarm.scenario) else path.stem), scenario
 
 
@@ -75,8 +83,11 @@ def _fly(swarm: Swarm, seed: int) -> SimulationResult | UnflownSeed:
         return UnflownSeed(seed, str(error))
 
 
-def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can be flown.
+def fly_seeds(
+    swarm: Swarm, seeds: Iterable[int], jobs: int = 1
+) -> Iterator[SimulationResult | UnflownSeed]:
+    """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can
+    be flown.
 
     With several ``jobs``, these processes end at once when the generator does.
     """
@@ -84,7 +95,9 @@ def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Sim
     if jobs == 1:
         yield from (_fly(swarm, seed) for seed in seeds)
         return
-    os.environ.update(SINGLE_THREADED)  # read by the numerical libraries of the new processes when they start
+    os.environ.update(
+        SINGLE_THREADED
+    )  # read by the numerical libraries of the new processes when they start
     workers: list[_Worker] = []
     try:
         for _ in range(jobs):
@@ -96,7 +109,9 @@ def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Sim
 
 
 class _Worker:
-    """A process that flies one seed after the other. ``turn``: the place of its ``seed`` in the order of all."""
+    """A process that flies one seed after the other. ``turn``: the place of its ``seed`` in the
+    order of all.
+    """
 
     def __init__(self, swarm: Swarm) -> None:
         self.swarm, self.seed, self.turn = swarm, 0, 0
@@ -129,8 +144,12 @@ class _Worker:
 
 
 def _work(swarm: Swarm, connection: Connection) -> None:
-    """Fly the seeds that arrive until the connection closes, and send back results, or errors that concern all seeds."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent ends this one
+    """Fly the seeds that arrive until the connection closes, and send back results, or errors that
+    concern all seeds.
+    """
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches all processes; the parent ends this one
     with contextlib.suppress(EOFError):
         while True:
             seed = connection.recv()
@@ -140,7 +159,9 @@ def _work(swarm: Swarm, connection: Connection) -> None:
                 connection.send(error)
 
 
-def _fly_on(workers: Sequence[_Worker], seeds: Iterator[int]) -> Iterator[SimulationResult | UnflownSeed]:
+def _fly_on(
+    workers: Sequence[_Worker], seeds: Iterator[int]
+) -> Iterator[SimulationResult | UnflownSeed]:
     """Yield the results of the seeds in their order; each worker that is free flies the next one."""
     flying: dict[Connection, _Worker] = {}
     flown: dict[int, SimulationResult | UnflownSeed] = {}
@@ -169,7 +190,9 @@ def _fly_on(workers: Sequence[_Worker], seeds: Iterator[int]) -> Iterator[Simula
 
 
 def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
-    """Yield flights of simpler and simpler cases with the first violation of a result, in other numbers."""
+    """Yield flights of simpler and simpler cases with the first violation of a result, in other
+    numbers.
+    """
     first, flown = result.violations[0], result
     judges_docking = _NOT_DOCKED in first.text
 
@@ -182,7 +205,9 @@ def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[Sim
             flown = fly_case(case, result.seed)
         except ScenarioError:  # a simplification that leaves the scenario inconsistent
             return None
-        same = (v.time_s for v in flown.violations if _without_numbers(v) == _without_numbers(first))
+        same = (
+            v.time_s for v in flown.violations if _without_numbers(v) == _without_numbers(first)
+        )
         return next(same, None)
 
     duration_s = load_scenario(find_scenario(result.case["extends"])).duration_s
@@ -207,7 +232,9 @@ def _without_numbers(violation: Violation) -> tuple[str, str, str]:
 
 
 def write_case(result: SimulationResult, folder: Path) -> Path:
-    """Write a case that fails as a scenario file, with what it violates in its first lines; return its path."""
+    """Write a case that fails as a scenario file, with what it violates in its first lines; return
+    its path.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{Path(result.case['extends']).stem}-seed-{result.seed}.toml"
     lines = [f"# {violation}" for violation in result.violations]
@@ -216,13 +243,17 @@ def write_case(result: SimulationResult, folder: Path) -> Path:
 
 
 def consistency(results: Iterable[SimulationResult]) -> tuple[float, int]:
-    """Return the mean NEES over the flights without lying sensors, each weighted equally, and their number."""
+    """Return the mean NEES over the flights without lying sensors, each weighted equally, and their
+    number.
+    """
     means = [float(np.mean(r.nees)) for r in results if r.honest and r.nees]
     return (float(np.mean(means)) if means else float("nan")), len(means)
 
 
 def inconsistency(results: Iterable[SimulationResult]) -> str | None:
-    """Return why the estimate's covariance is inconsistent over an ensemble, None if it is not or the ensemble is small."""
+    """Return why the estimate's covariance is inconsistent over an ensemble, None if it is not or
+    the ensemble is small.
+    """
     mean, number = consistency(results)
     low, high = NEES_LIMITS
     if number < LEAST_NEES_FLIGHTS or low <= mean <= high:

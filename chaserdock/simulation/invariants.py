@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold in every simulated flight, whatever fails: checked on all published messages, at every tick.
+"""What must hold in every simulated flight, whatever fails: checked on all published messages, at
+every tick.
 
-The checks see messages only, and trust none of the processes: who commands follows from what the chasers flew.
+The checks see messages only, and trust none of the processes: who commands follows from what the
+chasers flew.
 """
 
 from __future__ import annotations
@@ -49,7 +51,12 @@ from chaserdock_protocol.transport import RawSample
 from chaserdock_world.orbit import TargetOrbit
 
 from chaserdock.analysis.criteria import nearest_allowed_m
-from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error, relative_pose
+from chaserdock.analysis.pose_errors import (
+    normalized_square,
+    pose_covariance,
+    pose_error,
+    relative_pose,
+)
 
 from .message_checks import defects_of
 from .network import EPOCH_NS, decode_once
@@ -64,8 +71,8 @@ RETREAT_SLACK_M = 0.15
 TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 """Time (s) after which a retreat leads to the nominal place, and the noise of its reference."""
 SETTLING_S, STOPPING_S = 15.0, 3.0
-"""Time (s) after the last warning or command until a chaser has docked or is safe, at least the time that an approach takes;
-and until a chaser that is in motion has stopped."""
+"""Time (s) after the last warning or command until a chaser has docked or is safe, at least the
+time that an approach takes; and until a chaser that is in motion has stopped."""
 BRAKING_S = 20.0
 """Longest time (s) in which a chaser without a controller brakes."""
 DRIFT_ERROR_M = 0.1
@@ -75,20 +82,27 @@ ATTACHED = frozenset({"latched", "verified", "identify", "detumble", "stack_hold
 DOCKED = ATTACHED | {"docked"}
 DETUMBLING = frozenset({"identify", "detumble", "stack_hold"})
 _TUMBLE_SHARE, _TUMBLE_FLOOR_N_M_S = 0.05, 0.02
-"""By how much the angular momentum of a stack may rise above its least while it is stopped: share of its first value, floor."""
+"""By how much the angular momentum of a stack may rise above its least while it is stopped: share
+of its first value, floor.
+"""
 _IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
 _ANGULAR_FLOOR_N_M_S, _ARM_M = 2e-5, 0.1
 _CONSERVED_SHARE = 2e-3
 _SPUN_SHARE = 1e-5
-"""Largest unexplained change of angular momentum in a tick in an orbit, as a share of it; the turning frame gives 7e-5."""
+"""Largest unexplained change of angular momentum in a tick in an orbit, as a share of it; the
+turning frame gives 7e-5.
+"""
 _DISPLACEMENT_FLOOR_M = 2e-5
 _ROUNDING = 1e-6
 LATE_JITTERS = 6.0
 """Sum of the delays of three messages in mean jitters, which one in 16 exceeds."""
 KNOWN_AFTER_S = 0.1
-"""Time (s), in addition to the latency, after which a tick is known to a chaser that is not frozen."""
+"""Time (s), in addition to the latency, after which a tick is known to a chaser that is not frozen.
+"""
 FOLLOWING_S = 3.0
-"""Longest time (s) in which a chaser flies none of the commands that are published for it, unless a fault lasts."""
+"""Longest time (s) in which a chaser flies none of the commands that are published for it, unless a
+fault lasts.
+"""
 _GAP_S = 1.1
 """Commands that pause for longer, at a hand-over, are published again."""
 _HARMLESS = frozenset({"camera_off", "lying_sensor", "odometry_lie", "duplicate"})
@@ -97,9 +111,13 @@ _LIES = frozenset({"odometry_lie", "clock_jump", "corrupt"})
 _BESIDE_DAMAGE = frozenset({"corrupt", "flood", "duplicate"})
 """Kinds of faults beside which the controller still receives sightings, damaged or not."""
 ACCURACY_M, SEEN_S = 0.01, 0.5
-"""Largest error (m) of the target's position beside drift, while two honest chasers see it, or saw it so long (s) ago."""
+"""Largest error (m) of the target's position beside drift, while two honest chasers see it, or saw
+it so long (s) ago.
+"""
 DAMAGED_SIGHTINGS = 100.0
-"""Number of damaged sightings of which the controller names at least one as invalid; about one in 14 decodes and is."""
+"""Number of damaged sightings of which the controller names at least one as invalid; about one in
+14 decodes and is.
+"""
 _THRUSTER_FLOOR_N_S, _THRUSTER_SHARE = 0.01, 0.15
 _PLAN_SHARE = 1e-3
 
@@ -118,11 +136,13 @@ class Violation:
 
 @dataclass
 class Invariants:
-    """Checks the messages of one flight as they are published; each violation is noted once per subject.
+    """Checks the messages of one flight as they are published; each violation is noted once per
+    subject.
 
-    ``reasons``: warnings and errors in the log. ``reason_s``: time of the last one that concerns a chaser. ``dead``: processes
-    that were lost, and chasers that no command has reached, until these have flown commands for ``STOPPING_S``. ``nees``:
-    normalized squared errors of the estimated pose of the target, one a second (6 on average if consistent).
+    ``reasons``: warnings and errors in the log. ``reason_s``: time of the last one that concerns a
+    chaser. ``dead``: processes that were lost, and chasers that no command has reached, until these
+    have flown commands for ``STOPPING_S``. ``nees``: normalized squared errors of the estimated
+    pose of the target, one a second (6 on average if consistent).
     """
 
     scenario: Scenario
@@ -175,12 +195,16 @@ class Invariants:
         self._now_s, self._sender = 0.0, ""
         self._truth = self.scenario.truth.mismatch("chaser")
         self._nearest_m = {
-            f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
+            f"chaser/{i}": nearest_allowed_m(self.scenario, i)
+            for i in range(len(self.scenario.chasers))
         }
         self._cones = {
-            f"chaser/{p.chaser}": cone_of(self.scenario, p.chaser) for p in self.scenario.docking.ports
+            f"chaser/{p.chaser}": cone_of(self.scenario, p.chaser)
+            for p in self.scenario.docking.ports
         }
-        self._retreats_to_m = [_retreat_goals(self.scenario, i) for i in range(len(self.scenario.chasers))]
+        self._retreats_to_m = [
+            _retreat_goals(self.scenario, i) for i in range(len(self.scenario.chasers))
+        ]
         self._liars = {f.process for f in self.scenario.fault if f.kind == "lying_sensor"}
         self._handlers: dict[type, Callable[[Any], None]] = {
             Tick: self._on_tick,
@@ -239,7 +263,7 @@ class Invariants:
         if handle is not None:
             handle(message)
 
-    # -- bodies --------------------------------------------------------------------------------------------------
+    # -- bodies ------------------------------------------------------------------------------------
 
     def _on_tick(self, tick: Tick) -> None:
         if tick.tick == self._tick and len(tick.controllers) < len(self._controllers):
@@ -259,10 +283,14 @@ class Invariants:
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
         for i in self._latched - set(world.latched):
             if self.phases.get(i) in ATTACHED and not self._latch_may_open(i):
-                self.violate("latch holds", f"chaser/{i}", f"its latch opens in phase {self.phases[i]}")
+                self.violate(
+                    "latch holds", f"chaser/{i}", f"its latch opens in phase {self.phases[i]}"
+                )
         held = self._latched | set(world.latched)  # also until a release within this tick
         self._latched = set(world.latched)
-        self._touching = {n for pair in world.contacts for n in pair} | {f"chaser/{i}" for i in held}
+        self._touching = {n for pair in world.contacts for n in pair} | {
+            f"chaser/{i}" for i in held
+        }
         self._touching |= {f"chaser/{t.chaser}" for t in world.touches} | self._probing
         self._probing.clear()
         for body in self._bodies:
@@ -271,7 +299,9 @@ class Invariants:
         self._check_stack()
 
     def _on_docking(self, status: DockingStatus) -> None:
-        """Note a probe in contact, also one whose latch has opened: the world publishes it before the bodies of the tick."""
+        """Note a probe in contact, also one whose latch has opened: the world publishes it before
+        the bodies of the tick.
+        """
         if status.contact:
             self._probing.add(f"chaser/{status.chaser}")
 
@@ -312,7 +342,9 @@ class Invariants:
             self.violate("initial state", body.body, text)
 
     def _check_displacement(self, before: BodyTruth, after: BodyTruth) -> None:
-        """Compare the displacement of a body with its velocity: they differ by a changing force only."""
+        """Compare the displacement of a body with its velocity: they differ by a changing force
+        only.
+        """
         dt_s = 1.0 / self.scenario.time.rate_hz
         mean = np.add(before.velocity_m_s, after.velocity_m_s) / 2.0
         error_m = _distance(np.array(after.position_m), np.array(before.position_m) + mean * dt_s)
@@ -327,24 +359,34 @@ class Invariants:
             self.violate("displacement", after.body, text)
 
     def _check_momentum(self, before: BodyTruth, after: BodyTruth) -> None:
-        """Compare the changes of a chaser's momentum and angular momentum with what its actuators and disturbances give."""
+        """Compare the changes of a chaser's momentum and angular momentum with what its actuators
+        and disturbances give.
+        """
         drawn = self._drawn.get(after.body)
         if self.scenario.plume is not None and len(self.scenario.chasers) > 1:
             return  # plumes of the others push it
-        if drawn is None or any(drawn.centre_of_mass_m):  # the body's origin is not its centre of mass then
+        if drawn is None or any(
+            drawn.centre_of_mass_m
+        ):  # the body's origin is not its centre of mass then
             return
         truth, dt_s = self._truth, 1.0 / self.scenario.time.rate_hz
         impulse = np.array(after.impulse_N_s) + np.array(drawn.force_N) * dt_s
-        halfway = rotations.integrate(np.array(before.q_wxyz), np.array(before.omega_rad_s), 0.5 * dt_s)
+        halfway = rotations.integrate(
+            np.array(before.q_wxyz), np.array(before.omega_rad_s), 0.5 * dt_s
+        )
         linear, turning = self._orbital_impulse(before, drawn)
-        gained = drawn.mass_kg * (np.array(after.velocity_m_s) - np.array(before.velocity_m_s)) - linear
+        gained = (
+            drawn.mass_kg * (np.array(after.velocity_m_s) - np.array(before.velocity_m_s)) - linear
+        )
         error = length(gained - rotations.rotate(halfway, impulse))
         turned = math.hypot(*after.omega_rad_s) * dt_s
         allowed = _IMPULSE_FLOOR_N_S + (_IMPULSE_SHARE + turned) * (
             after.absolute_impulse_N_s + math.hypot(*drawn.force_N) * dt_s
         )
         if error > allowed + 5.0 * truth.force_noise_N * dt_s:
-            self.violate("momentum", after.body, f"{error:.2e} N s without a cause, {allowed:.2e} allowed")
+            self.violate(
+                "momentum", after.body, f"{error:.2e} N s without a cause, {allowed:.2e} allowed"
+            )
         inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
         angular = np.array(after.angular_impulse_N_m_s) + np.array(drawn.torque_N_m) * dt_s
         spun = rotations.rotate(after.q_wxyz, inertia @ after.omega_rad_s)
@@ -358,8 +400,8 @@ class Invariants:
             self.violate("angular momentum", after.body, text)
 
     def _orbital_impulse(self, before: BodyTruth, drawn: DrawnBody) -> tuple[Array, Array]:
-        """Return the changes (3,) of momentum and angular momentum, WRF, that the orbit gives a body in a tick; 0 in free
-        space."""
+        """Return the changes (3,) of momentum and angular momentum, WRF, that the orbit gives a
+        body in a tick; 0 in free space."""
         if self._orbit is None:
             return np.zeros(3), np.zeros(3)
         dt_s = 1.0 / self.scenario.time.rate_hz
@@ -378,7 +420,9 @@ class Invariants:
         return drawn.mass_kg * acceleration * dt_s, rotations.rotate(q, torque) * dt_s
 
     def _check_target(self, before: BodyTruth, body: BodyTruth) -> None:
-        """Compare the untouched target's motion with what its kind of motion conserves; in an orbit, with what that gives."""
+        """Compare the untouched target's motion with what its kind of motion conserves; in an
+        orbit, with what that gives.
+        """
         drawn = self._drawn.get("target")
         if drawn is None or self.scenario.plume is not None:
             return  # plumes push it
@@ -393,24 +437,31 @@ class Invariants:
         if self.scenario.target.motion == "torque_free":
             momentum = rotations.rotate(np.array(body.q_wxyz), inertia @ omega)
             conserved |= {
-                f"angular momentum {axis}": float(x) for axis, x in zip("xyz", momentum, strict=True)
+                f"angular momentum {axis}": float(x)
+                for axis, x in zip("xyz", momentum, strict=True)
             }
         scale = length(inertia @ omega)
         for name, value in conserved.items():
             begin = self._begin.setdefault(name, value)
             size = max(abs(begin), scale if name.startswith("angular") else abs(begin), 1e-9)
             if abs(value - begin) > _CONSERVED_SHARE * size:
-                self.violate("energy and momentum", "target", f"{name} from {begin:.6g} to {value:.6g}")
+                self.violate(
+                    "energy and momentum", "target", f"{name} from {begin:.6g} to {value:.6g}"
+                )
 
     def _check_stack(self) -> None:
-        """Check that the angular momentum of target and latched chasers does not rise while they stop its tumble."""
+        """Check that the angular momentum of target and latched chasers does not rise while they
+        stop its tumble.
+        """
         names = ["target", *(f"chaser/{i}" for i in sorted(self._latched))]
         stopping = any(self.phases.get(i) in DETUMBLING for i in self._latched)
         known = self._states.keys() & self._drawn.keys()
         if not stopping or not known.issuperset(names) or self._device_disturbed(self.time_s):
             self._tumble_N_m_s = None
             return
-        now = float(np.linalg.norm(_angular_momentum([(self._states[n], self._drawn[n]) for n in names])))
+        now = float(
+            np.linalg.norm(_angular_momentum([(self._states[n], self._drawn[n]) for n in names]))
+        )
         first, least = self._tumble_N_m_s or (now, now)
         self._tumble_N_m_s = (first, min(least, now))
         if now > least + _TUMBLE_SHARE * first + _TUMBLE_FLOOR_N_M_S:
@@ -418,13 +469,17 @@ class Invariants:
             self.violate("tumble falls", "target", text)
 
     def _device_disturbed(self, now_s: float) -> bool:
-        """Return whether thrusters may give something else than commanded: failures, lost or late messages, recent faults."""
+        """Return whether thrusters may give something else than commanded: failures, lost or late
+        messages, recent faults.
+        """
         s = self.scenario
         recent = any(f.at_s <= now_s <= f.at_s + (f.duration_s or 0.0) + 2.0 for f in s.fault)
         return bool(s.thruster_failure or recent or self._may_be_late())
 
     def _check_target_in_orbit(self, before: BodyTruth, body: BodyTruth, drawn: DrawnBody) -> None:
-        """Compare the change of the free target's angular momentum in a tick with what the orbit gives."""
+        """Compare the change of the free target's angular momentum in a tick with what the orbit
+        gives.
+        """
         inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
         spun = [rotations.rotate(s.q_wxyz, inertia @ s.omega_rad_s) for s in (before, body)]
         _, given = self._orbital_impulse(before, drawn)
@@ -437,7 +492,9 @@ class Invariants:
     def _check_distances(self) -> None:
         states, target = self._states, self._states.get("target")
         chasers = {
-            n: np.array(s.position_m) for n, s in states.items() if n != "target" and n not in self.dead
+            n: np.array(s.position_m)
+            for n, s in states.items()
+            if n != "target" and n not in self.dead
         }
         limit_m = self.scenario.limits.min_distance_chasers_m - KEEP_OUT_SLACK_M
         for (a, at), (b, bt) in itertools.combinations(chasers.items(), 2):
@@ -454,23 +511,28 @@ class Invariants:
                 self.violate("keep-out zone", name, f"{distance_m:.3f} m from the target")
 
     def _is_misled(self) -> bool:
-        """Return whether the sensors of half of the chasers lie, or lied until recently: who is honest cannot be known then."""
+        """Return whether the sensors of half of the chasers lie, or lied until recently: who is
+        honest cannot be known then.
+        """
         lies = [f for f in self.scenario.fault if f.kind == "lying_sensor"]
         recent = [
-            f.process for f in lies if f.at_s <= self.time_s <= f.at_s + (f.duration_s or 0.0) + SETTLING_S
+            f.process
+            for f in lies
+            if f.at_s <= self.time_s <= f.at_s + (f.duration_s or 0.0) + SETTLING_S
         ]
         return 2 * len(set(recent)) >= len(self.scenario.chasers)
 
     def _nearest_allowed_m(self, name: str, offset_m: Array) -> float:
-        """Return the smallest allowed distance from the target of a chaser at an offset (3,), TRF: smaller in its corridor, and for
-        one that controls itself, which the corridor of a rotating target leaves behind."""
+        """Return the smallest allowed distance from the target of a chaser at an offset (3,), TRF:
+        smaller in its corridor, and for one that controls itself, which the corridor of a rotating
+        target leaves behind."""
         cone = self._cones.get(name)
         in_corridor = cone is not None and cone.room_m(offset_m) > -KEEP_OUT_SLACK_M
         if in_corridor or (cone is not None and self._falls_back(int(name.partition("/")[2]))):
             return self._nearest_m[name]
         return self.scenario.limits.min_distance_target_m
 
-    # -- commands ------------------------------------------------------------------------------------------------
+    # -- commands ----------------------------------------------------------------------------------
 
     def _on_wrench(self, command: WrenchCommand) -> None:
         """Note since when a chaser is commanded without a break."""
@@ -510,44 +572,63 @@ class Invariants:
             self.violate("commands are flown", f"chaser/{i}", text)
 
     def _disturbed_until_s(self, name: str, now_s: float) -> float:
-        """Return until when faults or the network have kept commands from a chaser, at most ``now_s``; 0 if never."""
+        """Return until when faults or the network have kept commands from a chaser, at most
+        ``now_s``; 0 if never.
+        """
         return self._lasted_until_s([f for f in self.scenario.fault if _concerns(f, name)], now_s)
 
     def _lasted_until_s(self, faults: Sequence[Fault], now_s: float) -> float:
-        """Return until when one of the faults, a partition or a slow reader has lasted, at most ``now_s``; 0 if none."""
+        """Return until when one of the faults, a partition or a slow reader has lasted, at most
+        ``now_s``; 0 if none.
+        """
         s = self.scenario.simulation
         spans = [(f.at_s, f.at_s + (f.duration_s or 0.0)) for f in faults]
         spans += [(w.at_s, w.at_s + w.duration_s) for w in (*s.partition, *s.slow)]
         return max([0.0, *(min(end_s, now_s) for at_s, end_s in spans if at_s <= now_s)])
 
     def _note_return(self, command: ActuatorCommand) -> None:
-        """Judge a chaser again that has flown commands for ``STOPPING_S``, while no fault kept them from its actuators."""
+        """Judge a chaser again that has flown commands for ``STOPPING_S``, while no fault kept them
+        from its actuators.
+        """
         name, now_s = f"chaser/{command.chaser}", self.time_s
         if command.source != "command" or name in self._lost:
             self._returned_s.pop(name, None)
             return
-        since_s = max(self._returned_s.setdefault(name, now_s), self._disturbed_until_s(name, now_s))
+        since_s = max(
+            self._returned_s.setdefault(name, now_s), self._disturbed_until_s(name, now_s)
+        )
         if now_s - since_s > STOPPING_S:
             self.dead.remove(name)
             del self._returned_s[name]
 
     def _may_hand_over(self) -> bool:
-        """Return whether the network, or a fault within the last `FOLLOWING_S`, explains that the other controller commands."""
+        """Return whether the network, or a fault within the last `FOLLOWING_S`, explains that the
+        other controller commands.
+        """
         faults = [f for f in self.scenario.fault if f.kind not in _HARMLESS]
         until_s = self._lasted_until_s(faults, self.time_s)
         return self._may_be_late() or (until_s > 0.0 and self.time_s - until_s <= FOLLOWING_S)
 
     def _check_braking(self, command: ActuatorCommand) -> None:
-        """Check that a chaser without a controller ends braking; a latched one, or one without odometry, pushes not at all."""
+        """Check that a chaser without a controller ends braking; a latched one, or one without
+        odometry, pushes not at all.
+        """
         i, name = command.chaser, f"chaser/{command.chaser}"
         pushes = any((*command.force_N, *command.torque_N_m)) and i not in self._latched
-        if command.source != "brake" or not pushes or name in self.dead or self.scenario.thruster_failure:
+        if (
+            command.source != "brake"
+            or not pushes
+            or name in self.dead
+            or self.scenario.thruster_failure
+        ):
             self._braking_s.pop(i, None)
         elif (lasting_s := self.time_s - self._braking_s.setdefault(i, self.time_s)) > BRAKING_S:
             self.violate("liveness", name, f"brakes for {lasting_s:.0f} s")
 
     def _check_pulses(self, command: ActuatorCommand) -> None:
-        """Check that thrusters open before the force commanded since the last pulse gives more than all in one period."""
+        """Check that thrusters open before the force commanded since the last pulse gives more than
+        all in one period.
+        """
         body, i = self.scenario.chaser, command.chaser
         carried = body.actuation == "thrusters" and body.modulation.carry_over
         if command.pulses or command.isolated or not carried:
@@ -581,7 +662,9 @@ class Invariants:
         if before is not None and command.tick < before.tick:
             self.violate("no stale command", name, f"flies tick {command.tick} after {before.tick}")
         if before is not None and command.term < before.term:
-            self.violate("no superseded command", name, f"flies term {command.term} after {before.term}")
+            self.violate(
+                "no superseded command", name, f"flies term {command.term} after {before.term}"
+            )
         sender = commander_of(command.term)
         other = self._commanders.setdefault(command.tick, sender)
         # If the commander is lost in a tick, chasers may have executed its command before.
@@ -592,9 +675,11 @@ class Invariants:
         self._check_succession(command)
 
     def _check_succession(self, command: ActuatorCommand) -> None:
-        """Check that no command of a lower term is flown for a later tick than one of a higher term of the other controller.
+        """Check that no command of a lower term is flown for a later tick than one of a higher term
+        of the other controller.
 
-        A repeated tick may have both. A chaser that was lost may fly its commands late, but for their own ticks.
+        A repeated tick may have both. A chaser that was lost may fly its commands late, but for
+        their own ticks.
         """
         term, tick = command.term, command.tick
         first, last = self._term_ticks.get(term, (tick, tick))
@@ -606,7 +691,9 @@ class Invariants:
                 self.violate("one commander", f"chaser/{command.chaser}", text)
 
     def _check_hand_over(self, command: ActuatorCommand) -> None:
-        """Check that the network or a fault explains that a later tick is commanded by the other controller."""
+        """Check that the network or a fault explains that a later tick is commanded by the other
+        controller.
+        """
         before = max(self._term_ticks, default=command.term)
         newer = command.term > before and command.tick > self._term_ticks[before][1]
         handed_over = newer and commander_of(command.term) != commander_of(before)
@@ -621,14 +708,16 @@ class Invariants:
         return wall_s if clock is None else (wall_s - clock.offset_s) / (1.0 + clock.drift)
 
     def _known_tick(self) -> int:
-        """Return the newest tick that has reached the chasers by now: a world that was frozen opens many at once."""
+        """Return the newest tick that has reached the chasers by now: a world that was frozen opens
+        many at once.
+        """
         network = self.scenario.simulation
         if network.mode == "lockstep":
             return self._tick
         sent_s = self._now_s - network.latency_s - KNOWN_AFTER_S
         return next((tick for opened_s, tick in reversed(self._opened) if opened_s <= sent_s), -1)
 
-    # -- the rest ------------------------------------------------------------------------------------------------
+    # -- the rest ----------------------------------------------------------------------------------
 
     def _on_sighting(self, sighting: Sighting) -> None:
         name = f"chaser/{sighting.chaser}"
@@ -640,21 +729,29 @@ class Invariants:
             self._damaged += self._damaged_share(name, commander) if commander else 0.0
 
     def _damaged_share(self, chaser: str, commander: str) -> float:
-        """Return the share of a chaser's sightings that a fault damages now for the commander, and that it receives in time."""
+        """Return the share of a chaser's sightings that a fault damages now for the commander, and
+        that it receives in time.
+        """
         active = [
-            f for f in self.scenario.fault if f.at_s <= self.time_s < f.at_s + (f.duration_s or math.inf)
+            f
+            for f in self.scenario.fault
+            if f.at_s <= self.time_s < f.at_s + (f.duration_s or math.inf)
         ]
         if self.scenario.simulation.partition or any(
             _concerns(f, chaser) for f in active if f.kind not in _BESIDE_DAMAGE
         ):
             return 0.0
         shares = (
-            f.share or 1.0 for f in active if _damages_sightings(f, commander) and f.peer in (None, chaser)
+            f.share or 1.0
+            for f in active
+            if _damages_sightings(f, commander) and f.peer in (None, chaser)
         )
         return max(shares, default=0.0)
 
     def _check_accuracy(self, estimate: TargetEstimate, truth: BodyTruth) -> None:
-        """Check that one lying sensor does not mislead the estimate while two honest chasers see the target."""
+        """Check that one lying sensor does not mislead the estimate while two honest chasers see
+        the target.
+        """
         if len(self._liars) > 1 or any(f.kind in _LIES for f in self.scenario.fault):
             return
         if self.scenario.chaser.actuation == "thrusters" and self._may_be_late():
@@ -670,19 +767,28 @@ class Invariants:
             self.violate("accurate estimate", "target", text)
 
     def _is_pushed(self) -> bool:
-        """Return whether a thruster of a latched chaser may be stuck on without a report: detection pauses while latched."""
+        """Return whether a thruster of a latched chaser may be stuck on without a report: detection
+        pauses while latched.
+        """
         return any(
-            f.kind == "stuck_on" and not f.reported and f.at_s <= self.time_s and f.chaser in self._latched
+            f.kind == "stuck_on"
+            and not f.reported
+            and f.at_s <= self.time_s
+            and f.chaser in self._latched
             for f in self.scenario.thruster_failure
         )
 
     def _on_thrusters(self, report: ThrusterReport) -> None:
-        """Compare the impulse that a chaser expects of its thrusters with the true one, summed since the last fault."""
+        """Compare the impulse that a chaser expects of its thrusters with the true one, summed
+        since the last fault.
+        """
         i, name = report.chaser, f"chaser/{report.chaser}"
         body, now_s = self._states.get(name), report.tick / self.scenario.time.rate_hz
         suspected = [j for j, state in enumerate(report.thrusters) if state != "healthy"]
         if suspected and not (self.scenario.thruster_failure or self._may_be_late()):
-            self.violate("thrusters as expected", name, f"takes {suspected} for failed, but none is")
+            self.violate(
+                "thrusters as expected", name, f"takes {suspected} for failed, but none is"
+            )
         if (
             body is None
             or body.tick != report.tick
@@ -692,7 +798,10 @@ class Invariants:
             self._unexplained.pop(i, None)
             return
         true = [*body.impulse_N_s, *np.divide(body.angular_impulse_N_m_s, _ARM_M)]
-        expected = [*report.given_impulse_N_s, *np.divide(report.given_angular_impulse_N_m_s, _ARM_M)]
+        expected = [
+            *report.given_impulse_N_s,
+            *np.divide(report.given_angular_impulse_N_m_s, _ARM_M),
+        ]
         if i not in self._unexplained:
             self._unexplained[i], self._given_N_s[i] = np.zeros(6), 0.0
             return
@@ -700,19 +809,23 @@ class Invariants:
         self._given_N_s[i] += sum(body.thruster_impulse_N_s)
         error = float(np.linalg.norm(self._unexplained[i]))
         if error > self._thruster_error_N_s(name, self._given_N_s[i]):
-            text = (
-                f"expects {error:.2e} N s more of its thrusters than they gave, of {self._given_N_s[i]:.2e}"
-            )
+            text = f"expects {error:.2e} N s more of its thrusters than they gave, of {self._given_N_s[i]:.2e}"
             self.violate("thrusters as expected", name, text)
 
     def _thruster_error_N_s(self, name: str, given_N_s: float) -> float:
-        """Return by how much the impulse that thrusters have given may differ from the expected one."""
+        """Return by how much the impulse that thrusters have given may differ from the expected
+        one.
+        """
         truth, drawn = self._truth, self._drawn.get(name)
         late_s = truth.delay_s + 3.0 * truth.delay_jitter_s
         late_s += 0.0 if drawn is None else abs(drawn.clock_offset_s)
         # A thruster's force acts on position and, by its arm, on attitude.
         shifted_N_s = 2.0 * late_s * sum(t.thrust_N for t in self.scenario.chaser.thrusters)
-        return _THRUSTER_FLOOR_N_S + shifted_N_s + (_THRUSTER_SHARE + 3.0 * truth.thrust_share) * given_N_s
+        return (
+            _THRUSTER_FLOOR_N_S
+            + shifted_N_s
+            + (_THRUSTER_SHARE + 3.0 * truth.thrust_share) * given_N_s
+        )
 
     def _on_estimate(self, estimate: TargetEstimate) -> None:
         truth = self._states.get("target")
@@ -725,11 +838,17 @@ class Invariants:
             return
         true, known = ((np.array(x.position_m), np.array(x.q_wxyz)) for x in (truth, estimate))
         self.nees.append(
-            float(normalized_square(pose_error(*true, *known), pose_covariance(estimate.covariance)))
+            float(
+                normalized_square(pose_error(*true, *known), pose_covariance(estimate.covariance))
+            )
         )
         for relative in estimate.relative:
             own = self._states.get(f"chaser/{relative.chaser}")
-            if own is not None and own.body not in self._touching and own.sim_time_ns == estimate.sim_time_ns:
+            if (
+                own is not None
+                and own.body not in self._touching
+                and own.sim_time_ns == estimate.sim_time_ns
+            ):
                 self.relative_nees.append(_relative_nees(relative, own, truth))
 
     def _on_reference(self, reference: Reference) -> None:
@@ -739,18 +858,23 @@ class Invariants:
             nominal_m = self.scenario.chasers[i].position_m
             near_m = min(away_m, math.hypot(*nominal_m)) - RETREAT_SLACK_M
             # From the far side of the target the way back passes it.
-            self._retreats_from_m[i] = near_m if np.dot(reference.offset_m, nominal_m) > 0.0 else 0.0
+            self._retreats_from_m[i] = (
+                near_m if np.dot(reference.offset_m, nominal_m) > 0.0 else 0.0
+            )
             self._homing_m.pop(i, None)
         self.phases[i] = reference.phase
         if reference.phase in ("retreat", "abort") and reference.phase_time_s > TURNING_S:
             self._check_homing(i, reference)
         if reference.phase in ("retreat", "abort") and away_m < self._retreats_from_m[i]:
             self.violate(
-                "retreat leads away", f"chaser/{i}", f"its reference is {away_m:.2f} m from the target"
+                "retreat leads away",
+                f"chaser/{i}",
+                f"its reference is {away_m:.2f} m from the target",
             )
 
     def _check_homing(self, i: int, reference: Reference) -> None:
-        """Check that a retreat leads to the chaser's nominal place or, for another attempt, to the entry of its corridor.
+        """Check that a retreat leads to the chaser's nominal place or, for another attempt, to the
+        entry of its corridor.
 
         Controllers begin it by their own estimates: after a hand-over it may be less far.
         """
@@ -778,8 +902,8 @@ class Invariants:
                 self.violate("no loss without a cause", lost, event.what)
 
     def _concerned(self, event: Event) -> set[int]:
-        """Return the chasers that an event may keep from docking: the one that publishes it, or those that world or
-        controllers name; all if they name none."""
+        """Return the chasers that an event may keep from docking: the one that publishes it, or
+        those that world or controllers name; all if they name none."""
         if event.process.startswith("chaser/"):
             return {int(event.process.partition("/")[2])}
         named = {int(i) for i in re.findall(r"chaser[ /](\d+)", f"{event.what} {event.detail}")}
@@ -789,7 +913,9 @@ class Invariants:
 
     def _latch_may_open(self, i: int) -> bool:
         """Return whether a fault or a limited strength explains that a closed latch opens."""
-        faults = (f for f in self.scenario.fault if f.kind in LATCH_FAULTS and f.process == f"chaser/{i}")
+        faults = (
+            f for f in self.scenario.fault if f.kind in LATCH_FAULTS and f.process == f"chaser/{i}"
+        )
         lasting = any(f.at_s <= self.time_s <= f.at_s + (f.duration_s or 0.0) + 1.0 for f in faults)
         return lasting or "latch" in self.scenario.truth.model_fields_set
 
@@ -811,14 +937,20 @@ class Invariants:
         self.end = end
 
     def check_end(self, crashes: dict[str, str], stalled: tuple[str, ...]) -> None:
-        """Check what must hold when a flight is over: it ended, all processes did, and each mission is docked or safe."""
+        """Check what must hold when a flight is over: it ended, all processes did, and each mission
+        is docked or safe.
+        """
         for name, trace in crashes.items():
             self.violate("no crash", name, trace.strip().splitlines()[-1])
         for name in stalled:
             self.violate("liveness", name, "has not ended")
-        if self._damaged >= DAMAGED_SIGHTINGS and not any("invalid sighting" in r for r in self.reasons):
+        if self._damaged >= DAMAGED_SIGHTINGS and not any(
+            "invalid sighting" in r for r in self.reasons
+        ):
             self.violate(
-                "damage is named", "controller", f"takes about {self._damaged:.0f} damaged sightings as valid"
+                "damage is named",
+                "controller",
+                f"takes about {self._damaged:.0f} damaged sightings as valid",
             )
         if self.end is None:
             self.violate("liveness", "world", "the mission has not ended")
@@ -833,40 +965,60 @@ class Invariants:
             if phase in ATTACHED and chaser not in self._latched and name not in self.dead:
                 self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
             error_m = self._docking_error_m(chaser)
-            if phase == "docked" and not self._falls_back(chaser) and error_m > self._docked_within_m():
+            if (
+                phase == "docked"
+                and not self._falls_back(chaser)
+                and error_m > self._docked_within_m()
+            ):
                 self.violate(
-                    "liveness", name, f"is in phase docked, but {error_m:.3f} m from its docking place"
+                    "liveness",
+                    name,
+                    f"is in phase docked, but {error_m:.3f} m from its docking place",
                 )
             if phase not in DOCKED and not self._disturbed():
                 self.violate(
-                    "liveness", name, f"ends in phase {phase or 'none'}, although nothing disturbed it"
+                    "liveness",
+                    name,
+                    f"ends in phase {phase or 'none'}, although nothing disturbed it",
                 )
             if not self.state_at_end(chaser):
-                self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+                self.violate(
+                    "liveness", name, f"ends in phase {phase or 'none'} without a named reason"
+                )
 
     def state_at_end(self, chaser: int) -> str:
-        """Return how a chaser that is to dock ends: ``docked``, ``safe``, ``unfinished``, or empty if it is none of these.
+        """Return how a chaser that is to dock ends: ``docked``, ``safe``, ``unfinished``, or empty
+        if it is none of these.
 
-        Safe: no command reaches it, or it keeps its distance and a warning or command names why. Unfinished: the time after
-        the last warning or command was too short for an approach, or a lost chaser is in the way.
+        Safe: no command reaches it, or it keeps its distance and a warning or command names why.
+        Unfinished: the time after the last warning or command was too short for an approach, or a
+        lost chaser is in the way.
         """
         phase = self.phases.get(chaser, "")
         commands = [e for e in self.scenario.timeline if chaser in e.chasers]
         named = chaser in self.reason_s or any(e.command in _NAMED_IN for e in commands)
         if phase in DOCKED and not self._falls_back(chaser):
             return "docked"
-        if f"chaser/{chaser}" in self.dead or (named and (phase in SAFE_PHASES or self._falls_back(chaser))):
+        if f"chaser/{chaser}" in self.dead or (
+            named and (phase in SAFE_PHASES or self._falls_back(chaser))
+        ):
             return "safe"
         last_s = max(self.reason_s.get(chaser, 0.0), *(e.at_s for e in commands), 0.0)
         in_time = self.time_s - last_s < settling_s(self.scenario, chaser)
-        return "unfinished" if (in_time or self._is_blocked(chaser)) and phase not in SAFE_PHASES else ""
+        return (
+            "unfinished"
+            if (in_time or self._is_blocked(chaser)) and phase not in SAFE_PHASES
+            else ""
+        )
 
     def _falls_back(self, chaser: int) -> bool:
         """Return whether no command reaches a chaser: it is lost, stopped, or controls itself."""
         return f"chaser/{chaser}" in self.dead or self._sources.get(chaser, "command") != "command"
 
     def _docking_place(self, chaser: int) -> Array | None:
-        """Return the true place (WRF, m) where a chaser without a port docks; None if the truth is not known."""
+        """Return the true place (WRF, m) where a chaser without a port docks; None if the truth is
+        not known.
+        """
         target = self._states.get("target")
         if target is None:
             return None
@@ -875,26 +1027,36 @@ class Invariants:
         return target.position_m + rotations.rotate(np.array(target.q_wxyz), offset_m)
 
     def _docking_error_m(self, chaser: int) -> float:
-        """Return the true distance of a chaser without a port from the place where it docks; 0 if the truth is not known."""
+        """Return the true distance of a chaser without a port from the place where it docks; 0 if
+        the truth is not known.
+        """
         place, own = self._docking_place(chaser), self._states.get(f"chaser/{chaser}")
         return 0.0 if place is None or own is None else math.dist(place, own.position_m)
 
     def _is_blocked(self, chaser: int) -> bool:
-        """Return whether a lost chaser drifts so close to the docking place, or to a chaser with a port, that others avoid it."""
+        """Return whether a lost chaser drifts so close to the docking place, or to a chaser with a
+        port, that others avoid it.
+        """
         own = self._states.get(f"chaser/{chaser}")
         port = self.scenario.docking.port_of(chaser)
         place = self._docking_place(chaser) if port is None or own is None else own.position_m
         near_m = self.scenario.limits.min_distance_chasers_m + LOST_MARGIN_M + DRIFT_ERROR_M
         lost = [state for name, state in self._states.items() if name in self._lost]
-        return place is not None and any(math.dist(place, state.position_m) < near_m for state in lost)
+        return place is not None and any(
+            math.dist(place, state.position_m) < near_m for state in lost
+        )
 
     def _docked_within_m(self) -> float:
-        """Return the largest true distance of a docked chaser from its place: that of the scenario and errors of the estimate."""
+        """Return the largest true distance of a docked chaser from its place: that of the scenario
+        and errors of the estimate.
+        """
         drift_m = self.scenario.navigation.errors().position_drift_m
         return self.scenario.approach.docked_position_m + ACCURACY_M + 4.0 * drift_m
 
     def _disturbed(self) -> bool:
-        """Return whether anything may keep the chasers from docking: faults, the network, commands, or another plant."""
+        """Return whether anything may keep the chasers from docking: faults, the network, commands,
+        or another plant.
+        """
         s = self.scenario
         network = s.simulation.model_dump(exclude={"mode", "latency_s", "jitter_s", "duplicate"})
         commands = {e.command for e in s.timeline} - {"approach"}
@@ -903,19 +1065,25 @@ class Invariants:
 
 
 def settling_s(s: Scenario, chaser: int) -> float:
-    """Return how long a chaser may take after the last disturbance: for an approach from rest, or another attempt."""
+    """Return how long a chaser may take after the last disturbance: for an approach from rest, or
+    another attempt.
+    """
     d, approach = s.docking, s.approach
     if d.port_of(chaser) is None:
         way_m = math.hypot(*s.chasers[chaser].position_m) - approach.dock_distance_m
         moving_s = PEAK_SPEED * max(0.0, way_m) / approach.max_speed_m_s
         return max(SETTLING_S, STOPPING_S + moving_s + approach.docked_time_s)
     out_s = d.entry_m / approach.max_speed_m_s
-    in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (d.final_m + d.overdrive_m) / d.contact_speed_m_s
+    in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (
+        d.final_m + d.overdrive_m
+    ) / d.contact_speed_m_s
     return SETTLING_S + out_s + in_s + d.settle_s + 2.0 * d.pull_s
 
 
 def _retreat_goals(s: Scenario, chaser: int) -> Array:
-    """Return the places (1 or 2, 3), TRF, to which a retreat may lead: the nominal one, and the entry of the corridor to a port."""
+    """Return the places (1 or 2, 3), TRF, to which a retreat may lead: the nominal one, and the
+    entry of the corridor to a port.
+    """
     port, goals_m = s.docking.port_of(chaser), [np.array(s.chasers[chaser].position_m)]
     if port is not None:
         goals_m.append(centre_offset(port, s.chaser.probe_reach_m, s.docking.entry_m))
@@ -933,7 +1101,9 @@ def _damages_sightings(fault: Fault, controller: str) -> bool:
 
 
 def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth) -> float:
-    """Return the normalized squared error (6 on average if consistent) of the pose of a chaser relative to the target."""
+    """Return the normalized squared error (6 on average if consistent) of the pose of a chaser
+    relative to the target.
+    """
     own_pose, target_pose = ((np.array(b.position_m), np.array(b.q_wxyz)) for b in (own, target))
     true = relative_pose(*own_pose, *target_pose)
     error = pose_error(*true, np.array(estimate.position_m), np.array(estimate.q_wxyz))

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold for each published message by itself, beyond what the decoder checks. Pure functions."""
+"""What must hold for each published message by itself, beyond what the decoder checks. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ _UNIT = 1e-6
 _LIMIT_SHARE = 1.01
 """Share of a limit up to which chasers accept commands."""
 _SYMMETRY = 1e-9
-"""Largest asymmetry and largest negative eigenvalue of a covariance, as a share of its largest variance."""
+"""Largest asymmetry and largest negative eigenvalue of a covariance, as a share of its largest
+variance.
+"""
 
 
 def defects_of(message: Any, scenario: Scenario) -> list[str]:
@@ -49,7 +53,8 @@ def covariance_defect(values: Sequence[float]) -> str:
     shifted = matrix.copy()
     shifted.reshape(-1)[:: size + 1] += _SYMMETRY * scale
     try:
-        # Exists unless an eigenvalue is below -_SYMMETRY * scale, and is faster than the eigenvalues.
+        # Exists unless an eigenvalue is below -_SYMMETRY * scale, and is faster than the
+        # eigenvalues.
         np.linalg.cholesky(shifted)
         return ""
     except np.linalg.LinAlgError:
@@ -127,8 +132,12 @@ def _plan(plan: Plan, scenario: Scenario) -> Iterator[str]:
     yield from _within_limits(plan.inputs, scenario)
 
 
-def _within_limits(wrenches: Sequence[float], scenario: Scenario, single: bool = False) -> Iterator[str]:
-    """Check wrenches, six numbers each. ``single``: thrusters may be commanded one by one, up to all in the same direction."""
+def _within_limits(
+    wrenches: Sequence[float], scenario: Scenario, single: bool = False
+) -> Iterator[str]:
+    """Check wrenches, six numbers each. ``single``: thrusters may be commanded one by one, up to
+    all in the same direction.
+    """
     limits, thrusters = scenario.chaser.wrench_max, scenario.chaser.thrusters
     if single:
         limits = np.maximum(limits, np.abs(wrench_matrix(thrusters)) @ thrusts_max(thrusters))
@@ -138,12 +147,16 @@ def _within_limits(wrenches: Sequence[float], scenario: Scenario, single: bool =
 
 
 def _wrench(command: WrenchCommand, scenario: Scenario) -> Iterator[str]:
-    yield from _within_limits([*command.force_N, *command.torque_N_m], scenario, bool(command.thrusts_N))
+    yield from _within_limits(
+        [*command.force_N, *command.torque_N_m], scenario, bool(command.thrusts_N)
+    )
     if command.mode in ("none", "wait", "yield"):
         return
     lifetime_s = (command.expires_ns - command.sim_time_ns) * 1e-9
     stated_s = scenario.controller.command_lifetime_s
-    if command.sim_time_ns and abs(lifetime_s - stated_s) > 1e-6:  # stamps of a wrong clock end at 0
+    if (
+        command.sim_time_ns and abs(lifetime_s - stated_s) > 1e-6
+    ):  # stamps of a wrong clock end at 0
         yield f"command with a lifetime of {lifetime_s:g} s, {stated_s:g} stated"
 
 

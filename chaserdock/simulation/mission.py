@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly one scenario in this process: all processes of the mission, unchanged, on a simulated network."""
+"""Fly one scenario in this process: all processes of the mission, unchanged, on a simulated
+network.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +27,17 @@ from .scheduler import Scheduler, Task
 Tap = Callable[[str, RawSample], None]
 
 _START_S, _END_S = 30.0, 60.0
-"""Longest virtual time from the start of the processes to the first tick, and from the mission's end to theirs (s)."""
+"""Longest virtual time from the start of the processes to the first tick, and from the mission's
+end to theirs (s).
+"""
 
 
 @dataclass(frozen=True)
 class SimulatedFlight:
     """A simulated flight. ``statuses``: exit status by process; None of one that was killed.
 
-    ``crashes``: traceback by process. ``stalled``: processes that had not ended when the time was over. ``output``: what the
-    processes printed. ``time_s``: virtual time at the end.
+    ``crashes``: traceback by process. ``stalled``: processes that had not ended when the time was
+    over. ``output``: what the processes printed. ``time_s``: virtual time at the end.
     """
 
     folder: Path
@@ -52,10 +56,11 @@ def simulate(
     tap: Tap | None = None,
     over: Callable[[], bool] | None = None,
 ) -> SimulatedFlight:
-    """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes to ``folder``.
+    """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes
+    to ``folder``.
 
-    ``tap`` sees every message when it is published: the sender's name, the sample. The flight is broken off when ``over``
-    holds. Raises ScenarioError and MissingPackageError.
+    ``tap`` sees every message when it is published: the sender's name, the sample. The flight is
+    broken off when ``over`` holds. Raises ScenarioError and MissingPackageError.
     """
     scenario = load_scenario(path, overrides)
     require_packages(scenario)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated network: carries the messages of all nodes in virtual time, with the faults of ``Conditions``.
+"""Simulated network: carries the messages of all nodes in virtual time, with the faults of
+``Conditions``.
 
-It behaves as Zenoh over TCP links: messages of one priority arrive in order, declarations and messages travel the same
-links, a link that is cut or congested holds back what must not be lost and drops the rest. Deliveries run within the
-scheduler, so that publishing never waits.
+It behaves as Zenoh over TCP links: messages of one priority arrive in order, declarations and
+messages travel the same links, a link that is cut or congested holds back what must not be lost and
+drops the rest. Deliveries run within the scheduler, so that publishing never waits.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from chaserdock_protocol.transport.network import Connection, Host, Query, Reply
 from .scheduler import NEVER, Due, Killed, Scheduler, VirtualQueue
 
 LINK_BYTES = 1 << 20
-"""A link drops droppable messages while so many bytes are on it, as Zenoh with the options of ``transport.config`` does."""
+"""A link drops droppable messages while so many bytes are on it, as Zenoh with the options of
+``transport.config`` does.
+"""
 LEASE_S = 2.0
 """Time after which a silent process counts as lost in real time, as under ``chaserdock run``."""
 _RETRY_S = 0.2
@@ -36,20 +39,26 @@ EPOCH_NS = 1_800_000_000 * 10**9
 
 @lru_cache(maxsize=128)
 def decode_once(kind: type[T], payload: bytes, encoding: str) -> T:
-    """Decode as ``codec.decode``; the receivers of a message share the result, which cannot be changed."""
+    """Decode as ``codec.decode``; the receivers of a message share the result, which cannot be
+    changed.
+    """
     return codec.decode(kind, payload, encoding)
 
 
 @lru_cache(maxsize=4096)
 def matches(expression: str, key: str) -> bool:
-    """Return whether a key expression includes a key: ``*`` stands for one chunk, ``**`` for any number."""
+    """Return whether a key expression includes a key: ``*`` stands for one chunk, ``**`` for any
+    number.
+    """
     pattern = re.escape(expression).replace(r"\*\*/", "(.*/)?").replace(r"\*\*", ".*")
     return re.fullmatch(pattern.replace(r"\*", "[^/]*"), key) is not None
 
 
 @dataclass
 class Traffic:
-    """What the network has carried and lost. ``recorded``: messages that arrived at the recorder, by key."""
+    """What the network has carried and lost. ``recorded``: messages that arrived at the recorder,
+    by key.
+    """
 
     sent: int = 0
     lost: int = 0
@@ -79,9 +88,11 @@ class _Subscription:
 
 
 class SimulatedNetwork:
-    """The ``Network`` of one simulated mission. ``tap`` sees every message when it is published: sender, sample.
+    """The ``Network`` of one simulated mission. ``tap`` sees every message when it is published:
+    sender, sample.
 
-    ``lockstep``: nothing is lost, duplicated or reordered on one link, as TCP guarantees; conditions only delay.
+    ``lockstep``: nothing is lost, duplicated or reordered on one link, as TCP guarantees;
+    conditions only delay.
     """
 
     def __init__(
@@ -92,7 +103,12 @@ class SimulatedNetwork:
         lockstep: bool,
         tap: Callable[[str, RawSample], None] | None = None,
     ) -> None:
-        self.scheduler, self.conditions, self.lockstep, self.tap = scheduler, conditions, lockstep, tap
+        self.scheduler, self.conditions, self.lockstep, self.tap = (
+            scheduler,
+            conditions,
+            lockstep,
+            tap,
+        )
         self.traffic = Traffic()
         self.first_tick_s: float | None = None
         self._latency_s, self._jitter_s = conditions.latency_s, conditions.jitter_s
@@ -122,9 +138,11 @@ class SimulatedNetwork:
         """Return a random stream of this network's seed."""
         return random.Random(f"{self._seed} {parts}")
 
-    # -- messages ------------------------------------------------------------------------------------------------
+    # -- messages ----------------------------------------------------------------------------------
 
-    def publish(self, sender: SimulatedConnection, raw: RawSample, qos: str, blocking: bool) -> None:
+    def publish(
+        self, sender: SimulatedConnection, raw: RawSample, qos: str, blocking: bool
+    ) -> None:
         """Send a sample to all who have subscribed to its key, as far as the sender knows."""
         if sender.closed:
             return
@@ -150,7 +168,12 @@ class SimulatedNetwork:
         return self._routes[key]
 
     def _send(
-        self, sender: SimulatedConnection, to: _Subscription, raw: RawSample, qos: str, blocking: bool
+        self,
+        sender: SimulatedConnection,
+        to: _Subscription,
+        raw: RawSample,
+        qos: str,
+        blocking: bool,
     ) -> None:
         name, size = sender.name, len(raw.payload)
         link = to.links.get(name)
@@ -182,7 +205,9 @@ class SimulatedNetwork:
     ) -> tuple[int, float]:
         """Return how many copies of a message arrive in real time, and the additional delay (s)."""
         c, late_s = self.conditions, 0.0
-        if droppable and (link.bytes + size > LINK_BYTES or self._cut_until_s(sender, receiver) > 0.0):
+        if droppable and (
+            link.bytes + size > LINK_BYTES or self._cut_until_s(sender, receiver) > 0.0
+        ):
             self.traffic.lost += 1
             return 0, 0.0
         if self.first_tick_s is None:
@@ -206,7 +231,8 @@ class SimulatedNetwork:
     ) -> None:
         """Call ``call(*args)`` when a message arrives that is sent now.
 
-        It arrives after all earlier ones of its priority, unless ``late_s`` < 0, and after all declarations.
+        It arrives after all earlier ones of its priority, unless ``late_s`` < 0, and after all
+        declarations.
         """
         link, due_s = self._link(sender, receiver), self._due_s(sender, receiver, late_s)
         self._call_in_order(link, due_s, call, qos, late_s, args)
@@ -221,7 +247,9 @@ class SimulatedNetwork:
         if late_s < 0.0:
             delay_s += 4.0 * (self._latency_s + self._jitter_s)
         due_s = self.scheduler.now_s + delay_s
-        return max(due_s, self._cut_until_s(sender, receiver)) if self.conditions.partition else due_s
+        return (
+            max(due_s, self._cut_until_s(sender, receiver)) if self.conditions.partition else due_s
+        )
 
     def _call_in_order(
         self,
@@ -237,7 +265,9 @@ class SimulatedNetwork:
             return
         last = link.last
         after, declared = last.get(qos, NEVER), last.get("control", NEVER)
-        last[qos] = self.scheduler.call_at(due_s, call, after if after > declared else declared, args)
+        last[qos] = self.scheduler.call_at(
+            due_s, call, after if after > declared else declared, args
+        )
 
     def _link(self, sender: str, receiver: str) -> _LinkState:
         link = self._links.get((sender, receiver))
@@ -245,7 +275,7 @@ class SimulatedNetwork:
             link = self._links[sender, receiver] = _LinkState()
         return link
 
-    # -- partitions and liveliness -------------------------------------------------------------------------------
+    # -- partitions and liveliness -----------------------------------------------------------------
 
     def _cut_until_s(self, sender: str, receiver: str) -> float:
         """Return the end of the partition between two processes (virtual time, s), 0 without one."""
@@ -264,8 +294,13 @@ class SimulatedNetwork:
         begin_s = self.first_tick_s or 0.0
         for partition in self.conditions.partition:
             if partition.duration_s > LEASE_S:
-                for at_s in (partition.at_s + LEASE_S, partition.at_s + partition.duration_s + 1e-3):
-                    self.scheduler.call_at(begin_s + at_s, lambda p=partition: self._review_liveliness(p))
+                for at_s in (
+                    partition.at_s + LEASE_S,
+                    partition.at_s + partition.duration_s + 1e-3,
+                ):
+                    self.scheduler.call_at(
+                        begin_s + at_s, lambda p=partition: self._review_liveliness(p)
+                    )
 
     def _review_liveliness(self, partition: Partition) -> None:
         for name in list(self._connections):
@@ -299,12 +334,14 @@ class SimulatedNetwork:
         self._connections[name].close()
 
     def announce(self, name: str) -> None:
-        """Let all others review whether a process is alive, after the time that the news takes to them."""
+        """Let all others review whether a process is alive, after the time that the news takes to
+        them.
+        """
         for other in list(self._connections.values()):
             if other.name != name:
                 self.deliver(name, other.name, lambda other=other: other.review(name))
 
-    # -- declarations --------------------------------------------------------------------------------------------
+    # -- declarations ------------------------------------------------------------------------------
 
     def subscribe(
         self, owner: SimulatedConnection, expression: str, arrived: Callable[[RawSample], None]
@@ -319,7 +356,9 @@ class SimulatedNetwork:
 
     def _declare(self, subscription: _Subscription, publisher: str) -> None:
         """Let a publisher know a subscription when the declaration arrives there."""
-        self.deliver(subscription.owner.name, publisher, lambda: subscription.known_to.add(publisher))
+        self.deliver(
+            subscription.owner.name, publisher, lambda: subscription.known_to.add(publisher)
+        )
 
     def ask(
         self,
@@ -339,7 +378,9 @@ class SimulatedNetwork:
                 self.deliver(server.name, asker.name, lambda: replied(reply), "event")
 
             query = _SimulatedQuery(payload, encoding, answer)
-            self.deliver(asker.name, server.name, lambda s=server, q=query: s.serve(key, q), "event")
+            self.deliver(
+                asker.name, server.name, lambda s=server, q=query: s.serve(key, q), "event"
+            )
             return
 
     def forget(self, connection: SimulatedConnection) -> None:
@@ -450,19 +491,25 @@ class SimulatedConnection:
 
 
 class SimulatedHost:
-    """The ``Host`` of a process in virtual time. Its clock differs from the scheduler's by an offset and a drift."""
+    """The ``Host`` of a process in virtual time. Its clock differs from the scheduler's by an
+    offset and a drift.
+    """
 
     def __init__(self, name: str, network: SimulatedNetwork) -> None:
         self.name = name
         self.frozen_until_s = 0.0
         self._network, self._scheduler = network, network.scheduler
-        self._ids = network.seeded("ids", name, len(network.scheduler.tasks), network.scheduler.now_s)
+        self._ids = network.seeded(
+            "ids", name, len(network.scheduler.tasks), network.scheduler.now_s
+        )
         clock = next((c for c in network.conditions.clock if c.process == name), None)
-        self._offset_s, self._rate = (0.0, 1.0) if clock is None else (clock.offset_s, 1.0 + clock.drift)
+        self._offset_s, self._rate = (
+            (0.0, 1.0) if clock is None else (clock.offset_s, 1.0 + clock.drift)
+        )
         self._slow = [s for s in network.conditions.slow if s.process == name]
         self._dead = False
 
-    # -- time ----------------------------------------------------------------------------------------------------
+    # -- time --------------------------------------------------------------------------------------
 
     def now_s(self) -> float:
         return self._offset_s + self._rate * self._scheduler.now_s
@@ -514,7 +561,7 @@ class SimulatedHost:
         run()
         return end
 
-    # -- the process ---------------------------------------------------------------------------------------------
+    # -- the process -------------------------------------------------------------------------------
 
     def finish_startup(self) -> None:
         """Do nothing: many missions share the interpreter."""

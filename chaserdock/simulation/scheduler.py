@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cooperative scheduler in virtual time: tasks that run one at a time and hand over only where they wait.
+"""Cooperative scheduler in virtual time: tasks that run one at a time and hand over only where they
+wait.
 
-A task is a greenlet. It runs until it waits for a time or an item; the scheduler then advances virtual time to the next
-event and continues the task that it wakes. Events at equal times come in an order drawn from the seed, so that a seed
-repeats a run exactly and seeds differ in their interleavings.
+A task is a greenlet. It runs until it waits for a time or an item; the scheduler then advances
+virtual time to the next event and continues the task that it wakes. Events at equal times come in
+an order drawn from the seed, so that a seed repeats a run exactly and seeds differ in their
+interleavings.
 """
 
 from __future__ import annotations
@@ -29,15 +31,20 @@ Due = tuple[float, float]
 """Virtual time (s) of an event, and its place among those of the same time."""
 NEVER: Due = (0.0, 0.0)
 SPREAD, WAKE_SPREAD = 32.0, 128.0
-"""How many later events of the same time may come before an event, and before a task that is woken continues."""
+"""How many later events of the same time may come before an event, and before a task that is woken
+continues.
+"""
 MOST_EVENTS = 1_000_000
-"""Most events at one virtual time without progress: a tick has a few hundred, with a flood 100,000."""
+"""Most events at one virtual time without progress: a tick has a few hundred, with a flood 100,000.
+"""
 
 
 class Task:
-    """One task. ``result`` is its return value; ``error`` the traceback of the exception that ended it, empty if none did.
+    """One task. ``result`` is its return value; ``error`` the traceback of the exception that ended
+    it, empty if none did.
 
-    ``until_s``: virtual time (s) at which a pause ends, None without a limit. ``timer_s``: time of its pending timer.
+    ``until_s``: virtual time (s) at which a pause ends, None without a limit. ``timer_s``: time of
+    its pending timer.
     """
 
     def __init__(self, name: str, work: Callable[[], Any]) -> None:
@@ -77,9 +84,14 @@ class Scheduler:
         self._running: Task | None = None
 
     def call_at(
-        self, time_s: float, call: Callable[..., object], after: Due = NEVER, args: tuple[Any, ...] = ()
+        self,
+        time_s: float,
+        call: Callable[..., object],
+        after: Due = NEVER,
+        args: tuple[Any, ...] = (),
     ) -> Due:
-        """Call ``call(*args)``, which must not wait, at a time and after the call of ``after``; return when.
+        """Call ``call(*args)``, which must not wait, at a time and after the call of ``after``;
+        return when.
 
         At once if the time has passed.
         """
@@ -100,9 +112,11 @@ class Scheduler:
         return task
 
     def run(self, limit_s: float, over: Callable[[], bool] | None = None) -> bool:
-        """Run until all tasks have ended; return False if they have not by ``limit_s``, or when ``over`` holds.
+        """Run until all tasks have ended; return False if they have not by ``limit_s``, or when
+        ``over`` holds.
 
-        Also returns False after ``MOST_EVENTS`` events at one time without ``note_progress``: they would go on forever.
+        Also returns False after ``MOST_EVENTS`` events at one time without ``note_progress``: they
+        would go on forever.
         """
         self._hub = getcurrent()
         self.note_progress()
@@ -120,7 +134,9 @@ class Scheduler:
         return True
 
     def note_progress(self) -> None:
-        """Note that events at the present time lead somewhere: without latency, a flight in lock-step has a single time."""
+        """Note that events at the present time lead somewhere: without latency, a flight in
+        lock-step has a single time.
+        """
         self._last_event = self._count + MOST_EVENTS
 
     def end(self) -> None:
@@ -131,7 +147,7 @@ class Scheduler:
             task.done = True
         self._events.clear()
 
-    # -- for tasks -----------------------------------------------------------------------------------------------
+    # -- for tasks ---------------------------------------------------------------------------------
 
     def pause(self, timeout_s: float | None) -> None:
         """Let others run until the time has passed or ``wake`` is called for the running task."""
@@ -142,7 +158,8 @@ class Scheduler:
         else:
             until_s = self.now_s + timeout_s
             if until_s == self.now_s and timeout_s > 0.0:
-                # Below the resolution of virtual time: a reader that waits for its own, finer clock would wait forever.
+                # Below the resolution of virtual time: a reader that waits for its own, finer clock
+                # would wait forever.
                 until_s = math.nextafter(until_s, math.inf)
             task.until_s = until_s
             # One timer per task: a pause that outlasts the pending one sets no other.
@@ -169,7 +186,8 @@ class Scheduler:
     def wake(self, task: Task) -> None:
         """Continue a task that pauses, at the present time.
 
-        Other events of this time are likelier to come first, so that a reader often finds several messages.
+        Other events of this time are likelier to come first, so that a reader often finds several
+        messages.
         """
         self._count += 1
         place = self._count + WAKE_SPREAD * self._draw()
@@ -202,7 +220,8 @@ class Scheduler:
 class VirtualQueue(BoundedQueue[Any]):
     """A ``BoundedQueue`` whose reader waits in virtual time, by a clock of this rate.
 
-    ``before_take``, if any, runs in the reader's task before it takes an item. ``most``: most items that have been in it.
+    ``before_take``, if any, runs in the reader's task before it takes an item. ``most``: most items
+    that have been in it.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reduce a failing case: fewest faults, shortest duration, simplest values with the same violation.
 
-Greedy delta debugging (A. Zeller, R. Hildebrandt, 2002): each pass proposes simpler cases, coarse ones first, and keeps one
-whenever it still fails, until a whole pass changes nothing.
+Greedy delta debugging (A. Zeller, R. Hildebrandt, 2002): each pass proposes simpler cases, coarse
+ones first, and keeps one whenever it still fails, until a whole pass changes nothing.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ _SECTIONS = ("truth", "simulation", "controller")
 def shrink(
     case: Case, violation_s: Judge, violated_s: float, duration_s: float, attempts: int = 200
 ) -> Iterator[Case]:
-    """Yield simpler and simpler cases with the violation of ``case``, which is at ``violated_s`` of ``duration_s``.
+    """Yield simpler and simpler cases with the violation of ``case``, which is at ``violated_s`` of
+    ``duration_s``.
 
-    ``violation_s`` returns the mission time of the violation in a case, None without it; it is called ``attempts`` times at
-    most.
+    ``violation_s`` returns the mission time of the violation in a case, None without it; it is
+    called ``attempts`` times at most.
     """
 
     def shorter(case: Case) -> Iterator[Case]:
@@ -68,7 +69,9 @@ def shrink(
 
 
 def _changed(case: Case, path: tuple[Any, ...], value: Any) -> Case:
-    """Return a copy with another value at a path; without the key, and without sections left empty, for None."""
+    """Return a copy with another value at a path; without the key, and without sections left empty,
+    for None.
+    """
     changed = copy.deepcopy(case)
     at: Any = changed
     for key in path[:-1]:
@@ -121,7 +124,9 @@ def _without_items(case: Case) -> Iterator[Case]:
 
 
 def _without_keys(case: Case) -> Iterator[Case]:
-    """Yield the case without whole sections, then without single keys of them and of rows, and with seed 0."""
+    """Yield the case without whole sections, then without single keys of them and of rows, and with
+    seed 0.
+    """
     for section in _SECTIONS:
         if section in case:
             yield {k: v for k, v in copy.deepcopy(case).items() if k != section}
@@ -153,7 +158,9 @@ def _shorter_faults(case: Case) -> Iterator[Case]:
         for k, row in enumerate(_at(case, path)):
             for key in ("duration_s", "copies", "delay_s", "offset_s"):
                 if key in row:
-                    shorter = round(row[key] / 2.0, 2) if isinstance(row[key], float) else row[key] // 2
+                    shorter = (
+                        round(row[key] / 2.0, 2) if isinstance(row[key], float) else row[key] // 2
+                    )
                     if abs(shorter) >= 0.1:
                         yield _changed(case, (*path, k, key), shorter)
             if row.get("share", 1.0) < 1.0:

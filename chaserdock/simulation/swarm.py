@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random flights: each seed draws a subset of the kinds of faults, and from these its faults, network and operator commands.
+"""Random flights: each seed draws a subset of the kinds of faults, and from these its faults,
+network and operator commands.
 
-Leaving out most kinds in each flight finds more than mixing all of them always (A. Groce et al., "Swarm testing", 2012). A
-flight is a ``Case``: the keys of a scenario file that extends a shipped scenario.
+Leaving out most kinds in each flight finds more than mixing all of them always (A. Groce et al.,
+"Swarm testing", 2012). A flight is a ``Case``: the keys of a scenario file that extends a shipped
+scenario.
 """
 
 from __future__ import annotations
@@ -42,10 +44,16 @@ RECEIVED = {
 }
 MESSAGE_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt")
 """Kinds of faults of what a process receives."""
-PUBLISHED = {"world": ["image", "odometry"], "controller": ["wrench"], "chaser": ["sighting", "actuators"]}
+PUBLISHED = {
+    "world": ["image", "odometry"],
+    "controller": ["wrench"],
+    "chaser": ["sighting", "actuators"],
+}
 
 LONG_EVERY, RECOVERY_S = 4, 10.0
-"""One seed in so many flies on until docking can be judged: so long (s) after the last disturbance, and as long as an approach."""
+"""One seed in so many flies on until docking can be judged: so long (s) after the last disturbance,
+and as long as an approach.
+"""
 
 Case = dict[str, Any]
 """Keys and values of a scenario file."""
@@ -53,9 +61,11 @@ Case = dict[str, Any]
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """One simulated flight. ``fingerprint``: of all messages with their times; equal in equal flights.
+    """One simulated flight. ``fingerprint``: of all messages with their times; equal in equal
+    flights.
 
-    ``nees``: of the estimate, one value a second; ``honest``: no sensor lies, so that it should be consistent.
+    ``nees``: of the estimate, one value a second; ``honest``: no sensor lies, so that it should be
+    consistent.
     """
 
     seed: int
@@ -124,8 +134,14 @@ def _draw_severity(kind: str, draw: random.Random) -> dict[str, Any]:
 def draw_case(
     name: str, seed: int, scenario: Scenario, *, images: bool = False, mode: str | None = None
 ) -> Case:
-    """Return the flight of a seed: a variant of scenario ``name``, which is ``scenario`` when loaded."""
-    draw, chasers, end_s = random.Random(f"swarm {seed}"), len(scenario.chasers), scenario.duration_s
+    """Return the flight of a seed: a variant of scenario ``name``, which is ``scenario`` when
+    loaded.
+    """
+    draw, chasers, end_s = (
+        random.Random(f"swarm {seed}"),
+        len(scenario.chasers),
+        scenario.duration_s,
+    )
     case: Case = {"extends": name, "name": f"seed-{seed}", "seed": seed % 2**32}
     if not images:
         case["perception"] = {"name": "statistical"}
@@ -161,18 +177,26 @@ def draw_case(
 
 
 def _long_enough_s(case: Case, scenario: Scenario) -> float:
-    """Return the duration (s) of a flight in which the chasers have the time to dock after the last disturbance."""
-    rows = [e.model_dump() for e in scenario.timeline] if "timeline" not in case else case["timeline"]
+    """Return the duration (s) of a flight in which the chasers have the time to dock after the last
+    disturbance.
+    """
+    rows = (
+        [e.model_dump() for e in scenario.timeline] if "timeline" not in case else case["timeline"]
+    )
     network = case["simulation"]
     rows = [*rows, *case["fault"], *case.get("thruster_failure", [])]
     rows += [*network.get("partition", []), *network.get("slow", [])]
     last_s = max((row["at_s"] + row.get("duration_s", 0.0) for row in rows), default=0.0)
-    needed_s = last_s + RECOVERY_S + max(settling_s(scenario, i) for i in range(len(scenario.chasers)))
+    needed_s = (
+        last_s + RECOVERY_S + max(settling_s(scenario, i) for i in range(len(scenario.chasers)))
+    )
     return max(scenario.duration_s, float(math.ceil(needed_s)))
 
 
 def _draw_device_faults(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:
-    """Return at most one fault of the messages of thrusters or docking sensors, where a scenario has them."""
+    """Return at most one fault of the messages of thrusters or docking sensors, where a scenario
+    has them.
+    """
     readers = [("controller", "thrusters")] if scenario.chaser.actuation == "thrusters" else []
     if scenario.docking.kind == "capture":
         readers.append(("controller", "docking"))
@@ -182,9 +206,11 @@ def _draw_device_faults(draw: random.Random, scenario: Scenario) -> list[dict[st
     return [_draw_message_fault(draw.choice(MESSAGE_KINDS), draw, scenario, readers)]
 
 
-def _draw_other_faults(draw: random.Random, scenario: Scenario, standby: bool) -> list[dict[str, Any]]:
-    """Return at most one fault: of the leases that a controller receives, a controller that is cut off, or a flood of leases
-    or of a device's messages."""
+def _draw_other_faults(
+    draw: random.Random, scenario: Scenario, standby: bool
+) -> list[dict[str, Any]]:
+    """Return at most one fault: of the leases that a controller receives, a controller that is cut
+    off, or a flood of leases or of a device's messages."""
     if draw.random() > 0.15:
         return []
     controllers = ["controller", *(["standby"] if standby else [])]
@@ -249,7 +275,10 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
 
     def window() -> dict[str, float]:
         duration_s = draw.choice([0.2, 1.0, 4.0]) * draw.uniform(0.5, 1.5)
-        return {"at_s": round(draw.uniform(0.5, 0.8 * end_s), 2), "duration_s": round(duration_s, 2)}
+        return {
+            "at_s": round(draw.uniform(0.5, 0.8 * end_s), 2),
+            "duration_s": round(duration_s, 2),
+        }
 
     section: dict[str, Any] = {"mode": draw.choice(["lockstep", "realtime", "realtime"])}
     section["latency_s"] = draw.choice([0.0, 0.0005, 0.002, 0.01])
@@ -269,7 +298,9 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
         ]
     if draw.random() < 0.25:
         reader = draw.choice([*names, "recorder"])
-        section["slow"] = [{**window(), "process": reader, "each_s": draw.choice([0.001, 0.005, 0.02])}]
+        section["slow"] = [
+            {**window(), "process": reader, "each_s": draw.choice([0.001, 0.005, 0.02])}
+        ]
     if draw.random() < 0.3:
         wrong = draw.sample(names, draw.choice([1, 2]))
         section["clock"] = [
@@ -341,7 +372,8 @@ def fly_case(
 
         def tap(sender: str, raw: RawSample) -> None:
             nonlocal fingerprint
-            # The recorder listens from the first tick on, and is not asked for its own and for presence.
+            # The recorder listens from the first tick on, and is not asked for its own and for
+            # presence.
             if (published or raw.key == topics.TICK.key) and sender != "recorder":
                 published[raw.key] += not raw.key.endswith("/presence")
             fingerprint = zlib.crc32(
@@ -380,7 +412,10 @@ def _is_honest(scenario: Scenario) -> bool:
 
 def _check_consistency(checks: Invariants) -> None:
     """Compare the errors of the estimates of one flight with their covariances."""
-    for name, nees in (("target", checks.nees), ("chasers relative to the target", checks.relative_nees)):
+    for name, nees in (
+        ("target", checks.nees),
+        ("chasers relative to the target", checks.relative_nees),
+    ):
         if len(nees) >= LEAST_ESTIMATES and (mean := sum(nees) / len(nees)) > FLIGHT_NEES:
             checks.violate("covariance consistency", name, f"mean NEES {mean:.0f} in one flight")
 
@@ -391,7 +426,9 @@ def memory_folder() -> str | None:
 
 
 def outcome_of(checks: Invariants) -> str:
-    """Return the first violated invariant, or the least final state of the chasers that are to dock."""
+    """Return the first violated invariant, or the least final state of the chasers that are to
+    dock.
+    """
     if checks.violations:
         return checks.violations[0].invariant
     states = {checks.state_at_end(i) for i in checks.to_dock}
@@ -422,15 +459,18 @@ def _check_recording(checks: Invariants, flight: SimulatedFlight, published: Cou
     for key, number in expected.items():
         if recorded.get(key, 0) != number:
             checks.violate(
-                "no recorded data lost", key, f"{recorded.get(key, 0)} of {number} messages are in the log"
+                "no recorded data lost",
+                key,
+                f"{recorded.get(key, 0)} of {number} messages are in the log",
             )
 
 
 def queue_limit(reader: str, published: int, ticks: int, missed_ticks: float = 0.0) -> int:
     """Return how many messages may wait for a process in a flight with so many messages and ticks.
 
-    The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the mean. ``missed_ticks``: the
-    most ticks that a process opens or replies to at once, after it was frozen or slow.
+    The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the
+    mean. ``missed_ticks``: the most ticks that a process opens or replies to at once, after it was
+    frozen or slow.
     """
     behind = missed_ticks + (RECORDER_WINDOW_TICKS + 2 if reader == "recorder" else 0)
     return max(QUEUE_LIMIT, math.ceil(behind * published / max(1, ticks)))
@@ -450,7 +490,9 @@ def _falls_behind(reader: str, s: Scenario) -> bool:
 
 
 def check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
-    """Check that queues stay short, except those of readers that are slow, frozen, cut off or flooded."""
+    """Check that queues stay short, except those of readers that are slow, frozen, cut off or
+    flooded.
+    """
     s = checks.scenario
     behind_s = [f.duration_s or 0.0 for f in s.fault if f.kind == "freeze"]
     behind_s += [slow.duration_s for slow in s.simulation.slow]
@@ -463,7 +505,11 @@ def check_queues(checks: Invariants, flight: SimulatedFlight, published: int) ->
 
 
 LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
-"""Largest mean normalized squared error (6 if consistent) of at least so many estimates of one flight without lying sensors."""
+"""Largest mean normalized squared error (6 if consistent) of at least so many estimates of one
+flight without lying sensors.
+"""
 _LIES = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
 QUEUE_LIMIT = 400
-"""Most messages that may wait for a reader which is not slow, frozen, cut off or flooded; see ``queue_limit``."""
+"""Most messages that may wait for a reader which is not slow, frozen, cut off or flooded; see
+``queue_limit``.
+"""

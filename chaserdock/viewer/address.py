@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Address of the viewer's page and admission of connections. Imports no viser: the launcher uses it, too."""
+"""Address of the viewer's page and admission of connections. Imports no viser: the launcher uses
+it, too.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ DEFAULT_PORT = 8080
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _TRIES = 20
 TOKEN_VARIABLE = "CHASERDOCK_VIEWER_TOKEN"
-"""Environment variable with the token of the page: unlike an argument, other users cannot read it."""
+"""Environment variable with the token of the page: unlike an argument, other users cannot read it.
+"""
 
 
 class ViewError(ChaserdockError):
@@ -30,9 +33,9 @@ def free_port(host: str, port: int | None) -> int:
     first, reason = DEFAULT_PORT if port is None else port, ""
     for candidate in range(first, first + _TRIES if port is None else first + 1):
         try:
-            family, kind, protocol, _, address = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)[
-                0
-            ]
+            family, kind, protocol, _, address = socket.getaddrinfo(
+                host, candidate, type=socket.SOCK_STREAM
+            )[0]
             with socket.socket(family, kind, protocol) as probe:
                 # As in asyncio servers: a port with connections in TIME_WAIT is available.
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -41,13 +44,17 @@ def free_port(host: str, port: int | None) -> int:
         except OSError as error:
             reason = error.strerror or str(error)
             if isinstance(error, socket.gaierror) or "assign" in reason:
-                raise ViewError(f"--host {host}: {reason}; give an address of this machine") from None
+                raise ViewError(
+                    f"--host {host}: {reason}; give an address of this machine"
+                ) from None
     which = f"port {first}" if port is not None else f"ports {first} to {first + _TRIES - 1}"
     raise ViewError(f"{which} of {host}: {reason}; choose another with --port")
 
 
 def page_token() -> str:
-    """Return the token of the page: that of the environment, otherwise a random one. Raise ViewError."""
+    """Return the token of the page: that of the environment, otherwise a random one. Raise
+    ViewError.
+    """
     token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
     if not re.fullmatch(r"[A-Za-z0-9_-]{16,}", token):
         raise ViewError(f"{TOKEN_VARIABLE}: give at least 16 letters, digits, - or _")
@@ -57,11 +64,15 @@ def page_token() -> str:
 def url_of(host: str, port: int, token: str) -> str:
     """Return the URL of the page for a browser on this machine."""
     shown = DEFAULT_HOST if host in ("0.0.0.0", "::") else host
-    return f"http://[{shown}]:{port}/{token}/" if ":" in shown else f"http://{shown}:{port}/{token}/"
+    return (
+        f"http://[{shown}]:{port}/{token}/" if ":" in shown else f"http://{shown}:{port}/{token}/"
+    )
 
 
 def path_below_token(path: str, token: str) -> str | None:
-    """Return the path and query of a request without the token in front, or None if it has no valid token."""
+    """Return the path and query of a request without the token in front, or None if it has no valid
+    token.
+    """
     first, rest = re.fullmatch(r"/?([^/?]*)(.*)", path, re.DOTALL).groups()  # type: ignore[union-attr]
     if not compare_digest(first.encode(errors="replace"), token.encode()):
         return None
@@ -69,10 +80,12 @@ def path_below_token(path: str, token: str) -> str | None:
 
 
 def is_own_origin(origins: Sequence[str], requested_hosts: Sequence[str], host: str) -> bool:
-    """Return whether a web socket is opened by the viewer's page (``Origin`` equals ``Host``) or by a program (no ``Origin``).
+    """Return whether a web socket is opened by the viewer's page (``Origin`` equals ``Host``) or by
+    a program (no ``Origin``).
 
-    ``origins``, ``requested_hosts``: values of these headers, of which a request states at most one and exactly one. On a
-    loopback address ``Host`` must be a loopback name, which prevents DNS rebinding.
+    ``origins``, ``requested_hosts``: values of these headers, of which a request states at most one
+    and exactly one. On a loopback address ``Host`` must be a loopback name, which prevents DNS
+    rebinding.
     """
     if len(origins) > 1 or len(requested_hosts) != 1:
         return False

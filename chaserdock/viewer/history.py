@@ -162,13 +162,15 @@ class History:
             case StackEstimate():
                 self._add_identification(message)
             case SolverStatus():
-                self.series["solve_ms", None].add(message.sim_time_ns / 1e9, message.wall_solve_s * 1e3)
+                self.series["solve_ms", None].add(
+                    message.sim_time_ns / 1e9, message.wall_solve_s * 1e3
+                )
             case Health():
                 self.rejected[message.process] = sum(message.rejected.values()) + message.lost
 
     def _add_identification(self, message: StackEstimate) -> None:
-        """Add the standard deviations of the target: of the mass, of the centre of mass per axis at the worst, and of the worst
-        element of the inertia as a share of the largest moment."""
+        """Add the standard deviations of the target: of the mass, of the centre of mass per axis at
+        the worst, and of the worst element of the inertia as a share of the largest moment."""
         time_s, (values, sigmas) = message.sim_time_ns / 1e9, values_of(message.target)
         self.series["mass_sigma_percent", None].add(time_s, 100.0 * float(sigmas[0] / values[0]))
         self.series["centre_sigma_mm", None].add(time_s, 1e3 * float(sigmas[1:4].max()))
@@ -183,7 +185,9 @@ class History:
                 text = f"{message.process}: {message.what} {message.detail}".strip()
                 self.add_line(time_s, message.level, text)
             case CommandReply():
-                self.add_line(time_s, "info" if message.accepted else "warning", reply_text(message))
+                self.add_line(
+                    time_s, "info" if message.accepted else "warning", reply_text(message)
+                )
             case MissionEnd():
                 level = "info" if message.complete else "error"
                 self.add_line(time_s, level, f"the mission has ended: {message.reason}")
@@ -202,7 +206,9 @@ class History:
 
     def lines_until(self, time_s: float, most: int) -> list[Line]:
         """Return the latest lines up to ``time_s``, newest first."""
-        return sorted((x for x in reversed(self.lines) if x.time_s <= time_s), key=lambda x: -x.time_s)[:most]
+        return sorted(
+            (x for x in reversed(self.lines) if x.time_s <= time_s), key=lambda x: -x.time_s
+        )[:most]
 
     def _add_position(self, odometry: Odometry) -> None:
         target = self._target
@@ -225,7 +231,9 @@ class History:
         away_m = float(np.linalg.norm(np.subtract(odometry.position_m, reference.position_m)))
         turned = float(rotations.angle_between(reference.q_wxyz, odometry.q_wxyz))
         self.series["position_error_mm", reference.chaser].add(time_s, away_m * 1e3)
-        self.series["orientation_error_deg", reference.chaser].add(time_s, float(np.degrees(turned)))
+        self.series["orientation_error_deg", reference.chaser].add(
+            time_s, float(np.degrees(turned))
+        )
 
     def _add_estimation_error(self, estimate: TargetEstimate) -> None:
         true = self._truth.get(estimate.sim_time_ns)

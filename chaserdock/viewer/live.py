@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Viewer of a running mission: receives messages, draws, sends commands. A process of its own.
 
-It keeps only the newest messages of each topic, the rest is dropped inside Zenoh: a blocked browser never delays the
-mission. After the end of a mission it waits for the next one.
+It keeps only the newest messages of each topic, the rest is dropped inside Zenoh: a blocked browser
+never delays the mission. After the end of a mission it waits for the next one.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ _WAITING = "no mission is running"
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Address and content of the page. ``truth``: subscribe to ground truth, if access rights allow it."""
+    """Address and content of the page. ``truth``: subscribe to ground truth, if access rights allow
+    it.
+    """
 
     host: str = DEFAULT_HOST
     port: int | None = None
@@ -60,8 +62,9 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
     stop, token = StopSignal(watch_parent), page_token()
     with ThreadPoolExecutor(1, "session") as opener:
         opener.submit(int).result()
-        # Only drawing has a low priority. Zenoh's threads inherit the priority of the thread that opens the session
-        # (nice(2) applies to a thread), and an unread link would delay its publishers.
+        # Only drawing has a low priority. Zenoh's threads inherit the priority of the thread that
+        # opens the session (nice(2) applies to a thread), and an unread link would delay its
+        # publishers.
         os.nice(_DRAWING_NICE)
 
         def connect() -> Node:
@@ -91,7 +94,8 @@ class _Stopped(Exception):
 class _Patience:
     """Opens a node as soon as a router accepts the connection; says once that none does.
 
-    Each attempt takes ``_ATTEMPT_S`` at most, in native code, where no signal is handled. Raises _Stopped.
+    Each attempt takes ``_ATTEMPT_S`` at most, in native code, where no signal is handled. Raises
+    _Stopped.
     """
 
     def __init__(self, connect: Callable[[], Node], stop: Callable[[], bool]) -> None:
@@ -113,7 +117,9 @@ _INSTANCE = unique_id()
 
 
 def _join(node: Node) -> JoinReply | None:
-    return node.query(topics.JOIN_KEY, JoinRequest(process="viewer", instance=_INSTANCE), JoinReply, 0.5)
+    return node.query(
+        topics.JOIN_KEY, JoinRequest(process="viewer", instance=_INSTANCE), JoinReply, 0.5
+    )
 
 
 def _next_mission(
@@ -148,7 +154,9 @@ class _Feed:
         feed = cls([node.subscribe_newest(topics.TICK, _STATES)])
         if truth:
             bodies = ["target", *(f"chaser/{i}" for i in range(chasers))]
-            feed.subscriptions += [node.subscribe_newest(topics.TRUTH_BODY, _STATES, body) for body in bodies]
+            feed.subscriptions += [
+                node.subscribe_newest(topics.TRUTH_BODY, _STATES, body) for body in bodies
+            ]
             feed.subscriptions += [
                 node.subscribe_newest(topics.TRUTH_LOAD, _STATES, i) for i in range(chasers)
             ]
@@ -157,7 +165,8 @@ class _Feed:
             depth = 1 if topic is topics.IMAGE else _STATES
             feed.subscriptions += [node.subscribe_newest(topic, depth, i) for i in range(chasers)]
         feed.subscriptions += [
-            node.subscribe_newest(topic, _STATES) for topic in (topics.TARGET, topics.STACK, topics.SOLVER)
+            node.subscribe_newest(topic, _STATES)
+            for topic in (topics.TARGET, topics.STACK, topics.SOLVER)
         ]
         events = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
         feed.subscriptions += [node.subscribe_newest(topic, _EVENTS) for topic in events]
@@ -172,7 +181,11 @@ class _MissionView:
     """One mission, until another one starts."""
 
     def __init__(
-        self, connect: Callable[[], Node], server: viser.ViserServer, mission: JoinReply, options: ViewOptions
+        self,
+        connect: Callable[[], Node],
+        server: viser.ViserServer,
+        mission: JoinReply,
+        options: ViewOptions,
     ) -> None:
         self._open_node, self._mission, self._truth = connect, mission, options.truth
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
@@ -210,10 +223,15 @@ class _MissionView:
                 if silent and begun_s - joined_s > _JOIN_PERIOD_S:
                     joined_s = begun_s
                     reply = _join(self._node)
-                    if reply is not None and reply.accepted and reply.run_id != self._mission.run_id:
+                    if (
+                        reply is not None
+                        and reply.accepted
+                        and reply.run_id != self._mission.run_id
+                    ):
                         return
                     if reply is None and begun_s - connected_s > _RECONNECT_S:
-                        # Between peers, Zenoh does not reopen a link that was closed because it was not read.
+                        # Between peers, Zenoh does not reopen a link that was closed because it was
+                        # not read.
                         connected_s = begun_s
                         self._node.close()
                         self._connect()
@@ -262,7 +280,7 @@ class _MissionView:
         """Return the processes that have disappeared; none after the end of the mission."""
         return set() if self._state.ended is not None else self._seen - self._alive - {"operator"}
 
-    # -- commands -----------------------------------------------------------------------------------------
+    # -- commands ----------------------------------------------------------------------------------
 
     def _command(self, what: str, chaser: int) -> None:
         try:
@@ -278,7 +296,9 @@ class _MissionView:
             self._page.show_reply(f"{what} chaser {chaser}: sent")
             command = OperatorCommand(command=what, chaser=chaser, operator="viewer")  # type: ignore[arg-type]
             try:
-                reply = self._node.query(topics.OPERATE_KEY, command, CommandReply, _REPLY_TIMEOUT_S)
+                reply = self._node.query(
+                    topics.OPERATE_KEY, command, CommandReply, _REPLY_TIMEOUT_S
+                )
             except ChaserdockError as error:
                 self._page.show_reply(f"⚠ {what} chaser {chaser}: {error}")
                 continue

@@ -61,7 +61,9 @@ _exposure = msgspec.msgpack.Decoder(_Exposure)
 
 
 class LoggedMission:
-    """A recorded mission: ``history`` covers all of it, ``at`` returns the state at any time. Raises LogError."""
+    """A recorded mission: ``history`` covers all of it, ``at`` returns the state at any time.
+    Raises LogError.
+    """
 
     def __init__(self, source: LogSource) -> None:
         self.scenario, self.run = logged_scenario(source)
@@ -71,9 +73,11 @@ class LoggedMission:
         self.truth = False
         self._chunks: list[tuple[Path, int]] = []
         self._channels: dict[Path, dict[int, Channel]] = {}
-        # By key: for each chunk with messages of that key, the time of the first one and the chunk's number. One entry
-        # per message would take 0.5 GB for ten hours.
-        self._index: dict[str, tuple[array[int], array[int]]] = defaultdict(lambda: (array("q"), array("l")))
+        # By key: for each chunk with messages of that key, the time of the first one and the
+        # chunk's number. One entry per message would take 0.5 GB for ten hours.
+        self._index: dict[str, tuple[array[int], array[int]]] = defaultdict(
+            lambda: (array("q"), array("l"))
+        )
         self._latest: dict[str, int] = defaultdict(int)
         self._shown = {topic.key_of(): topic for topic in (*OF_ALL, topics.TRUTH_DRAWN)}
         self._shown |= {topic.key_of(i): topic for topic in OF_CHASERS for i in range(self.chasers)}
@@ -126,7 +130,9 @@ class LoggedMission:
 
     def _decode(self, topic: Topic, channel: Channel, stored: McapMessage) -> Any:
         try:
-            return decode_logged(topic.kind, stored.data, channel.metadata.get("zenoh_encoding", ""))
+            return decode_logged(
+                topic.kind, stored.data, channel.metadata.get("zenoh_encoding", "")
+            )
         except Rejected:
             return None
 
@@ -143,14 +149,17 @@ class LoggedMission:
         return out
 
     def at(self, time_s: float) -> MissionState:
-        """Return the state at a simulated time: the latest message of every key up to then. Raise LogError."""
+        """Return the state at a simulated time: the latest message of every key up to then. Raise
+        LogError.
+        """
         state, until = MissionState.empty(self.chasers), round(time_s * 1e9) + 1
         for key, topic in self._shown.items():
             times, chunks = self._index[key]
             last = bisect_right(times, until) - 1
             if last < 0:
                 continue
-            # The first message of the chunk counts whatever its own time: an earlier one had a later time.
+            # The first message of the chunk counts whatever its own time: an earlier one had a
+            # later time.
             first, *more = self._chunk(chunks[last])[key]
             channel, stored = first
             for later in more:

@@ -71,7 +71,9 @@ SPEEDS = ("0.25", "0.5", "1", "2", "5", "10", "20")
 
 
 class Page:
-    """The page of one mission, shared by all tabs. ``command`` is called on viser's threads; None: no buttons."""
+    """The page of one mission, shared by all tabs. ``command`` is called on viser's threads; None:
+    no buttons.
+    """
 
     def __init__(
         self,
@@ -106,7 +108,7 @@ class Page:
             dark_mode=dark, show_logo=False, show_share_button=False, control_width="large"
         )
 
-    # -- building -----------------------------------------------------------------------------------------
+    # -- building ----------------------------------------------------------------------------------
 
     def _main_panel(self, dark: bool, command: SendCommand | None) -> None:
         gui = self._server.gui
@@ -206,7 +208,9 @@ class Page:
         self._columns = 1 if number == 1 else 2 if number <= 8 else 3
         self._tile = (round(_IMAGE_PX * camera.height_px / camera.width_px), _IMAGE_PX)
         rows = -(-number // self._columns)
-        self._mosaic = np.full((rows * self._tile[0], self._columns * self._tile[1], 3), 60, np.uint8)
+        self._mosaic = np.full(
+            (rows * self._tile[0], self._columns * self._tile[1], 3), 60, np.uint8
+        )
         with images.add_tab("Cameras"):
             self._enlarged: int | None = None
             if number > 1:
@@ -250,7 +254,7 @@ class Page:
             padding=(8, 12, 0, 0),
         )
 
-    # -- drawing ------------------------------------------------------------------------------------------
+    # -- drawing -----------------------------------------------------------------------------------
 
     @property
     def watched(self) -> bool:
@@ -278,7 +282,11 @@ class Page:
     def _write(
         self, state: MissionState, history: History, mode: str, speed: float | None, lost: set[str]
     ) -> None:
-        mass = () if self._mass is None else ((self._mass, text.mass_properties(self._scenario, state)),)
+        mass = (
+            ()
+            if self._mass is None
+            else ((self._mass, text.mass_properties(self._scenario, state)),)
+        )
         for element, content in (
             *mass,
             (self._head, text.head(self._scenario, state, mode, speed)),

@@ -32,9 +32,12 @@ def view_log(
     mode = f"log of run {mission.run.get('run_id', '?')}, {mission.run.get('mode', '?')}"
     with page_server(options.host, options.port, token) as server:
         truth = mission.truth and options.truth
-        page = Page(server, mission.scenario, dark=options.dark, truth=truth, command=None, timeline=line)
+        page = Page(
+            server, mission.scenario, dark=options.dark, truth=truth, command=None, timeline=line
+        )
         print_status(
-            "viewer", f"{url_of(options.host, server.get_port(), token)} shows the log; Ctrl-C ends this"
+            "viewer",
+            f"{url_of(options.host, server.get_port(), token)} shows the log; Ctrl-C ends this",
         )
         before_s = time.monotonic()
         while not stop():

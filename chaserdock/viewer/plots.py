@@ -17,7 +17,9 @@ POINTS = 240
 """Maximum number of points of a curve: about one per pixel."""
 
 COLOURS = SERIES
-"""Colours of the chasers, those of the figures and the film; beyond the last they repeat, with dashed curves."""
+"""Colours of the chasers, those of the figures and the film; beyond the last they repeat, with
+dashed curves.
+"""
 ESTIMATE_COLOUR = "#e0a800"
 
 
@@ -36,8 +38,9 @@ class Plot:
 def plots_of(
     chasers: int, truth: bool, ports: Sequence[int] = (), identified: bool = False
 ) -> tuple[Plot, ...]:
-    """Return the plots of the page; the estimation error and the loads at the ports of the chasers ``ports`` only with ground
-    truth; the uncertainty of the target's mass properties only if they are ``identified``."""
+    """Return the plots of the page; the estimation error and the loads at the ports of the chasers
+    ``ports`` only with ground truth; the uncertainty of the target's mass properties only if they
+    are ``identified``."""
 
     def each(quantity: ChartQuantity, numbers: Iterable[int] = range(chasers)) -> tuple[Curve, ...]:
         return tuple((f"chaser {i}", COLOURS[i % len(COLOURS)], quantity, i) for i in numbers)
@@ -64,12 +67,15 @@ def plots_of(
 
 
 def points_of(plot: Plot, history: History, begin_s: float, until_s: float) -> tuple[Array, ...]:
-    """Return times (K,) and the values (K,) of each curve, 2 <= K <= ``POINTS``; zeros without data.
+    """Return times (K,) and the values (K,) of each curve, 2 <= K <= ``POINTS``; zeros without
+    data.
 
-    Each value is the maximum of an equal time bin, so that no peak is lost. A curve without a value in a bin of another
-    curve keeps its previous value.
+    Each value is the maximum of an equal time bin, so that no peak is lost. A curve without a value
+    in a bin of another curve keeps its previous value.
     """
-    series = [history.series[quantity, chaser].until(until_s) for _, _, quantity, chaser in plot.curves]
+    series = [
+        history.series[quantity, chaser].until(until_s) for _, _, quantity, chaser in plot.curves
+    ]
     edges = np.linspace(begin_s, max(until_s, begin_s + 1e-3), POINTS + 1)
     peaks = np.full((len(series), POINTS), np.nan)
     for row, (times, values) in zip(peaks, series, strict=True):

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3-D scene, drawn with viser: bodies, estimate, plans, corridors, keep-out sphere, camera frustums."""
+"""3-D scene, drawn with viser: bodies, estimate, plans, corridors, keep-out sphere, camera
+frustums.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ class SceneView:
         self._target = self._body("/scene/target", shapes.mesh_of(bodies.target))
         self._estimate = scene.add_frame("/scene/estimate", axes_length=0.25, axes_radius=0.003)
         size = scenario.target_model().size_m
-        self._lines("/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0)
+        self._lines(
+            "/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0
+        )
         self._keep_out_m = scenario.limits.min_distance_target_m
         self._keep_out = self._lines(
             "/scene/estimate/keep_out", shapes.sphere(self._keep_out_m), (176, 118, 128), 1.0
@@ -65,7 +69,9 @@ class SceneView:
             colour = _rgb(COLOURS[i % len(COLOURS)])
             name = f"/scene/chaser_{i}"
             self._chasers.append(self._body(name, shapes.mesh_of(bodies.chaser, colour)))
-            scene.add_label(f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2]))
+            scene.add_label(
+                f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2])
+            )
             self._frustums.append(
                 scene.add_camera_frustum(
                     f"{name}/camera",
@@ -84,13 +90,19 @@ class SceneView:
                 self._lines(f"/scene/plan_{i}", shapes.polyline(np.zeros((0, 3))), colour, 3.0)
             )
             self._references.append(
-                scene.add_frame(f"/scene/reference_{i}", axes_length=0.08, axes_radius=0.0025, visible=False)
+                scene.add_frame(
+                    f"/scene/reference_{i}", axes_length=0.08, axes_radius=0.0025, visible=False
+                )
             )
-            trail = self._lines(f"/scene/estimate/trail_{i}", shapes.polyline(np.zeros((0, 3))), colour, 1.0)
+            trail = self._lines(
+                f"/scene/estimate/trail_{i}", shapes.polyline(np.zeros((0, 3))), colour, 1.0
+            )
             self._trails.append(trail)
             corridor = shapes.corridor_of(scenario, i)
             if corridor is not None:
-                self._corridors.append(self._lines(f"/scene/estimate/corridor_{i}", corridor, colour, 1.0))
+                self._corridors.append(
+                    self._lines(f"/scene/estimate/corridor_{i}", corridor, colour, 1.0)
+                )
         self.view: ViewFrom = VIEWS[0]
         far = 2.0 * max(math.hypot(*c.position_m) for c in scenario.chasers)
         server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)
@@ -110,7 +122,11 @@ class SceneView:
 
     def _body(self, name: str, mesh: shapes.Mesh) -> Any:
         solid = trimesh.Trimesh(
-            mesh.vertices_m, mesh.triangles, vertex_colors=mesh.colours, process=False, validate=False
+            mesh.vertices_m,
+            mesh.triangles,
+            vertex_colors=mesh.colours,
+            process=False,
+            validate=False,
         )
         return self._scene.add_mesh_trimesh(name, solid, cast_shadow=False, receive_shadow=False)
 
@@ -145,9 +161,13 @@ class SceneView:
             self._keep_out_m, self._keep_out.points = keep_out_m, shapes.sphere(keep_out_m)
         for i, chaser in enumerate(state.chasers):
             self._place(self._chasers[i], state.chaser(i))
-            self._place(self._references[i], pose_of(chaser.reference) if chaser.reference else None)
+            self._place(
+                self._references[i], pose_of(chaser.reference) if chaser.reference else None
+            )
             if chaser.plan is not None:
-                self._plans[i].points = shapes.polyline(np.reshape(chaser.plan.positions_m, (-1, 3)))
+                self._plans[i].points = shapes.polyline(
+                    np.reshape(chaser.plan.positions_m, (-1, 3))
+                )
             if slow and estimate is not None:
                 trail = history.trails[i].between(state.time_s() - TRAIL_S, state.time_s())
                 self._trails[i].points = shapes.polyline(trail)

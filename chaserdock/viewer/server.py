@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Web server of the page: viser's, bound to one address, without public sharing, closed to pages of other origins and
-to programs without the page's token."""
+"""Web server of the page: viser's, bound to one address, without public sharing, closed to pages of
+other origins and to programs without the page's token."""
 
 from __future__ import annotations
 
@@ -25,9 +25,11 @@ _RequestHandler = Callable[[ServerConnection, Request], Response | None]
 
 @contextlib.contextmanager
 def page_server(host: str, port: int | None, token: str) -> Iterator[viser.ViserServer]:
-    """Run a page server on ``host``; without a ``port``, on the first free one from 8080 on. Raise ViewError.
+    """Run a page server on ``host``; without a ``port``, on the first free one from 8080 on. Raise
+    ViewError.
 
-    ``token``: first segment of the path of the page and of its web socket, which is rejected without it.
+    ``token``: first segment of the path of the page and of its web socket, which is rejected
+    without it.
     """
     server = _open(host, port, token)
     try:
@@ -46,7 +48,9 @@ def _open(host: str, port: int | None, token: str) -> viser.ViserServer:
         server = viser.ViserServer(host=host, port=chosen, verbose=False)
     if server.get_port() != chosen:
         server.stop()
-        raise ViewError(f"port {chosen} of {host} has just been taken; try again or choose one with --port")
+        raise ViewError(
+            f"port {chosen} of {host} has just been taken; try again or choose one with --port"
+        )
     _disable_sharing(server)
     return server
 
@@ -62,9 +66,10 @@ def _disable_sharing(server: viser.ViserServer) -> None:
 def _checked_requests(host: str, token: str) -> Iterator[None]:
     """Make a viser server that starts meanwhile check every request before it accepts a web socket.
 
-    A browser lets any web site open a socket to this machine, which could then send commands. viser has no option for
-    this check, and its callback for a new client comes after the handshake, when frames may already be buffered. So
-    this replaces the function that starts its server; tests/chaserdock/test_viewer.py checks the effect.
+    A browser lets any web site open a socket to this machine, which could then send commands. viser
+    has no option for this check, and its callback for a new client comes after the handshake, when
+    frames may already be buffered. So this replaces the function that starts its server;
+    tests/chaserdock/test_viewer.py checks the effect.
     """
 
     def serve_checked(*args: Any, process_request: _RequestHandler, **options: Any) -> serve:
@@ -78,7 +83,8 @@ def _checked_requests(host: str, token: str) -> Iterator[None]:
 
 
 def request_check(respond: _RequestHandler, host: str, token: str) -> _RequestHandler:
-    """Return ``respond`` restricted to requests with the token and, for web sockets, of the page's own origin.
+    """Return ``respond`` restricted to requests with the token and, for web sockets, of the page's
+    own origin.
 
     ``respond`` returns None to accept a web socket. The files of viser's client are public.
     """
@@ -89,7 +95,9 @@ def request_check(respond: _RequestHandler, host: str, token: str) -> _RequestHa
         if response is None:
             origins = request.headers.get_all("Origin")
             if not is_own_origin(origins, request.headers.get_all("Host"), host):
-                logging.getLogger(__name__).warning("rejected a page of origin %s", ", ".join(origins))
+                logging.getLogger(__name__).warning(
+                    "rejected a page of origin %s", ", ".join(origins)
+                )
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "origin not allowed\n")
         if path is None and (response is None or request.path.partition("?")[0] == "/"):
             return connection.respond(

@@ -30,7 +30,9 @@ class Mesh:
 
 
 def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> Mesh:
-    """Return faces with their decals as a mesh in body axes; ``tint`` colours the faces, not the decals."""
+    """Return faces with their decals as a mesh in body axes; ``tint`` colours the faces, not the
+    decals.
+    """
     corners: list[Array] = []
     normals: list[Array] = []
     colours: list[Array] = []
@@ -45,7 +47,8 @@ def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> 
             # Three layers: border, black square, white cells.
             corners.append(painted + face.normal * _LAYER_M * (1 + min(layer, 2)))
             colours.append(np.full((4, 3), float(grey)))
-    # Vertices are not shared, so that each quadrangle has flat shading; corners are counterclockwise seen from outside.
+    # Vertices are not shared, so that each quadrangle has flat shading; corners are
+    # counterclockwise seen from outside.
     quads = np.array([_counterclockwise(c, n) for c, n in zip(corners, normals, strict=True)])
     halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     triangles = (4 * np.arange(len(quads), dtype=np.int32)[:, None, None] + halves).reshape(-1, 3)
@@ -59,7 +62,9 @@ def _counterclockwise(corners: Array, normal: Array) -> Array:
 
 
 def polyline(points: Array) -> NDArray[np.float32]:
-    """Convert points (K, 3) to segments (K - 1, 2, 3); one of zero length for fewer than two points."""
+    """Convert points (K, 3) to segments (K - 1, 2, 3); one of zero length for fewer than two
+    points.
+    """
     if len(points) < 2:
         points = np.zeros((2, 3)) if len(points) == 0 else np.repeat(points, 2, axis=0)
     return np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
@@ -73,12 +78,16 @@ def box_edges(size_m: tuple[float, float, float]) -> NDArray[np.float32]:
 
 
 def tube(begin_m: Array, end_m: Array, radius_m: float) -> NDArray[np.float32]:
-    """Return a cylinder about the line between two points (3,) as segments (K, 2, 3): rings and four generatrices."""
+    """Return a cylinder about the line between two points (3,) as segments (K, 2, 3): rings and
+    four generatrices.
+    """
     axis = (end_m - begin_m) / max(1e-12, float(np.linalg.norm(end_m - begin_m)))
     radial = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     radial /= np.linalg.norm(radial)
     angles = np.linspace(0.0, 2.0 * np.pi, _SIDES + 1)
-    circle = radius_m * (np.outer(np.cos(angles), radial) + np.outer(np.sin(angles), np.cross(axis, radial)))
+    circle = radius_m * (
+        np.outer(np.cos(angles), radial) + np.outer(np.sin(angles), np.cross(axis, radial))
+    )
     rings = [polyline(circle + begin_m + share * (end_m - begin_m)) for share in (0.0, 0.5, 1.0)]
     along = np.stack([circle[:-1:6] + begin_m, circle[:-1:6] + end_m], axis=1).astype(np.float32)
     return np.concatenate([*rings, along])
@@ -100,8 +109,9 @@ def sphere(radius_m: float) -> NDArray[np.float32]:
 def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | None:
     """Return a chaser's approach corridor in TRF as segments (K, 2, 3), or None.
 
-    With capture: the region allowed for its centre from the corridor entry to the port, narrower in the final approach.
-    Otherwise: the line from its station to the docking distance, with the radius of the docking tolerance.
+    With capture: the region allowed for its centre from the corridor entry to the port, narrower in
+    the final approach. Otherwise: the line from its station to the docking distance, with the
+    radius of the docking tolerance.
     """
     docking, port = scenario.docking, scenario.docking.port_of(chaser)
     if docking.kind == "capture":
@@ -112,7 +122,10 @@ def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | 
             centre_offset(port, reach_m, g) for g in (docking.entry_m, docking.final_m, 0.0)
         )
         return np.concatenate(
-            [tube(entry, final, docking.corridor.lateral_m), tube(final, port_m, docking.final.lateral_m)]
+            [
+                tube(entry, final, docking.corridor.lateral_m),
+                tube(final, port_m, docking.final.lateral_m),
+            ]
         )
     begin = np.array(scenario.chasers[chaser].position_m)
     distance_m = float(np.linalg.norm(begin))

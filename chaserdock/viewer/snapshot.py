@@ -132,8 +132,8 @@ def keep_newest(store: OrderedDict[int, Any], key: int, message: Any, kept: int 
 
 @dataclass
 class MissionState:
-    """Latest messages of the mission; ``truth`` by body (``target``, ``chaser/0``), empty without access to it. ``true_body``: the
-    target's true mass properties, with access to ground truth."""
+    """Latest messages of the mission; ``truth`` by body (``target``, ``chaser/0``), empty without
+    access to it. ``true_body``: the target's true mass properties, with access to ground truth."""
 
     chasers: list[ChaserState]
     tick: Tick | None = None
@@ -170,14 +170,17 @@ class MissionState:
                 self.chasers[message.chaser].update(message)
 
     def images_of_one_moment(self) -> list[Image | None]:
-        """Return an image of each chaser: of the newest exposure of which all images, and if possible all sightings, have arrived.
+        """Return an image of each chaser: of the newest exposure of which all images, and if
+        possible all sightings, have arrived.
 
         Without such an exposure, and for a chaser whose images have stopped, it is the latest.
         """
         images = [c.image for c in self.chasers]
         newest_ns = max((image.sim_time_ns for image in images if image is not None), default=0)
         present = [
-            c for c in self.chasers if c.image is not None and c.image.sim_time_ns >= newest_ns - _RECENT_NS
+            c
+            for c in self.chasers
+            if c.image is not None and c.image.sim_time_ns >= newest_ns - _RECENT_NS
         ]
         common = set[int].intersection(*(set(c.images) for c in present)) if present else set[int]()
         seen = {t for t in common if all(c.sighting_in(c.images[t]) is not None for c in present)}
@@ -192,7 +195,11 @@ class MissionState:
 
     def estimate(self) -> Pose | None:
         """Return the estimated pose of the target."""
-        return pose_of(self.target) if self.target is not None and self.target.status != "none" else None
+        return (
+            pose_of(self.target)
+            if self.target is not None and self.target.status != "none"
+            else None
+        )
 
     def true_target(self) -> Pose | None:
         """Return the true pose of the target, with access to ground truth."""
@@ -213,5 +220,7 @@ class MissionState:
 
     def keep_out_m(self, default: float) -> float:
         """Return the largest minimum distance to the target that applies to a chaser."""
-        limits = [c.reference.min_distance_target_m for c in self.chasers if c.reference is not None]
+        limits = [
+            c.reference.min_distance_target_m for c in self.chasers if c.reference is not None
+        ]
         return max(limits, default=default)

@@ -20,15 +20,22 @@ _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
 
 def head(scenario: FlightScenario, state: MissionState, mode: str, speed: float | None) -> str:
     """Return time, speed, estimator status, and how the mission ended."""
-    lines = [f"**{scenario.name}** · {mode}", f"**{state.time_s():.1f} s** of {scenario.duration_s:g} s"]
+    lines = [
+        f"**{scenario.name}** · {mode}",
+        f"**{state.time_s():.1f} s** of {scenario.duration_s:g} s",
+    ]
     if speed is not None:
         lines[1] += f" · {speed:.2f} x real time"
     if state.target is not None:
-        lines.append(f"target: {state.target.status}, used by the filter: {_numbers(state.target.accepted)}")
+        lines.append(
+            f"target: {state.target.status}, used by the filter: {_numbers(state.target.accepted)}"
+        )
         if state.target.rejected:
             lines[-1] += f", rejected: {_numbers(state.target.rejected)}"
     if state.ended is not None:
-        lines.append(f"{'ended' if state.ended.complete else '⛔ ended early'}: {state.ended.reason}")
+        lines.append(
+            f"{'ended' if state.ended.complete else '⛔ ended early'}: {state.ended.reason}"
+        )
     return "  \n".join(lines)
 
 
@@ -58,14 +65,22 @@ def chasers(state: MissionState, history: History) -> str:
 
 
 def mass_properties(scenario: FlightScenario, state: MissionState) -> str:
-    """Return a table of the identified mass properties of target and stack beside the stated and, if known, the true ones."""
+    """Return a table of the identified mass properties of target and stack beside the stated and,
+    if known, the true ones.
+    """
     if state.stack is None:
         return "not yet identified"
     true = None if state.true_body is None else true_values(state.true_body)
     head = ("", "target", "stated", *(("true",) if true is not None else ()), "stack")
     lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
     for row in property_rows(state.stack, stated_values(scenario), true, "-"):
-        cells = (row.name, row.target, row.stated, *((row.true,) if true is not None else ()), row.stack)
+        cells = (
+            row.name,
+            row.target,
+            row.stated,
+            *((row.true,) if true is not None else ()),
+            row.stack,
+        )
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -120,7 +135,9 @@ def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
 
 
 def events(lines: list[Line], most: int = 99) -> str:
-    """Return at most so many event lines, newest first; lines that differ in numbers only are one, with their count."""
+    """Return at most so many event lines, newest first; lines that differ in numbers only are one,
+    with their count.
+    """
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
         # Events differ by the number of a chaser or thruster, not by measured values.

@@ -21,11 +21,12 @@ from .parameters import estimator_of, nmpc_parameters
 
 
 class ControllerCore:
-    """The controller's stages, which keep its state from tick to tick. ``inspecting``: the chasers that guidance let inspect the
-    target in the last tick.
+    """The controller's stages, which keep its state from tick to tick. ``inspecting``: the chasers
+    that guidance let inspect the target in the last tick.
 
-    ``now_s`` is a wall clock that only measures solve times; in ``realtime`` the scenario's solve budget follows from them.
-    ``estimator`` replaces the scenario's. Raises PluginError for an installed solver that cannot be held to a budget.
+    ``now_s`` is a wall clock that only measures solve times; in ``realtime`` the scenario's solve
+    budget follows from them. ``estimator`` replaces the scenario's. Raises PluginError for an
+    installed solver that cannot be held to a budget.
     """
 
     def __init__(

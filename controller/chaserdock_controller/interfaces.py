@@ -48,8 +48,8 @@ ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search", "detu
 class TickInputs:
     """Messages of a tick. Sightings may belong to earlier ticks.
 
-    ``odometry``: of the tick; a lost one is extrapolated for a while. ``outdated``: the newest odometry of chasers that have none of
-    this tick, by chaser.
+    ``odometry``: of the tick; a lost one is extrapolated for a while. ``outdated``: the newest
+    odometry of chasers that have none of this tick, by chaser.
     """
 
     tick: int
@@ -78,7 +78,9 @@ class TickOutputs:
 
 
 class AppliedImpulse(NamedTuple):
-    """Impulse (6,), N s and N m s, body axes, since the tick before: ``measured`` by thrusters, or commanded."""
+    """Impulse (6,), N s and N m s, body axes, since the tick before: ``measured`` by thrusters, or
+    commanded.
+    """
 
     impulse: Array
     measured: bool
@@ -86,15 +88,19 @@ class AppliedImpulse(NamedTuple):
 
 @dataclass(frozen=True)
 class Observation:
-    """Result of ingest: checked inputs and what follows from them about the chasers; mappings by chaser.
+    """Result of ingest: checked inputs and what follows from them about the chasers; mappings by
+    chaser.
 
-    ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states, of ``outdated`` chasers extrapolated;
-    ``invalid``: why a state is not. ``outdated``: valid odometry of earlier ticks, with the times of these, of chasers without newer.
-    ``lost``: last odometry of chasers that are obstacles to the others. ``interrupted``: chasers without odometry for a while before
-    this tick, as they sent none or this controller received none. ``ahead``: what acts on a chaser until ``effective_ns``, as
-    durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
-    ``isolated``: thrusters that chasers report as closed. ``thruster_impulses``: of the thrusters (n,) since the tick before, N s,
-    as chasers report them. ``last_commands``: to chasers without odometry in this tick, (6,); what they fly now is not known.
+    ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states, of
+    ``outdated`` chasers extrapolated; ``invalid``: why a state is not. ``outdated``: valid odometry
+    of earlier ticks, with the times of these, of chasers without newer. ``lost``: last odometry of
+    chasers that are obstacles to the others. ``interrupted``: chasers without odometry for a while
+    before this tick, as they sent none or this controller received none. ``ahead``: what acts on a
+    chaser until ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,).
+    Wrenches are N and N m, body axes. ``isolated``: thrusters that chasers report as closed.
+    ``thruster_impulses``: of the thrusters (n,) since the tick before, N s, as chasers report them.
+    ``last_commands``: to chasers without odometry in this tick, (6,); what they fly now is not
+    known.
     """
 
     tick: int
@@ -131,9 +137,10 @@ class Observation:
 class IdentifiedStack:
     """Mass properties of the stack and of the target alone, as identified until now.
 
-    ``chasers``: where they are fixed. ``motion``: of the centre of mass (WRF) and the target's axes. ``thrust_factors`` (n,):
-    estimated over stated thrust, by chaser. ``failed``: thrusters found stuck, by chaser. ``informative`` returns the
-    thrusters (chaser, number) whose pulses would tell most about the mass properties, the best first.
+    ``chasers``: where they are fixed. ``motion``: of the centre of mass (WRF) and the target's
+    axes. ``thrust_factors`` (n,): estimated over stated thrust, by chaser. ``failed``: thrusters
+    found stuck, by chaser. ``informative`` returns the thrusters (chaser, number) whose pulses
+    would tell most about the mass properties, the best first.
     """
 
     stack: MassProperties
@@ -147,9 +154,9 @@ class IdentifiedStack:
 
 @dataclass(frozen=True, eq=False)
 class EstimatedShape:
-    """Errors of the target's known geometry: ``parameters``, their estimated values (k,) and covariance (k, k), both in the
-    parameters' standard deviations; number of ``views``, the share of directions that they cover, and whether this tick brought
-    one (``changed``)."""
+    """Errors of the target's known geometry: ``parameters``, their estimated values (k,) and
+    covariance (k, k), both in the parameters' standard deviations; number of ``views``, the share
+    of directions that they cover, and whether this tick brought one (``changed``)."""
 
     parameters: tuple[GeometryParameter, ...]
     values: Array
@@ -161,15 +168,18 @@ class EstimatedShape:
 
 @dataclass(frozen=True)
 class TargetEstimation:
-    """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose is known.
+    """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose
+    is known.
 
-    ``own``: estimated states of the chasers with valid odometry; ``own_at_effect``: the same at ``Observation.effective_ns``,
-    (13,): p, v (WRF), q_wxyz, omega (body). ``disturbances``: estimated force and torque (6,) on a chaser, body axes.
-    ``motion_covariances``: (6, 6) of a chaser's position and velocity relative to the target, WRF, unless passive safety is off.
+    ``own``: estimated states of the chasers with valid odometry; ``own_at_effect``: the same at
+    ``Observation.effective_ns``, (13,): p, v (WRF), q_wxyz, omega (body). ``disturbances``:
+    estimated force and torque (6,) on a chaser, body axes. ``motion_covariances``: (6, 6) of a
+    chaser's position and velocity relative to the target, WRF, unless passive safety is off.
     ``relative``: poses of the chasers relative to the target, if estimated with covariance.
-    ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
-    target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are. ``shape``: errors of
-    the known geometry, once they are estimated. ``doubtful``: chasers whose odometry may be wrong.
+    ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds
+    the target; ``body``: the target and these chasers as one rigid body. ``stack``: their mass
+    properties as identified, if they are. ``shape``: errors of the known geometry, once they are
+    estimated. ``doubtful``: chasers whose odometry may be wrong.
     """
 
     target: TargetState
@@ -196,7 +206,9 @@ class TargetEstimation:
 
 @dataclass(frozen=True)
 class ReferencePose:
-    """Reference of one chaser now: position (3,) and attitude (4,) in WRF, ``offset_m`` (3,) in TRF."""
+    """Reference of one chaser now: position (3,) and attitude (4,) in WRF, ``offset_m`` (3,) in
+    TRF.
+    """
 
     position_m: Array
     q_wxyz: Array
@@ -206,8 +218,8 @@ class ReferencePose:
 
 @dataclass(frozen=True)
 class DirectCommand:
-    """Force and torque (6,), body axes, of a chaser that is not flown by the NMPC; ``thrusts_N`` (n,), if not None: those of
-    its thrusters, which give that wrench."""
+    """Force and torque (6,), body axes, of a chaser that is not flown by the NMPC; ``thrusts_N``
+    (n,), if not None: those of its thrusters, which give that wrench."""
 
     mode: ControlMode
     wrench: Array
@@ -216,8 +228,8 @@ class DirectCommand:
 
 @dataclass(frozen=True)
 class Directive:
-    """Guidance of one chaser. ``isolated`` and ``trusted``: thrusters, by operator command. ``reference`` is None while
-    the target or the chaser's own state is unknown."""
+    """Guidance of one chaser. ``isolated`` and ``trusted``: thrusters, by operator command.
+    ``reference`` is None while the target or the chaser's own state is unknown."""
 
     phase: Phase
     phase_time_s: float
@@ -231,7 +243,8 @@ class Directive:
 
 @dataclass(frozen=True)
 class HorizonReference:
-    """References of N ``chasers`` over D stages: the guidance part of an ``NmpcInput`` (shapes there).
+    """References of N ``chasers`` over D stages: the guidance part of an ``NmpcInput`` (shapes
+    there).
 
     ``attached``: chasers whose latch holds the target; they are obstacles and follow its motion.
     """
@@ -249,8 +262,8 @@ class HorizonReference:
 
 @dataclass(frozen=True)
 class GuidanceResult:
-    """Result of guidance. ``horizon`` is None when no chaser is planned for. ``abort_margins``: margin in sigmas of the best abort
-    of each chaser whose passive safety is enforced now."""
+    """Result of guidance. ``horizon`` is None when no chaser is planned for. ``abort_margins``:
+    margin in sigmas of the best abort of each chaser whose passive safety is enforced now."""
 
     directives: Mapping[int, Directive]
     horizon: HorizonReference | None
@@ -266,7 +279,9 @@ class GuidanceResult:
 
 @dataclass(frozen=True)
 class PlanCertificate:
-    """Passive safety of a chaser's newest plan: the worst coast, and the time (s) from the plan's beginning to its loss of thrust."""
+    """Passive safety of a chaser's newest plan: the worst coast, and the time (s) from the plan's
+    beginning to its loss of thrust.
+    """
 
     coast: CoastCertificate
     loss_s: float
@@ -287,10 +302,11 @@ class PlanningHistory(Protocol):
 
 @dataclass(frozen=True)
 class PlanResult:
-    """Result of planning: the plan of ``chasers``, row by row; None without a usable solve. ``wall_s``: time of the solve.
+    """Result of planning: the plan of ``chasers``, row by row; None without a usable solve.
+    ``wall_s``: time of the solve.
 
-    ``flyable``: the plan of each chaser that may be flown, an earlier one for a while after a failed solve. ``certificates``: passive
-    safety of the newest plans, where it is monitored.
+    ``flyable``: the plan of each chaser that may be flown, an earlier one for a while after a
+    failed solve. ``certificates``: passive safety of the newest plans, where it is monitored.
     """
 
     chasers: tuple[int, ...]

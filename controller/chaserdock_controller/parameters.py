@@ -45,10 +45,13 @@ def nmpc_settings(controller: Controller, limits: Limits) -> dict[str, Any]:
 
 
 def target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]:
-    """Return the process noise of the target for each motion model: the default, or what the scenario states."""
+    """Return the process noise of the target for each motion model: the default, or what the
+    scenario states.
+    """
     stated = (estimator.target_acceleration_noise, estimator.target_angular_noise)
     return {
-        model: (stated[0] or default[0], stated[1] or default[1]) for model, default in TARGET_NOISE.items()
+        model: (stated[0] or default[0], stated[1] or default[1])
+        for model, default in TARGET_NOISE.items()
     }
 
 
@@ -60,8 +63,9 @@ def _far_noise(scenario: FlightScenario) -> SightingNoise:
 
 
 def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
-    """Return the estimator that the scenario names: a built-in one, or an installed ``chaserdock.estimators`` entry point,
-    called with the scenario. Raises PluginError if there is none of that name."""
+    """Return the estimator that the scenario names: a built-in one, or an installed
+    ``chaserdock.estimators`` entry point, called with the scenario. Raises PluginError if there is
+    none of that name."""
     name = scenario.estimator.name
     if name not in ESTIMATORS:
         return plugins.load("estimator", name, ESTIMATORS)(scenario)
@@ -88,12 +92,17 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
         navigation=errors,
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
-        unexpected_velocity_m_s=body.force_max_N / body.mass_kg / scenario.time.rate_hz / math.sqrt(3.0),
+        unexpected_velocity_m_s=body.force_max_N
+        / body.mass_kg
+        / scenario.time.rate_hz
+        / math.sqrt(3.0),
         unexpected_omega_rad_s=math.sqrt(3.0)
         * body.torque_max_N_m
         / min(body.inertia)
         / scenario.time.rate_hz,
-        mean_motion_rad_s=0.0 if scenario.orbit is None else scenario.orbit.elements.mean_motion_rad_s,
+        mean_motion_rad_s=0.0
+        if scenario.orbit is None
+        else scenario.orbit.elements.mean_motion_rad_s,
         target_noise=target_noise(scenario.estimator),
         shape=_far_noise(scenario),
     )

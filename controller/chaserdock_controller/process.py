@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller process: receives the messages of a tick, has it processed, and publishes the outputs."""
+"""The controller process: receives the messages of a tick, has it processed, and publishes the
+outputs.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ _RECEIVE_TIMEOUT_S = 0.2
 
 
 def main(options: ProcessOptions) -> int:
-    """Run the controller; return 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
+    """Run the controller; return 0 when the mission ended, 1 when stopped before, 2 when it could
+    not join.
+    """
 
     def work(node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
@@ -58,10 +62,17 @@ def main(options: ProcessOptions) -> int:
         now_s = node.host.now_s
         core = ControllerCore(scenario, now_s, realtime=realtime)
         controller = ControllerProcess(node, scenario, core, realtime, now_s=now_s)
-        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, not realtime, node.host)
+        node.message_filter = create_fault_layer(
+            faults, node.name, scenario.timing, not realtime, node.host
+        )
         controller.open(instance, options.stall_s)
         node.host.finish_startup()
-        while not (controller.ended or controller.replaced or stop() or controller.heartbeat.world_is_gone()):
+        while not (
+            controller.ended
+            or controller.replaced
+            or stop()
+            or controller.heartbeat.world_is_gone()
+        ):
             controller.listen()
         if not controller.replaced:
             controller.farewell()
@@ -73,9 +84,9 @@ def main(options: ProcessOptions) -> int:
 class ControllerProcess:
     """Barrier and I/O: a tick is processed once every message that it needs has arrived or is lost.
 
-    In real time a tick is processed with what has arrived when its patience is over, by ``now_s``, or when the first
-    odometry of the next one arrives. A standby processes the same ticks without publishing. ``replaying``: this process
-    leads in every tick.
+    In real time a tick is processed with what has arrived when its patience is over, by ``now_s``,
+    or when the first odometry of the next one arrives. A standby processes the same ticks without
+    publishing. ``replaying``: this process leads in every tick.
     """
 
     def __init__(
@@ -138,7 +149,7 @@ class ControllerProcess:
         """Publish the last messages of this process."""
         self.heartbeat.farewell(self.done_tick, self.tick.sim_time_ns if self.tick else 0)
 
-    # -- receiving -------------------------------------------------------------------------------------------
+    # -- receiving ---------------------------------------------------------------------------------
 
     def listen(self) -> None:
         """Receive one message, and process the tick if it is ready then."""
@@ -158,7 +169,9 @@ class ControllerProcess:
             self._process(tick)
 
     def _missing_keys(self) -> tuple[str, ...]:
-        """Return the keys of the messages that the open tick waits for, or that the next one begins with."""
+        """Return the keys of the messages that the open tick waits for, or that the next one begins
+        with.
+        """
         tick = self.tick
         if tick is None or tick.tick <= self.done_tick:
             return (topics.TICK.key_of(),)
@@ -168,7 +181,9 @@ class ControllerProcess:
     def _open_tick(self) -> Tick | None:
         """Return the tick that waits for its deadline, in real time."""
         tick = self.tick
-        is_open = self.realtime and not self.replaying and tick is not None and tick.tick > self.done_tick
+        is_open = (
+            self.realtime and not self.replaying and tick is not None and tick.tick > self.done_tick
+        )
         return tick if is_open else None
 
     def _timeout_s(self) -> float:
@@ -218,7 +233,7 @@ class ControllerProcess:
             if self.standby.leads:
                 self._publish_event(level, text, odometry)
 
-    # -- processing ------------------------------------------------------------------------------------------
+    # -- processing --------------------------------------------------------------------------------
 
     def _process(self, tick: Tick) -> None:
         start_s = self.now_s()
@@ -249,14 +264,15 @@ class ControllerProcess:
             health = create_health(self.node, tick.tick, tick.sim_time_ns)
             self.node.publish(topics.HEALTH, health, self.name)
 
-    # -- publishing ------------------------------------------------------------------------------------------
+    # -- publishing --------------------------------------------------------------------------------
 
     def _publish(
         self, tick: Tick, out: TickOutputs, wall_s: float, operated: tuple[OperatorCommand, ...]
     ) -> None:
         node = self.node
         if self.standby.others:
-            # Before the wrenches: once a tick is answered, the standby knows the commands that it was answered with.
+            # Before the wrenches: once a tick is answered, the standby knows the commands that it
+            # was answered with.
             self._publish_state(tick, operated=operated)
         node.publish(topics.TARGET, out.target)
         if out.stack is not None:
@@ -289,12 +305,18 @@ class ControllerProcess:
 
     def _publish_state(self, tick: Tick, **fields: Any) -> None:
         sender = self.standby.authority
-        state = ControllerState(process=self.name, term=sender.term, instance=sender.instance, **fields)
+        state = ControllerState(
+            process=self.name, term=sender.term, instance=sender.instance, **fields
+        )
         stamp = {"tick": tick.tick, "sim_time_ns": tick.sim_time_ns}
         self.node.publish(topics.STATE, msgspec.structs.replace(state, **stamp))
 
-    def _publish_event(self, level: Level, text: str, at: Tick | Odometry | ControllerState) -> None:
-        event = Event(tick=at.tick, sim_time_ns=at.sim_time_ns, process=self.name, level=level, what=text)
+    def _publish_event(
+        self, level: Level, text: str, at: Tick | Odometry | ControllerState
+    ) -> None:
+        event = Event(
+            tick=at.tick, sim_time_ns=at.sim_time_ns, process=self.name, level=level, what=text
+        )
         self.node.publish(topics.EVENT, event, self.name)
 
     def _report_role(self, text: str, at: Tick) -> None:
@@ -303,10 +325,12 @@ class ControllerProcess:
             print_status(self.name, f"{at.sim_time_ns / 1e9:.2f} s: {text}")
         self._publish_event("info", text, at)
 
-    # -- leader and standby ----------------------------------------------------------------------------------
+    # -- leader and standby ------------------------------------------------------------------------
 
     def _dispatch_leadership(self, received: ReceivedMessage) -> bool:
-        """Apply what a message says about the leader, ahead of held messages; return whether that is all it says."""
+        """Apply what a message says about the leader, ahead of held messages; return whether that
+        is all it says.
+        """
         match received.message:
             case ControllerState() as state:
                 if state.process != self.name:
@@ -337,20 +361,26 @@ class ControllerProcess:
         return False
 
     def _decide(self, processed: Tick | None = None) -> None:
-        """Determine who commands, and take or leave the command; ``processed``: see ``HotStandby.decide``."""
+        """Determine who commands, and take or leave the command; ``processed``: see
+        ``HotStandby.decide``.
+        """
         standby = self.standby
         newest, led = processed or standby.newest, standby.leads
         if newest is None:
             return
         if standby.decide(processed):
-            self._publish_event("warning", "takes over without any state of the flight so far", newest)
+            self._publish_event(
+                "warning", "takes over without any state of the flight so far", newest
+            )
         if standby.leads != led:
             self._change_role(newest)
         if not standby.leads and (processed is not None or not self.realtime):
             self._leave_unused_leases(newest)
 
     def _leave_unused_leases(self, tick: Tick) -> None:
-        """Let the chasers wait that have granted their lease to this controller, which lacks a majority."""
+        """Let the chasers wait that have granted their lease to this controller, which lacks a
+        majority.
+        """
         stamp = (tick.tick, tick.revision)
         if stamp <= self._left_at or not self.standby.is_decided(tick):
             return
@@ -374,7 +404,8 @@ class ControllerProcess:
             self._report_role(f"commands in term {term}" if leads else "stands by", tick)
         result = self._last_result
         if leads and result is not None and result[0].tick == tick.tick:
-            # Processed already as a standby, for a leader that cannot publish its own result any more.
+            # Processed already as a standby, for a leader that cannot publish its own result any
+            # more.
             self._publish(tick, result[1], result[2], ())
 
     def _refuse_requests(self, tick: Tick) -> None:
@@ -391,7 +422,9 @@ class ControllerProcess:
                 self.checkpoint.restore(state.state)
             except CheckpointError as error:
                 self.node.counts.rejected["controller/state:format"] += 1
-                self._publish_event("error", f"the leader's state cannot be restored: {error}", state)
+                self._publish_event(
+                    "error", f"the leader's state cannot be restored: {error}", state
+                )
                 return
             self.done_tick = max(self.done_tick, state.tick)
             self.standby.state_restored(state.tick)

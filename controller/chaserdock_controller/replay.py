@@ -50,19 +50,26 @@ def _core_of(scenario: FlightScenario) -> ControllerCore:
 def _with_leader(
     recorded: Iterable[ReceivedMessage],
 ) -> Iterator[tuple[Commander | None, list[ReceivedMessage]]]:
-    """Return the messages of each tick with the last controller that commanded it, None if none did."""
+    """Return the messages of each tick with the last controller that commanded it, None if none
+    did.
+    """
     for _, group in groupby(recorded, key=lambda r: r.message.tick):
         received = list(group)
         commands = [r.message for r in received if r.topic is topics.WRENCH]
         commands = [c for c in commands if c.mode not in ("wait", "yield")]
         last = max(commands, key=lambda c: c.term, default=None)
-        yield None if last is None else Commander(last.commander, last.instance, last.term), received
+        yield (
+            None if last is None else Commander(last.commander, last.instance, last.term),
+            received,
+        )
 
 
 def _play(
     scenario: FlightScenario, recorded: Iterable[ReceivedMessage], core_of: Callable[[], Any]
 ) -> Iterator[Published]:
-    """Return the outputs of the leader. A new leader keeps the state of the one before; a restarted process does not."""
+    """Return the outputs of the leader. A new leader keeps the state of the one before; a restarted
+    process does not.
+    """
     node, controller, last_seq = ReplayNode("controller"), None, -1
     last_leader = authority = Commander("controller", "", 0)
     for commander, messages in _with_leader(recorded):
@@ -73,7 +80,9 @@ def _play(
             restarted = is_target and received.message.seq < last_seq and leader == last_leader.name
             if controller is None or restarted:
                 node = ReplayNode("controller")
-                controller = ControllerProcess(cast(Node, node), scenario, core_of(), replaying=True)
+                controller = ControllerProcess(
+                    cast(Node, node), scenario, core_of(), replaying=True
+                )
                 controller.heartbeat = cast(Any, SilentHeartbeat())
             controller.standby.replayed = authority
             if is_target:
@@ -88,17 +97,23 @@ def _play(
                 controller.listen()
                 # Events of a standby are published on its own branch, which is not compared.
                 yield from (
-                    s for s in node.take_published() if s[0] is not topics.EVENT or leader != "standby"
+                    s
+                    for s in node.take_published()
+                    if s[0] is not topics.EVENT or leader != "standby"
                 )
         last_leader = authority
 
 
-def play_controller(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
+def play_controller(
+    scenario: FlightScenario, recorded: Iterable[ReceivedMessage]
+) -> Iterator[Published]:
     """Return everything that the controller publishes."""
     return _play(scenario, recorded, lambda: _core_of(scenario))
 
 
-def play_fusion(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
+def play_fusion(
+    scenario: FlightScenario, recorded: Iterable[ReceivedMessage]
+) -> Iterator[Published]:
     """Return the target's estimates only."""
     return _play(scenario, recorded, lambda: _EstimationOnly(_core_of(scenario)))
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller that is no part of chaserdock: it speaks the published protocol with `zenoh` and `msgpack` alone.
+"""A controller that is no part of chaserdock: it speaks the published protocol with `zenoh` and
+`msgpack` alone.
 
-It takes the place of `chaserdock controller` for one chaser: joins the mission, tracks the target with an alpha-beta
-filter on the chaser's sightings, and flies a PD law. Written to be read by someone who does the same in another
-language; what each message holds is in docs/protocol.md.
+It takes the place of `chaserdock controller` for one chaser: joins the mission, tracks the target
+with an alpha-beta filter on the chaser's sightings, and flies a PD law. Written to be read by
+someone who does the same in another language; what each message holds is in docs/protocol.md.
 
     python foreign_controller.py tcp/127.0.0.1:7447
 """
@@ -26,7 +27,7 @@ def encoding(kind):
     return f"application/msgpack;chaserdock.{kind}.v1"
 
 
-# -- quaternions (w, x, y, z), body to world ---------------------------------------------------------------
+# -- quaternions (w, x, y, z), body to world -------------------------------------------------------
 
 
 def multiply(p, q):
@@ -75,7 +76,7 @@ def add(a, b, factor=1.0):
     return tuple(x + factor * y for x, y in zip(a, b, strict=True))
 
 
-# -- the target ---------------------------------------------------------------------------------------------
+# -- the target ------------------------------------------------------------------------------------
 
 Q_CRF_IRF = (0.5, -0.5, 0.5, -0.5)  # the camera looks along the body's +X, its top towards +Z
 
@@ -108,20 +109,26 @@ class Target:
 
 
 def seen_pose(scenario, odometry, solution):
-    """Target pose in the world from a sighting's solution (in the camera) and the chaser's odometry."""
+    """Target pose in the world from a sighting's solution (in the camera) and the chaser's
+    odometry.
+    """
     in_body = add(scenario["camera"]["position_m"], rotate(Q_CRF_IRF, solution["position_m"]))
     position = add(odometry["position_m"], rotate(odometry["q_wxyz"], in_body))
     return position, unit(multiply(odometry["q_wxyz"], multiply(Q_CRF_IRF, solution["q_wxyz"])))
 
 
-# -- control ------------------------------------------------------------------------------------------------
+# -- control ---------------------------------------------------------------------------------------
 
 
 def wrench(scenario, odometry, target):
-    """PD law towards the reference pose on the target; force and torque in body axes, within the limits."""
+    """PD law towards the reference pose on the target; force and torque in body axes, within the
+    limits.
+    """
     body, place = scenario["chaser"], scenario["chasers"][odometry["chaser"]]
     m, size = body["mass_kg"], body["size_m"]
-    inertia = body["inertia_kg_m2"] or [m / 12 * (sum(s * s for s in size) - size[i] ** 2) for i in range(3)]
+    inertia = body["inertia_kg_m2"] or [
+        m / 12 * (sum(s * s for s in size) - size[i] ** 2) for i in range(3)
+    ]
     offset = place["position_m"]
     aim = add(target.position, rotate(target.q, offset))
     aim_velocity = add(target.velocity, rotate(target.q, cross(target.omega, offset)))
@@ -131,7 +138,9 @@ def wrench(scenario, odometry, target):
     q = odometry["q_wxyz"]
     pull = add(aim, odometry["position_m"], -1.0)
     push = add(aim_velocity, odometry["velocity_m_s"], -1.0)
-    acceleration = tuple(c + kp * a + kd * b for a, b, c in zip(pull, push, centripetal, strict=True))
+    acceleration = tuple(
+        c + kp * a + kd * b for a, b, c in zip(pull, push, centripetal, strict=True)
+    )
     turn = log(multiply(conjugate(q), aim_q))
     spin = add(rotate(conjugate(place["q_wxyz"]), target.omega), odometry["omega_rad_s"], -1.0)
     force = tuple(m * a for a in rotate(conjugate(q), acceleration))
@@ -143,7 +152,7 @@ def wrench(scenario, odometry, target):
     return limited(force, body["force_max_N"]), limited(torque, body["torque_max_N_m"])
 
 
-# -- the process --------------------------------------------------------------------------------------------
+# -- the process -----------------------------------------------------------------------------------
 
 
 class Controller:
@@ -183,7 +192,9 @@ class Controller:
             time.sleep(0.1)
 
     def listen(self):
-        """Subscribe; presence last, so that a process that receives ours can reach all other subscriptions."""
+        """Subscribe; presence last, so that a process that receives ours can reach all other
+        subscriptions.
+        """
         self.token = self.session.liveliness().declare_token(f"live/{NAME}")
         keys = (
             "world/tick",
@@ -195,7 +206,8 @@ class Controller:
         )
         self.subscribers = [
             self.session.declare_subscriber(
-                key, lambda s: self.inbox.put((str(s.key_expr), msgpack.unpackb(s.payload.to_bytes())))
+                key,
+                lambda s: self.inbox.put((str(s.key_expr), msgpack.unpackb(s.payload.to_bytes()))),
             )
             for key in keys
         ]
@@ -206,7 +218,11 @@ class Controller:
     def publish_presence(self):
         while not self.over.wait(0.05):
             self.publish(
-                f"{NAME}/presence", "Presence", process=NAME, instance=self.instance, heard=dict(self.heard)
+                f"{NAME}/presence",
+                "Presence",
+                process=NAME,
+                instance=self.instance,
+                heard=dict(self.heard),
             )
 
     def fly(self):
@@ -242,16 +258,24 @@ class Controller:
             if len(here) == len(stated) == len(tick["chasers"]) and (
                 not tick["images"] or len(looked) == len(here)
             ):
-                # It is the only controller, to which all chasers grant their leases. With a second one, see docs/protocol.md.
+                # It is the only controller, to which all chasers grant their leases. With a second
+                # one, see docs/protocol.md.
                 term = max((leases[i]["term"] for i in stated), default=0)
-                self.answer(scenario, tick, term, target, odometry, sightings if tick["images"] else {})
+                self.answer(
+                    scenario, tick, term, target, odometry, sightings if tick["images"] else {}
+                )
                 done = now
         self.over.set()
         self.heartbeat.join()  # its last messages belong to the counts
         counts = {key: n + 1 for key, n in self.seq.items()}
         time_ns = tick["sim_time_ns"] if tick else 0
         self.publish(
-            f"{NAME}/farewell", "Farewell", tick=done, sim_time_ns=time_ns, process=NAME, published=counts
+            f"{NAME}/farewell",
+            "Farewell",
+            tick=done,
+            sim_time_ns=time_ns,
+            process=NAME,
+            published=counts,
         )
         self.session.close()
 
@@ -267,7 +291,9 @@ class Controller:
         physics_hz, rate_hz = scenario["time"]["physics_hz"], scenario["time"]["rate_hz"]
         step = tick["tick"] * physics_hz // rate_hz + round(latency_s * physics_hz)
         for i in tick["chasers"]:
-            force, torque = wrench(scenario, odometry[i], target) if known else ([0.0] * 3, [0.0] * 3)
+            force, torque = (
+                wrench(scenario, odometry[i], target) if known else ([0.0] * 3, [0.0] * 3)
+            )
             self.publish(
                 f"{NAME}/chaser/{i}/wrench",
                 "WrenchCommand",

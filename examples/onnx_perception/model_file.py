@@ -28,11 +28,15 @@ def network(weights, facts):
         nodes.append(helper.make_node("Relu", [f"c{k}"], [name]))
     nodes.append(helper.make_node("Flatten", [name], ["flat"]))
     nodes.append(
-        helper.make_node("Gemm", ["flat", constant("wh", hidden[0]), constant("bh", hidden[1])], ["h"])
+        helper.make_node(
+            "Gemm", ["flat", constant("wh", hidden[0]), constant("bh", hidden[1])], ["h"]
+        )
     )
     nodes.append(helper.make_node("Relu", ["h"], ["a"]))
     nodes.append(
-        helper.make_node("Gemm", ["a", constant("wl", last[0]), constant("bl", last[1])], ["places"])
+        helper.make_node(
+            "Gemm", ["a", constant("wl", last[0]), constant("bl", last[1])], ["places"]
+        )
     )
     graph = helper.make_graph(
         nodes,

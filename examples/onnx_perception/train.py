@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train the network of onnx_perception.py on a dataset of ``chaserdock dataset``: ``python train.py DATASET [--out landmarks.onnx]``.
+"""Train the network of onnx_perception.py on a dataset of ``chaserdock dataset``: ``python train.py
+DATASET [--out landmarks.onnx]``.
 
-A convolutional network of 0.3 million weights maps a crop of 64 x 64 pixels to the places of landmarks. Needs jax and onnx.
+A convolutional network of 0.3 million weights maps a crop of 64 x 64 pixels to the places of
+landmarks. Needs jax and onnx.
 """
 
 import argparse
@@ -25,7 +27,9 @@ BATCH, RATE = 64, 2e-3
 
 
 def landmarks_of(points_m):
-    """Return landmarks (n, 3) far from each other: each one is the vertex farthest from those before."""
+    """Return landmarks (n, 3) far from each other: each one is the vertex farthest from those
+    before.
+    """
     chosen = [points_m[np.argmax(np.linalg.norm(points_m, axis=1))]]
     for _ in range(LANDMARKS - 1):
         distance = np.min([np.linalg.norm(points_m - c, axis=1) for c in chosen], axis=0)
@@ -41,13 +45,17 @@ def load(images, camera, landmarks):
         region = find_region(pixels)
         if region is not None:
             label = item.label
-            at = camera.project(rotations.rotate(label.q_irf_trf_wxyz, landmarks) + label.position_irf_m)
+            at = camera.project(
+                rotations.rotate(label.q_irf_trf_wxyz, landmarks) + label.position_irf_m
+            )
             loaded.append((pixels, region, at))
     return loaded
 
 
 def batch_of(samples, rng=None):
-    """Return inputs (n, 1, SIDE, SIDE) and targets (n, 2 k) of samples, randomly turned, shifted and scaled with ``rng``."""
+    """Return inputs (n, 1, SIDE, SIDE) and targets (n, 2 k) of samples, randomly turned, shifted
+    and scaled with ``rng``.
+    """
     inputs, targets = [], []
     for pixels, (centre, half), at in samples:
         turn = 0.0
@@ -71,7 +79,9 @@ def initial(rng):
         weights.append((scale * rng.normal(size=(outputs, inputs, side, side)), np.zeros(outputs)))
     flat = FILTERS[-1][2] * (SIDE // 2 ** len(FILTERS)) ** 2
     for inputs, outputs in ((flat, HIDDEN), (HIDDEN, 2 * LANDMARKS)):
-        weights.append((np.sqrt(2.0 / inputs) * rng.normal(size=(inputs, outputs)), np.zeros(outputs)))
+        weights.append(
+            (np.sqrt(2.0 / inputs) * rng.normal(size=(inputs, outputs)), np.zeros(outputs))
+        )
     return jax.tree.map(lambda w: jnp.asarray(w, dtype=jnp.float32), weights)
 
 
@@ -116,7 +126,9 @@ def train(samples, epochs, rng, limit_s=np.inf):
         for start in range(0, len(order) - BATCH + 1, BATCH):
             x, y = batch_of([samples[k] for k in order[start : start + BATCH]], rng)
             number += 1
-            share = max((epoch + start / len(order)) / epochs, (time.process_time() - begin_s) / limit_s)
+            share = max(
+                (epoch + start / len(order)) / epochs, (time.process_time() - begin_s) / limit_s
+            )
             rate = RATE * 0.5 * (1.0 + np.cos(np.pi * min(share, 1.0))) + 1e-5
             weights, first, second, value = step(weights, first, second, number, rate, x, y)
             losses.append(float(value))
@@ -130,11 +142,15 @@ def train(samples, epochs, rng, limit_s=np.inf):
 
 
 def spread_of(found, samples, images, camera, landmarks):
-    """Return standard deviations (6,) of poses, m per m and rad, from the median errors, and the RMS that 95 % of fits reach."""
+    """Return standard deviations (6,) of poses, m per m and rad, from the median errors, and the
+    RMS that 95 % of fits reach.
+    """
     errors, rms = [], []
     for places_found, (_, (centre, half), _), item in zip(found, samples, images, strict=True):
         px = camera.undistort(places_found.reshape(-1, 2) * half + centre)
-        done, turn, position = cv2.solvePnP(landmarks, px, camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP)
+        done, turn, position = cv2.solvePnP(
+            landmarks, px, camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP
+        )
         if not done:
             continue
         q, label = rotations.exp(turn[:, 0]), item.label
@@ -160,7 +176,8 @@ def main():
     landmarks = landmarks_of(data.shape.points_m)
     samples = load(data.of_split("train")[: options.images], data.camera, landmarks)
     weights = train(samples, options.epochs, np.random.default_rng(1), options.cpu_limit_s)
-    # The errors that the perception states: of training images, turned, so that validation images stay unseen.
+    # The errors that the perception states: of training images, turned, so that validation images
+    # stay unseen.
     checked = data.of_split("train")[:500]
     images = [i for i in checked if find_region(read_grey(i.path, data.camera)) is not None]
     fitted = load(images, data.camera, landmarks)
@@ -172,7 +189,9 @@ def main():
         "most_rms": str(most_rms),
     }
     onnx.save(network(weights, facts), str(options.out))
-    print(f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB, sigma {np.round(sigma, 4).tolist()}")
+    print(
+        f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB, sigma {np.round(sigma, 4).tolist()}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A perception of twenty lines: OpenCV's markers, one PnP over all corners, a covariance from the distance."""
+"""A perception of twenty lines: OpenCV's markers, one PnP over all corners, a covariance from the
+distance.
+"""
 
 import cv2
 import numpy as np
@@ -28,8 +30,12 @@ class OwnPerception:
         px = np.array([c for _, c in found], dtype=float)
         points = np.concatenate([self.markers[i] for i, _ in found])
         ideal = self.camera.undistort(px).reshape(-1, 2)
-        _, turn, position = cv2.solvePnP(points, ideal, self.camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP)
+        _, turn, position = cv2.solvePnP(
+            points, ideal, self.camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP
+        )
         q, z = rotations.exp(turn[:, 0]), float(position[2, 0])
-        sigma = np.array([0.001, 0.001, 0.004, 0.02, 0.02, 0.02]) * z  # metres and radians at z metres
+        sigma = (
+            np.array([0.001, 0.001, 0.004, 0.02, 0.02, 0.02]) * z
+        )  # metres and radians at z metres
         pose = TargetPose(position[:, 0], q, np.diag(sigma**2), 0.5)
         return PerceptionResult((pose,), np.array([i for i, _ in found]), px, ())

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A PD law in the place of the NMPC: same references, same limits, no look ahead and no regard for obstacles."""
+"""A PD law in the place of the NMPC: same references, same limits, no look ahead and no regard for
+obstacles.
+"""
 
 import numpy as np
 from chaserdock_controller.nmpc import NmpcPlan
@@ -33,7 +35,12 @@ class Pd:
         velocity = (reference[1, :3] - reference[0, :3]) / dt
         pull = KP * (reference[0, :3] - x[:3]) + KD * (velocity - x[3:6])
         error = rotations.log(rotations.multiply(rotations.conjugate(x[6:10]), reference[0, 3:]))
-        rate = rotations.log(rotations.multiply(rotations.conjugate(reference[0, 3:]), reference[1, 3:])) / dt
+        rate = (
+            rotations.log(
+                rotations.multiply(rotations.conjugate(reference[0, 3:]), reference[1, 3:])
+            )
+            / dt
+        )
         turn = np.array(p.inertia_kg_m2) @ (KP * error + KD * (rate - x[10:]))
         return np.concatenate([p.mass_kg * rotations.rotate_inverse(x[6:10], pull), turn])
 

@@ -22,5 +22,7 @@ def length(vector: Array) -> float:
 
 
 def limited(values: Array, limits: Array) -> Array:
-    """Return values (n,) within plus and minus ``limits`` (n,), as ``numpy.clip`` does in three times the time."""
+    """Return values (n,) within plus and minus ``limits`` (n,), as ``numpy.clip`` does in three
+    times the time.
+    """
     return np.minimum(np.maximum(values, -limits), limits)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reference attitudes that keep a chaser facing the target when its offset differs from the nominal one."""
+"""Reference attitudes that keep a chaser facing the target when its offset differs from the nominal
+one.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,28 @@ from .arrays import Array
 from .rotations import multiply, normalize
 
 
-def facing_attitudes(nominal_m: ArrayLike, q_nominal_wxyz: ArrayLike, offsets_m: ArrayLike) -> Array:
+def facing_attitudes(
+    nominal_m: ArrayLike, q_nominal_wxyz: ArrayLike, offsets_m: ArrayLike
+) -> Array:
     """Return the attitudes (K, 4), chaser body to TRF, at offsets (K, 3) in TRF.
 
-    The nominal attitude (4,) belongs to the nominal offset (3,). It is rotated by the shortest rotation from the
-    nominal direction a to the direction b of the offset, q = normalize([1 + a . b, a x b]). For an offset opposite to
-    the nominal one the axis is not unique: the axis perpendicular to a that is closest to z (to x if a is along z) is
-    used. At the target's centre the attitude is the nominal one.
+    The nominal attitude (4,) belongs to the nominal offset (3,). It is rotated by the shortest
+    rotation from the nominal direction a to the direction b of the offset, q = normalize([1 + a .
+    b, a x b]). For an offset opposite to the nominal one the axis is not unique: the axis
+    perpendicular to a that is closest to z (to x if a is along z) is used. At the target's centre
+    the attitude is the nominal one.
     """
     offsets = np.atleast_2d(np.asarray(offsets_m, dtype=float))
     a = np.asarray(nominal_m, dtype=float) / np.linalg.norm(nominal_m)
     length = np.linalg.norm(offsets, axis=1, keepdims=True)
     b = np.where(length > 1e-9, offsets / np.maximum(length, 1e-9), a)
-    turn = np.concatenate([1.0 + (b @ a)[:, None], np.cross(np.broadcast_to(a, b.shape), b)], axis=1)
+    turn = np.concatenate(
+        [1.0 + (b @ a)[:, None], np.cross(np.broadcast_to(a, b.shape), b)], axis=1
+    )
     axis = np.eye(3)[2 if abs(a[2]) < 0.9 else 0]
     axis = axis - (axis @ a) * a
     half_turn = np.concatenate([[0.0], axis / np.linalg.norm(axis)])
     opposite = np.linalg.norm(turn, axis=1, keepdims=True) < 1e-6
-    return multiply(normalize(np.where(opposite, half_turn, turn)), np.asarray(q_nominal_wxyz, dtype=float))
+    return multiply(
+        normalize(np.where(opposite, half_turn, turn)), np.asarray(q_nominal_wxyz, dtype=float)
+    )

@@ -42,8 +42,8 @@ class ActuatedBody(Protocol):
 def brake_wrench(
     odometry: MovingBody, body: ActuatedBody, velocity_m_s: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """Return the force and torque (6,), body axes, that stop a chaser's rotation and its motion relative to
-    ``velocity_m_s`` (3,), WRF."""
+    """Return the force and torque (6,), body axes, that stop a chaser's rotation and its motion
+    relative to ``velocity_m_s`` (3,), WRF."""
     relative = np.asarray(odometry.velocity_m_s) - np.asarray(velocity_m_s)
     velocity = rotations.rotate_inverse(odometry.q_wxyz, relative)
     force = np.clip(-body.mass_kg / BRAKE_TIME_S * velocity, -body.force_max_N, body.force_max_N)

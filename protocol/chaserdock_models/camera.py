@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pinhole camera with Brown-Conrady lens distortion, and its mounting on the chaser.
 
-Pixel centres lie at integer coordinates: the image covers (-0.5, width - 0.5) x (-0.5, height - 0.5).
-"Ideal" pixels belong to the same camera matrix without lens distortion. The distortion model and the order of its
-coefficients are those of OpenCV: D. C. Brown, "Decentering distortion of lenses", 1966.
+Pixel centres lie at integer coordinates: the image covers (-0.5, width - 0.5) x (-0.5, height -
+0.5). "Ideal" pixels belong to the same camera matrix without lens distortion. The distortion model
+and the order of its coefficients are those of OpenCV: D. C. Brown, "Decentering distortion of
+lenses", 1966.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ Q_CRF_IRF_FORWARD_WXYZ: tuple[float, float, float, float] = (0.5, -0.5, 0.5, -0.
 class Camera:
     """One camera and its mounting.
 
-    ``width_px``, ``height_px``: image size. ``fx_px``, ``fy_px``, ``cx_px``, ``cy_px``: camera matrix.
-    ``distortion``: (k1, k2, p1, p2[, k3]), dimensionless, or empty for none.
-    ``position_crf_m``: optical centre in CRF. ``q_crf_irf_wxyz``: rotation IRF -> CRF.
-    Raises ValueError for sizes or focal lengths that are not positive and a wrong number of coefficients.
+    ``width_px``, ``height_px``: image size. ``fx_px``, ``fy_px``, ``cx_px``, ``cy_px``: camera
+    matrix. ``distortion``: (k1, k2, p1, p2[, k3]), dimensionless, or empty for none.
+    ``position_crf_m``: optical centre in CRF. ``q_crf_irf_wxyz``: rotation IRF -> CRF. Raises
+    ValueError for sizes or focal lengths that are not positive and a wrong number of coefficients.
     """
 
     width_px: int
@@ -59,7 +60,8 @@ class Camera:
         position_crf_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
         distortion: tuple[float, ...] = (),
     ) -> Camera:
-        """Create a forward-looking camera with square pixels and a horizontal field of view ``hfov_rad``.
+        """Create a forward-looking camera with square pixels and a horizontal field of view
+        ``hfov_rad``.
 
         Raises ValueError for a field of view outside (0, pi).
         """
@@ -75,7 +77,9 @@ class Camera:
 
     @cached_property
     def _matrix(self) -> Array:
-        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
+        )
 
     @cached_property
     def _focal(self) -> Array:
@@ -86,11 +90,15 @@ class Camera:
         return np.array([self.cx_px, self.cy_px])
 
     def project(self, points_irf_m: ArrayLike) -> Array:
-        """Project to pixels (..., 2), with lens distortion, points (..., 3) in IRF; NaN for points not in front."""
+        """Project to pixels (..., 2), with lens distortion, points (..., 3) in IRF; NaN for points
+        not in front.
+        """
         return self.distort(self.project_ideal(points_irf_m))
 
     def project_ideal(self, points_irf_m: ArrayLike) -> Array:
-        """Project to ideal pixels (..., 2) points (..., 3) in IRF; NaN for points not in front of the camera."""
+        """Project to ideal pixels (..., 2) points (..., 3) in IRF; NaN for points not in front of
+        the camera.
+        """
         points = np.asarray(points_irf_m, dtype=float)
         z = np.where(points[..., 2:] > 0.0, points[..., 2:], np.nan)
         return points[..., :2] / z * self._focal + self._centre
@@ -106,8 +114,8 @@ class Camera:
     def undistort(self, px: ArrayLike) -> Array:
         """Convert pixels in the distorted image (..., 2) to ideal pixels (..., 2).
 
-        Fixed-point iteration to convergence (1e-9 px). NaN where it does not converge, i.e. outside the part of the
-        image in which the distortion is invertible.
+        Fixed-point iteration to convergence (1e-9 px). NaN where it does not converge, i.e. outside
+        the part of the image in which the distortion is invertible.
         """
         px = np.asarray(px, dtype=float)
         if not self.distortion:
@@ -122,15 +130,17 @@ class Camera:
                 x = x + error
                 if not np.any(np.abs(error) > tolerance):
                     break
-            diverged = ~np.all(np.abs(distorted - self._distort_normalized(x)) < 1e3 * tolerance, axis=-1)
+            diverged = ~np.all(
+                np.abs(distorted - self._distort_normalized(x)) < 1e3 * tolerance, axis=-1
+            )
         x[diverged] = np.nan
         return x * focal + centre
 
     def irf_pose_in_world(
         self, chaser_position_w_m: ArrayLike, chaser_q_w_crf_wxyz: ArrayLike
     ) -> tuple[Array, Array]:
-        """Return the optical centre (3,) in WRF and the rotation IRF -> WRF (4,) of the camera on a chaser at this
-        pose."""
+        """Return the optical centre (3,) in WRF and the rotation IRF -> WRF (4,) of the camera on a
+        chaser at this pose."""
         q_w_crf = np.asarray(chaser_q_w_crf_wxyz, dtype=float)
         position = np.asarray(chaser_position_w_m, dtype=float) + rotations.rotate(
             q_w_crf, self.position_crf_m

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 class Timing:
     """Physics steps, ticks and latencies of a mission.
 
-    ``rate_hz``: ticks per second, a divisor of ``physics_hz``. ``image_hz``: images per second, a divisor of
-    ``rate_hz``. ``latency_steps``: time from exposure to actuation in physics steps.
+    ``rate_hz``: ticks per second, a divisor of ``physics_hz``. ``image_hz``: images per second, a
+    divisor of ``rate_hz``. ``latency_steps``: time from exposure to actuation in physics steps.
     """
 
     physics_hz: int

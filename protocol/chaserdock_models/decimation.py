@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fewer triangles for a mesh: quadric edge collapse, and the deviation that it causes.
 
-M. Garland, P. Heckbert: Surface Simplification Using Quadric Error Metrics, 1997, as in the package fast-simplification.
+M. Garland, P. Heckbert: Surface Simplification Using Quadric Error Metrics, 1997, as in the package
+fast-simplification.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ _BISECTIONS = 5
 
 
 def deviation_m(part: MeshPart, other: MeshPart) -> float:
-    """Return the largest distance, m, of vertices and triangle centres of either surface from the other one.
+    """Return the largest distance, m, of vertices and triangle centres of either surface from the
+    other one.
 
-    An upper bound at those points: the distance is exact for the triangles near each of them. Of large meshes every n-th
-    point is used.
+    An upper bound at those points: the distance is exact for the triangles near each of them. Of
+    large meshes every n-th point is used.
     """
     return max(_one_sided(part, other), _one_sided(other, part))
 
@@ -37,7 +39,9 @@ def _one_sided(part: MeshPart, other: MeshPart) -> float:
     points = points[:: max(1, len(points) // _QUERIES)]
     corners = other.vertices_m[other.triangles]
     samples, owner = _surface_samples(corners)
-    near = owner[KDTree(samples).query(points, k=min(_NEAR, len(samples)))[1].reshape(len(points), -1)]
+    near = owner[
+        KDTree(samples).query(points, k=min(_NEAR, len(samples)))[1].reshape(len(points), -1)
+    ]
     distance = _point_triangle(np.repeat(points[:, None], near.shape[1], axis=1), corners[near])
     return float(distance.min(axis=1).max())
 
@@ -45,7 +49,12 @@ def _one_sided(part: MeshPart, other: MeshPart) -> float:
 def _surface_samples(corners: Array) -> tuple[Array, IntArray]:
     """Return points (n, 3) spread over triangles (m, 3, 3), and the triangle (n,) of each."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    area = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        / 2
+    )
     spacing = max(float(np.sqrt(area.sum() / _SAMPLES)), 1e-12)
     steps = np.clip(np.ceil(edges / spacing), 1, 40).astype(int)
     points, owner = [], []
@@ -78,20 +87,26 @@ def _point_triangle(points: Array, corners: Array) -> Array:
 
 
 def decimated(part: MeshPart, count: int) -> MeshPart:
-    """Return a closed part of about ``count`` triangles; the part itself where fewer triangles would not be closed."""
+    """Return a closed part of about ``count`` triangles; the part itself where fewer triangles
+    would not be closed.
+    """
     import fast_simplification  # slow to import, and needed for meshes of files only
 
     vertices, triangles, *_ = fast_simplification.simplify(
         part.vertices_m, part.triangles.astype(np.int32), target_count=max(count, _LEAST)
     )
     out = replace(
-        part, vertices_m=np.asarray(vertices, dtype=float), triangles=np.asarray(triangles, dtype=np.int64)
+        part,
+        vertices_m=np.asarray(vertices, dtype=float),
+        triangles=np.asarray(triangles, dtype=np.int64),
     )
     return out if len(triangles) >= 4 and not open_edges(out) else part
 
 
 def limited(mesh: TriangleMesh, triangles: int) -> tuple[TriangleMesh, float]:
-    """Return a mesh of about ``triangles`` triangles at most, and its deviation, m; small parts keep all of theirs."""
+    """Return a mesh of about ``triangles`` triangles at most, and its deviation, m; small parts
+    keep all of theirs.
+    """
     if mesh.triangle_count <= triangles:
         return mesh, 0.0
     share = triangles / mesh.triangle_count
@@ -101,7 +116,9 @@ def limited(mesh: TriangleMesh, triangles: int) -> tuple[TriangleMesh, float]:
 
 
 def simplified(mesh: TriangleMesh, tolerance_m: float) -> TriangleMesh:
-    """Return a mesh with fewer triangles whose surface deviates from the given one by at most ``tolerance_m``."""
+    """Return a mesh with fewer triangles whose surface deviates from the given one by at most
+    ``tolerance_m``.
+    """
     return replace(mesh, parts=tuple(_simplified_part(p, tolerance_m) for p in mesh.parts))
 
 

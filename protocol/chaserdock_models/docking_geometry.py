@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Geometry of a probe relative to its docking port, shared by guidance and simulator. Pure functions."""
+"""Geometry of a probe relative to its docking port, shared by guidance and simulator. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +43,9 @@ class PoseLimits(Protocol):
 class PortView:
     """State of a probe's tip relative to its port, in the port's rotating frame.
 
-    ``gap_m``: along the axis, positive outside. ``lateral_m``: distance from the axis. ``closing_m_s``: speed towards
-    the port. ``angle_rad``: between the chaser's attitude and its docked attitude. ``rate_rad_s``: of the chaser relative to the
-    target.
+    ``gap_m``: along the axis, positive outside. ``lateral_m``: distance from the axis.
+    ``closing_m_s``: speed towards the port. ``angle_rad``: between the chaser's attitude and its
+    docked attitude. ``rate_rad_s``: of the chaser relative to the target.
     """
 
     gap_m: float
@@ -69,12 +71,16 @@ class PortView:
 
 
 def centre_offset(port: PortGeometry, reach_m: float, gap_m: float) -> Array:
-    """Return a chaser's centre (3,) in TRF when its tip is ``gap_m`` in front of the port and its +X along -axis."""
+    """Return a chaser's centre (3,) in TRF when its tip is ``gap_m`` in front of the port and its
+    +X along -axis.
+    """
     return np.asarray(port.position_m) + np.asarray(port.axis) * (reach_m + gap_m)
 
 
 def axis_error_deg(port: PortGeometry, q_off_wxyz: Array) -> float:
-    """Return the angle between a chaser's +X and the inward axis of its port; ``q_off_wxyz`` (4,) CRF to TRF."""
+    """Return the angle between a chaser's +X and the inward axis of its port; ``q_off_wxyz`` (4,)
+    CRF to TRF.
+    """
     ahead = rotations.rotate(q_off_wxyz, (1.0, 0.0, 0.0))
     return math.degrees(math.acos(min(1.0, max(-1.0, -float(ahead @ np.asarray(port.axis))))))
 
@@ -84,8 +90,9 @@ def view_of(
 ) -> PortView:
     """Return the state of the tip relative to the port.
 
-    ``reach_m``: distance of the tip from the chaser's centre along +X. ``q_off_wxyz`` (4,): docked attitude, CRF to
-    TRF. Velocities are relative to the rotating target, as seen by an observer on the port.
+    ``reach_m``: distance of the tip from the chaser's centre along +X. ``q_off_wxyz`` (4,): docked
+    attitude, CRF to TRF. Velocities are relative to the rotating target, as seen by an observer on
+    the port.
     """
     tip = rotations.rotate(chaser.q_wxyz, (reach_m, 0.0, 0.0))
     position = rotations.rotate_inverse(target.q_wxyz, chaser.position_m + tip - target.position_m)
@@ -124,7 +131,11 @@ def segments_apart(a: Array, b: Array, c: Array, d: Array) -> float:
     u, v, r = b - a, d - c, a - c
     uu, vv, uv, ur, vr = (float(x) for x in (u @ u, v @ v, u @ v, u @ r, v @ r))
     slant = uu * vv - uv * uv
-    s = min(1.0, max(0.0, (uv * vr - ur * vv) / slant)) if slant > 1e-12 * uu * vv and slant > 0.0 else 0.0
+    s = (
+        min(1.0, max(0.0, (uv * vr - ur * vv) / slant))
+        if slant > 1e-12 * uu * vv and slant > 0.0
+        else 0.0
+    )
     t = (uv * s + vr) / vv if vv > 0.0 else 0.0
     if not 0.0 <= t <= 1.0 or vv == 0.0:
         t = min(1.0, max(0.0, t))

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of a known mesh as independent parameters, each with its standard deviation and the displacement of every vertex by it.
+"""Errors of a known mesh as independent parameters, each with its standard deviation and the
+displacement of every vertex by it.
 
-The parameters: a turn of each joint about each body axis, the scale of what is not on a joint, and the visible border of solar
-panels, whose grid of cells a known mesh does not have. Trackers estimate them with the pose, the controller fuses them.
+The parameters: a turn of each joint about each body axis, the scale of what is not on a joint, and
+the visible border of solar panels, whose grid of cells a known mesh does not have. Trackers
+estimate them with the pose, the controller fuses them.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ _RIM_SIGMA_M = 0.001
 
 @dataclass(frozen=True)
 class GeometryParameter:
-    """An error of the geometry: ``name``, such as ``panel_left x``, ``scale`` or ``rim``; ``sigma``: standard deviation, rad, as a
-    share, or m."""
+    """An error of the geometry: ``name``, such as ``panel_left x``, ``scale`` or ``rim``;
+    ``sigma``: standard deviation, rad, as a share, or m."""
 
     name: str
     sigma: float
@@ -33,8 +35,14 @@ class GeometryParameter:
 def geometry_parameters(
     mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float
 ) -> tuple[GeometryParameter, ...]:
-    """Return the parameters of a mesh, in the order of `error_modes`; none without a standard deviation."""
-    turns = [f"{joint} {axis}" for joint in mesh.joints for axis in "xyz"] if joint_sigma_rad > 0.0 else []
+    """Return the parameters of a mesh, in the order of `error_modes`; none without a standard
+    deviation.
+    """
+    turns = (
+        [f"{joint} {axis}" for joint in mesh.joints for axis in "xyz"]
+        if joint_sigma_rad > 0.0
+        else []
+    )
     parameters = [GeometryParameter(name, joint_sigma_rad) for name in turns]
     if scale_sigma > 0.0:
         parameters.append(GeometryParameter("scale", scale_sigma))
@@ -44,7 +52,9 @@ def geometry_parameters(
 
 
 def error_modes(mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float) -> Array:
-    """Return the displacements (k, n, 3), m, of the vertices of all parts by one standard deviation of each parameter."""
+    """Return the displacements (k, n, 3), m, of the vertices of all parts by one standard deviation
+    of each parameter.
+    """
     known = _vertices(mesh.parts)
     modes = []
     for parameter in geometry_parameters(mesh, joint_sigma_rad, scale_sigma):

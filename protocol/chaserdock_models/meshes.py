@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Triangle meshes of bodies: parts, materials, joints, geometry errors, and mass properties.
 
-A mesh consists of parts, each a closed surface of one material, with triangles counter-clockwise as seen from outside.
-Flight software and world both use this module, but not the same mesh: the world's differs from the known one by
-`with_geometry_errors`.
+A mesh consists of parts, each a closed surface of one material, with triangles counter-clockwise as
+seen from outside. Flight software and world both use this module, but not the same mesh: the
+world's differs from the known one by `with_geometry_errors`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ Texture = Literal["", "insulation", "cells"]
 
 @dataclass(frozen=True)
 class Material:
-    """A surface: ``diffuse`` and ``specular`` reflectance (0 to 1) with Blinn's exponent ``shininess``.
+    """A surface: ``diffuse`` and ``specular`` reflectance (0 to 1) with Blinn's exponent
+    ``shininess``.
 
-    ``texture``: "insulation" (wrinkled foil), "cells" (grid of solar cells), or "" for a uniform surface.
-    ``relative_density``: density over that of the other parts, for mass properties.
+    ``texture``: "insulation" (wrinkled foil), "cells" (grid of solar cells), or "" for a uniform
+    surface. ``relative_density``: density over that of the other parts, for mass properties.
     """
 
     name: str
@@ -38,7 +39,8 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """A closed surface: ``vertices_m`` (n, 3) in body axes and ``triangles`` (m, 3), indices of vertices.
+    """A closed surface: ``vertices_m`` (n, 3) in body axes and ``triangles`` (m, 3), indices of
+    vertices.
 
     ``joint``: name of the joint that the part moves with; "" if it is fixed to the body.
     """
@@ -74,7 +76,9 @@ class TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class TriangleSoup:
-    """All triangles of a mesh: ``corners_m`` (m, 3, 3) and ``normals`` (m, 3, 3) by triangle and corner, ``part`` (m,)."""
+    """All triangles of a mesh: ``corners_m`` (m, 3, 3) and ``normals`` (m, 3, 3) by triangle and
+    corner, ``part`` (m,).
+    """
 
     corners_m: Array
     normals: Array
@@ -82,11 +86,15 @@ class TriangleSoup:
 
 
 CREASE_RAD = np.radians(35.0)
-"""Triangles that meet at a larger angle have a crease between them; across smaller ones, shading is smooth."""
+"""Triangles that meet at a larger angle have a crease between them; across smaller ones, shading is
+smooth.
+"""
 
 
 def triangle_soup(mesh: TriangleMesh) -> TriangleSoup:
-    """Return the triangles of a mesh with smooth normals inside creases of less than ``CREASE_RAD``."""
+    """Return the triangles of a mesh with smooth normals inside creases of less than
+    ``CREASE_RAD``.
+    """
     corners = np.concatenate([part.vertices_m[part.triangles] for part in mesh.parts])
     normals = np.concatenate([_corner_normals(part) for part in mesh.parts])
     number = np.repeat(np.arange(len(mesh.parts)), [len(part.triangles) for part in mesh.parts])
@@ -94,7 +102,9 @@ def triangle_soup(mesh: TriangleMesh) -> TriangleSoup:
 
 
 def _corner_normals(part: MeshPart) -> Array:
-    """Return unit normals (m, 3, 3) at the corners: sums, weighted by angle, over neighbours on the same side of creases."""
+    """Return unit normals (m, 3, 3) at the corners: sums, weighted by angle, over neighbours on the
+    same side of creases.
+    """
     corners = part.vertices_m[part.triangles]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
@@ -113,7 +123,9 @@ def _corner_normals(part: MeshPart) -> Array:
             continue
         faces = [i for i, _ in uses]
         weights = np.array([angle[i, k] for i, k in uses])
-        smooth = (flat[faces] @ flat[faces].T > np.cos(CREASE_RAD)) @ (weights[:, None] * flat[faces])
+        smooth = (flat[faces] @ flat[faces].T > np.cos(CREASE_RAD)) @ (
+            weights[:, None] * flat[faces]
+        )
         smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-30)
         for (i, k), normal in zip(uses, smooth, strict=True):
             out[i, k] = normal
@@ -121,11 +133,15 @@ def _corner_normals(part: MeshPart) -> Array:
 
 
 def without_parts(mesh: TriangleMesh, names: Iterable[str]) -> TriangleMesh:
-    """Return a mesh without some parts. Raises ValueError for an unknown name, or if nothing is left."""
+    """Return a mesh without some parts. Raises ValueError for an unknown name, or if nothing is
+    left.
+    """
     names = tuple(names)
     unknown = [name for name in names if name not in mesh.part_names]
     if unknown:
-        raise ValueError(f"{mesh.name} has no part {unknown[0]!r}; its parts: {', '.join(mesh.part_names)}")
+        raise ValueError(
+            f"{mesh.name} has no part {unknown[0]!r}; its parts: {', '.join(mesh.part_names)}"
+        )
     parts = tuple(part for part in mesh.parts if part.name not in names)
     if not parts:
         raise ValueError(f"{mesh.name}: no part would be left")
@@ -137,7 +153,8 @@ def with_geometry_errors(
 ) -> TriangleMesh:
     """Return a mesh whose body is larger by ``scale_share``, and whose joints are turned.
 
-    ``turns_rad``: rotation vector (3,) in body axes by name of the joint. Parts on a joint keep their size and move with it.
+    ``turns_rad``: rotation vector (3,) in body axes by name of the joint. Parts on a joint keep
+    their size and move with it.
     """
     factor = 1.0 + scale_share
     joints = {name: tuple((factor * np.array(at)).tolist()) for name, at in mesh.joints.items()}
@@ -154,9 +171,13 @@ def with_geometry_errors(
 
 
 def moved(mesh: TriangleMesh, offset_m: Array, factor: Array | float = 1.0) -> TriangleMesh:
-    """Return a mesh scaled by ``factor`` (scalar or (3,), positive), then displaced by ``offset_m`` (3,)."""
+    """Return a mesh scaled by ``factor`` (scalar or (3,), positive), then displaced by ``offset_m``
+    (3,).
+    """
     parts = tuple(replace(p, vertices_m=p.vertices_m * factor + offset_m) for p in mesh.parts)
-    joints = {name: tuple((np.array(at) * factor + offset_m).tolist()) for name, at in mesh.joints.items()}
+    joints = {
+        name: tuple((np.array(at) * factor + offset_m).tolist()) for name, at in mesh.joints.items()
+    }
     return TriangleMesh(mesh.name, parts, joints)
 
 
@@ -167,34 +188,43 @@ def volume_m3(part: MeshPart) -> float:
 
 
 def open_edges(part: MeshPart) -> int:
-    """Return the number of edges that are not shared by two triangles of opposite direction: 0 for a closed surface."""
+    """Return the number of edges that are not shared by two triangles of opposite direction: 0 for
+    a closed surface.
+    """
     return int(np.abs(_edge_balance(part)[1]).sum())
 
 
 def hole_m(part: MeshPart) -> Array | None:
-    """Return the middle (3,), body axes, of the first edge that is not shared by two triangles of opposite direction."""
+    """Return the middle (3,), body axes, of the first edge that is not shared by two triangles of
+    opposite direction.
+    """
     edges, balance = _edge_balance(part)
     open_ones = edges[balance != 0]
     return part.vertices_m[open_ones[0]].mean(axis=0) if len(open_ones) else None
 
 
 def _edge_balance(part: MeshPart) -> tuple[IntArray, IntArray]:
-    """Return the edges (n, 2), lower vertex first, and how many more triangles (n,) use each upwards than downwards."""
+    """Return the edges (n, 2), lower vertex first, and how many more triangles (n,) use each
+    upwards than downwards.
+    """
     ends = np.concatenate(
         [part.triangles[:, [0, 1]], part.triangles[:, [1, 2]], part.triangles[:, [2, 0]]]
     ).astype(np.int64)
     upwards = ends[:, 0] < ends[:, 1]
     keys = ends.min(axis=1) * len(part.vertices_m) + ends.max(axis=1)
     unique, where = np.unique(keys, return_inverse=True)
-    balance = np.bincount(where, weights=np.where(upwards, 1.0, -1.0), minlength=len(unique)).astype(np.int64)
+    balance = np.bincount(
+        where, weights=np.where(upwards, 1.0, -1.0), minlength=len(unique)
+    ).astype(np.int64)
     return np.stack(np.divmod(unique, len(part.vertices_m)), axis=1), balance
 
 
 def mass_properties(mesh: TriangleMesh, mass_kg: float) -> tuple[Array, Array]:
-    """Return centre of mass (3,), m, and inertia tensor (3, 3) about it, kg m^2, body axes, of closed homogeneous parts.
+    """Return centre of mass (3,), m, and inertia tensor (3, 3) about it, kg m^2, body axes, of
+    closed homogeneous parts.
 
-    Exact integrals over the tetrahedra between origin and triangles (F. Tonon, 2004). Parts that overlap count twice.
-    Raises ValueError if the volume is not positive.
+    Exact integrals over the tetrahedra between origin and triangles (F. Tonon, 2004). Parts that
+    overlap count twice. Raises ValueError if the volume is not positive.
     """
     volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     for part in mesh.parts:
@@ -206,7 +236,8 @@ def mass_properties(mesh: TriangleMesh, mass_kg: float) -> tuple[Array, Array]:
         first += six @ sums / 24.0
         # Integral of x x^T over a tetrahedron with one corner at the origin.
         second += (
-            np.einsum("i,ij,ik->jk", six, sums, sums) + np.einsum("i,icj,ick->jk", six, corners, corners)
+            np.einsum("i,ij,ik->jk", six, sums, sums)
+            + np.einsum("i,icj,ick->jk", six, corners, corners)
         ) / 120.0
     if not volume > 0.0:
         raise ValueError(

@@ -28,7 +28,9 @@ class MountedChaser:
         return self.position_m + rotations.rotate(self.q_wxyz, points_m)
 
     def wrench_to_stack(self, wrench: Array, centre_m: Array) -> Array:
-        """Return a wrench (6, ...) at CRF's origin in body axes as wrench about ``centre_m`` (3,) in TRF axes."""
+        """Return a wrench (6, ...) at CRF's origin in body axes as wrench about ``centre_m`` (3,)
+        in TRF axes.
+        """
         turn = rotations.to_matrix(self.q_wxyz)
         force = turn @ wrench[:3]
         arm = rotations.skew(self.position_m - centre_m)
@@ -43,7 +45,8 @@ def plume_free(
     ports_m: Sequence[Array],
     chaser_size_m: tuple[float, float, float],
 ) -> NDArray[np.bool_]:
-    """Return which thrusters (N n,) may fire: those whose plume hits neither the target, a port, nor another chaser.
+    """Return which thrusters (N n,) may fire: those whose plume hits neither the target, a port,
+    nor another chaser.
 
     ``ports_m``: points (3,), TRF.
     """

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Orbits about the Earth: elements, two-body gravity with J2, and the Hill frame of an orbit.
 
-Positions and velocities are in ECI: inertial axes at the Earth's centre, Z along its pole, X to the vernal equinox. The
-Hill frame (also LVLH or RSW) moves with the orbit: X radial, away from the Earth; Z along the angular momentum; Y completes
-the right-handed frame, along the motion on a circular orbit. Sources: Vallado, Fundamentals of Astrodynamics and
-Applications, 4th edition, sections 2.6 and 8.6; Alfriend et al., Spacecraft Formation Flying, section 4.1.
+Positions and velocities are in ECI: inertial axes at the Earth's centre, Z along its pole, X to the
+vernal equinox. The Hill frame (also LVLH or RSW) moves with the orbit: X radial, away from the
+Earth; Z along the angular momentum; Y completes the right-handed frame, along the motion on a
+circular orbit. Sources: Vallado, Fundamentals of Astrodynamics and Applications, 4th edition,
+sections 2.6 and 8.6; Alfriend et al., Spacecraft Formation Flying, section 4.1.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ EARTH_J2 = 1.0826269e-3
 """Gravitational parameter, equatorial radius and second zonal coefficient: EGM96."""
 
 MAX_STEP_S = 10.0
-"""Longest integration step: RK4 then errs by about 1 cm per low orbit, and by micrometres relative to it at 100 m."""
+"""Longest integration step: RK4 then errs by about 1 cm per low orbit, and by micrometres relative
+to it at 100 m.
+"""
 
 Scalars3 = tuple[float, float, float]
 
@@ -104,9 +107,9 @@ def propagate(state: OrbitState, duration_s: float, j2: float = EARTH_J2) -> Orb
 class HillFrame:
     """Hill frame of an orbit at one moment.
 
-    ``axes``: (3, 3), rows are its axes in ECI. ``rate_rad_s``, ``rate_change_rad_s2``: (3,) its angular velocity against
-    inertial space and the derivative of that, in its own axes. ``pole``: (3,) the Earth's pole in its axes. ``speed_m_s``:
-    (3,) velocity of the origin in its axes.
+    ``axes``: (3, 3), rows are its axes in ECI. ``rate_rad_s``, ``rate_change_rad_s2``: (3,) its
+    angular velocity against inertial space and the derivative of that, in its own axes. ``pole``:
+    (3,) the Earth's pole in its axes. ``speed_m_s``: (3,) velocity of the origin in its axes.
     """
 
     axes: Array
@@ -121,25 +124,35 @@ class HillFrame:
 def hill_frame(state: OrbitState, j2: float = EARTH_J2) -> HillFrame:
     """Return the Hill frame of an orbit under two-body gravity and J2.
 
-    With the perturbing acceleration (f_r, f_t, f_h): rate = (r f_h / h, 0, h / r^2), h' = r f_t (Gauss's equations).
+    With the perturbing acceleration (f_r, f_t, f_h): rate = (r f_h / h, 0, h / r^2), h' = r f_t
+    (Gauss's equations).
     """
     position, velocity = state.position_m, state.velocity_m_s
     r = float(np.linalg.norm(position))
     momentum = np.array(cross_components(*position.tolist(), *velocity.tolist()))
     h = float(np.linalg.norm(momentum))
     radial, normal = position / r, momentum / h
-    axes = np.stack([radial, np.array(cross_components(*normal.tolist(), *radial.tolist())), normal])
+    axes = np.stack(
+        [radial, np.array(cross_components(*normal.tolist(), *radial.tolist())), normal]
+    )
     v_r, v_t, _ = (axes @ velocity).tolist()
     _, f_t, f_h = (axes @ gravity(position, j2)).tolist() if j2 else (0.0, 0.0, 0.0)
     rate_r, rate_n = r * f_h / h, h / (r * r)
-    # f_h is along an axis that turns itself: d(f . n) = f' . n + f . (rate x n), and rate x n = -rate_r y.
+    # f_h is along an axis that turns itself: d(f . n) = f' . n + f . (rate x n), and rate x n =
+    # -rate_r y.
     f_h_change = float(normal @ _j2_change(position, velocity, j2)) - rate_r * f_t
     h_change = r * f_t
     rate_r_change = (v_r * f_h + r * f_h_change) / h - r * f_h * h_change / (h * h)
     rate_n_change = h_change / (r * r) - 2.0 * h * v_r / r**3
     x, y, z = axes[:, 2].tolist()
     return HillFrame(
-        axes, r, (v_r, v_t, 0.0), (rate_r, 0.0, rate_n), (rate_r_change, 0.0, rate_n_change), (x, y, z), j2
+        axes,
+        r,
+        (v_r, v_t, 0.0),
+        (rate_r, 0.0, rate_n),
+        (rate_r_change, 0.0, rate_n_change),
+        (x, y, z),
+        j2,
     )
 
 
@@ -165,7 +178,9 @@ def to_eci(
 
 
 def from_eci(state: OrbitState, body: OrbitState, j2: float = EARTH_J2) -> tuple[Array, Array]:
-    """Return position (3,) and velocity (3,) of a body in an orbit's Hill frame; inverse of ``to_eci``."""
+    """Return position (3,) and velocity (3,) of a body in an orbit's Hill frame; inverse of
+    ``to_eci``.
+    """
     frame = hill_frame(state, j2)
     rho = frame.axes @ (body.position_m - state.position_m)
     v = frame.axes @ (body.velocity_m_s - state.velocity_m_s)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environment of an orbit: direction and eclipse of the Sun, and drag. Vectors are in ECI (orbit.py)."""
+"""Environment of an orbit: direction and eclipse of the Sun, and drag. Vectors are in ECI
+(orbit.py).
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ _ATMOSPHERE = (
 
 
 def sun_position(when: datetime) -> Array:
-    """Return the Sun's position (3,), m, to 0.01 degrees between 1950 and 2050 (Vallado, algorithm 29).
+    """Return the Sun's position (3,), m, to 0.01 degrees between 1950 and 2050 (Vallado, algorithm
+    29).
 
     ``when`` carries a time zone.
     """
@@ -58,13 +61,17 @@ def sun_position(when: datetime) -> Array:
     )
     tilt = math.radians(23.439291 - 0.0130042 * centuries)
     sine = math.sin(longitude)
-    return distance_m * np.array([math.cos(longitude), math.cos(tilt) * sine, math.sin(tilt) * sine])
+    return distance_m * np.array(
+        [math.cos(longitude), math.cos(tilt) * sine, math.sin(tilt) * sine]
+    )
 
 
 def sunlit_share(position_m: ArrayLike, sun_m: ArrayLike) -> float:
-    """Return the share of the Sun's disc, 0 to 1, that the Earth leaves visible from a position outside it.
+    """Return the share of the Sun's disc, 0 to 1, that the Earth leaves visible from a position
+    outside it.
 
-    Discs of the Sun and of a spherical Earth (Montenbruck and Gill, Satellite Orbits, section 3.4.2).
+    Discs of the Sun and of a spherical Earth (Montenbruck and Gill, Satellite Orbits, section
+    3.4.2).
     """
     position, sun = np.asarray(position_m, dtype=float), np.asarray(sun_m, dtype=float)
     to_sun = sun - position
@@ -85,7 +92,9 @@ def sunlit_share(position_m: ArrayLike, sun_m: ArrayLike) -> float:
 def density(altitude_m: float) -> float:
     """Return the density of a mean atmosphere, kg/m^3, at 100 km and above (Vallado, table 8-4)."""
     km = altitude_m / 1e3
-    base, at_base, scale = next((row for row in reversed(_ATMOSPHERE) if row[0] <= km), _ATMOSPHERE[0])
+    base, at_base, scale = next(
+        (row for row in reversed(_ATMOSPHERE) if row[0] <= km), _ATMOSPHERE[0]
+    )
     return at_base * math.exp(-(km - base) / scale)
 
 

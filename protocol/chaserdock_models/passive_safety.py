@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passive safety: how far the coast after a total loss of thrust stays from a keep-out sphere around the target.
+"""Passive safety: how far the coast after a total loss of thrust stays from a keep-out sphere
+around the target.
 
-The coast is free motion, or Clohessy-Wiltshire motion in an orbit (relative_motion.py). Definition: Fehse, Automated
-Rendezvous and Docking of Spacecraft, section 4.4 (passive trajectory protection).
+The coast is free motion, or Clohessy-Wiltshire motion in an orbit (relative_motion.py). Definition:
+Fehse, Automated Rendezvous and Docking of Spacecraft, section 4.4 (passive trajectory protection).
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from .relative_motion import cw_transition
 
 STEP_S = 10.0
 """Step of the samples of a coast; between them the motion is bounded by chord and sagitta."""
-# Half of the change of acceleration in a step (1 %) on top of the sagitta |dv| dt / 8 of a constant acceleration.
+# Half of the change of acceleration in a step (1 %) on top of the sagitta |dv| dt / 8 of a constant
+# acceleration.
 _SAGITTA_SHARE = 1.02 / 8.0
 
 
@@ -27,9 +29,10 @@ _SAGITTA_SHARE = 1.02 / 8.0
 class CoastCertificate:
     """Closest approach of the coasts from the states of a plan.
 
-    ``margin_sigmas``: smallest distance from the keep-out sphere over the standard deviation along the line from the target;
-    negative inside. ``distance_m``: a lower bound on the distance from the target there. ``time_s``: time of it after the loss
-    of thrust. ``loss``: index of the state at which thrust is lost.
+    ``margin_sigmas``: smallest distance from the keep-out sphere over the standard deviation along
+    the line from the target; negative inside. ``distance_m``: a lower bound on the distance from
+    the target there. ``time_s``: time of it after the loss of thrust. ``loss``: index of the state
+    at which thrust is lost.
     """
 
     margin_sigmas: float
@@ -40,8 +43,8 @@ class CoastCertificate:
 
 @dataclass(frozen=True)
 class ClosestApproaches:
-    """Closest approach of the coast from each of M states: ``margin_sigmas``, ``distance_m`` and ``time_s`` (M,), as in
-    ``CoastCertificate``."""
+    """Closest approach of the coast from each of M states: ``margin_sigmas``, ``distance_m`` and
+    ``time_s`` (M,), as in ``CoastCertificate``."""
 
     margin_sigmas: Array
     distance_m: Array
@@ -49,9 +52,11 @@ class ClosestApproaches:
 
 
 class CoastModel:
-    """Transition matrices of a coast of ``duration_s`` on an orbit with this mean motion; without one, of free motion.
+    """Transition matrices of a coast of ``duration_s`` on an orbit with this mean motion; without
+    one, of free motion.
 
-    The coast is sampled every ``step_s``. A longer step is faster, and its lower bound on the distance lower.
+    The coast is sampled every ``step_s``. A longer step is faster, and its lower bound on the
+    distance lower.
     """
 
     def __init__(self, mean_motion_rad_s: float, duration_s: float, step_s: float = STEP_S) -> None:
@@ -62,11 +67,13 @@ class CoastModel:
         self._by_axis = np.ascontiguousarray(rows.transpose(1, 0, 2))
         # With these the trace of a position's covariance is one product.
         self._squares = (rows.transpose(0, 2, 1) @ rows).reshape(-1, 36)
-        # The acceleration of a coast turns with the orbit: in a step it changes by less than n dt of itself.
+        # The acceleration of a coast turns with the orbit: in a step it changes by less than n dt
+        # of itself.
         self._sagitta_share = max(_SAGITTA_SHARE, (1.0 + mean_motion_rad_s * self._step_s) / 8.0)
 
     def certify(self, states: Array, covariance: Array, keep_out_m: float) -> CoastCertificate:
-        """Return the certificate of the states (M, 6) of a plan: position and velocity relative to the target, WRF.
+        """Return the certificate of the states (M, 6) of a plan: position and velocity relative to
+        the target, WRF.
 
         ``covariance`` (6, 6): of a state's error, the same for all states of the plan.
         """
@@ -74,20 +81,27 @@ class CoastModel:
         found = self._closest_in(columns, states, covariance, keep_out_m)
         loss = int(np.argmin(found.margin_sigmas))
         return CoastCertificate(
-            float(found.margin_sigmas[loss]), float(found.distance_m[loss]), float(found.time_s[loss]), loss
+            float(found.margin_sigmas[loss]),
+            float(found.distance_m[loss]),
+            float(found.time_s[loss]),
+            loss,
         )
 
     def closest(self, states: Array, covariance: Array, keep_out_m: float) -> ClosestApproaches:
-        """Return the approach with the smallest margin of the coast from each of the states (M, 6); arguments as in ``certify``."""
+        """Return the approach with the smallest margin of the coast from each of the states (M, 6);
+        arguments as in ``certify``.
+        """
         return self._closest_in(np.arange(len(self._times_s) - 1), states, covariance, keep_out_m)
 
     def tangent_planes(
         self, states: Array, covariance: Array, keep_out_m: float, sigmas: float, count: int
     ) -> Array:
-        """Return half-spaces (M, count, 7) at the closest approaches of the coast from each of M states; arguments as in ``certify``.
+        """Return half-spaces (M, count, 7) at the closest approaches of the coast from each of M
+        states; arguments as in ``certify``.
 
-        [c (6), d]: at its moment, c' x >= d suffices for a state x (6,) to keep ``sigmas`` standard deviations from the keep-out;
-        c is zero where a coast has fewer approaches. Those with the smallest margins are returned.
+        [c (6), d]: at its moment, c' x >= d suffices for a state x (6,) to keep ``sigmas`` standard
+        deviations from the keep-out; c is zero where a coast has fewer approaches. Those with the
+        smallest margins are returned.
         """
         coasts = (self._by_axis @ states.T).transpose(2, 1, 0)
         distances = np.sqrt(np.square(coasts).sum(axis=2))
@@ -100,7 +114,9 @@ class CoastModel:
         samples = np.argsort(lowest, axis=1, kind="stable")[:, :count]
         # The closest approach is in the step before or after the sample.
         before, after = (
-            self._planes_in(np.clip(steps, 0, len(self._times_s) - 2), states, covariance, keep_out_m, sigmas)
+            self._planes_in(
+                np.clip(steps, 0, len(self._times_s) - 2), states, covariance, keep_out_m, sigmas
+            )
             for steps in (samples - 1, samples)
         )
         planes = np.where((before[1] < after[1])[..., None], before[0], after[0])
@@ -110,7 +126,9 @@ class CoastModel:
     def _planes_in(
         self, steps: IntArray, states: Array, covariance: Array, keep_out_m: float, sigmas: float
     ) -> tuple[Array, Array]:
-        """Return half-spaces (M, C, 7) of the closest approach within ``steps`` (M, C) of the coasts, and its margins (M, C)."""
+        """Return half-spaces (M, C, 7) of the closest approach within ``steps`` (M, C) of the
+        coasts, and its margins (M, C).
+        """
         parts = self._transitions[steps], self._transitions[steps + 1]
         begin, end = (np.einsum("mcij,mj->mci", part, states) for part in parts)
         here, step = begin[..., :3], end[..., :3] - begin[..., :3]
@@ -120,7 +138,11 @@ class CoastModel:
         chord_m = np.linalg.norm(nearest, axis=2)
         line = np.where((chord_m > 1e-6)[..., None], nearest, _across(step))
         line /= np.linalg.norm(line, axis=2)[..., None]
-        bulge_m = self._sagitta_share * self._step_s * np.linalg.norm(end[..., 3:] - begin[..., 3:], axis=2)
+        bulge_m = (
+            self._sagitta_share
+            * self._step_s
+            * np.linalg.norm(end[..., 3:] - begin[..., 3:], axis=2)
+        )
         slopes = [np.einsum("mci,mcij->mcj", line, part[..., :3, :]) for part in parts]
         variances = [np.einsum("mci,ij,mcj->mc", slope, covariance, slope) for slope in slopes]
         sigma_m = np.sqrt(np.maximum(np.maximum(*variances), 1e-18))
@@ -130,9 +152,11 @@ class CoastModel:
         return np.concatenate([normal, bound[..., None]], axis=2), margin
 
     def _candidates(self, states: Array, covariance: Array, keep_out_m: float) -> IntArray:
-        """Return the steps of the coasts that can contain the smallest margin of all states; arguments as in ``certify``.
+        """Return the steps of the coasts that can contain the smallest margin of all states;
+        arguments as in ``certify``.
 
-        The distance is bounded as in ``_room``, the standard deviation by the root of the trace of the covariance.
+        The distance is bounded as in ``_room``, the standard deviation by the root of the trace of
+        the covariance.
         """
         room_m = self._room(states) - keep_out_m
         trace = self._squares @ covariance.ravel()
@@ -143,7 +167,9 @@ class CoastModel:
         return np.flatnonzero(bound <= least + 1e-9 * abs(least))
 
     def _room(self, states: Array) -> Array:
-        """Return lower bounds (T,) on the distance of the coasts of all states (M, 6) in each step (native/coast.c)."""
+        """Return lower bounds (T,) on the distance of the coasts of all states (M, 6) in each step
+        (native/coast.c).
+        """
         columns, room = _columns(states), np.empty(len(self._times_s) - 1)
         work = scratch(columns.size)
         function("coast_room")(
@@ -157,7 +183,10 @@ class CoastModel:
     ) -> ClosestApproaches:
         """Return ``closest`` within these steps (L,) of the coasts (native/coast.c)."""
         padded, found = _columns(states), np.empty((3, -(-len(states) // 4) * 4))
-        steps, spread = np.ascontiguousarray(columns, dtype=np.int64), np.ascontiguousarray(covariance)
+        steps, spread = (
+            np.ascontiguousarray(columns, dtype=np.int64),
+            np.ascontiguousarray(covariance),
+        )
         approaches = (c_void_p * 3)(*map(location, found))
         function("coast_closest")(
             c_int64(len(steps)), address(steps), address(self._transitions), c_int64(padded.shape[1]), address(padded),
@@ -168,7 +197,9 @@ class CoastModel:
 
 
 def _columns(states: Array) -> Array:
-    """Return states (M, 6) as columns (6, P) for the kernels: P is the next multiple of four, and the last state is repeated."""
+    """Return states (M, 6) as columns (6, P) for the kernels: P is the next multiple of four, and
+    the last state is repeated.
+    """
     count = -(-len(states) // 4) * 4
     columns = np.empty((6, count))
     columns[:, : len(states)], columns[:, len(states) :] = states.T, states[-1][:, None]
@@ -176,7 +207,9 @@ def _columns(states: Array) -> Array:
 
 
 def _across(step: Array) -> Array:
-    """Return vectors (..., 3) across the given ones, for coasts through the target's centre, which have no line from it."""
+    """Return vectors (..., 3) across the given ones, for coasts through the target's centre, which
+    have no line from it.
+    """
     least = np.eye(3)[np.argmin(np.abs(step), axis=-1)]
     side = np.cross(step, least)
     return np.where(np.linalg.norm(side, axis=-1, keepdims=True) > 0.0, side, least)

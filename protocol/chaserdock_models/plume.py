@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plumes of thrusters: which boxes and points they hit, and what they exert. Pure functions; SI units, radians.
+"""Plumes of thrusters: which boxes and points they hit, and what they exert. Pure functions; SI
+units, radians.
 
-For the question of a hit the plume is a cone without end. Its momentum flux is that of Simons: A cos^m(pi theta / 2 theta_limit) / r^2
-at the angle theta from the axis and the distance r, and none beyond theta_limit (G. A. Simons, Effect of Nozzle Boundary Layers on
-Rocket Exhaust Plumes, AIAA Journal 10, 1972; there m = 2 / (gamma - 1), which is 5 for a cold gas with gamma = 1.4).
+For the question of a hit the plume is a cone without end. Its momentum flux is that of Simons: A
+cos^m(pi theta / 2 theta_limit) / r^2 at the angle theta from the axis and the distance r, and none
+beyond theta_limit (G. A. Simons, Effect of Nozzle Boundary Layers on Rocket Exhaust Plumes, AIAA
+Journal 10, 1972; there m = 2 / (gamma - 1), which is 5 for a cold gas with gamma = 1.4).
 """
 
 from __future__ import annotations
@@ -32,10 +34,11 @@ _EDGES = np.array(
 
 
 def angle_to_box(nozzle_m: Array, axis: Array, box: Box) -> float:
-    """Return the smallest angle between ``axis`` (3,), of unit length, and the direction from the nozzle (3,) to a point of a box.
+    """Return the smallest angle between ``axis`` (3,), of unit length, and the direction from the
+    nozzle (3,) to a point of a box.
 
-    0 if the nozzle is in the box or the axis meets it. Otherwise the smallest angle is at an edge: within a plane that the axis
-    does not meet, the angle has no minimum.
+    0 if the nozzle is in the box or the axis meets it. Otherwise the smallest angle is at an edge:
+    within a plane that the axis does not meet, the angle has no minimum.
     """
     local = rotations.rotate_inverse(box.q_wxyz, nozzle_m - np.asarray(box.position_m))
     direction = rotations.rotate_inverse(box.q_wxyz, axis)
@@ -62,7 +65,9 @@ def angle_to_box(nozzle_m: Array, axis: Array, box: Box) -> float:
 
 
 def _meets(origin: Array, direction: Array, half: Array) -> bool:
-    """Return whether a ray meets the cuboid of half edges ``half`` about the origin of its own axes."""
+    """Return whether a ray meets the cuboid of half edges ``half`` about the origin of its own
+    axes.
+    """
     parallel = np.abs(direction) < 1e-12
     if np.any(parallel & (np.abs(origin) > half)):
         return False
@@ -74,16 +79,24 @@ def _meets(origin: Array, direction: Array, half: Array) -> bool:
 
 
 def angle_to_point(nozzle_m: Array, axis: Array, point_m: Array) -> float:
-    """Return the angle between ``axis`` (3,), of unit length, and the direction from the nozzle (3,) to a point (3,)."""
+    """Return the angle between ``axis`` (3,), of unit length, and the direction from the nozzle
+    (3,) to a point (3,).
+    """
     off = np.asarray(point_m) - nozzle_m
     distance = float(np.linalg.norm(off))
     return 0.0 if distance == 0.0 else math.acos(max(-1.0, min(1.0, float(off @ axis) / distance)))
 
 
 def plume_hits(
-    nozzle_m: Array, force: Array, half_angle_rad: float, boxes: Sequence[Box], points_m: Sequence[Array] = ()
+    nozzle_m: Array,
+    force: Array,
+    half_angle_rad: float,
+    boxes: Sequence[Box],
+    points_m: Sequence[Array] = (),
 ) -> bool:
-    """Return whether the plume of a thruster at ``nozzle_m`` (3,) hits a box or a point; ``force`` (3,): its unit direction."""
+    """Return whether the plume of a thruster at ``nozzle_m`` (3,) hits a box or a point; ``force``
+    (3,): its unit direction.
+    """
     axis = -np.asarray(force, dtype=float)
     return any(angle_to_box(nozzle_m, axis, box) < half_angle_rad for box in boxes) or any(
         angle_to_point(nozzle_m, axis, point) < half_angle_rad for point in points_m
@@ -92,7 +105,9 @@ def plume_hits(
 
 @dataclass(frozen=True, eq=False)
 class Panels:
-    """Flat parts of a body's surface in its axes: centres (P, 3), outward normals (P, 3), areas (P,)."""
+    """Flat parts of a body's surface in its axes: centres (P, 3), outward normals (P, 3), areas
+    (P,).
+    """
 
     centres_m: Array
     normals: Array
@@ -124,35 +139,49 @@ def panels_of(boxes: Sequence[Box], parts: int = 6) -> Panels:
 
 @dataclass(frozen=True)
 class PlumeFlux:
-    """Momentum flux of a plume per newton of thrust: ``limit_rad`` (below pi / 2) and ``exponent`` as in the module's docstring."""
+    """Momentum flux of a plume per newton of thrust: ``limit_rad`` (below pi / 2) and ``exponent``
+    as in the module's docstring.
+    """
 
     limit_rad: float
     exponent: float
 
     @cached_property
     def axial(self) -> float:
-        """Factor A: the flux through any surface that closes the cone carries the thrust along the axis."""
+        """Factor A: the flux through any surface that closes the cone carries the thrust along the
+        axis.
+        """
         nodes, weights = np.polynomial.legendre.leggauss(64)
         theta = 0.5 * self.limit_rad * (nodes + 1.0)
         shape = np.cos(0.5 * math.pi * theta / self.limit_rad) ** self.exponent
-        carried = float((weights * shape * np.cos(theta) * np.sin(theta)).sum()) * 0.5 * self.limit_rad
+        carried = (
+            float((weights * shape * np.cos(theta) * np.sin(theta)).sum()) * 0.5 * self.limit_rad
+        )
         return 1.0 / (2.0 * math.pi * carried)
 
     def at(self, cosines: Array) -> Array:
-        """Return the flux times the square of the distance, 1/sr, at angles with these cosines (...)."""
+        """Return the flux times the square of the distance, 1/sr, at angles with these cosines
+        (...).
+        """
         theta = np.arccos(np.clip(cosines, -1.0, 1.0))
         shape = np.cos(0.5 * math.pi * np.minimum(theta / self.limit_rad, 1.0)) ** self.exponent
         return np.where(theta < self.limit_rad, self.axial * shape, 0.0)
 
 
 def plume_wrench(
-    flux: PlumeFlux, panels: Panels, nozzles_m: Array, forces: Array, thrusts_N: Array, reach_m: float
+    flux: PlumeFlux,
+    panels: Panels,
+    nozzles_m: Array,
+    forces: Array,
+    thrusts_N: Array,
+    reach_m: float,
 ) -> Array:
-    """Return force and torque (6,) about the origin, in the axes of the panels, that the plumes of thrusters exert on them.
+    """Return force and torque (6,) about the origin, in the axes of the panels, that the plumes of
+    thrusters exert on them.
 
-    ``nozzles_m``, ``forces`` (n, 3): nozzles and unit directions of the thrusters' forces; the plumes go the opposite way.
-    Each panel that faces a nozzle within ``reach_m`` takes up the whole momentum of the flux through it; panels do not shade
-    others.
+    ``nozzles_m``, ``forces`` (n, 3): nozzles and unit directions of the thrusters' forces; the
+    plumes go the opposite way. Each panel that faces a nozzle within ``reach_m`` takes up the whole
+    momentum of the flux through it; panels do not shade others.
     """
     firing = thrusts_N > 0.0
     if not firing.any():
@@ -162,7 +191,9 @@ def plume_wrench(
     along = away / distance[..., None]
     facing = -np.einsum("npi,pi->np", along, panels.normals)
     cosines = -np.einsum("npi,ni->np", along, forces[firing])
-    share = np.where((facing > 0.0) & (distance <= reach_m), flux.at(cosines) * facing / distance**2, 0.0)
+    share = np.where(
+        (facing > 0.0) & (distance <= reach_m), flux.at(cosines) * facing / distance**2, 0.0
+    )
     force = (thrusts_N[firing, None] * share * panels.areas_m2)[..., None] * along
     torque = np.cross(panels.centres_m, force)
     return np.concatenate([force.sum(axis=(0, 1)), torque.sum(axis=(0, 1))])

@@ -12,7 +12,9 @@ from .arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class CarriedBody:
-    """A rigid body: mass, inertia tensor (3, 3) about its centre of mass, and that centre (3,); TRF."""
+    """A rigid body: mass, inertia tensor (3, 3) about its centre of mass, and that centre (3,);
+    TRF.
+    """
 
     mass_kg: float
     inertia_kg_m2: Array
@@ -22,10 +24,12 @@ class CarriedBody:
 def tumble_load(
     target: CarriedBody, chaser: CarriedBody, tip_m: Array, omega_rad_s: Array
 ) -> tuple[Array, Array]:
-    """Return force (3,) and torque about the tip (3,), TRF, that a latched chaser exerts on its port.
+    """Return force (3,) and torque about the tip (3,), TRF, that a latched chaser exerts on its
+    port.
 
-    Target and chaser are one free body that rotates at ``omega_rad_s`` (3,), TRF, and nothing else acts on them. ``tip_m``
-    (3,): place of the port, TRF. Newton-Euler equations of the chaser under the composite's motion.
+    Target and chaser are one free body that rotates at ``omega_rad_s`` (3,), TRF, and nothing else
+    acts on them. ``tip_m`` (3,): place of the port, TRF. Newton-Euler equations of the chaser under
+    the composite's motion.
     """
     omega, total_kg = np.asarray(omega_rad_s, dtype=float), target.mass_kg + chaser.mass_kg
     apart = chaser.centre_m - target.centre_m

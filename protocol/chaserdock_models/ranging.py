@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Range of a far target, the attitude that it sends, and, without images, its bearing: the model of ``[ranging]``."""
+"""Range of a far target, the attitude that it sends, and, without images, its bearing: the model of
+``[ranging]``.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,8 @@ from .camera import Camera
 
 @dataclass(frozen=True)
 class RangingErrors:
-    """Standard deviations of the white errors: range (m) and, in addition, as a share of it; bearing and attitude per axis (rad).
-    ``reach_m``: greatest range."""
+    """Standard deviations of the white errors: range (m) and, in addition, as a share of it;
+    bearing and attitude per axis (rad). ``reach_m``: greatest range."""
 
     range_m: float
     range_share: float
@@ -31,8 +33,8 @@ class RangingErrors:
 
 @dataclass(frozen=True, eq=False)
 class RangedPose:
-    """A measured pose: position (3,) m in IRF, rotation (4,) TRF to IRF, covariance (6, 6) over position (IRF axes) and rotation (TRF
-    axes), and the bearing's standard deviation in pixels."""
+    """A measured pose: position (3,) m in IRF, rotation (4,) TRF to IRF, covariance (6, 6) over
+    position (IRF axes) and rotation (TRF axes), and the bearing's standard deviation in pixels."""
 
     position_m: Array
     q_wxyz: Array
@@ -42,7 +44,9 @@ class RangedPose:
 
 @dataclass(frozen=True, eq=False)
 class RangeReading:
-    """Distance (m) of TRF's origin from the optical centre with its standard deviation, and the sent attitude, TRF to IRF (4,)."""
+    """Distance (m) of TRF's origin from the optical centre with its standard deviation, and the
+    sent attitude, TRF to IRF (4,).
+    """
 
     range_m: float
     sigma_m: float
@@ -60,7 +64,8 @@ def _in_view(errors: RangingErrors, camera: Camera, position_m: Array) -> bool:
 def range_reading(
     errors: RangingErrors, camera: Camera, position_m: Array, q_wxyz: Array, white: Array
 ) -> RangeReading | None:
-    """Return range and attitude of a true pose (position (3,) in IRF, rotation (4,) TRF to IRF); None out of the image or of reach.
+    """Return range and attitude of a true pose (position (3,) in IRF, rotation (4,) TRF to IRF);
+    None out of the image or of reach.
 
     ``white`` (4,): standard normal numbers, from which the errors follow.
     """
@@ -75,7 +80,8 @@ def range_reading(
 def ranged_pose(
     errors: RangingErrors, camera: Camera, position_m: Array, q_wxyz: Array, white: Array
 ) -> RangedPose | None:
-    """Return the measurement of a true pose (position (3,) in IRF, rotation (4,) TRF to IRF); None out of the image or of reach.
+    """Return the measurement of a true pose (position (3,) in IRF, rotation (4,) TRF to IRF); None
+    out of the image or of reach.
 
     ``white`` (6,): standard normal numbers, from which the errors follow.
     """

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Relative motion in the Hill frame of an orbit (orbit.py).
 
-Nonlinear: two-body gravity with differential J2, for the simulator. Linear, for prediction: Clohessy and Wiltshire,
-Terminal Guidance System for Satellite Rendezvous, 1960; valid on a circular orbit and for distances small against its radius.
+Nonlinear: two-body gravity with differential J2, for the simulator. Linear, for prediction:
+Clohessy and Wiltshire, Terminal Guidance System for Satellite Rendezvous, 1960; valid on a circular
+orbit and for distances small against its radius.
 """
 
 from __future__ import annotations
@@ -29,8 +30,11 @@ from .rigid_body import rk4_step
 from .scalar_rotations import rotated_components
 
 
-def relative_acceleration(frame: HillFrame, position_m: Scalars3, velocity_m_s: Scalars3) -> Scalars3:
-    """Return the acceleration (3,) in the Hill frame of a free body at a position (3,) and velocity (3,) in it.
+def relative_acceleration(
+    frame: HillFrame, position_m: Scalars3, velocity_m_s: Scalars3
+) -> Scalars3:
+    """Return the acceleration (3,) in the Hill frame of a free body at a position (3,) and velocity
+    (3,) in it.
 
     In scalars, since the simulator calls it for every body in every physics step.
     """
@@ -39,7 +43,8 @@ def relative_acceleration(frame: HillFrame, position_m: Scalars3, velocity_m_s: 
     r = frame.radius_m
     a, _, c = frame.rate_rad_s
     da, _, dc = frame.rate_change_rad_s2
-    # Gravity at R + rho minus that at R, without their cancellation (Battin's f(q)): q = |R + rho|^2 / R^2 - 1.
+    # Gravity at R + rho minus that at R, without their cancellation (Battin's f(q)): q = |R +
+    # rho|^2 / R^2 - 1.
     q = (2.0 * r * x + x * x + y * y + z * z) / (r * r)
     n2 = EARTH_MU_M3_S2 / r**3
     root = math.sqrt(1.0 + q)
@@ -57,7 +62,9 @@ def relative_acceleration(frame: HillFrame, position_m: Scalars3, velocity_m_s: 
 
 
 def _j2_difference(frame: HillFrame, x: float, y: float, z: float, q: float) -> Scalars3:
-    """Return the acceleration of J2 at R + rho minus that at R, in the Hill frame; ``q``: |R + rho|^2 / R^2 - 1."""
+    """Return the acceleration of J2 at R + rho minus that at R, in the Hill frame; ``q``: |R +
+    rho|^2 / R^2 - 1.
+    """
     r = frame.radius_m
     px, py, pz = frame.pole
     k = -1.5 * frame.j2 * EARTH_MU_M3_S2 * EARTH_RADIUS_M**2 / r**4
@@ -76,11 +83,13 @@ def _j2_difference(frame: HillFrame, x: float, y: float, z: float, q: float) -> 
 def relative_torque(
     frame: HillFrame, q_wxyz: Sequence[float], omega_rad_s: Scalars3, moments: Scalars3
 ) -> Scalars3:
-    """Return the torque (3,), body axes, by which a body's rotation against the Hill frame differs from a free rotation.
+    """Return the torque (3,), body axes, by which a body's rotation against the Hill frame differs
+    from a free rotation.
 
-    ``q_wxyz`` (4,): principal axes to Hill frame; ``omega_rad_s`` (3,): rate against the Hill frame, body axes. It is the
-    gravity gradient 3 mu / r^3 u x I u (u: away from the Earth) and the effect of the turning frame with rate W: with
-    w = omega + W, I omega' = torque - w x I w + I (omega x W) - I W'.
+    ``q_wxyz`` (4,): principal axes to Hill frame; ``omega_rad_s`` (3,): rate against the Hill
+    frame, body axes. It is the gravity gradient 3 mu / r^3 u x I u (u: away from the Earth) and the
+    effect of the turning frame with rate W: with w = omega + W, I omega' = torque - w x I w + I
+    (omega x W) - I W'.
     """
     w, x, y, z = q_wxyz
     ua, ub, uc = rotated_components(w, -x, -y, -z, 1.0, 0.0, 0.0)
@@ -101,7 +110,9 @@ def relative_torque(
 
 
 def gravity_gradient(radius_m: float, up: Scalars3, moments: Scalars3) -> Scalars3:
-    """Return the torque (3,) of the gravity gradient, body axes. ``up`` (3,): unit vector away from the Earth, body axes."""
+    """Return the torque (3,) of the gravity gradient, body axes. ``up`` (3,): unit vector away from
+    the Earth, body axes.
+    """
     k = 3.0 * EARTH_MU_M3_S2 / radius_m**3
     a, b, c = up
     ia, ib, ic = moments
@@ -109,9 +120,15 @@ def gravity_gradient(radius_m: float, up: Scalars3, moments: Scalars3) -> Scalar
 
 
 def propagate_relative(
-    orbit: OrbitState, position_m: ArrayLike, velocity_m_s: ArrayLike, duration_s: float, j2: float = EARTH_J2
+    orbit: OrbitState,
+    position_m: ArrayLike,
+    velocity_m_s: ArrayLike,
+    duration_s: float,
+    j2: float = EARTH_J2,
 ) -> tuple[Array, Array]:
-    """Return position (3,) and velocity (3,) in an orbit's Hill frame of a free body after ``duration_s``, by RK4."""
+    """Return position (3,) and velocity (3,) in an orbit's Hill frame of a free body after
+    ``duration_s``, by RK4.
+    """
 
     def derivative(s: Array) -> Array:
         frame = hill_frame(OrbitState(s[:3], s[3:6]), j2)
@@ -120,7 +137,9 @@ def propagate_relative(
             [s[3:6], gravity(s[:3], j2), s[9:], relative_acceleration(frame, (x, y, z), (u, v, w))]
         )
 
-    y = np.concatenate([orbit.position_m, orbit.velocity_m_s, np.ravel(position_m), np.ravel(velocity_m_s)])
+    y = np.concatenate(
+        [orbit.position_m, orbit.velocity_m_s, np.ravel(position_m), np.ravel(velocity_m_s)]
+    )
     count = max(1, math.ceil(abs(duration_s) / MAX_STEP_S))
     for _ in range(count):
         y = rk4_step(derivative, y, duration_s / count)
@@ -128,7 +147,9 @@ def propagate_relative(
 
 
 def cw_matrix(mean_motion_rad_s: float) -> Array:
-    """Return the matrix (6, 6) of Clohessy-Wiltshire: d(position, velocity)/dt = matrix (position, velocity)."""
+    """Return the matrix (6, 6) of Clohessy-Wiltshire: d(position, velocity)/dt = matrix (position,
+    velocity).
+    """
     n = mean_motion_rad_s
     matrix = np.zeros((6, 6))
     matrix[:3, 3:] = np.eye(3)
@@ -138,9 +159,11 @@ def cw_matrix(mean_motion_rad_s: float) -> Array:
 
 
 def cw_transition(mean_motion_rad_s: float, time_s: ArrayLike) -> Array:
-    """Return the transition matrices (..., 6, 6) of Clohessy-Wiltshire over ``time_s`` (...); without rate, of free motion.
+    """Return the transition matrices (..., 6, 6) of Clohessy-Wiltshire over ``time_s`` (...);
+    without rate, of free motion.
 
-    The closed form of Clohessy and Wiltshire; differences of nearly equal numbers are written without cancellation.
+    The closed form of Clohessy and Wiltshire; differences of nearly equal numbers are written
+    without cancellation.
     """
     n, t = mean_motion_rad_s, np.asarray(time_s, dtype=float)
     phi = np.zeros((*t.shape, 6, 6))
@@ -152,18 +175,28 @@ def cw_transition(mean_motion_rad_s: float, time_s: ArrayLike) -> Array:
     s, c, versine = np.sin(a), np.cos(a), 2.0 * np.sin(0.5 * a) ** 2
     lag = _sine_lag(a)  # sin a - a
     phi[..., 0, 0], phi[..., 0, 3], phi[..., 0, 4] = 1.0 + 3.0 * versine, s / n, 2.0 * versine / n
-    phi[..., 1, 0], phi[..., 1, 3], phi[..., 1, 4] = 6.0 * lag, -2.0 * versine / n, t + 4.0 * lag / n
+    phi[..., 1, 0], phi[..., 1, 3], phi[..., 1, 4] = (
+        6.0 * lag,
+        -2.0 * versine / n,
+        t + 4.0 * lag / n,
+    )
     phi[..., 2, 2], phi[..., 2, 5] = c, s / n
     phi[..., 3, 0], phi[..., 3, 3], phi[..., 3, 4] = 3.0 * n * s, c, 2.0 * s
-    phi[..., 4, 0], phi[..., 4, 3], phi[..., 4, 4] = -6.0 * n * versine, -2.0 * s, 1.0 - 4.0 * versine
+    phi[..., 4, 0], phi[..., 4, 3], phi[..., 4, 4] = (
+        -6.0 * n * versine,
+        -2.0 * s,
+        1.0 - 4.0 * versine,
+    )
     phi[..., 5, 2], phi[..., 5, 5] = -n * s, c
     return phi
 
 
 def cw_wrench(mean_motion_rad_s: float, state: Array, mass_kg: float, moments: Scalars3) -> Array:
-    """Return force and torque (6,), body axes, that move a body in free space as a circular orbit moves it in its Hill frame.
+    """Return force and torque (6,), body axes, that move a body in free space as a circular orbit
+    moves it in its Hill frame.
 
-    ``state`` (13,): position, velocity, attitude, rate as in ``rigid_body``; ``moments``: principal, along the body's axes.
+    ``state`` (13,): position, velocity, attitude, rate as in ``rigid_body``; ``moments``:
+    principal, along the body's axes.
     """
     n = mean_motion_rad_s
     frame = HillFrame(
@@ -181,8 +214,12 @@ def cw_wrench(mean_motion_rad_s: float, state: Array, mass_kg: float, moments: S
     return np.array([*rotated_components(w, -x, -y, -z, *force.tolist()), *torque])
 
 
-def cw_acceleration(mean_motion_rad_s: float, position_m: ArrayLike, velocity_m_s: ArrayLike) -> Array:
-    """Return the accelerations (..., 3) of Clohessy-Wiltshire at positions (..., 3) and velocities (..., 3)."""
+def cw_acceleration(
+    mean_motion_rad_s: float, position_m: ArrayLike, velocity_m_s: ArrayLike
+) -> Array:
+    """Return the accelerations (..., 3) of Clohessy-Wiltshire at positions (..., 3) and velocities
+    (..., 3).
+    """
     state = np.concatenate(
         [np.asarray(position_m, dtype=float), np.asarray(velocity_m_s, dtype=float)], axis=-1
     )
@@ -192,5 +229,10 @@ def cw_acceleration(mean_motion_rad_s: float, position_m: ArrayLike, velocity_m_
 def _sine_lag(angle: Array) -> Array:
     """Return sin(angle) - angle; a series where the difference would lose digits."""
     square = angle * angle
-    series = -angle * square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
+    series = (
+        -angle
+        * square
+        / 6.0
+        * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
+    )
     return np.where(np.abs(angle) < 0.1, series, np.sin(angle) - angle)

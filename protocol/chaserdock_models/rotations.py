@@ -2,9 +2,10 @@
 """Rotations: Hamilton quaternions, scalar first, unit length, body to world.
 
 ``q_wxyz`` rotates a vector given in body axes into world axes: ``v_world = rotate(q, v_body)``.
-Every function takes arrays whose last axis is the quaternion (4) or vector (3) and broadcasts over the leading axes.
-A single quaternion gives the same bits as an array of them. ``scalar_rotations`` is faster for single quaternions in
-inner loops. Formulas: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017.
+Every function takes arrays whose last axis is the quaternion (4) or vector (3) and broadcasts over
+the leading axes. A single quaternion gives the same bits as an array of them. ``scalar_rotations``
+is faster for single quaternions in inner loops. Formulas: J. Sola, "Quaternion kinematics for the
+error-state Kalman filter", 2017.
 """
 
 from __future__ import annotations
@@ -18,14 +19,21 @@ from numpy.typing import ArrayLike
 
 from .arrays import Array
 from .native import address, function
-from .scalar_rotations import cross_components, matrix_components, product_components, rotated_components
+from .scalar_rotations import (
+    cross_components,
+    matrix_components,
+    product_components,
+    rotated_components,
+)
 
 IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 _CONJUGATED: Array = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def normalize(q: ArrayLike) -> Array:
-    """Return the unit quaternion (..., 4) along ``q`` (..., 4). Raises ValueError for a zero or non-finite one."""
+    """Return the unit quaternion (..., 4) along ``q`` (..., 4). Raises ValueError for a zero or
+    non-finite one.
+    """
     q = np.asarray(q, dtype=float)
     if q.ndim == 1:
         length = math.hypot(*q.tolist())
@@ -52,7 +60,9 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def _by_rows(kernel: str, a: Array, b: Array) -> Array:
-    """Return a kernel's result (..., n) for operands (..., m) and (..., n), which it repeats along leading axes."""
+    """Return a kernel's result (..., n) for operands (..., m) and (..., n), which it repeats along
+    leading axes.
+    """
     lead_a, lead_b = a.shape[:-1], b.shape[:-1]
     if not lead_b or lead_a[-len(lead_b) :] == lead_b:
         lead = lead_a
@@ -129,21 +139,28 @@ def exp(phi: ArrayLike) -> Array:
 
 
 def log(q: ArrayLike) -> Array:
-    """Return the shortest rotation vector (..., 3), rad, of a unit quaternion (..., 4) (Sola eq. 105)."""
+    """Return the shortest rotation vector (..., 3), rad, of a unit quaternion (..., 4) (Sola eq.
+    105).
+    """
     q = np.asarray(q, dtype=float)
     if q.ndim == 1:
         return np.array(_log_components(*q.tolist()))
     q = np.where(q[..., :1] < 0.0, -q, q)
     n = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     half = np.arctan2(n, q[..., :1])
-    # Near the identity 2 half / n tends to 2 / w. np.where evaluates both branches, so both divisors are kept nonzero.
+    # Near the identity 2 half / n tends to 2 / w. np.where evaluates both branches, so both
+    # divisors are kept nonzero.
     small = n <= 1e-9
-    scale = np.where(small, 2.0 / np.where(small, q[..., :1], 1.0), 2.0 * half / np.where(small, 1.0, n))
+    scale = np.where(
+        small, 2.0 / np.where(small, q[..., :1], 1.0), 2.0 * half / np.where(small, 1.0, n)
+    )
     return scale * q[..., 1:]
 
 
 def _log_components(w: float, x: float, y: float, z: float) -> list[float]:
-    """Return ``log`` of one quaternion with the bits of the array branch: NumPy's arctan2 differs from math's."""
+    """Return ``log`` of one quaternion with the bits of the array branch: NumPy's arctan2 differs
+    from math's.
+    """
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     n = math.sqrt(x * x + y * y + z * z)
@@ -171,7 +188,8 @@ def to_matrix(q: ArrayLike) -> Array:
 
 
 def from_matrix(r: ArrayLike) -> Array:
-    """Return the unit quaternion (4,), scalar part not negative, of a rotation matrix (3, 3), body to world.
+    """Return the unit quaternion (4,), scalar part not negative, of a rotation matrix (3, 3), body
+    to world.
 
     Shepperd's method: the largest of the four squared components is the pivot.
     """
@@ -196,7 +214,9 @@ def from_matrix(r: ArrayLike) -> Array:
 
 
 def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float | Array) -> Array:
-    """Return the attitude (..., 4) after ``dt_s`` (or (..., 1)) at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
+    """Return the attitude (..., 4) after ``dt_s`` (or (..., 1)) at constant body rate
+    ``omega_body`` (..., 3), rad/s (exact).
+    """
     return multiply(q, exp(np.asarray(omega_body, dtype=float) * dt_s))
 
 

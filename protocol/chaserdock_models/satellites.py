@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shipped satellites as meshes, generated from their dimensions.
 
-``tolerance_m`` is the largest distance between a true surface of revolution and its facets: a finer mesh has a smaller one.
-MeshPart names are stable: scenarios name parts that the flight software does not know of.
+``tolerance_m`` is the largest distance between a true surface of revolution and its facets: a finer
+mesh has a smaller one. MeshPart names are stable: scenarios name parts that the flight software
+does not know of.
 """
 
 from __future__ import annotations
@@ -20,8 +21,12 @@ from .meshes import Material, MeshPart, TriangleMesh, mass_properties, moved
 FINE_M = 2e-4
 """Tolerance of the meshes that the world draws."""
 
-INSULATION = Material("insulation", diffuse=0.45, specular=0.35, shininess=25.0, texture="insulation")
-CELLS = Material("cells", diffuse=0.16, specular=0.30, shininess=60.0, texture="cells", relative_density=2.0)
+INSULATION = Material(
+    "insulation", diffuse=0.45, specular=0.35, shininess=25.0, texture="insulation"
+)
+CELLS = Material(
+    "cells", diffuse=0.16, specular=0.30, shininess=60.0, texture="cells", relative_density=2.0
+)
 STRUCTURE = Material("structure", diffuse=0.60, specular=0.10, shininess=12.0)
 WHITE_PAINT = Material("white paint", diffuse=0.80)
 BARE_METAL = Material("bare metal", diffuse=0.38, specular=0.40, shininess=35.0)
@@ -49,7 +54,10 @@ def box(
     joint: str = "",
 ) -> MeshPart:
     """Return a cuboid, turned by the rotation vector ``turn_rad`` about its centre."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
+    corners = (
+        np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        * size_m
+    )
     vertices = rotations.rotate(rotations.exp(np.array(turn_rad)), corners) + np.array(centre_m)
     return MeshPart(name, material, _rounded(vertices), BOX_TRIANGLES, joint)
 
@@ -60,8 +68,8 @@ def lathe(
 ) -> MeshPart:  # fmt: skip
     """Return a surface of revolution about ``axis`` through ``base_m``.
 
-    ``profile_m``: radius and height of the corners of a closed polygon, counter-clockwise with the radius to the right;
-    radius 0 lies on the axis.
+    ``profile_m``: radius and height of the corners of a closed polygon, counter-clockwise with the
+    radius to the right; radius 0 lies on the axis.
     """
     radius = max(r for r, _ in profile_m)
     n = max(6, math.ceil(math.pi / math.acos(max(0.0, 1.0 - tolerance_m / radius))))
@@ -74,7 +82,9 @@ def lathe(
             vertices.append(np.array([[0.0, 0.0, h]]))
             rings.append([first] * n)
         else:
-            vertices.append(np.stack([r * np.cos(angles), r * np.sin(angles), np.full(n, h)], axis=1))
+            vertices.append(
+                np.stack([r * np.cos(angles), r * np.sin(angles), np.full(n, h)], axis=1)
+            )
             rings.append(list(range(first, first + n)))
     triangles = []
     for lower, upper in zip(rings, rings[1:] + rings[:1], strict=True):
@@ -135,7 +145,9 @@ def _dish(radius_m: float, depth_m: float, wall_m: float) -> list[tuple[float, f
 def _wings(
     bus_half_m: float, panel_m: Vector3, boom_m: float, tilt_rad: float, tolerance_m: float
 ) -> list[MeshPart]:
-    """Return two solar panels on booms along +Y ("north") and -Y ("south"), turned about the boom by ``tilt_rad``."""
+    """Return two solar panels on booms along +Y ("north") and -Y ("south"), turned about the boom
+    by ``tilt_rad``.
+    """
     parts = []
     for label, side in (("north", 1.0), ("south", -1.0)):
         joint = f"panel_{label}"
@@ -149,7 +161,9 @@ def _wings(
 
 
 def _geo_servicer(tolerance_m: float) -> TriangleMesh:
-    """Build a small geostationary satellite: insulated bus, two panels, dish, apogee nozzle inside the launch-adapter ring (-X)."""
+    """Build a small geostationary satellite: insulated bus, two panels, dish, apogee nozzle inside
+    the launch-adapter ring (-X).
+    """
     up: Vector3 = (0.0, 0.0, 1.0)
     parts = [
         box("bus", INSULATION, (0.40, 0.32, 0.32), (0.0, 0.0, 0.0)),
@@ -175,9 +189,16 @@ def _geo_servicer(tolerance_m: float) -> TriangleMesh:
         ),
         _cylinder("dish_arm", STRUCTURE, 0.010, 0.075, (0.09, 0.0, 0.16), up, tolerance_m),
         lathe(
-            "dish", WHITE_PAINT, _dish(0.125, 0.040, 0.003), (0.09, 0.0, 0.233), (0.45, 0.0, 1.0), tolerance_m
+            "dish",
+            WHITE_PAINT,
+            _dish(0.125, 0.040, 0.003),
+            (0.09, 0.0, 0.233),
+            (0.45, 0.0, 1.0),
+            tolerance_m,
         ),
-        _cylinder("dish_feed", STRUCTURE, 0.012, 0.085, (0.09, 0.0, 0.233), (0.45, 0.0, 1.0), tolerance_m),
+        _cylinder(
+            "dish_feed", STRUCTURE, 0.012, 0.085, (0.09, 0.0, 0.233), (0.45, 0.0, 1.0), tolerance_m
+        ),
         _tube(
             "star_tracker",
             BLACK_PAINT,
@@ -189,10 +210,22 @@ def _geo_servicer(tolerance_m: float) -> TriangleMesh:
         ),
         box("sensor", STRUCTURE, (0.05, 0.08, 0.06), (0.225, -0.08, 0.07)),
         _cylinder(
-            "antenna_whip", STRUCTURE, 0.003, 0.22, (-0.15, -0.12, 0.16), (-0.3, -0.35, 1.0), tolerance_m
+            "antenna_whip",
+            STRUCTURE,
+            0.003,
+            0.22,
+            (-0.15, -0.12, 0.16),
+            (-0.3, -0.35, 1.0),
+            tolerance_m,
         ),
         _cylinder(
-            "antenna_stub", STRUCTURE, 0.010, 0.06, (-0.12, 0.11, -0.16), (0.0, 0.0, -1.0), tolerance_m
+            "antenna_stub",
+            STRUCTURE,
+            0.010,
+            0.06,
+            (-0.12, 0.11, -0.16),
+            (0.0, 0.0, -1.0),
+            tolerance_m,
         ),
     ]
     for k, (y, z) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
@@ -201,12 +234,16 @@ def _geo_servicer(tolerance_m: float) -> TriangleMesh:
                   (-1.0, 0.0, 0.0), tolerance_m)
         )  # fmt: skip
     return TriangleMesh(
-        "geo_servicer", tuple(parts), {"panel_north": (0.0, 0.164, 0.0), "panel_south": (0.0, -0.164, 0.0)}
+        "geo_servicer",
+        tuple(parts),
+        {"panel_north": (0.0, 0.164, 0.0), "panel_south": (0.0, -0.164, 0.0)},
     )
 
 
 def _cubesat_12u(tolerance_m: float) -> TriangleMesh:
-    """Build a twelve-unit CubeSat: rails, body-mounted cells, two deployed panels, tape antennas, camera and nozzle."""
+    """Build a twelve-unit CubeSat: rails, body-mounted cells, two deployed panels, tape antennas,
+    camera and nozzle.
+    """
     body: Vector3 = (0.340, 0.220, 0.226)
     parts = [box("bus", BLACK_PAINT, (0.330, 0.210, 0.216), (0.0, 0.0, 0.0))]
     for k, (y, z) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
@@ -224,20 +261,28 @@ def _cubesat_12u(tolerance_m: float) -> TriangleMesh:
         box("antenna_1", BARE_METAL, (0.0016, 0.006, 0.170), (-0.155, -0.03, -0.190), (0.0, -0.15, 0.0)),
     ]  # fmt: skip
     return TriangleMesh(
-        "cubesat_12u", tuple(parts), {"panel_north": (0.0, 0.113, 0.0), "panel_south": (0.0, -0.113, 0.0)}
+        "cubesat_12u",
+        tuple(parts),
+        {"panel_north": (0.0, 0.113, 0.0), "panel_south": (0.0, -0.113, 0.0)},
     )
 
 
 def _chaser_body(tolerance_m: float) -> TriangleMesh:
-    """Build the body of a chaser: a deck with rim, tanks, thruster pods and a camera housing, 0.25 x 0.25 x 0.05 m."""
+    """Build the body of a chaser: a deck with rim, tanks, thruster pods and a camera housing, 0.25
+    x 0.25 x 0.05 m.
+    """
     parts = [
         box("deck", STRUCTURE, (0.226, 0.226, 0.030), (0.0, 0.0, -0.010)),
         box("cells", CELLS, (0.120, 0.200, 0.003), (-0.045, 0.0, 0.0065)),
-        _cylinder("tank", BARE_METAL, 0.018, 0.120, (0.050, -0.060, 0.007), (0.0, 1.0, 0.0), tolerance_m),
+        _cylinder(
+            "tank", BARE_METAL, 0.018, 0.120, (0.050, -0.060, 0.007), (0.0, 1.0, 0.0), tolerance_m
+        ),
         box("front", BLACK_PAINT, (0.012, 0.110, 0.040), (0.119, 0.0, -0.005)),
     ]
     for k, (x, y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        parts.append(box(f"pod_{k}", BLACK_PAINT, (0.030, 0.030, 0.050), (0.110 * x, 0.110 * y, 0.0)))
+        parts.append(
+            box(f"pod_{k}", BLACK_PAINT, (0.030, 0.030, 0.050), (0.110 * x, 0.110 * y, 0.0))
+        )
     return TriangleMesh("chaser_body", tuple(parts), {})
 
 
@@ -255,9 +300,11 @@ def satellite_names() -> tuple[str, ...]:
 
 @lru_cache
 def satellite(name: str, tolerance_m: float = FINE_M) -> TriangleMesh:
-    """Return a shipped satellite; the origin is its centre of mass, to 0.1 mm, but that of the cuboid for `chaser_body`.
+    """Return a shipped satellite; the origin is its centre of mass, to 0.1 mm, but that of the
+    cuboid for `chaser_body`.
 
-    Raises ValueError, listing the known names, for an unknown one, and for a tolerance that is not positive.
+    Raises ValueError, listing the known names, for an unknown one, and for a tolerance that is not
+    positive.
     """
     if name not in _SATELLITES:
         raise ValueError(f"unknown satellite {name!r}; known: {', '.join(satellite_names())}")

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations of one quaternion at a time, in plain Python floats.
 
-The conventions are those of ``rotations`` (Hamilton, scalar first, unit length, body to world), which handles arrays of
-rotations. For a single quaternion these functions are five to twenty times faster; the estimator calls them several
-hundred times in an update.
+The conventions are those of ``rotations`` (Hamilton, scalar first, unit length, body to world),
+which handles arrays of rotations. For a single quaternion these functions are five to twenty times
+faster; the estimator calls them several hundred times in an update.
 
-The functions ``*_components`` hold the formulas. They use ``+ - *`` only, so ``rotations`` evaluates them on arrays and
-the NMPC on CasADi symbols. Formulas: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017.
+The functions ``*_components`` hold the formulas. They use ``+ - *`` only, so ``rotations``
+evaluates them on arrays and the NMPC on CasADi symbols. Formulas: J. Sola, "Quaternion kinematics
+for the error-state Kalman filter", 2017.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ def cross_components(ax, ay, az, bx, by, bz) -> list:
 
 
 def rotated_components(w, x, y, z, vx, vy, vz) -> list:
-    """Return the components of v rotated by the unit quaternion (w, u): v + w t + u x t with t = 2 u x v."""
+    """Return the components of v rotated by the unit quaternion (w, u): v + w t + u x t with t = 2
+    u x v.
+    """
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
     return [
         vx + w * tx + (y * tz - z * ty),
@@ -99,8 +102,8 @@ def skew(v: Array) -> Array:
 
 
 def right_jacobian(phi: Array) -> Array:
-    """Return the right Jacobian of SO(3) (3, 3): exp(phi + d) = exp(phi) exp(Jr(phi) d) to first order (Sola eq.
-    183)."""
+    """Return the right Jacobian of SO(3) (3, 3): exp(phi + d) = exp(phi) exp(Jr(phi) d) to first
+    order (Sola eq. 183)."""
     x, y, z = phi.tolist()
     a2 = x * x + y * y + z * z
     if a2 < 1e-8:

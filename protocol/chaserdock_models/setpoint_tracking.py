@@ -13,7 +13,8 @@ from . import rotations
 from .arrays import Array
 from .braking import ActuatedBody, MovingBody
 
-# Second-order control laws: natural frequencies of position (a few cm/s) and attitude, and their damping ratio.
+# Second-order control laws: natural frequencies of position (a few cm/s) and attitude, and their
+# damping ratio.
 _POSITION_RAD_S, _ATTITUDE_RAD_S, _DAMPING = 0.3, 0.6, 0.9
 
 
@@ -26,8 +27,8 @@ class PlacedBody(MovingBody, Protocol):
 
 @dataclass(frozen=True)
 class Setpoint:
-    """Reference of the control law: position and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) body axes, and
-    feed-forward ``wrench`` (6,) in body axes."""
+    """Reference of the control law: position and velocity (3,) WRF, attitude (4,) body to WRF, rate
+    (3,) body axes, and feed-forward ``wrench`` (6,) in body axes."""
 
     position_m: Array
     velocity_m_s: Array
@@ -40,9 +41,13 @@ def track_setpoint(own: PlacedBody, body: ActuatedBody, setpoint: Setpoint) -> A
     """Return force and torque (6,), body axes, within the body's limits, that track a setpoint."""
     position_error = setpoint.position_m - np.asarray(own.position_m)
     velocity_error = setpoint.velocity_m_s - np.asarray(own.velocity_m_s)
-    acceleration = _POSITION_RAD_S**2 * position_error + 2 * _DAMPING * _POSITION_RAD_S * velocity_error
+    acceleration = (
+        _POSITION_RAD_S**2 * position_error + 2 * _DAMPING * _POSITION_RAD_S * velocity_error
+    )
     force = setpoint.wrench[:3] + body.mass_kg * rotations.rotate_inverse(own.q_wxyz, acceleration)
-    attitude_error = rotations.log(rotations.multiply(rotations.conjugate(own.q_wxyz), setpoint.q_wxyz))
+    attitude_error = rotations.log(
+        rotations.multiply(rotations.conjugate(own.q_wxyz), setpoint.q_wxyz)
+    )
     rate_error = setpoint.omega_rad_s - np.asarray(own.omega_rad_s)
     alpha = _ATTITUDE_RAD_S**2 * attitude_error + 2 * _DAMPING * _ATTITUDE_RAD_S * rate_error
     torque = setpoint.wrench[3:] + np.asarray(body.inertia) * alpha

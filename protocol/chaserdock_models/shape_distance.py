@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signed distance from the cuboids of a body, with its gradient, and distances between bodies of cuboids. Pure functions.
+"""Signed distance from the cuboids of a body, with its gradient, and distances between bodies of
+cuboids. Pure functions.
 
-The distance from a cuboid is that from its nearest point; inside it is negative, to the nearest face (C. Ericson, Real-Time
-Collision Detection, 2005, section 5.1.4). Between bodies the distance is that of two planes that separate them: the gap along one
-direction, which is at most the distance. The NMPC's kernel computes the same (nmpc/native/planes.c).
+The distance from a cuboid is that from its nearest point; inside it is negative, to the nearest
+face (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.4). Between bodies the distance
+is that of two planes that separate them: the gap along one direction, which is at most the
+distance. The NMPC's kernel computes the same (nmpc/native/planes.c).
 """
 
 from __future__ import annotations
@@ -21,29 +23,38 @@ from .targets import Box
 def chaser_boxes(
     size_m: tuple[float, float, float] = (0.25, 0.25, 0.05), probe_reach_m: float = 0.35
 ) -> tuple[Box, ...]:
-    """Return the boxes of a chaser in CRF: its body and a thin docking probe along +X up to ``probe_reach_m``.
+    """Return the boxes of a chaser in CRF: its body and a thin docking probe along +X up to
+    ``probe_reach_m``.
 
     Raises ValueError if the probe does not reach beyond the body.
     """
     front = size_m[0] / 2.0
     if probe_reach_m <= front:
-        raise ValueError(f"the probe ({probe_reach_m} m) must reach beyond the body's front ({front} m)")
+        raise ValueError(
+            f"the probe ({probe_reach_m} m) must reach beyond the body's front ({front} m)"
+        )
     length = probe_reach_m - front
     probe = Box((length, 0.012, 0.012), (front + length / 2.0, 0.0, 0.0), shade=0.45)
     return (Box(size_m, shade=0.3), probe)
 
 
 def box_table(boxes: Sequence[Box]) -> Array:
-    """Return centres (3), rotations box to body (9, row-major) and half edges (3) of cuboids, (C, 15)."""
+    """Return centres (3), rotations box to body (9, row-major) and half edges (3) of cuboids, (C,
+    15).
+    """
     rows = [
-        np.concatenate([b.position_m, rotations.to_matrix(b.q_wxyz).ravel(), np.array(b.size_m) / 2.0])
+        np.concatenate(
+            [b.position_m, rotations.to_matrix(b.q_wxyz).ravel(), np.array(b.size_m) / 2.0]
+        )
         for b in boxes
     ]
     return np.array(rows).reshape(-1, 15)
 
 
 def moved(table: Array, positions_m: ArrayLike, q_wxyz: ArrayLike) -> Array:
-    """Return a table (C, 15) for poses of the body (K, 3), (K, 4): (K, C, 15), in the frame of the poses."""
+    """Return a table (C, 15) for poses of the body (K, 3), (K, 4): (K, C, 15), in the frame of the
+    poses.
+    """
     turns = rotations.to_matrix(np.asarray(q_wxyz, dtype=float))
     out = np.empty((len(turns), len(table), 15))
     out[:, :, :3] = np.asarray(positions_m)[:, None] + np.einsum("kij,cj->kci", turns, table[:, :3])
@@ -54,7 +65,8 @@ def moved(table: Array, positions_m: ArrayLike, q_wxyz: ArrayLike) -> Array:
 
 
 def signed_distance(table: Array, point_m: ArrayLike) -> tuple[float, Array]:
-    """Return the least signed distance (m) of a point (3,) from the cuboids of a table (C, 15), and its gradient (3,).
+    """Return the least signed distance (m) of a point (3,) from the cuboids of a table (C, 15), and
+    its gradient (3,).
 
     Infinity without cuboids.
     """
@@ -77,15 +89,21 @@ def signed_distance(table: Array, point_m: ArrayLike) -> tuple[float, Array]:
 
 
 def reach_along(table: Array, direction: ArrayLike, q_wxyz: ArrayLike) -> float:
-    """Return how far a body (C, 15) in the attitude (4,) reaches from its origin along a unit vector (3,), m."""
-    local = rotations.rotate_inverse(np.asarray(q_wxyz, dtype=float), np.asarray(direction, dtype=float))
+    """Return how far a body (C, 15) in the attitude (4,) reaches from its origin along a unit
+    vector (3,), m.
+    """
+    local = rotations.rotate_inverse(
+        np.asarray(q_wxyz, dtype=float), np.asarray(direction, dtype=float)
+    )
     along = table[:, 3:12].reshape(-1, 3, 3).transpose(0, 2, 1) @ local
     return float((table[:, :3] @ local + (np.abs(along) * table[:, 12:]).sum(axis=1)).max())
 
 
-def distance_from_cuboids(table: Array, body: Array, position_m: ArrayLike, q_wxyz: ArrayLike) -> float:
-    """Return the least gap (m) between cuboids (C, 15) and a ``body`` (S, 15) in a pose (3,), (4,), along the gradients of the signed
-    distances of its origin."""
+def distance_from_cuboids(
+    table: Array, body: Array, position_m: ArrayLike, q_wxyz: ArrayLike
+) -> float:
+    """Return the least gap (m) between cuboids (C, 15) and a ``body`` (S, 15) in a pose (3,), (4,),
+    along the gradients of the signed distances of its origin."""
     gaps = []
     for row in table:
         distance_m, normal = signed_distance(row[None], position_m)
@@ -96,7 +114,9 @@ def distance_from_cuboids(table: Array, body: Array, position_m: ArrayLike, q_wx
 def distance_between(
     body: Array, pose: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]
 ) -> float:
-    """Return the gap (m) between two bodies of equal shape (S, 15) in poses (3,), (4,), along the line between their origins."""
+    """Return the gap (m) between two bodies of equal shape (S, 15) in poses (3,), (4,), along the
+    line between their origins.
+    """
     line = np.asarray(pose[0], dtype=float) - np.asarray(other[0], dtype=float)
     apart_m = float(np.linalg.norm(line))
     if apart_m == 0.0:
@@ -106,8 +126,9 @@ def distance_between(
 
 
 def separations(one: Array, other: Array) -> Array:
-    """Return the largest gap (M,), m, of cuboids (M, 15) from others (M, 15), in one frame, along the directions of the
-    separating-axis test: positive exactly if they are disjoint, at most the distance.
+    """Return the largest gap (M,), m, of cuboids (M, 15) from others (M, 15), in one frame, along
+    the directions of the separating-axis test: positive exactly if they are disjoint, at most the
+    distance.
 
     S. Gottschalk, M. Lin, D. Manocha, OBBTree, SIGGRAPH 1996.
     """

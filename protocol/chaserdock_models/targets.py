@@ -17,7 +17,8 @@ from .arrays import Array, Quaternion, Vector3
 from .meshes import MeshPart, TriangleMesh
 from .satellites import satellite
 
-# The six faces of a box in the order of the marker ids: outward normal, and up direction of the markers.
+# The six faces of a box in the order of the marker ids: outward normal, and up direction of the
+# markers.
 FACES: tuple[tuple[Vector3, Vector3], ...] = (
     ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -30,7 +31,8 @@ FACES: tuple[tuple[Vector3, Vector3], ...] = (
 
 @dataclass(frozen=True)
 class Box:
-    """A cuboid: edge lengths ``size_m``, centre and attitude in the frame of the body it belongs to.
+    """A cuboid: edge lengths ``size_m``, centre and attitude in the frame of the body it belongs
+    to.
 
     ``shade``: reflectance, 0 (black) to 1 (white).
     """
@@ -48,14 +50,19 @@ DEFAULT_DICTIONARY = "DICT_4X4_50"
 @lru_cache
 def cuboid_corners(size_m: Vector3) -> Array:
     """Return the corners (8, 3) of a cuboid about the origin, z changing fastest; read-only."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
+    corners = (
+        np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        * size_m
+    )
     corners.setflags(write=False)
     return corners
 
 
 @dataclass(frozen=True)
 class Marker:
-    """A square ArUco marker; ``side_m``: edge of its black square; ``q_trf_marker_wxyz``: marker -> TRF."""
+    """A square ArUco marker; ``side_m``: edge of its black square; ``q_trf_marker_wxyz``: marker ->
+    TRF.
+    """
 
     id: int
     side_m: float
@@ -63,7 +70,9 @@ class Marker:
     q_trf_marker_wxyz: Quaternion
 
     def corners_trf_m(self) -> Array:
-        """Return the corners (4, 3) in TRF: top left, top right, bottom right, bottom left of the upright marker."""
+        """Return the corners (4, 3) in TRF: top left, top right, bottom right, bottom left of the
+        upright marker.
+        """
         h = self.side_m / 2.0
         corners = np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
         return rotations.rotate(self.q_trf_marker_wxyz, corners) + self.position_trf_m
@@ -78,10 +87,10 @@ class TargetModel:
     """A target: ``boxes`` in TRF, ``markers`` of the OpenCV ``dictionary``, overall ``size_m``.
 
     ``white_margin_m``: width of the white border printed around every marker, under its neighbours.
-    ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws instead of the boxes, scaled by ``mesh_scale``;
-    empty for none.
-    ``satellite``: name of the mesh that is drawn; empty for none. ``hulls``: whether the boxes enclose the parts of that mesh;
-    then collisions use convex pieces of these, otherwise the boxes.
+    ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws instead of the boxes, scaled
+    by ``mesh_scale``; empty for none. ``satellite``: name of the mesh that is drawn; empty for
+    none. ``hulls``: whether the boxes enclose the parts of that mesh; then collisions use convex
+    pieces of these, otherwise the boxes.
     """
 
     name: str
@@ -101,14 +110,20 @@ class TargetModel:
 
 
 def face_rotation(face: int) -> Array:
-    """Return the rotation (4,) from the axes of face ``face`` (0..5; x right, y up, z outward) to the box's axes."""
+    """Return the rotation (4,) from the axes of face ``face`` (0..5; x right, y up, z outward) to
+    the box's axes.
+    """
     normal, up = (np.array(v) for v in FACES[face])
     return rotations.from_matrix(np.stack([np.cross(up, normal), up, normal], axis=-1))
 
 
 def face_extent(size_m: Vector3, face: int) -> tuple[float, float, float]:
-    """Return width (right), height (up) and distance from the box's centre of face ``face``, metres."""
-    right, up, out = (np.abs(axis) @ np.array(size_m) for axis in rotations.to_matrix(face_rotation(face)).T)
+    """Return width (right), height (up) and distance from the box's centre of face ``face``,
+    metres.
+    """
+    right, up, out = (
+        np.abs(axis) @ np.array(size_m) for axis in rotations.to_matrix(face_rotation(face)).T
+    )
     return float(right), float(up), float(out) / 2.0
 
 
@@ -125,7 +140,8 @@ def _paper() -> TargetModel:
     return TargetModel("paper", (Box(size, shade=0.6),), markers, "DICT_5X5_50", size, 0.005)
 
 
-# Edge length, and right and up coordinate of the centre, of the twelve markers on a face of the servicer and the client.
+# Edge length, and right and up coordinate of the centre, of the twelve markers on a face of the
+# servicer and the client.
 _SERVICER_LAYOUT: tuple[Vector3, ...] = (
     (0.108, -0.086, 0.086),
     (0.108, 0.086, 0.086),
@@ -153,7 +169,9 @@ def _with_clusters(name: str, size: Vector3) -> TargetModel:
 
 
 def box_around(part: MeshPart) -> Box:
-    """Return the smaller of the cuboids around a part along the body's axes and along the part's principal axes."""
+    """Return the smaller of the cuboids around a part along the body's axes and along the part's
+    principal axes.
+    """
     vertices = part.vertices_m
     _, principal = np.linalg.eigh(np.cov(vertices.T))
     principal[:, 2] *= np.sign(np.linalg.det(principal))
@@ -164,7 +182,9 @@ def box_around(part: MeshPart) -> Box:
         candidates.append((float(np.prod(high - low)), axes, axes @ (low + high) / 2.0, high - low))
     along_body, along_part = candidates
     # Principal axes of a cube are arbitrary, and its volume along them can only be equal or larger.
-    _, axes, centre, size = along_part if along_part[0] < along_body[0] * (1.0 - 1e-6) else along_body
+    _, axes, centre, size = (
+        along_part if along_part[0] < along_body[0] * (1.0 - 1e-6) else along_body
+    )
     x, y, z = np.round(centre, 9).tolist()
     a, b, c = np.round(size, 9).tolist()
     qw, qx, qy, qz = rotations.from_matrix(axes).tolist()
@@ -182,7 +202,14 @@ def mesh_target(mesh: TriangleMesh) -> TargetModel:
     low, high = mesh.bounds_m()
     x, y, z = (2.0 * np.maximum(-low, high)).tolist()
     return TargetModel(
-        mesh.name, mesh_boxes(mesh), (), DEFAULT_DICTIONARY, (x, y, z), 0.0, satellite=mesh.name, hulls=True
+        mesh.name,
+        mesh_boxes(mesh),
+        (),
+        DEFAULT_DICTIONARY,
+        (x, y, z),
+        0.0,
+        satellite=mesh.name,
+        hulls=True,
     )
 
 
@@ -206,7 +233,9 @@ def target_names() -> tuple[str, ...]:
 
 @lru_cache
 def target_model(name: str) -> TargetModel:
-    """Return the built-in target ``name``. Raises ValueError, listing the known names, for any other."""
+    """Return the built-in target ``name``. Raises ValueError, listing the known names, for any
+    other.
+    """
     if name not in _MODELS:
         raise ValueError(f"unknown target {name!r}; known: {', '.join(sorted(_MODELS))}")
     return _MODELS[name]()
@@ -224,7 +253,9 @@ def clear_margin_m(model: TargetModel, marker: Marker) -> float:
     depths = rotations.rotate(q_marker_trf, positions - np.array(marker.position_trf_m))[:, 2]
     for i in np.flatnonzero(np.abs(depths) < 1e-6):
         other = model.markers[i]
-        corners = rotations.rotate(q_marker_trf, other.corners_trf_m() - np.array(marker.position_trf_m))
+        corners = rotations.rotate(
+            q_marker_trf, other.corners_trf_m() - np.array(marker.position_trf_m)
+        )
         if other.id != marker.id and np.all(np.abs(corners[:, 2]) < 1e-6):
             gaps = np.maximum(corners[:, :2].min(axis=0) - half, -half - corners[:, :2].max(axis=0))
             if gaps.min() < 0.0:  # beside a side, not diagonally off a corner

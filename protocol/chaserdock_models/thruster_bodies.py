@@ -12,8 +12,8 @@ _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 def _tetra12() -> dict[str, Any]:
-    """Return a cube with three 1.5 N thrusters on each of four corners: one thruster under the 12 tetrahedral
-    rotations.
+    """Return a cube with three 1.5 N thrusters on each of four corners: one thruster under the 12
+    tetrahedral rotations.
 
     With any one thruster stuck off or stuck on, all six degrees of freedom stay controllable.
     """
@@ -22,7 +22,9 @@ def _tetra12() -> dict[str, Any]:
     thrusters = [
         {
             "position_m": tuple(arm_m * sign for sign in signs),
-            "direction": tuple(s * direction[axis] / length for s, axis in zip(signs, axes, strict=True)),
+            "direction": tuple(
+                s * direction[axis] / length for s, axis in zip(signs, axes, strict=True)
+            ),
             "thrust_N": 1.5,
         }
         for axes in _CYCLIC_AXES
@@ -39,14 +41,19 @@ def _tetra12() -> dict[str, Any]:
 
 
 def _slider() -> dict[str, Any]:
-    """Return the paper's body with four 2.3 N thrusters on each corner of its plate: two in the plane, one up, one
-    down.
+    """Return the paper's body with four 2.3 N thrusters on each corner of its plate: two in the
+    plane, one up, one down.
 
     The paper's 2 N and 0.05 N m on all axes at once stay available with any one thruster lost.
     """
     arm_m = 0.125
     thrusters = [
-        {"position_m": (x * arm_m, y * arm_m, 0.0), "direction": direction, "thrust_N": 2.3, **_FAST}
+        {
+            "position_m": (x * arm_m, y * arm_m, 0.0),
+            "direction": direction,
+            "thrust_N": 2.3,
+            **_FAST,
+        }
         for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))
         for direction in ((-x, 0.0, 0.0), (0.0, -y, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
     ]

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Impulse of thrusters from the opening times of their valves; used by the simulator and by a chaser's own model.
+"""Impulse of thrusters from the opening times of their valves; used by the simulator and by a
+chaser's own model.
 
-Times are integer nanoseconds of simulated time. A valve is open where a pulse or a failure opens it and its shut-off
-valve is not closed. Thrust rises linearly within ``rise_s`` of the opening and falls linearly within ``fall_s`` of the
-closing. A gap no longer than the fall time does not close the valve, and a pulse shorter than the minimum on-time does
-not open it. Impulses between two times are exact, so they do not depend on the step size.
+Times are integer nanoseconds of simulated time. A valve is open where a pulse or a failure opens it
+and its shut-off valve is not closed. Thrust rises linearly within ``rise_s`` of the opening and
+falls linearly within ``fall_s`` of the closing. A gap no longer than the fall time does not close
+the valve, and a pulse shorter than the minimum on-time does not open it. Impulses between two times
+are exact, so they do not depend on the step size.
 """
 
 from __future__ import annotations
@@ -78,7 +80,9 @@ class _Thruster:
         self.failure: tuple[FailureKind, int, float] | None = None
 
     def open_spans(self) -> list[Span]:
-        """Return the spans in which thrust is commanded or forced: the valve is open and not shut off."""
+        """Return the spans in which thrust is commanded or forced: the valve is open and not shut
+        off.
+        """
         spans = merge_spans(self.pulses, self.fall_ns)
         if self.failure is not None:
             kind, at_ns, _ = self.failure
@@ -92,7 +96,9 @@ class _Thruster:
 
     def factor(self, begin_ns: float) -> float:
         """Return the fraction of the nominal thrust for an opening at ``begin_ns``."""
-        weak = self.failure is not None and self.failure[0] == "weak" and begin_ns >= self.failure[1]
+        weak = (
+            self.failure is not None and self.failure[0] == "weak" and begin_ns >= self.failure[1]
+        )
         return self.failure[2] if weak and self.failure is not None else 1.0
 
     def forget_before(self, time_ns: int) -> None:
@@ -113,8 +119,8 @@ class Valves:
         self._table: tuple[Array, ...] | None = None
 
     def pulse(self, thruster: int, open_ns: int, close_ns: int) -> bool:
-        """Open a thruster's valve for a span. Return False for an unknown thruster or a span below the minimum
-        on-time."""
+        """Open a thruster's valve for a span. Return False for an unknown thruster or a span below
+        the minimum on-time."""
         if (
             not 0 <= thruster < len(self._thrusters)
             or close_ns - open_ns < self._thrusters[thruster].shortest_ns
@@ -144,18 +150,24 @@ class Valves:
 
     def shut_at(self, time_ns: int) -> tuple[int, ...]:
         """Return the thrusters whose shut-off valve is closed at ``time_ns``."""
-        return tuple(k for k, j in enumerate(self._thrusters) if any(b <= time_ns < e for b, e in j.shut))
+        return tuple(
+            k for k, j in enumerate(self._thrusters) if any(b <= time_ns < e for b, e in j.shut)
+        )
 
-    def fail(self, thruster: int, kind: FailureKind | None, at_ns: int, factor: float | None = None) -> None:
-        """Set the failure of a thruster from ``at_ns`` on, or clear it (None). ``factor``: thrust fraction for
-        ``weak``."""
+    def fail(
+        self, thruster: int, kind: FailureKind | None, at_ns: int, factor: float | None = None
+    ) -> None:
+        """Set the failure of a thruster from ``at_ns`` on, or clear it (None). ``factor``: thrust
+        fraction for ``weak``."""
         self._thrusters[thruster].failure = (
             None if kind is None else (kind, at_ns, 1.0 if factor is None else factor)
         )
         self._table = None
 
     def forget_before(self, time_ns: int) -> None:
-        """Discard spans that have no effect after ``time_ns``; earlier times can no longer be queried."""
+        """Discard spans that have no effect after ``time_ns``; earlier times can no longer be
+        queried.
+        """
         for thruster in self._thrusters:
             thruster.forget_before(time_ns)
         self._table = None
@@ -172,7 +184,9 @@ class Valves:
         return self._table
 
     def impulses(self, edges_ns: Array) -> Array:
-        """Return the impulse (K, n), N s, of each thruster between successive times (K + 1,), integer nanoseconds."""
+        """Return the impulse (K, n), N s, of each thruster between successive times (K + 1,),
+        integer nanoseconds.
+        """
         thruster, begin, end, rise, fall, factor = self._spans()
         out = np.zeros((len(edges_ns) - 1, len(self._thrusters)))
         if len(thruster):
@@ -187,7 +201,9 @@ class Valves:
         out = np.zeros(len(self._thrusters))
         thruster, begin, end = self._spans()[:3]
         np.add.at(
-            out, thruster.astype(int), np.clip(np.minimum(end, to_ns) - np.maximum(begin, from_ns), 0.0, None)
+            out,
+            thruster.astype(int),
+            np.clip(np.minimum(end, to_ns) - np.maximum(begin, from_ns), 0.0, None),
         )
         return out * 1e-9
 
@@ -197,7 +213,9 @@ class Valves:
 
 
 def _ramp(after_ns: Array, length_ns: Array) -> Array:
-    """Return the integral of a linear rise from 0 to 1 within ``length_ns``, nanoseconds; length zero is a step."""
+    """Return the integral of a linear rise from 0 to 1 within ``length_ns``, nanoseconds; length
+    zero is a step.
+    """
     x = np.maximum(after_ns, 0.0)
     length = np.maximum(length_ns, 1e-3)
     # A span that never ends has an infinitely late fall, where ``x`` is zero.

@@ -17,7 +17,9 @@ from .messages import Message, encoding_of
 MAX_BYTES = 17_000_000
 UNIT_QUATERNION_TOLERANCE = 1e-6
 MAX_MAGNITUDE = 1e15
-"""Bound of every float (SI units): beyond any mission, and small enough that its powers remain finite."""
+"""Bound of every float (SI units): beyond any mission, and small enough that its powers remain
+finite.
+"""
 
 T = TypeVar("T", bound=Struct)
 
@@ -46,8 +48,9 @@ def encode(message: Struct) -> bytes:
 def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
     """Decode and validate a message of type ``kind``.
 
-    Raises Rejected with reason ``encoding`` (another type or version), ``size``, ``format`` (no msgpack, wrong type or
-    shape), ``not_finite``, ``range``, ``not_unit_quaternion`` or ``not_a_covariance``.
+    Raises Rejected with reason ``encoding`` (another type or version), ``size``, ``format`` (no
+    msgpack, wrong type or shape), ``not_finite``, ``range``, ``not_unit_quaternion`` or
+    ``not_a_covariance``.
     """
     if encoding is not None and encoding != (expected := encoding_of(kind)):
         raise Rejected("encoding", f"got {encoding!r}, expected {expected!r}")
@@ -62,8 +65,8 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
 
 
 def check_numbers(message: Struct) -> None:
-    """Raise Rejected unless every float is finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of unit length and
-    no variance negative."""
+    """Raise Rejected unless every float is finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of
+    unit length and no variance negative."""
     if not _passes_fast_check(message):
         _check_fields(message)
 
@@ -82,7 +85,8 @@ class _FieldGetters(NamedTuple):
 def _passes_fast_check(message: Struct) -> bool:
     """Return True only if all numbers of a message are valid, by a few calls into C.
 
-    False requires the detailed check. ``hypot`` propagates NaN and infinity, and is at least as large as each component.
+    False requires the detailed check. ``hypot`` propagates NaN and infinity, and is at least as
+    large as each component.
     """
     getters = _field_getters(type(message))
     if getters is None:
@@ -107,9 +111,13 @@ def _passes_fast_check(message: Struct) -> bool:
 
 def _parts_pass_fast_check(message: Struct, getters: _FieldGetters) -> bool:
     parts, optional = getters.parts, getters.optional
-    if optional is not None and not all(p is None or _passes_fast_check(p) for p in optional(message)):
+    if optional is not None and not all(
+        p is None or _passes_fast_check(p) for p in optional(message)
+    ):
         return False
-    return parts is None or all(_passes_fast_check(part) for several in parts(message) for part in several)
+    return parts is None or all(
+        _passes_fast_check(part) for several in parts(message) for part in several
+    )
 
 
 @cache
@@ -193,8 +201,8 @@ def _fields_with_floats(kind: type[Struct]) -> tuple[str, ...]:
 
 
 def holds_floats(kind: inspect.Type) -> bool:
-    """Return whether a field of this type may hold floats, directly or in structures. Raises TypeError for a type that
-    ``check_numbers`` does not support."""
+    """Return whether a field of this type may hold floats, directly or in structures. Raises
+    TypeError for a type that ``check_numbers`` does not support."""
     match kind:
         case inspect.FloatType() | inspect.StructType():
             return True
@@ -219,7 +227,9 @@ def _bad_number(name: str, value: float) -> Rejected:
 
 
 def _check_covariance(name: str, values: tuple[float, ...]) -> None:
-    """Reject negative variances. Users that invert the matrix check that it is positive semi-definite."""
+    """Reject negative variances. Users that invert the matrix check that it is positive
+    semi-definite.
+    """
     step = isqrt(len(values)) + 1
     if min(values[::step]) < 0.0:
         raise Rejected("not_a_covariance", f"{name} has a negative variance")
@@ -237,13 +247,16 @@ _LATER_FIELDS = frozenset({"given_thrusters_N_s", "geometry", "ranging", "expect
 
 
 def without_wall_time(message: Message) -> dict[str, Any]:
-    """Return the fields that are equal in two equal flights: all but wall-clock times and process instances.
+    """Return the fields that are equal in two equal flights: all but wall-clock times and process
+    instances.
 
-    Fields that came later are left out while they are empty, so that flights without them keep their digest.
+    Fields that came later are left out while they are empty, so that flights without them keep
+    their digest.
     """
     return {
         name: value
         for name in message.__struct_fields__
-        if not name.startswith("wall_") and name not in ("instance", "controllers", "chaser_instances")
+        if not name.startswith("wall_")
+        and name not in ("instance", "controllers", "chaser_instances")
         if (value := getattr(message, name)) or name not in _LATER_FIELDS
     }

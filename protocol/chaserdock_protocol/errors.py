@@ -12,11 +12,15 @@ class ChaserdockError(Exception):
 
 
 class MissingPackageError(ChaserdockError, ImportError):
-    """A package that this part of chaserdock needs is not installed. The text states how to install it."""
+    """A package that this part of chaserdock needs is not installed. The text states how to install
+    it.
+    """
 
 
 def require_extra(package: str, extra: str) -> None:
-    """Raise MissingPackageError unless ``package``, which chaserdock[extra] installs, can be imported."""
+    """Raise MissingPackageError unless ``package``, which chaserdock[extra] installs, can be
+    imported.
+    """
     if find_spec(package) is None:
         raise MissingPackageError(
             f"{package} is not installed; install chaserdock[{extra}]: pip install 'chaserdock[{extra}]'",
@@ -25,7 +29,9 @@ def require_extra(package: str, extra: str) -> None:
 
 
 @contextmanager
-def errors_of_writing(path: Path | str, kind: type[ChaserdockError] = ChaserdockError) -> Iterator[None]:
+def errors_of_writing(
+    path: Path | str, kind: type[ChaserdockError] = ChaserdockError
+) -> Iterator[None]:
     """Raise an OSError as an error of this ``kind``, which names the path and the reason."""
     try:
         yield

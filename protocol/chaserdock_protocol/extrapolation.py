@@ -19,6 +19,8 @@ def extrapolate(odometry: Odometry, tick: int, time_ns: int) -> Odometry:
         odometry,
         tick=tick,
         sim_time_ns=time_ns,
-        position_m=vector(np.asarray(odometry.position_m) + np.asarray(odometry.velocity_m_s) * elapsed_s),
+        position_m=vector(
+            np.asarray(odometry.position_m) + np.asarray(odometry.velocity_m_s) * elapsed_s
+        ),
         q_wxyz=vector(rotations.normalize(rotations.multiply(odometry.q_wxyz, rotation))),
     )

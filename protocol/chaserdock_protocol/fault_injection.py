@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inject the scenario's faults into the messages of a process, by simulated time.
 
-Network faults (loss, delay, corruption) apply at the *receiver*: the log holds the message as sent, and receivers may
-lose different messages. Faults of a process (false odometry, clock jump, flood) apply at the *publisher*, so that the
-log holds the faulty message. Random draws depend only on the seed of the
-process' faults, the key and the tick.
+Network faults (loss, delay, corruption) apply at the *receiver*: the log holds the message as sent,
+and receivers may lose different messages. Faults of a process (false odometry, clock jump, flood)
+apply at the *publisher*, so that the log holds the faulty message. Random draws depend only on the
+seed of the process' faults, the key and the tick.
 
-In lock-step a tick waits for its messages. A lost, late or damaged message is therefore replaced by a ``LostMessage``,
-on which the reader stops waiting. Real-time readers do not wait, and get none.
+In lock-step a tick waits for its messages. A lost, late or damaged message is therefore replaced by
+a ``LostMessage``, on which the reader stops waiting. Real-time readers do not wait, and get none.
 """
 
 from __future__ import annotations
@@ -22,7 +22,13 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.clock import Timing
 
-from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, ON_PUBLISHING, ON_RECEIPT, Fault, ProcessFaults
+from chaserdock_protocol.scenario.faults import (
+    FAULTY_TOPICS,
+    ON_PUBLISHING,
+    ON_RECEIPT,
+    Fault,
+    ProcessFaults,
+)
 
 from . import codec, topics
 from .codec import Rejected
@@ -32,12 +38,16 @@ from .transport.network import Host
 
 _CORRUPTED_BYTES = 4
 _SENDER_FIELDS = ("commander", "instance", "holder")
-"""Fields that name a sender. In real time a reader must refuse a message that names another one; see ``FaultLayer``."""
+"""Fields that name a sender. In real time a reader must refuse a message that names another one;
+see ``FaultLayer``.
+"""
 
 
 @dataclass(frozen=True)
 class LostMessage:
-    """Placeholder, in lock-step, for a message of this tick that the reader will not receive from ``sender``."""
+    """Placeholder, in lock-step, for a message of this tick that the reader will not receive from
+    ``sender``.
+    """
 
     tick: int
     sim_time_ns: int
@@ -47,8 +57,8 @@ class LostMessage:
 def sender_of(topic: Topic, place: str | None, receiver: str, message: Any = None) -> str:
     """Return the sender of a topic from the view of a receiver.
 
-    Sensor topics come from the world for the chaser itself, and from the chaser (telemetry) for other receivers. The
-    sender of a command is the controller that ``message`` names.
+    Sensor topics come from the world for the chaser itself, and from the chaser (telemetry) for
+    other receivers. The sender of a command is the controller that ``message`` names.
     """
     if isinstance(message, WrenchCommand) and message.commander:
         return message.commander
@@ -94,10 +104,11 @@ class FaultLayer:
                 transitions.append(("fault ends", fault.text()))
         return transitions
 
-    # -- faults of the process itself ---------------------------------------------------------------------
+    # -- faults of the process itself --------------------------------------------------------------
 
     def apply_process_faults(self, tick: int) -> None:
-        """Kill or freeze this process if that is due. Call it before processing anything of the tick.
+        """Kill or freeze this process if that is due. Call it before processing anything of the
+        tick.
 
         A restarted process ignores faults that began before its first tick.
         """
@@ -117,10 +128,12 @@ class FaultLayer:
             else:
                 self.host.freeze(fault.duration_s or 0.0)
 
-    # -- published messages ------------------------------------------------------------------------------
+    # -- published messages ------------------------------------------------------------------------
 
     def outgoing(self, topic: Topic, place: int | str | None, message: Any) -> list[Any]:
-        """Return the messages to publish instead of ``message``: unchanged, modified, or several copies."""
+        """Return the messages to publish instead of ``message``: unchanged, modified, or several
+        copies.
+        """
         copies = 1
         for _, fault in self._publishing:
             if not self.active(fault, message.tick):
@@ -142,10 +155,12 @@ class FaultLayer:
         self.count[fault.kind] = self.count.get(fault.kind, 0) + 1
         return result
 
-    # -- received messages --------------------------------------------------------------------------------
+    # -- received messages -------------------------------------------------------------------------
 
     def incoming(self, topic: Topic, place: str | None, message: Any, payload: bytes) -> list[Any]:
-        """Return the messages to deliver instead of ``message``, in order. See ``LostMessage`` for losses."""
+        """Return the messages to deliver instead of ``message``, in order. See ``LostMessage`` for
+        losses.
+        """
         if message.tick >= 0:
             self.apply_process_faults(message.tick)
         key = topic.key_of(place)
@@ -169,7 +184,11 @@ class FaultLayer:
                 return [*out, *lost]
             if fault.kind == "corrupt":
                 damaged = self._corrupt(topic, key, message, payload)
-                return [*out, *(lost if damaged is None else [damaged]), *self._release_overtaken(key)]
+                return [
+                    *out,
+                    *(lost if damaged is None else [damaged]),
+                    *self._release_overtaken(key),
+                ]
             return [*out, *lost, *self._release_overtaken(key)]  # cut, drop, camera_off
         return [*out, message, *self._release_overtaken(key)]
 
@@ -231,7 +250,11 @@ def create_fault_layer(
     faults: ProcessFaults, name: str, timing: Timing, lockstep: bool, host: Host
 ) -> FaultLayer | None:
     """Return the fault layer of process ``name``, which runs on ``host``, or None without faults."""
-    return FaultLayer(faults.faults, name, timing, faults.seed, lockstep, host) if faults.faults else None
+    return (
+        FaultLayer(faults.faults, name, timing, faults.seed, lockstep, host)
+        if faults.faults
+        else None
+    )
 
 
 def _rotation(fault: Fault) -> Array:
@@ -243,7 +266,9 @@ def _shift(position_m: Any, fault: Fault) -> Any:
 
 
 def _falsify_odometry(odometry: Odometry, fault: Fault) -> Odometry:
-    """Shift the position by ``offset_m`` (WRF) and rotate the attitude by ``rotation_deg`` (rotation vector, CRF)."""
+    """Shift the position by ``offset_m`` (WRF) and rotate the attitude by ``rotation_deg``
+    (rotation vector, CRF).
+    """
     return msgspec.structs.replace(
         odometry,
         position_m=_shift(odometry.position_m, fault),
@@ -252,7 +277,9 @@ def _falsify_odometry(odometry: Odometry, fault: Fault) -> Odometry:
 
 
 def _falsify_sighting(sighting: Sighting, fault: Fault) -> Sighting:
-    """Shift every solution by ``offset_m`` and rotate it by ``rotation_deg`` (rotation vector), both in IRF."""
+    """Shift every solution by ``offset_m`` and rotate it by ``rotation_deg`` (rotation vector),
+    both in IRF.
+    """
 
     def falsify(solution: PoseSolution) -> PoseSolution:
         return msgspec.structs.replace(
@@ -261,11 +288,15 @@ def _falsify_sighting(sighting: Sighting, fault: Fault) -> Sighting:
             q_wxyz=codec.vector(rotations.multiply(_rotation(fault), solution.q_wxyz)),
         )
 
-    return msgspec.structs.replace(sighting, solutions=tuple(falsify(s) for s in sighting.solutions))
+    return msgspec.structs.replace(
+        sighting, solutions=tuple(falsify(s) for s in sighting.solutions)
+    )
 
 
 def _shift_stamps(message: Message, offset_s: float) -> Message:
-    """Shift every simulated-time stamp by ``offset_s``, to 0 at least. The tick number does not depend on the clock."""
+    """Shift every simulated-time stamp by ``offset_s``, to 0 at least. The tick number does not
+    depend on the clock.
+    """
     shifted = {
         name: max(0, getattr(message, name) + round(offset_s * 1e9))
         for name in ("sim_time_ns", "effective_time_ns", "expires_ns")

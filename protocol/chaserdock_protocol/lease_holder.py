@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leases that chasers have granted, as a controller knows them: who commands a tick. No I/O; ticks are the only clock.
+"""Leases that chasers have granted, as a controller knows them: who commands a tick. No I/O; ticks
+are the only clock.
 
-A controller commands a tick while a majority of the chasers that take part in it have promised it to that controller. Any two
-majorities share a chaser, and a chaser promises a tick to one controller only. A chaser that is lost in a tick still counts in
-it: a majority of the others need not share a chaser with one that included it.
+A controller commands a tick while a majority of the chasers that take part in it have promised it
+to that controller. Any two majorities share a chaser, and a chaser promises a tick to one
+controller only. A chaser that is lost in a tick still counts in it: a majority of the others need
+not share a chaser with one that included it.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from .leases import is_majority, next_term
 from .messages import Lease, Tick
 
 PATIENCE_TICKS = 3
-"""A controller gives a lease back after it had no majority for so many ticks; after one if the other commands meanwhile."""
+"""A controller gives a lease back after it had no majority for so many ticks; after one if the
+other commands meanwhile.
+"""
 _MOST_KNOWN = 8
 
 
@@ -33,11 +37,12 @@ class Commander:
 
 @dataclass
 class LeaseHolder:
-    """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this controller.
+    """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this
+    controller.
 
-    ``_renewed``: tick in which a chaser has last stated a longer lease of the same holder, and so has executed a command.
-    ``_first``: the first revisions of the last ticks. ``_claimed``, ``_ceded``: newest ticks that this controller, and another one,
-    was found to command.
+    ``_renewed``: tick in which a chaser has last stated a longer lease of the same holder, and so
+    has executed a command. ``_first``: the first revisions of the last ticks. ``_claimed``,
+    ``_ceded``: newest ticks that this controller, and another one, was found to command.
     """
 
     name: str
@@ -62,7 +67,11 @@ class LeaseHolder:
         known = self.leases.get(lease.chaser)
         if known is not None and _age(lease) <= _age(known):
             return
-        if known is not None and lease.instance == known.instance and lease.until_tick > known.until_tick:
+        if (
+            known is not None
+            and lease.instance == known.instance
+            and lease.until_tick > known.until_tick
+        ):
             self._renewed[lease.chaser] = lease.tick
         self.leases[lease.chaser] = lease
 
@@ -118,11 +127,13 @@ class LeaseHolder:
         return None
 
     def claim(self, tick: Tick) -> bool:
-        """Return whether this controller commands a tick; ``term`` is then the number to command with.
+        """Return whether this controller commands a tick; ``term`` is then the number to command
+        with.
 
-        With a new grant, or after the other has commanded, it is no smaller than any that chasers have stated up to that tick, so
-        that the newest commander has the highest. Otherwise it stays: the other controller may hold a higher term in a minority, or
-        in later ticks, whose leases a controller that was frozen may have read before it finishes its own.
+        With a new grant, or after the other has commanded, it is no smaller than any that chasers
+        have stated up to that tick, so that the newest commander has the highest. Otherwise it
+        stays: the other controller may hold a higher term in a minority, or in later ticks, whose
+        leases a controller that was frozen may have read before it finishes its own.
         """
         found = self.commander_of(tick)
         if found is None:
@@ -130,7 +141,8 @@ class LeaseHolder:
         if (found.name, found.instance) != (self.name, self.instance):
             self._ceded = max(self._ceded, tick.tick)
             return False
-        # Chasers that were cut off may hold older grants than those with which the other has commanded meanwhile.
+        # Chasers that were cut off may hold older grants than those with which the other has
+        # commanded meanwhile.
         regained = self._claimed < self._ceded < tick.tick
         self._claimed = max(self._claimed, tick.tick)
         if found.term > self.term or regained:
@@ -139,19 +151,25 @@ class LeaseHolder:
         return True
 
     def _is_commanded_since(self, since: int, tick: Tick) -> bool:
-        """Return whether another controller holds a majority at a tick, all of which has executed its commands since a tick."""
+        """Return whether another controller holds a majority at a tick, all of which has executed
+        its commands since a tick.
+        """
         granted = [
-            lease for name in tick.controllers if name != self.name for lease in self._granted(name, tick)
+            lease
+            for name in tick.controllers
+            if name != self.name
+            for lease in self._granted(name, tick)
         ]
         return is_majority(
             {x.chaser for x in granted if self._renewed.get(x.chaser, -1) >= since}, tick.chasers
         )
 
     def take_idle(self, tick: Tick) -> dict[int, tuple[int, bool]]:
-        """Return the chasers that may wait for a command of this controller, which does not command the tick.
+        """Return the chasers that may wait for a command of this controller, which does not command
+        the tick.
 
-        Those are the chasers whose lease it holds, and those whose lease of this tick was lost: term, and whether the lease is
-        given back now.
+        Those are the chasers whose lease it holds, and those whose lease of this tick was lost:
+        term, and whether the lease is given back now.
         """
         held = {lease.chaser: lease.term for lease in self._granted(self.name, tick)}
         self._idle_since = {i: self._idle_since.get(i, tick.tick) for i in held}

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leases of command authority: rules that the chasers, which grant them, and all others share. Pure functions.
+"""Leases of command authority: rules that the chasers, which grant them, and all others share. Pure
+functions.
 
-A lease covers a range of the world's ticks, not a span of a clock: no delay of a message and no error of a clock lets two
-controllers hold one chaser's lease of the same tick.
+A lease covers a range of the world's ticks, not a span of a clock: no delay of a message and no
+error of a clock lets two controllers hold one chaser's lease of the same tick.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ def defect_of(lease: Lease, rate_hz: float) -> str:
 
 
 def next_term(term: int, controller: str) -> int:
-    """Return the smallest number above ``term`` that belongs to a controller: no two controllers share a term."""
+    """Return the smallest number above ``term`` that belongs to a controller: no two controllers
+    share a term.
+    """
     number = term + 1
     while commander_of(number) != controller:
         number += 1
@@ -54,7 +57,9 @@ def commander_of(term: int) -> str:
 
 
 def is_majority(granted: Collection[int], live: Collection[int]) -> bool:
-    """Return whether chasers ``granted`` are a majority of those that are ``live``: of an even number, half with the first."""
+    """Return whether chasers ``granted`` are a majority of those that are ``live``: of an even
+    number, half with the first.
+    """
     if not live or not granted:
         return False
     return 2 * len(granted) + (min(live) in granted) > len(live)

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages that processes exchange and logs store.
 
-On the wire a message is a msgpack map of its field names; the Zenoh encoding carries its type and version (see
-``codec``). A new field gets a default, so that old logs stay readable. A renamed field or a changed meaning gets a new
-``VERSION`` and a migration in ``recording/schema_migrations.py``.
+On the wire a message is a msgpack map of its field names; the Zenoh encoding carries its type and
+version (see ``codec``). A new field gets a default, so that old logs stay readable. A renamed field
+or a changed meaning gets a new ``VERSION`` and a migration in ``recording/schema_migrations.py``.
 
 Common fields: ``seq`` numbers the messages of one publisher on one key from 0 (set when published);
-``tick`` is the world's tick of the message; ``sim_time_ns`` is simulated time, and for everything derived from an image
-the time of its *exposure*. No field depends on a wall clock, except those whose name begins with ``wall_``.
+``tick`` is the world's tick of the message; ``sim_time_ns`` is simulated time, and for everything
+derived from an image the time of its *exposure*. No field depends on a wall clock, except those
+whose name begins with ``wall_``.
 """
 
 from __future__ import annotations
@@ -75,14 +76,17 @@ PhaseName = Literal[
 ]
 """Phase of a chaser. Those from ``wait`` on occur only if docking ends by capture."""
 Latch = Literal["keep", "arm", "release"]
-"""Command of a probe's latch: no change; close at a valid touch and stay closed; open and stay open."""
+"""Command of a probe's latch: no change; close at a valid touch and stay closed; open and stay
+open.
+"""
 
 
 class RangeMeasurement(Struct, frozen=True, kw_only=True):
     """Measurement of a range sensor, and the attitude that the target sends.
 
-    ``range_m``: distance of TRF's origin from the camera's optical centre, with its standard deviation. ``q_wxyz`` takes TRF to IRF;
-    ``attitude_covariance_rad2`` is row-major (3, 3) over dtheta in TRF axes with q_true = q (x) exp(dtheta).
+    ``range_m``: distance of TRF's origin from the camera's optical centre, with its standard
+    deviation. ``q_wxyz`` takes TRF to IRF; ``attitude_covariance_rad2`` is row-major (3, 3) over
+    dtheta in TRF axes with q_true = q (x) exp(dtheta).
     """
 
     range_m: float
@@ -94,8 +98,8 @@ class RangeMeasurement(Struct, frozen=True, kw_only=True):
 class PoseSolution(Struct, frozen=True, kw_only=True):
     """One pose of the target in the camera frame.
 
-    ``position_m`` is TRF's origin in IRF, ``q_wxyz`` takes TRF to IRF. ``covariance`` is row-major (6, 6)
-    over (position in IRF axes, dtheta in TRF axes) with q_true = q (x) exp(dtheta).
+    ``position_m`` is TRF's origin in IRF, ``q_wxyz`` takes TRF to IRF. ``covariance`` is row-major
+    (6, 6) over (position in IRF axes, dtheta in TRF axes) with q_true = q (x) exp(dtheta).
     """
 
     position_m: Vector3
@@ -109,7 +113,9 @@ SquareOfParameters = Annotated[tuple[float, ...], Meta(max_length=64 * 64)]
 
 
 class ExpectedPose(Struct, frozen=True, kw_only=True):
-    """Pose of the target in the camera of a chaser that is expected at ``sim_time_ns``; in the frames of ``PoseSolution``."""
+    """Pose of the target in the camera of a chaser that is expected at ``sim_time_ns``; in the
+    frames of ``PoseSolution``.
+    """
 
     sim_time_ns: Count
     position_m: Vector3
@@ -119,10 +125,11 @@ class ExpectedPose(Struct, frozen=True, kw_only=True):
 class GeometryMeasurement(Struct, frozen=True, kw_only=True):
     """Information of one image on the k errors of the target's known geometry.
 
-    ``information``: row-major (k, k), for any pose of the target; ``vector``: it times the estimate (k,); both empty for an image for
-    which no view was rendered. ``position_m``: of the target in IRF as the image shows it if the geometry has no errors;
-    ``position_by_errors``: its change by the errors, row-major (3, k); ``position_covariance_m2``: for known errors.
-    In units of the errors' prior standard deviations, in the order of ``GeometryEstimate.names``.
+    ``information``: row-major (k, k), for any pose of the target; ``vector``: it times the estimate
+    (k,); both empty for an image for which no view was rendered. ``position_m``: of the target in
+    IRF as the image shows it if the geometry has no errors; ``position_by_errors``: its change by
+    the errors, row-major (3, k); ``position_covariance_m2``: for known errors. In units of the
+    errors' prior standard deviations, in the order of ``GeometryEstimate.names``.
     """
 
     information: SquareOfParameters = ()
@@ -133,10 +140,12 @@ class GeometryMeasurement(Struct, frozen=True, kw_only=True):
 
 
 class GeometryEstimate(Struct, frozen=True, kw_only=True):
-    """Errors of the target's known geometry as estimated from ``views`` images, which cover a share of all directions.
+    """Errors of the target's known geometry as estimated from ``views`` images, which cover a share
+    of all directions.
 
-    ``names``: of the k errors: a joint and a body axis about which it is turned (rad), ``scale`` (share) or ``rim`` (m).
-    ``sigmas``: prior standard deviations. ``values`` and row-major ``covariance`` (k, k): of the estimate, in the same units.
+    ``names``: of the k errors: a joint and a body axis about which it is turned (rad), ``scale``
+    (share) or ``rim`` (m). ``sigmas``: prior standard deviations. ``values`` and row-major
+    ``covariance`` (k, k): of the estimate, in the same units.
     """
 
     names: Annotated[tuple[Text, ...], Meta(max_length=64)]
@@ -148,10 +157,11 @@ class GeometryEstimate(Struct, frozen=True, kw_only=True):
 
 
 class CameraCalibration(Struct, frozen=True, kw_only=True):
-    """Calibration error of chaser ``chaser``'s camera, as estimated in flight, with standard deviations.
+    """Calibration error of chaser ``chaser``'s camera, as estimated in flight, with standard
+    deviations.
 
-    ``turn_rad``: rotation vector in CRF from the nominal mounting. ``shift_m``: lens position error in CRF.
-    ``focal_share``: relative error of the focal length.
+    ``turn_rad``: rotation vector in CRF from the nominal mounting. ``shift_m``: lens position error
+    in CRF. ``focal_share``: relative error of the focal length.
     """
 
     chaser: ChaserId
@@ -164,10 +174,12 @@ class CameraCalibration(Struct, frozen=True, kw_only=True):
 
 
 class RelativeEstimate(Struct, frozen=True, kw_only=True):
-    """Estimated pose of chaser ``chaser`` relative to the target, and the disturbance that acts on the chaser.
+    """Estimated pose of chaser ``chaser`` relative to the target, and the disturbance that acts on
+    the chaser.
 
-    ``position_m`` is CRF's origin in TRF, ``q_wxyz`` takes CRF to TRF. ``covariance`` is row-major (6, 6) over (position in TRF
-    axes, dtheta in CRF axes) with q_true = q (x) exp(dtheta). ``force_N`` and ``torque_N_m``: body axes.
+    ``position_m`` is CRF's origin in TRF, ``q_wxyz`` takes CRF to TRF. ``covariance`` is row-major
+    (6, 6) over (position in TRF axes, dtheta in CRF axes) with q_true = q (x) exp(dtheta).
+    ``force_N`` and ``torque_N_m``: body axes.
     """
 
     chaser: ChaserId
@@ -179,7 +191,8 @@ class RelativeEstimate(Struct, frozen=True, kw_only=True):
 
 
 class ProbeTouch(Struct, frozen=True, kw_only=True):
-    """First contact of a probe's tip with the target at ``sim_time_ns``: position and velocity relative to its port.
+    """First contact of a probe's tip with the target at ``sim_time_ns``: position and velocity
+    relative to its port.
 
     ``latched``: whether the latch closed. ``refused``: the reason if it did not.
     """
@@ -213,10 +226,11 @@ class Message(Struct, frozen=True, kw_only=True):
 class Tick(Message, frozen=True, kw_only=True):
     """Start of a tick, or (``revision`` > 0) a correction of the processes that take part in it.
 
-    ``chasers``: those whose reply the world expects. ``controllers``: connected controllers with their instances, in the
-    order of succession. ``since``: by process, the tick since which it takes part without a break; a lease that was stated
-    before is void. ``chaser_instances``: instances of ``chasers``, by process. A process that is listed with another instance
-    was lost and replaced; it ends.
+    ``chasers``: those whose reply the world expects. ``controllers``: connected controllers with
+    their instances, in the order of succession. ``since``: by process, the tick since which it
+    takes part without a break; a lease that was stated before is void. ``chaser_instances``:
+    instances of ``chasers``, by process. A process that is listed with another instance was lost
+    and replaced; it ends.
     """
 
     revision: Count = 0
@@ -237,8 +251,8 @@ class MissionEnd(Message, frozen=True, kw_only=True):
 class Image(Message, frozen=True, kw_only=True):
     """An image of chaser ``chaser``'s camera; ``sim_time_ns`` is the middle of the exposure.
 
-    ``ranging``: the target's range and sent attitude at that time, where the scenario has ``[ranging]`` and the target is in reach and
-    in the image.
+    ``ranging``: the target's range and sent attitude at that time, where the scenario has
+    ``[ranging]`` and the target is in reach and in the image.
     """
 
     chaser: ChaserId
@@ -253,11 +267,12 @@ _EXACT = (0.0,) * 9
 
 
 class Odometry(Message, frozen=True, kw_only=True):
-    """A chaser's own navigation solution: position and velocity in WRF, attitude CRF to WRF, rate in CRF.
+    """A chaser's own navigation solution: position and velocity in WRF, attitude CRF to WRF, rate
+    in CRF.
 
-    Covariances are row-major (3, 3), of position and velocity in WRF, of attitude (q_true = q (x) exp(dtheta)) and rate in
-    CRF. They describe the white noise, which is new in every tick; zero is exact. The scenario's ``[navigation]`` states
-    errors that are correlated in time.
+    Covariances are row-major (3, 3), of position and velocity in WRF, of attitude (q_true = q (x)
+    exp(dtheta)) and rate in CRF. They describe the white noise, which is new in every tick; zero is
+    exact. The scenario's ``[navigation]`` states errors that are correlated in time.
     """
 
     chaser: ChaserId
@@ -272,8 +287,9 @@ class Odometry(Message, frozen=True, kw_only=True):
 
 
 class DockingStatus(Message, frozen=True, kw_only=True):
-    """Measurement of a chaser's docking sensor. ``contact``: contact of the probe's tip since the last tick. ``armed``:
-    the latch will close at a touch within its tolerances. ``latched``: it has closed."""
+    """Measurement of a chaser's docking sensor. ``contact``: contact of the probe's tip since the
+    last tick. ``armed``: the latch will close at a touch within its tolerances. ``latched``: it has
+    closed."""
 
     chaser: ChaserId
     contact: bool
@@ -282,12 +298,13 @@ class DockingStatus(Message, frozen=True, kw_only=True):
 
 
 class BodyTruth(Message, frozen=True, kw_only=True):
-    """Ground truth of one body (``target`` or ``chaser/0``), for recorder, analysis and viewer alone.
+    """Ground truth of one body (``target`` or ``chaser/0``), for recorder, analysis and viewer
+    alone.
 
-    ``impulse_N_s`` and ``angular_impulse_N_m_s``: impulses of its actuators since the last tick, in body axes.
-    ``absolute_impulse_N_s``: time integral of the sum of the force components' magnitudes. With thrusters, since the
-    last tick: ``thruster_impulse_N_s`` and valve opening time ``thruster_open_s`` of each, and ``propellant_kg`` used
-    (the body's mass is constant).
+    ``impulse_N_s`` and ``angular_impulse_N_m_s``: impulses of its actuators since the last tick, in
+    body axes. ``absolute_impulse_N_s``: time integral of the sum of the force components'
+    magnitudes. With thrusters, since the last tick: ``thruster_impulse_N_s`` and valve opening time
+    ``thruster_open_s`` of each, and ``propellant_kg`` used (the body's mass is constant).
     """
 
     body: Text
@@ -306,7 +323,8 @@ class BodyTruth(Message, frozen=True, kw_only=True):
 class WorldTruth(Message, frozen=True, kw_only=True):
     """Contacts between bodies in the physics steps since the last tick, and saturated commands.
 
-    ``touches``: contacts of probe tips with the target, not included in ``contacts``. ``latched``: chasers latched now.
+    ``touches``: contacts of probe tips with the target, not included in ``contacts``. ``latched``:
+    chasers latched now.
     """
 
     contacts: Annotated[tuple[tuple[Text, Text], ...], Meta(max_length=1024)]
@@ -317,13 +335,14 @@ class WorldTruth(Message, frozen=True, kw_only=True):
 
 
 class PortLoad(Message, frozen=True, kw_only=True):
-    """Ground truth of the load at a chaser's port: what the latched chaser exerts on it, torque about the tip. Zero without
-    a latch.
+    """Ground truth of the load at a chaser's port: what the latched chaser exerts on it, torque
+    about the tip. Zero without a latch.
 
-    Axes of the port: x outward, z as that of the docked chaser's CRF. ``force_N``, ``torque_N_m``: in the last physics step.
-    ``peak_*``: largest magnitudes in the physics steps since the last tick: of force and torque, of the force along the
-    axis (``axial``) and across it (``shear``), and of the torque across it (``bending``). ``closing_impulse_N_s``: of the
-    steps in which a latch closed, which are not in the peaks.
+    Axes of the port: x outward, z as that of the docked chaser's CRF. ``force_N``, ``torque_N_m``:
+    in the last physics step. ``peak_*``: largest magnitudes in the physics steps since the last
+    tick: of force and torque, of the force along the axis (``axial``) and across it (``shear``),
+    and of the torque across it (``bending``). ``closing_impulse_N_s``: of the steps in which a
+    latch closed, which are not in the peaks.
     """
 
     chaser: ChaserId
@@ -338,9 +357,11 @@ class PortLoad(Message, frozen=True, kw_only=True):
 
 
 class PlumeLoad(Message, frozen=True, kw_only=True):
-    """Ground truth of what the plumes of the chasers' thrusters gave a body since the last tick, with ``[plume]``.
+    """Ground truth of what the plumes of the chasers' thrusters gave a body since the last tick,
+    with ``[plume]``.
 
-    ``impulse_N_s``, ``angular_impulse_N_m_s``: about the body's origin, in its axes. ``peak_force_N``: largest force.
+    ``impulse_N_s``, ``angular_impulse_N_m_s``: about the body's origin, in its axes.
+    ``peak_force_N``: largest force.
     """
 
     body: Text
@@ -350,12 +371,13 @@ class PlumeLoad(Message, frozen=True, kw_only=True):
 
 
 class DrawnBody(Struct, frozen=True, kw_only=True):
-    """What the scenario drew for one body (``target`` or ``chaser/0``), body axes unless stated otherwise.
+    """What the scenario drew for one body (``target`` or ``chaser/0``), body axes unless stated
+    otherwise.
 
-    ``inertia_kg_m2``: row-major (3, 3) about the centre of mass. ``thrust_share``: relative error of each thruster (with
-    ideal actuation: of force and torque per axis); ``thrust_turn_rad``: three numbers each (with ideal actuation: of force
-    and torque). Odometry biases: position in WRF. ``camera_*``: error against the calibration. ``marker_shift_m``: three
-    numbers a marker.
+    ``inertia_kg_m2``: row-major (3, 3) about the centre of mass. ``thrust_share``: relative error
+    of each thruster (with ideal actuation: of force and torque per axis); ``thrust_turn_rad``:
+    three numbers each (with ideal actuation: of force and torque). Odometry biases: position in
+    WRF. ``camera_*``: error against the calibration. ``marker_shift_m``: three numbers a marker.
     """
 
     body: Text
@@ -378,7 +400,9 @@ class DrawnBody(Struct, frozen=True, kw_only=True):
 
 
 class DrawnTruth(Message, frozen=True, kw_only=True):
-    """True bodies, actuators and sensors, as drawn from the seed; published once, at the first tick."""
+    """True bodies, actuators and sensors, as drawn from the seed; published once, at the first
+    tick.
+    """
 
     bodies: Annotated[tuple[DrawnBody, ...], Meta(max_length=257)]
 
@@ -387,8 +411,9 @@ class Sighting(Message, frozen=True, kw_only=True):
     """Target poses that a chaser measured in one image; empty ``solutions`` if it detected nothing.
 
     The best solution comes first; a second one follows if a single small marker is ambiguous.
-    ``corners_px``: u, v of the four corners of each used marker, in the distorted image. ``geometry``: by shape only.
-    ``acquiring``: the chaser is still searching an earlier image for the target, or tracking it through those since then.
+    ``corners_px``: u, v of the four corners of each used marker, in the distorted image.
+    ``geometry``: by shape only. ``acquiring``: the chaser is still searching an earlier image for
+    the target, or tracking it through those since then.
     """
 
     chaser: ChaserId
@@ -406,9 +431,10 @@ class Sighting(Message, frozen=True, kw_only=True):
 class TargetEstimate(Message, frozen=True, kw_only=True):
     """Fused odometry of the target at ``sim_time_ns``: position and velocity in WRF, rate in TRF.
 
-    ``covariance`` is row-major (12, 12) over (position, velocity, dtheta in TRF, rate in TRF). With status ``none``,
-    before the first sighting, the values are meaningless. ``cameras``: estimated calibration errors, if estimated.
-    ``relative``: poses of the chasers relative to the target, from an estimator that estimates the chasers, too.
+    ``covariance`` is row-major (12, 12) over (position, velocity, dtheta in TRF, rate in TRF). With
+    status ``none``, before the first sighting, the values are meaningless. ``cameras``: estimated
+    calibration errors, if estimated. ``relative``: poses of the chasers relative to the target,
+    from an estimator that estimates the chasers, too.
     """
 
     status: Literal["none", "tracking", "predicting", "lost"]
@@ -424,7 +450,8 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
 
 
 class MassEstimate(Struct, frozen=True, kw_only=True):
-    """Estimated mass properties of a body: centre of mass and inertia about it in TRF axes, the latter as xx, yy, zz, xy, xz, yz.
+    """Estimated mass properties of a body: centre of mass and inertia about it in TRF axes, the
+    latter as xx, yy, zz, xy, xz, yz.
 
     ``covariance`` is row-major (10, 10) over (mass, centre of mass, inertia).
     """
@@ -436,10 +463,12 @@ class MassEstimate(Struct, frozen=True, kw_only=True):
 
 
 class StackEstimate(Message, frozen=True, kw_only=True):
-    """Identified mass properties at ``sim_time_ns``: of the ``stack`` of the target and ``chasers``, and of the ``target`` alone.
+    """Identified mass properties at ``sim_time_ns``: of the ``stack`` of the target and
+    ``chasers``, and of the ``target`` alone.
 
-    ``thrust_factors``: estimated over stated thrust of every thruster, chaser after chaser. ``failed``: for each chaser the
-    thrusters that the motion of the stack shows to be stuck. Without chasers both bodies are the freely tumbling target.
+    ``thrust_factors``: estimated over stated thrust of every thruster, chaser after chaser.
+    ``failed``: for each chaser the thrusters that the motion of the stack shows to be stuck.
+    Without chasers both bodies are the freely tumbling target.
     """
 
     chasers: ChaserIds
@@ -465,25 +494,30 @@ class Reference(Message, frozen=True, kw_only=True):
 
 
 class WrenchCommand(Message, frozen=True, kw_only=True):
-    """Commanded force and torque of a chaser, in body axes, from ``effective_time_ns`` to ``expires_ns``.
+    """Commanded force and torque of a chaser, in body axes, from ``effective_time_ns`` to
+    ``expires_ns``.
 
-    ``tick`` is that of the odometry that it is based on. ``mode`` is its origin: the NMPC's plan, a safe command
-    (``track`` the reference without a plan, ``brake`` to rest, ``coast`` without force), the ``search`` for a target
-    that no chaser sees, the ``pull`` that verifies a latch, the ``detumble`` of a stack, or ``none``: no command, as the
-    chaser's state is unknown. ``thrusts_N``, with ``detumble`` only: thrust of every thruster, in place of an allocation by
-    the chaser; force and torque are then those of the thrusts.
-    Without a majority of leases a controller commands nothing: it lets the chaser ``wait``, or gives its lease back (``yield``).
-    ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an operator declared
-    healthy, which overrides the chaser's fault detection. ``free``: no contact or latch, so that the motion identifies
-    thruster faults. ``geometry``: newest estimate of the target's geometry, by which the chaser corrects what it knows; when it
-    has changed, and once a second. ``expected``: to a chaser that does not see a target without markers, where it will be in the next
-    tick. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
+    ``tick`` is that of the odometry that it is based on. ``mode`` is its origin: the NMPC's plan, a
+    safe command (``track`` the reference without a plan, ``brake`` to rest, ``coast`` without
+    force), the ``search`` for a target that no chaser sees, the ``pull`` that verifies a latch, the
+    ``detumble`` of a stack, or ``none``: no command, as the chaser's state is unknown.
+    ``thrusts_N``, with ``detumble`` only: thrust of every thruster, in place of an allocation by
+    the chaser; force and torque are then those of the thrusts. Without a majority of leases a
+    controller commands nothing: it lets the chaser ``wait``, or gives its lease back (``yield``).
+    ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an
+    operator declared healthy, which overrides the chaser's fault detection. ``free``: no contact or
+    latch, so that the motion identifies thruster faults. ``geometry``: newest estimate of the
+    target's geometry, by which the chaser corrects what it knows; when it has changed, and once a
+    second. ``expected``: to a chaser that does not see a target without markers, where it will be
+    in the next tick. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
     """
 
     chaser: ChaserId
     effective_time_ns: Count
     expires_ns: Count
-    mode: Literal["nmpc", "track", "brake", "coast", "pull", "search", "detumble", "none", "wait", "yield"]
+    mode: Literal[
+        "nmpc", "track", "brake", "coast", "pull", "search", "detumble", "none", "wait", "yield"
+    ]
     force_N: Vector3
     torque_N_m: Vector3
     thrusts_N: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
@@ -499,9 +533,11 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
 
 
 class Plan(Message, frozen=True, kw_only=True):
-    """The NMPC's plan for one chaser: ``stages`` + 1 states, ``stages`` inputs, ``step_s`` apart from ``sim_time_ns``.
+    """The NMPC's plan for one chaser: ``stages`` + 1 states, ``stages`` inputs, ``step_s`` apart
+    from ``sim_time_ns``.
 
-    ``positions_m`` (3 numbers a state), ``q_wxyz`` (4 a state) and ``inputs`` (force, torque: 6 a stage), flattened.
+    ``positions_m`` (3 numbers a state), ``q_wxyz`` (4 a state) and ``inputs`` (force, torque: 6 a
+    stage), flattened.
     """
 
     chaser: ChaserId
@@ -512,12 +548,15 @@ class Plan(Message, frozen=True, kw_only=True):
 
 
 class PassiveSafety(Message, frozen=True, kw_only=True):
-    """Certificate of one chaser: the coasts after a loss of all thrust at any state of its newest plan (``limits.passive_safety``).
+    """Certificate of one chaser: the coasts after a loss of all thrust at any state of its newest
+    plan (``limits.passive_safety``).
 
-    ``margin_sigmas``: smallest distance of a coast from the keep-out over its standard deviation; negative inside.
-    ``distance_m``: a lower bound on the distance from the target there, ``closest_s`` after the loss of thrust, which is
-    ``loss_s`` after the plan's beginning. ``safe``: the margin is at least ``limits.estimate_margin_sigmas``. ``enforced``: the
-    chaser aborts while it is not. ``abort_margin_sigmas``: the same margin of the best abort from here; None where none is sought.
+    ``margin_sigmas``: smallest distance of a coast from the keep-out over its standard deviation;
+    negative inside. ``distance_m``: a lower bound on the distance from the target there,
+    ``closest_s`` after the loss of thrust, which is ``loss_s`` after the plan's beginning.
+    ``safe``: the margin is at least ``limits.estimate_margin_sigmas``. ``enforced``: the chaser
+    aborts while it is not. ``abort_margin_sigmas``: the same margin of the best abort from here;
+    None where none is sought.
     """
 
     chaser: ChaserId
@@ -546,11 +585,12 @@ class SolverStatus(Message, frozen=True, kw_only=True):
 class ActuatorCommand(Message, frozen=True, kw_only=True):
     """A chaser's command to its actuators, body axes, from ``effective_time_ns`` on.
 
-    ``source``: ``command`` for the command of the controller that holds its lease, in ``term``. Without one it flies its last
-    ``plan`` to its end, comes to rest (``brake``) and then keeps clear of the target (``hold``).
-    With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, ``isolated`` the
-    thrusters whose shut-off valves are closed from ``effective_time_ns`` on, and force and torque the demand.
-    ``instance``: that of the chaser's process.
+    ``source``: ``command`` for the command of the controller that holds its lease, in ``term``.
+    Without one it flies its last ``plan`` to its end, comes to rest (``brake``) and then keeps
+    clear of the target (``hold``). With thrusters, ``pulses`` are those of the carrier periods that
+    begin while this command acts, ``isolated`` the thrusters whose shut-off valves are closed from
+    ``effective_time_ns`` on, and force and torque the demand. ``instance``: that of the chaser's
+    process.
     """
 
     chaser: ChaserId
@@ -566,11 +606,12 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
 
 
 class Lease(Message, frozen=True, kw_only=True):
-    """Command authority over chaser ``chaser``, granted by it to the controller ``holder``; empty: to none.
+    """Command authority over chaser ``chaser``, granted by it to the controller ``holder``; empty:
+    to none.
 
-    Its ticks are those from ``from_tick`` (in revision ``from_revision`` on) to ``until_tick``. The chaser executes commands
-    of that controller's ``instance`` only, and of no term before ``term``. ``tick`` and ``revision`` are those of the newest
-    ``Tick`` that the chaser has received.
+    Its ticks are those from ``from_tick`` (in revision ``from_revision`` on) to ``until_tick``. The
+    chaser executes commands of that controller's ``instance`` only, and of no term before ``term``.
+    ``tick`` and ``revision`` are those of the newest ``Tick`` that the chaser has received.
     """
 
     chaser: ChaserId
@@ -584,11 +625,13 @@ class Lease(Message, frozen=True, kw_only=True):
 
 
 class ThrusterReport(Message, frozen=True, kw_only=True):
-    """Capability of a chaser's thrusters, by its own estimate, at the time of the odometry of the same tick.
+    """Capability of a chaser's thrusters, by its own estimate, at the time of the odometry of the
+    same tick.
 
-    ``force_max_N`` and ``torque_max_N_m`` can be reached on all body axes at once. ``coming_*``: remaining impulse (body
-    axes) of commanded pulses, without the part that belongs to the next command. ``given_*``: expected impulse of the
-    thrusters since the previous report; ``given_thrusters_N_s``: of each, with identification only.
+    ``force_max_N`` and ``torque_max_N_m`` can be reached on all body axes at once. ``coming_*``:
+    remaining impulse (body axes) of commanded pulses, without the part that belongs to the next
+    command. ``given_*``: expected impulse of the thrusters since the previous report;
+    ``given_thrusters_N_s``: of each, with identification only.
     """
 
     chaser: ChaserId
@@ -613,9 +656,11 @@ class Event(Message, frozen=True, kw_only=True):
 
 
 class Health(Message, frozen=True, kw_only=True):
-    """Message counters of a process: rejected (by reason), lost (gaps in ``seq``), discarded as stale.
+    """Message counters of a process: rejected (by reason), lost (gaps in ``seq``), discarded as
+    stale.
 
-    ``blas``: the linear algebra library in use, whose kernels differ in the last bits; empty if not known.
+    ``blas``: the linear algebra library in use, whose kernels differ in the last bits; empty if not
+    known.
     """
 
     process: Text
@@ -633,13 +678,15 @@ class RecorderAck(Message, frozen=True, kw_only=True):
 class OperatorCommand(Message, frozen=True, kw_only=True):
     """An operator's command, sent as a query. ``offset_m`` (TRF): with ``goto`` only.
 
-    ``operator``: name for the log. A command is rejected after ``expires_ns``. The controller publishes it with the tick
-    at which it was accepted or rejected, so that the log holds all inputs.
+    ``operator``: name for the log. A command is rejected after ``expires_ns``. The controller
+    publishes it with the tick at which it was accepted or rejected, so that the log holds all
+    inputs.
 
-    ``calibrate`` rotates the chaser while it observes the target, which makes its camera mounting observable.
-    ``inspect`` flies once around the target, whose geometry is estimated from the images meanwhile.
-    ``detumble`` stops the tumble of the target with the thrusters of the latched chasers that it is sent to.
-    ``isolate`` closes the shut-off valve of ``thruster``; ``restore`` opens it and declares the thruster healthy.
+    ``calibrate`` rotates the chaser while it observes the target, which makes its camera mounting
+    observable. ``inspect`` flies once around the target, whose geometry is estimated from the
+    images meanwhile. ``detumble`` stops the tumble of the target with the thrusters of the latched
+    chasers that it is sent to. ``isolate`` closes the shut-off valve of ``thruster``; ``restore``
+    opens it and declares the thruster healthy.
     """
 
     command: OperatorCommandName
@@ -661,10 +708,11 @@ class CommandReply(Message, frozen=True, kw_only=True):
 
 
 class ControllerState(Message, frozen=True, kw_only=True):
-    """The commanding controller's report to standbys: the tick is complete; ``operated``: its operator commands.
+    """The commanding controller's report to standbys: the tick is complete; ``operated``: its
+    operator commands.
 
-    ``state``, at intervals: serialized controller state after the tick, for standbys that joined late; else empty.
-    ``process``, ``instance`` and ``term``: of the sender; see ``Lease``.
+    ``state``, at intervals: serialized controller state after the tick, for standbys that joined
+    late; else empty. ``process``, ``instance`` and ``term``: of the sender; see ``Lease``.
     """
 
     process: Text
@@ -677,7 +725,8 @@ class ControllerState(Message, frozen=True, kw_only=True):
 class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):
     """Make a simulated thruster fail or repair it (``healthy``), if the scenario allows it.
 
-    The chaser does not receive it. ``factor``, with ``weak`` only: remaining share of the thrust, 0 to 1.
+    The chaser does not receive it. ``factor``, with ``weak`` only: remaining share of the thrust, 0
+    to 1.
     """
 
     chaser: ChaserId
@@ -688,10 +737,11 @@ class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):
 
 
 class Presence(Message, frozen=True, kw_only=True):
-    """Heartbeat of a process. ``heard``: processes whose presence it has received, name to instance.
+    """Heartbeat of a process. ``heard``: processes whose presence it has received, name to
+    instance.
 
-    ``waiting_for``: keys of the messages that it waits for, if it has nothing else to do. ``world``: identity of the session
-    of its mission's world, empty if unknown.
+    ``waiting_for``: keys of the messages that it waits for, if it has nothing else to do.
+    ``world``: identity of the session of its mission's world, empty if unknown.
     """
 
     process: Text
@@ -718,8 +768,9 @@ class JoinRequest(Struct, frozen=True, kw_only=True):
 class JoinReply(Struct, frozen=True, kw_only=True):
     """The world's reply: the flight scenario as JSON, or the reason of a rejection.
 
-    ``faults``: JSON of what the test bed injects at this process. For the code around the flight software only.
-    ``source``: identity of the world's session, which stamps its messages; others on its keys are ignored. Empty: unknown.
+    ``faults``: JSON of what the test bed injects at this process. For the code around the flight
+    software only. ``source``: identity of the world's session, which stamps its messages; others on
+    its keys are ignored. Empty: unknown.
     """
 
     accepted: bool
@@ -784,7 +835,9 @@ VERSION: dict[type[Struct], int] = {
 
 
 def encoding_of(kind: type[Struct]) -> str:
-    """Return the Zenoh encoding of a message type, such as ``application/msgpack;chaserdock.Odometry.v1``."""
+    """Return the Zenoh encoding of a message type, such as
+    ``application/msgpack;chaserdock.Odometry.v1``.
+    """
     return _encoding(kind, VERSION[kind])
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plugins: entry points of installed packages, by name.
 
-A scenario names a plugin. Only packages installed on the machine of the process are loaded, so that a scenario received
-over the network cannot load other code.
+A scenario names a plugin. Only packages installed on the machine of the process are loaded, so that
+a scenario received over the network cannot load other code.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ class PluginError(ChaserdockError):
 
 def installed(kind: Kind) -> dict[str, EntryPoint]:
     """Return the plugins of a kind that installed packages provide, by name."""
-    return {e.name: e for e in sorted(entry_points(group=_GROUPS[kind]), key=lambda e: (e.name, e.value))}
+    return {
+        e.name: e
+        for e in sorted(entry_points(group=_GROUPS[kind]), key=lambda e: (e.name, e.value))
+    }
 
 
 def require(kind: Kind, name: str, own: tuple[str, ...]) -> None:
@@ -42,12 +45,16 @@ def require(kind: Kind, name: str, own: tuple[str, ...]) -> None:
 
 
 def load(kind: Kind, name: str, own: tuple[str, ...]) -> Callable[..., Any]:
-    """Return the factory that an installed package provides as ``name``. Raises PluginError, also if its import fails."""
+    """Return the factory that an installed package provides as ``name``. Raises PluginError, also
+    if its import fails.
+    """
     require(kind, name, own)
     try:
         factory = installed(kind)[name].load()
     except Exception as error:  # a plugin's import may raise anything
-        raise PluginError(f"{kind} {name!r} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise PluginError(
+            f"{kind} {name!r} cannot be loaded: {type(error).__name__}: {error}"
+        ) from error
     if not callable(factory):
         raise PluginError(f"{kind} {name!r} is a {type(factory).__name__}, not a function or class")
     return factory

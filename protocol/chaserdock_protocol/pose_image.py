@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose images for the perception ``statistical``: one row of pixels that are the bytes of nine numbers.
+"""Pose images for the perception ``statistical``: one row of pixels that are the bytes of nine
+numbers.
 
-They are the pose of the target in the camera and what the perception draws its errors from. World and chaser exchange
-them as ``mono8`` images, so that everything but rendering and detection stays as it is.
+They are the pose of the target in the camera and what the perception draws its errors from. World
+and chaser exchange them as ``mono8`` images, so that everything but rendering and detection stays
+as it is.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ _NUMBERS_OF = struct.Struct(f"<{_NUMBERS}d")
 
 
 def encode_pose(position_irf_m: Array, q_irf_trf_wxyz: Array, seed: tuple[int, int]) -> bytes:
-    """Return the pixels of an image (1, ``WIDTH_PX``): position in IRF, rotation TRF to IRF, two numbers below 2^32."""
+    """Return the pixels of an image (1, ``WIDTH_PX``): position in IRF, rotation TRF to IRF, two
+    numbers below 2^32.
+    """
     return np.concatenate([position_irf_m, q_irf_trf_wxyz, seed]).astype("<f8").tobytes()
 
 

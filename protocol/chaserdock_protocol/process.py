@@ -21,7 +21,9 @@ SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-"""Environment of every process: single-threaded numerics, as processes outnumber cores, and for determinism."""
+"""Environment of every process: single-threaded numerics, as processes outnumber cores, and for
+determinism.
+"""
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,11 @@ class Rotation:
 
 @dataclass(frozen=True)
 class RosLink:
-    """How a bridge reaches ROS 2: endpoints to connect to, or to ``listen`` on as the router; ``domain``: ROS_DOMAIN_ID.
+    """How a bridge reaches ROS 2: endpoints to connect to, or to ``listen`` on as the router;
+    ``domain``: ROS_DOMAIN_ID.
 
-    ``control``: take the controller's place, with wrenches of ROS 2, instead of showing the mission.
+    ``control``: take the controller's place, with wrenches of ROS 2, instead of showing the
+    mission.
     """
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -53,11 +57,12 @@ class RosLink:
 class ProcessOptions:
     """Start options of a process. Each process uses a subset.
 
-    ``patience_s``: wall-clock time (s) that a process waits for a world, and the world for another process to connect before the
-    first tick. ``rejoin_s``: wall-clock time (s) that a lock-step world waits after it lost all processes. ``by_run``: the recorder
-    creates one folder per run in ``out``. ``until``: the router ends when this process has joined and left.
-    ``standby``: the controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM.
-    ``ros``: for the bridge.
+    ``patience_s``: wall-clock time (s) that a process waits for a world, and the world for another
+    process to connect before the first tick. ``rejoin_s``: wall-clock time (s) that a lock-step
+    world waits after it lost all processes. ``by_run``: the recorder creates one folder per run in
+    ``out``. ``until``: the router ends when this process has joined and left. ``standby``: the
+    controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM. ``ros``:
+    for the bridge.
     """
 
     link: Link = field(default_factory=Link)
@@ -87,7 +92,9 @@ class ProcessOptions:
 
 
 class StopSignal:
-    """Set by SIGINT, SIGTERM and, with ``watch_parent``, the end of standard input (the parent has ended)."""
+    """Set by SIGINT, SIGTERM and, with ``watch_parent``, the end of standard input (the parent has
+    ended).
+    """
 
     def __init__(self, watch_parent: bool, signals: bool = True) -> None:
         self._event = threading.Event()

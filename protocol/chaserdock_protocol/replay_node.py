@@ -20,7 +20,9 @@ Published = tuple[Topic, int | str | None, Message]
 
 
 class ReplayNode:
-    """Stands in for a ``Node``: delivers the messages that were put in, and collects published ones."""
+    """Stands in for a ``Node``: delivers the messages that were put in, and collects published
+    ones.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -68,9 +70,10 @@ class SilentHeartbeat:
 class Stage:
     """A part of the flight software that can be replayed on a log.
 
-    ``play(scenario, recorded)`` yields the messages that today's code publishes for the recorded ``inputs``. It also
-    gets the recorded ``outputs``, before the inputs of their tick, only to detect from their ``seq`` that a process was
-    restarted. Within a tick, messages come in the order of ``inputs``.
+    ``play(scenario, recorded)`` yields the messages that today's code publishes for the recorded
+    ``inputs``. It also gets the recorded ``outputs``, before the inputs of their tick, only to
+    detect from their ``seq`` that a process was restarted. Within a tick, messages come in the
+    order of ``inputs``.
     """
 
     process: str
@@ -79,12 +82,14 @@ class Stage:
     play: Callable[[FlightScenario, Iterable[ReceivedMessage]], Iterator[Published]]
 
 
-# Upper bound on the delay of a lock-step message in a log, in ticks: the flight waits for the recorder.
+# Upper bound on the delay of a lock-step message in a log, in ticks: the flight waits for the
+# recorder.
 _MAX_DELAY_TICKS = 64
 
 
 def order_by_tick(stage: Stage, recorded: Iterable[ReceivedMessage]) -> Iterator[ReceivedMessage]:
-    """Yield the messages of a lock-step flight by tick, and within a tick in the order of the stage's topics.
+    """Yield the messages of a lock-step flight by tick, and within a tick in the order of the
+    stage's topics.
 
     A recorder receives messages of different processes in any order.
     """

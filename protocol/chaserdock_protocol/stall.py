@@ -6,12 +6,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 DEFAULT_STALL_S = 60.0
-"""Time (s) without progress after which a lock-step mission ends, and without the world after which a process ends."""
+"""Time (s) without progress after which a lock-step mission ends, and without the world after which
+a process ends.
+"""
 _LONGEST_STEP_S = 0.5
 
 
 class StallTimer:
-    """Time (s) that a loop has waited in vain. A time in which the process did not run counts as one short step."""
+    """Time (s) that a loop has waited in vain. A time in which the process did not run counts as
+    one short step.
+    """
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s, self._last_s = now_s, now_s()
@@ -22,7 +26,9 @@ class StallTimer:
         self.waited_s = 0.0
 
     def update(self) -> float:
-        """Count the time since the last call, which is to be made at least twice a second; return the waited time."""
+        """Count the time since the last call, which is to be made at least twice a second; return
+        the waited time.
+        """
         now_s = self._now_s()
         self.waited_s += min(now_s - self._last_s, _LONGEST_STEP_S)
         self._last_s = now_s

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of topics: key, type, writer, readers, rate and quality of service.
 
-Keys are relative to the run's namespace and begin with their publisher's name, so that an access rule can restrict a
-process to its own branch. Only the world writes ``truth/**``, and no flight process may read it.
+Keys are relative to the run's namespace and begin with their publisher's name, so that an access
+rule can restrict a process to its own branch. Only the world writes ``truth/**``, and no flight
+process may read it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from msgspec import Struct
 
 from . import messages as m
 
-Role = Literal["world", "chaser", "controller", "recorder", "operator", "analysis", "viewer", "bridge"]
+Role = Literal[
+    "world", "chaser", "controller", "recorder", "operator", "analysis", "viewer", "bridge"
+]
 Qos = Literal["bulk", "state", "command", "event"]
 
 CONTROLLERS = ("controller", "standby")
@@ -28,10 +31,11 @@ _TRUTH_READERS: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """A key with at most one placeholder, ``{chaser}`` or ``{process}``, and its properties. Compared by identity.
+    """A key with at most one placeholder, ``{chaser}`` or ``{process}``, and its properties.
+    Compared by identity.
 
-    ``rate``: every tick (``tick``), every tick with images (``image``), every second of simulated time (``second``) or of
-    wall time (``presence``), or on an event (``event``).
+    ``rate``: every tick (``tick``), every tick with images (``image``), every second of simulated
+    time (``second``) or of wall time (``presence``), or on an event (``event``).
     """
 
     key: str
@@ -42,7 +46,9 @@ class Topic:
     qos: Qos
 
     def key_of(self, place: int | str | None = None) -> str:
-        """Return the concrete key. ``place``: chaser number or process name for the placeholder, if the key has one."""
+        """Return the concrete key. ``place``: chaser number or process name for the placeholder, if
+        the key has one.
+        """
         return _key_of(self, place)
 
 
@@ -68,29 +74,55 @@ ODOMETRY = _topic(
     "world/chaser/{chaser}/odometry", m.Odometry, "world", {"chaser", "controller"}, "tick", "state"
 )
 DOCKING = _topic(
-    "world/chaser/{chaser}/docking", m.DockingStatus, "world", {"chaser", "controller"}, "tick", "state"
+    "world/chaser/{chaser}/docking",
+    m.DockingStatus,
+    "world",
+    {"chaser", "controller"},
+    "tick",
+    "state",
 )
 TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _TRUTH_READERS, "tick", "state")
-TRUTH_LOAD = Topic("truth/chaser/{chaser}/load", m.PortLoad, "world", _TRUTH_READERS, "tick", "state")
+TRUTH_LOAD = Topic(
+    "truth/chaser/{chaser}/load", m.PortLoad, "world", _TRUTH_READERS, "tick", "state"
+)
 TRUTH_PLUME = Topic("truth/plume/{process}", m.PlumeLoad, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_DRAWN = Topic("truth/drawn", m.DrawnTruth, "world", _TRUTH_READERS, "event", "state")
-SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state")
-ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
-THRUSTERS = _topic("chaser/{chaser}/thrusters", m.ThrusterReport, "chaser", {"controller"}, "tick", "state")
+SIGHTING = _topic(
+    "chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state"
+)
+ACTUATORS = _topic(
+    "chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command"
+)
+THRUSTERS = _topic(
+    "chaser/{chaser}/thrusters", m.ThrusterReport, "chaser", {"controller"}, "tick", "state"
+)
 LEASE = _topic("chaser/{chaser}/lease", m.Lease, "chaser", {"controller"}, "tick", "command")
 WRENCH = _topic(
-    "controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command"
+    "controller/chaser/{chaser}/wrench",
+    m.WrenchCommand,
+    "controller",
+    {"chaser"},
+    "tick",
+    "command",
 )
-REFERENCE = _topic("controller/chaser/{chaser}/reference", m.Reference, "controller", set(), "tick", "state")
+REFERENCE = _topic(
+    "controller/chaser/{chaser}/reference", m.Reference, "controller", set(), "tick", "state"
+)
 # Same priority as the command, and sent before it; it may still arrive after the command.
-PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "command")
+PLAN = _topic(
+    "controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "command"
+)
 TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "command")
 STACK = _topic("controller/stack", m.StackEstimate, "controller", set(), "second", "state")
-SAFETY = _topic("controller/chaser/{chaser}/safety", m.PassiveSafety, "controller", set(), "tick", "state")
+SAFETY = _topic(
+    "controller/chaser/{chaser}/safety", m.PassiveSafety, "controller", set(), "tick", "state"
+)
 SOLVER = _topic("controller/solver", m.SolverStatus, "controller", set(), "tick", "state")
 COMMAND = _topic("controller/command", m.CommandReply, "controller", set(), "event", "event")
-STATE = _topic("controller/state", m.ControllerState, "controller", {"controller"}, "tick", "command")
+STATE = _topic(
+    "controller/state", m.ControllerState, "controller", {"controller"}, "tick", "command"
+)
 OPERATED = _topic("controller/operated", m.OperatorCommand, "controller", set(), "event", "event")
 ACK = _topic("recorder/ack", m.RecorderAck, "recorder", {"world"}, "tick", "command")
 EVENT = _topic("{process}/event", m.Event, "any", set(), "event", "event")
@@ -138,7 +170,9 @@ NEVER_DROPPED = (END, FAREWELL)
 """Published once, at the end, and never dropped, not even in real time."""
 
 JOIN_KEY = "world/join"
-"""Query: JoinRequest -> JoinReply, with the flight scenario, for any client: the name in a request is only a claim."""
+"""Query: JoinRequest -> JoinReply, with the flight scenario, for any client: the name in a request
+is only a claim.
+"""
 SCENARIO_KEY = "truth/scenario"
 """Query: ScenarioRequest -> ScenarioReply, with the full scenario."""
 OPERATE_KEY = "controller/operate"
@@ -178,7 +212,9 @@ def _is_number(text: str) -> bool:
 
 
 def is_process_name(name: str) -> bool:
-    """Return whether ``name`` is a process or body: ``world``, ``target`` (a body), ``controller``, ``recorder``, ``chaser/3`` …"""
+    """Return whether ``name`` is a process or body: ``world``, ``target`` (a body), ``controller``,
+    ``recorder``, ``chaser/3`` …
+    """
     head, slash, number = name.partition("/")
     if head == "chaser":
         return slash == "/" and _is_number(number)

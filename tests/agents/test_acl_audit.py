@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Audit log of access-control denials: process, action, key and count of each; allowed messages are not logged."""
+"""Audit log of access-control denials: process, action, key and count of each; allowed messages are
+not logged.
+"""
 
 from __future__ import annotations
 
@@ -48,26 +50,36 @@ def test_denied_messages_are_reported_but_not_cached_decisions() -> None:
     in_advance = (
         f"{HEAD} ACL (ingress): caching permissions for `rights/world/tick` ...",
         f"{HEAD} {put}",
-        f"{OTHER_THREAD} 4fc8 {SUBJECT} is unauthorized to Query (ingress) on rights/x",  # another thread: a message, not caching
+        # another thread: a message, not caching
+        f"{OTHER_THREAD} 4fc8 {SUBJECT} is unauthorized to Query (ingress) on rights/x",
         f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Declare Liveliness Subscriber (ingress) on rights/world/tick",
     )
     assert parse(*in_advance) == ["chaser-1 may not query x"]
     used = f"{HEAD} Using cached result: 4fc8 is unauthorized to Put (ingress) on rights/world/tick"
-    assert parse(*in_advance, used) == ["chaser-1 may not query x", "chaser-1 may not publish on world/tick"]
+    assert parse(*in_advance, used) == [
+        "chaser-1 may not query x",
+        "chaser-1 may not publish on world/tick",
+    ]
 
 
 def test_allowed_and_outgoing_messages_and_other_lines_are_not_reported() -> None:
     assert parse(f"{HEAD} 4fc8 {SUBJECT} is authorized to Put (ingress) on rights/world/tick") == []
-    assert parse(f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Put (egress) on rights/world/tick") == []
+    assert (
+        parse(f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Put (egress) on rights/world/tick") == []
+    )
     assert parse(f"{HEAD} something else", "", "is unauthorized to Put (ingress) on x") == []
 
 
 def test_client_without_role_is_reported() -> None:
-    line = f"{HEAD.replace('TRACE', ' INFO')} 4fc8 did not match any configured ACL subject. Default"
+    line = (
+        f"{HEAD.replace('TRACE', ' INFO')} 4fc8 did not match any configured ACL subject. Default"
+    )
     assert parse(line) == ["a client without a role (4fc8) may not do anything on **"]
 
 
-@pytest.mark.parametrize("why", ["peer sent no certificates", "invalid peer certificate: BadSignature"])
+@pytest.mark.parametrize(
+    "why", ["peer sent no certificates", "invalid peer certificate: BadSignature"]
+)
 def test_client_without_valid_certificate_is_reported(why: str) -> None:
     line = f"2026-11-22T12:02:55Z  WARN acc-0 ThreadId(05) {TLS_TARGET}: {why}. Hint: increase the limit."
     assert parse(line) == [f"a client without a certificate of this mission may not connect: {why}"]
@@ -75,7 +87,9 @@ def test_client_without_valid_certificate_is_reported(why: str) -> None:
 
 
 def test_hostile_keys_are_reported_in_one_short_printable_line() -> None:
-    (text,) = parse(f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Put (ingress) on \x1b[31m" + "k" * 5000)
+    (text,) = parse(
+        f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Put (ingress) on \x1b[31m" + "k" * 5000
+    )
     assert text.isprintable()
     assert len(text) < 300
 
@@ -112,11 +126,13 @@ def test_log_stream_is_parsed_across_arbitrary_chunks_and_other_lines_pass_throu
         "log.close()\n"
         "print(*log.take_denials())\n"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, text=True
+    ).stdout
     assert out == "another line\nchaser-1 may not publish on real\n"
 
 
-# -- a router as a process ------------------------------------------------------------------------------------
+# -- a router as a process -------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -137,7 +153,9 @@ def router(tmp_path: Path) -> Iterator[tuple[Path, str, subprocess.Popen[bytes]]
 def test_every_unauthorized_publication_is_logged_once(
     router: tuple[Path, str, subprocess.Popen[bytes]],
 ) -> None:
-    """Each process publishes on each key: exactly the denied ones appear as events and on standard error."""
+    """Each process publishes on each key: exactly the denied ones appear as events and on standard
+    error.
+    """
     keys, endpoint, process = router
     logged: list[str] = []
 
@@ -164,7 +182,9 @@ def test_every_unauthorized_publication_is_logged_once(
         for key in dict(table):
             session.put(key, "x")
         session.close()
-    expected = Counter(f"{identity.common_name} may not publish on {key}" for identity, key in denied)
+    expected = Counter(
+        f"{identity.common_name} may not publish on {key}" for identity, key in denied
+    )
     deadline = time.monotonic() + PATIENCE_S
     while len(logged) < len(expected) and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster selection: exact where that is possible, closest where not, cheap, and within limits that change."""
+"""Thruster selection: exact where that is possible, closest where not, cheap, and within limits
+that change.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,11 @@ def test_exact_to_a_billionth_inside_the_feasible_set(body: str) -> None:
     allocator, full, limits = CASES[body]
     rng = np.random.default_rng(1)
     for k in range(2000):
-        feasible = full * rng.uniform(0.0, 1.0, len(full)) * (rng.uniform(size=len(full)) < (k % 4 + 1) / 4)
+        feasible = (
+            full
+            * rng.uniform(0.0, 1.0, len(full))
+            * (rng.uniform(size=len(full)) < (k % 4 + 1) / 4)
+        )
         wrench = allocator.matrix @ feasible
         got = allocator.allocate(wrench, full)
         assert got.exact
@@ -38,8 +44,12 @@ def test_exact_to_a_billionth_inside_the_feasible_set(body: str) -> None:
 
 @given(st.sampled_from(BODIES), st.integers(0, 2**31), st.sets(st.integers(0, 11), max_size=2))
 @quick
-def test_closest_outside_and_thrusters_that_are_out_stay_out(body: str, seed: int, out: set[int]) -> None:
-    """The optimality conditions of the closest point: no thruster that could still give more, or less, would help."""
+def test_closest_outside_and_thrusters_that_are_out_stay_out(
+    body: str, seed: int, out: set[int]
+) -> None:
+    """The optimality conditions of the closest point: no thruster that could still give more, or
+    less, would help.
+    """
     allocator, full, limits = CASES[body]
     allowed = full.copy()
     allowed[list(out)] = 0.0
@@ -80,13 +90,19 @@ def test_nothing_asked_nothing_given() -> None:
 
 def test_numbers_that_are_none_are_refused() -> None:
     allocator, full, _ = CASES["tetra12"]
-    for wrench, limits in ((np.full(6, np.nan), full), (np.zeros(6), -full), (np.zeros(6), full * np.inf)):
+    for wrench, limits in (
+        (np.full(6, np.nan), full),
+        (np.zeros(6), -full),
+        (np.zeros(6), full * np.inf),
+    ):
         with pytest.raises(ValueError, match="finite"):
             allocator.allocate(wrench, limits)
 
 
 def test_a_lost_thruster_costs_its_share_of_the_box_only() -> None:
-    """Every corner of the limits that the chaser would report to the controller is still given exactly."""
+    """Every corner of the limits that the chaser would report to the controller is still given
+    exactly.
+    """
     allocator, full, limits = CASES["slider"]
     corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T * limits
     for lost in (0, 2):

@@ -31,7 +31,9 @@ COMMAND = WrenchCommand(
 
 
 def why_not(last_tick: int = 4, now_ns: int = 300_000_000, **changes: Any) -> str | None:
-    return refusal(msgspec.structs.replace(COMMAND, **changes), 1, BODY, last_tick, now_ns, 333_000_000)
+    return refusal(
+        msgspec.structs.replace(COMMAND, **changes), 1, BODY, last_tick, now_ns, 333_000_000
+    )
 
 
 def test_a_good_command_is_flown_as_it_is() -> None:
@@ -39,7 +41,9 @@ def test_a_good_command_is_flown_as_it_is() -> None:
     assert why_not(now_ns=799_999_999) is None
     assert why_not(last_tick=-1) is None
     assert why_not(force_N=(2.0 * 1.009, 0.0, 0.0)) is None  # rounding at the limit
-    assert why_not(effective_time_ns=833_000_000) is None  # a clock that is ahead by a command's lifetime
+    assert (
+        why_not(effective_time_ns=833_000_000) is None
+    )  # a clock that is ahead by a command's lifetime
     flown = passed_on(COMMAND)
     assert flown.source == "command"
     for field in ("tick", "sim_time_ns", "chaser", "effective_time_ns", "force_N", "torque_N_m"):
@@ -104,7 +108,9 @@ def test_braking_brings_a_chaser_to_rest_within_its_limits(seed: int) -> None:
 
 def test_braking_in_body_axes_pushes_against_the_motion_in_the_world() -> None:
     quarter = rotations.exp([0.0, 0.0, math.pi / 2])
-    o = odometry(velocity_m_s=(0.0, 0.03, 0.0), q_wxyz=tuple(quarter.tolist()), omega_rad_s=(0.0, 0.0, 0.0))
+    o = odometry(
+        velocity_m_s=(0.0, 0.03, 0.0), q_wxyz=tuple(quarter.tolist()), omega_rad_s=(0.0, 0.0, 0.0)
+    )
     force = brake_command(o, BODY, 0).force_N
     assert force[0] == pytest.approx(-0.3)  # world y is the body's x; 30 kg and three seconds
     np.testing.assert_allclose(force[1:], 0.0, atol=1e-12)

@@ -89,7 +89,8 @@ def target(
 def fly_fallback(
     scenario: Scenario, last: LastCommand, x: Array, seconds: float, disturbance: Any = (0.0,) * 6
 ) -> tuple[list[FallbackState], Array]:
-    """Simulate a rigid body in fallback; return its fallback state of each step and its states (K, 13).
+    """Simulate a rigid body in fallback; return its fallback state of each step and its states (K,
+    13).
 
     ``disturbance``: constant force and torque (6,), body axes, that the chaser does not know.
     """
@@ -106,13 +107,17 @@ def fly_fallback(
         u = u + np.asarray(disturbance)
         v = x[3:6] + rotations.rotate(x[6:10], u[:3]) / body.mass_kg * STEP_S
         omega = x[10:] + u[3:] / np.asarray(body.inertia) * STEP_S
-        x = np.concatenate([x[:3] + v * STEP_S, v, rotations.integrate(x[6:10], omega, STEP_S), omega])
+        x = np.concatenate(
+            [x[:3] + v * STEP_S, v, rotations.integrate(x[6:10], omega, STEP_S), omega]
+        )
         history.append(state)
         states.append(x)
     return history, np.array(states)
 
 
-def start(position_m: Any = (-1.0, 0.0, 0.0), velocity_m_s: Any = ZERO, omega_rad_s: Any = ZERO) -> Array:
+def start(
+    position_m: Any = (-1.0, 0.0, 0.0), velocity_m_s: Any = ZERO, omega_rad_s: Any = ZERO
+) -> Array:
     return np.array([*position_m, *velocity_m_s, *Q, *omega_rad_s], dtype=float)
 
 
@@ -130,7 +135,9 @@ def test_fallback_flies_the_plan_then_brakes_then_holds(scenario: Scenario) -> N
     np.testing.assert_allclose(x[STAGES, :3], [-1.0 + 3.0 * speed, 0.0, 0.0], atol=1e-3)
     at_rest = next(k for k, a in enumerate(history) if a.mode == "hold")
     assert np.linalg.norm(x[at_rest, 3:6]) < 0.005
-    assert np.linalg.norm(x[-1, :3] - x[at_rest, :3]) < 0.01  # outside the clearance: it holds this position
+    assert (
+        np.linalg.norm(x[-1, :3] - x[at_rest, :3]) < 0.01
+    )  # outside the clearance: it holds this position
 
 
 def test_fallback_returns_to_its_plan(scenario: Scenario) -> None:
@@ -166,7 +173,10 @@ def test_fallback_brakes_relative_to_a_drifting_target(scenario: Scenario) -> No
 
 def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
     history, x = fly_fallback(
-        scenario, LastCommand(), start(velocity_m_s=(0.05, -0.02, 0.01), omega_rad_s=(0.05, 0.02, -0.1)), 60.0
+        scenario,
+        LastCommand(),
+        start(velocity_m_s=(0.05, -0.02, 0.01), omega_rad_s=(0.05, 0.02, -0.1)),
+        60.0,
     )
     assert modes_of(history) == ["brake", "hold"]
     assert history[-1].distance_m is None
@@ -175,8 +185,13 @@ def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
 
 
 def test_braking_ends_where_a_disturbance_keeps_the_chaser_from_rest(scenario: Scenario) -> None:
-    """Seed 3065 of `fault-drill`: under 0.5 mN m chasers kept rotating at 0.5 deg/s, and braked for ever."""
-    near, torque = start((-0.45, 0.0, 0.0), omega_rad_s=(0.0, 0.05, 0.0)), (0.0, 0.0, 0.0, 0.0, 0.0005, 0.0)
+    """Seed 3065 of `fault-drill`: under 0.5 mN m chasers kept rotating at 0.5 deg/s, and braked for
+    ever.
+    """
+    near, torque = (
+        start((-0.45, 0.0, 0.0), omega_rad_s=(0.0, 0.05, 0.0)),
+        (0.0, 0.0, 0.0, 0.0, 0.0005, 0.0),
+    )
     history, x = fly_fallback(scenario, LastCommand(None, target()), near, 60.0, torque)
     assert modes_of(history) == ["brake", "hold"]
     assert [a.mode for a in history].count("brake") == BRAKE_LIMIT_S / STEP_S
@@ -184,12 +199,17 @@ def test_braking_ends_where_a_disturbance_keeps_the_chaser_from_rest(scenario: S
 
 
 def test_chaser_with_thrusters_is_at_rest_within_its_shortest_pulses() -> None:
-    """Seed 285 of `docking-contact`: pulses keep the rate between 0.3 and 1.1 deg/s, and it braked for ever, within the keep-out."""
+    """Seed 285 of `docking-contact`: pulses keep the rate between 0.3 and 1.1 deg/s, and it braked
+    for ever, within the keep-out.
+    """
     limits = fallback_limits(load_scenario(ROOT / "scenarios" / "docking-contact.toml"), 0)
     assert limits.rest_m_s == pytest.approx(0.004)
     assert np.degrees(limits.rest_rad_s) == pytest.approx(1.5, abs=0.01)
     slow = start(velocity_m_s=(0.002, 0.0, 0.0), omega_rad_s=(0.0, 0.019, 0.0))
-    assert next_state(FallbackState("brake"), moving(slow, 0.0), 0, LastCommand(), limits).mode == "hold"
+    assert (
+        next_state(FallbackState("brake"), moving(slow, 0.0), 0, LastCommand(), limits).mode
+        == "hold"
+    )
 
 
 def test_fallback_modes_do_not_return(scenario: Scenario) -> None:
@@ -226,13 +246,17 @@ def test_each_step_of_a_plan_has_its_own_input() -> None:
 @pytest.mark.parametrize("status", ["none", "lost"])
 def test_unknown_target_has_no_position(status: str) -> None:
     assert extrapolate_target(target(status=status), 10**9) is None
-    np.testing.assert_allclose(extrapolate_target(target(1.0, (0.0, 0.0, 0.5)), 2 * 10**9), [1.0, 0.0, 1.0])  # type: ignore[arg-type]
+    np.testing.assert_allclose(
+        extrapolate_target(target(1.0, (0.0, 0.0, 0.5)), 2 * 10**9), [1.0, 0.0, 1.0]
+    )  # type: ignore[arg-type]
 
 
 def test_clearance_is_outside_of_keep_out_sphere_and_corridor() -> None:
     for name in ("fault-drill", "docking-contact"):
         scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
-        assert clearance_m(scenario, 0) >= scenario.limits.min_distance_target_m + CLEARANCE_MARGIN_M
+        assert (
+            clearance_m(scenario, 0) >= scenario.limits.min_distance_target_m + CLEARANCE_MARGIN_M
+        )
     docking = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
     port = docking.docking.port_of(0)
     assert port is not None
@@ -240,7 +264,7 @@ def test_clearance_is_outside_of_keep_out_sphere_and_corridor() -> None:
     assert clearance_m(docking, 0) > np.linalg.norm(entry)
 
 
-# -- the chaser process -----------------------------------------------------------------------------------------
+# -- the chaser process ----------------------------------------------------------------------------
 
 
 def deliver(chaser: ChaserProcess, topic: Any, message: Any) -> list[tuple[Any, Any]]:
@@ -296,12 +320,16 @@ def sources(published: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
     return [(m.source, m.term) for t, m in published if t is topics.ACTUATORS]
 
 
-def test_lost_controller_reports_each_fallback_mode_once(chaser: ChaserProcess, scenario: Scenario) -> None:
+def test_lost_controller_reports_each_fallback_mode_once(
+    chaser: ChaserProcess, scenario: Scenario
+) -> None:
     plan = msgspec.structs.replace(straight(0.0), sim_time_ns=scenario.timing.effective_ns(0))
     deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))
     deliver(chaser, topics.PLAN, plan)
-    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 0, "controller", 1))) == [("command", 1)]
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 0, "controller", 1))) == [
+        ("command", 1)
+    ]
     published = []
     for tick in range(1, 40):
         published += deliver(chaser, topics.TICK, tick_of(scenario, tick))
@@ -317,10 +345,18 @@ def test_lost_controller_reports_each_fallback_mode_once(chaser: ChaserProcess, 
 
 
 @pytest.mark.parametrize("topic", [topics.PLAN, topics.TARGET])
-def test_fallback_does_not_depend_on_order_of_arrival(scenario: Scenario, topic: topics.Topic) -> None:
+def test_fallback_does_not_depend_on_order_of_arrival(
+    scenario: Scenario, topic: topics.Topic
+) -> None:
     x = start()
-    x[:3] = (0.3, 0.0, 0.0)  # inside the hold position, so that the wrench depends on the target's place
-    odometry = {k: msgspec.structs.replace(at(scenario, k), position_m=vector(x[:3])) for k in range(3)}
+    x[:3] = (
+        0.3,
+        0.0,
+        0.0,
+    )  # inside the hold position, so that the wrench depends on the target's place
+    odometry = {
+        k: msgspec.structs.replace(at(scenario, k), position_m=vector(x[:3])) for k in range(3)
+    }
 
     def replies(order: tuple[str, ...]) -> list[Any]:
         made = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
@@ -349,7 +385,9 @@ def test_fallback_does_not_depend_on_order_of_arrival(scenario: Scenario, topic:
     assert replies(("wrench", "target", "plan")) == expected
 
 
-def test_plan_without_its_command_is_not_executed(chaser: ChaserProcess, scenario: Scenario) -> None:
+def test_plan_without_its_command_is_not_executed(
+    chaser: ChaserProcess, scenario: Scenario
+) -> None:
     deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))
     deliver(chaser, topics.PLAN, straight(0.0))
@@ -395,7 +433,9 @@ def test_command_far_ahead_of_the_newest_tick_is_refused(
     assert chaser.leases.until_tick == until_tick
     assert chaser.node.counts.rejected["wrench:early tick"] == 1
     deliver_tick(4)
-    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == [("command", 1)]
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == [
+        ("command", 1)
+    ]
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, latest, "controller", 1))) == [
         ("command", 1)
     ]
@@ -406,11 +446,15 @@ def test_new_leader_within_a_tick_does_not_repeat_a_command(
 ) -> None:
     deliver(chaser, topics.TICK, tick_of(scenario, 3, "controller", "standby"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 3))
-    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [("command", 1)]
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [
+        ("command", 1)
+    ]
     deliver(chaser, topics.TICK, tick_of(scenario, 3, "standby", revision=1))
     assert deliver(chaser, topics.WRENCH, command(scenario, 3, "standby", 2)) == []
     deliver(chaser, topics.TICK, tick_of(scenario, 4, "standby"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 4))
     # Once the tick names the new term, commands of the previous leader are rejected.
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == []
-    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "standby", 2))) == [("command", 2)]
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "standby", 2))) == [
+        ("command", 2)
+    ]

@@ -34,7 +34,8 @@ TICK_S = 1.0 / 15
 class Case:
     """A body whose odometry comes from integrating what its thrusters really give.
 
-    With ``mismatched`` the true mass, inertia, centre of mass and thrusts are drawn with the assumed sigmas.
+    With ``mismatched`` the true mass, inertia, centre of mass and thrusts are drawn with the
+    assumed sigmas.
     """
 
     def __init__(
@@ -60,7 +61,10 @@ class Case:
         self.centre_m = sigma.centre_of_mass_m * draw.normal(size=3) * mismatched
         self.force_N = sigma.force_N * draw.normal(size=3) * mismatched
         self.noise = noise or ImpulseNoise()
-        self.matrix, self.full = wrench_matrix(self.body.thrusters), thrusts_max(self.body.thrusters)
+        self.matrix, self.full = (
+            wrench_matrix(self.body.thrusters),
+            thrusts_max(self.body.thrusters),
+        )
         least = self.full * [t.min_on_s for t in self.body.thrusters]
         self.watch = ThrusterFaultDetector(self.matrix, self.full, least, 13 + len(self.full))
         self.rng = np.random.default_rng(seed)
@@ -87,7 +91,9 @@ class Case:
             omega_rad_s=v[3],
         )
 
-    def step(self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None) -> ThrusterFault | None:
+    def step(
+        self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None
+    ) -> ThrusterFault | None:
         wrench = self.matrix @ (given_N_s * self.thrust) / TICK_S
         wrench[:3] += self.force_N
         wrench[3:] -= np.cross(self.centre_m, wrench[:3])
@@ -96,11 +102,18 @@ class Case:
         now = self._odometry()
         residual = observed_impulse(self.last, now, self.body) - self.matrix @ asked_N_s
         spread = covariance(self.noise, self.body, self.matrix, asked_N_s, self.last, now)
-        mismatch = mismatch_signatures(PlantMismatch(), self.body, self.matrix, asked_N_s, self.last, now)
+        mismatch = mismatch_signatures(
+            PlantMismatch(), self.body, self.matrix, asked_N_s, self.last, now
+        )
         self.last = now
         everyone: Flags = np.ones(len(self.full), dtype=np.bool_)
         return self.watch.update(
-            residual, spread, asked_N_s, TICK_S, everyone if suspects is None else suspects, mismatch
+            residual,
+            spread,
+            asked_N_s,
+            TICK_S,
+            everyone if suspects is None else suspects,
+            mismatch,
         )
 
     def random(self, share: float = 0.25) -> Array:
@@ -141,7 +154,9 @@ def test_stuck_on_is_found_within_three_ticks(body: str, thruster: int) -> None:
     ("body", "thruster"), [("tetra12", j) for j in range(12)] + [("slider", j) for j in range(16)]
 )
 @pytest.mark.parametrize(("left", "kind"), [(0.0, "stuck_off"), (0.5, "weak")])
-def test_a_lost_thruster_is_found_after_some_pulses(body: str, thruster: int, left: float, kind: str) -> None:
+def test_a_lost_thruster_is_found_after_some_pulses(
+    body: str, thruster: int, left: float, kind: str
+) -> None:
     case = Case(body, thruster)
     verdict = None
     for _ in range(120):
@@ -230,7 +245,9 @@ def test_a_bump_or_a_pull_is_no_thruster(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_commands_that_reach_no_valve_are_no_failure(seed: int) -> None:
-    """Seed 192 of `docking-contact`: of twelve healthy thrusters three were isolated within two seconds."""
+    """Seed 192 of `docking-contact`: of twelve healthy thrusters three were isolated within two
+    seconds.
+    """
     case = Case("tetra12", seed, odometry_noise=True)
     for tick in range(120):
         asked = case.random()
@@ -247,7 +264,9 @@ def test_only_suspects_are_blamed() -> None:
 
 
 def test_residuals_of_white_noise_are_consistent_and_larger_ones_are_not() -> None:
-    """Over 10 ticks the energy of noise has 60 degrees of freedom: 60 on average, 115 at five sigma."""
+    """Over 10 ticks the energy of noise has 60 degrees of freedom: 60 on average, 115 at five
+    sigma.
+    """
     assert is_consistent(energy=110.0, explained=0.0, squared=0.0, ticks=10)
     assert not is_consistent(energy=120.0, explained=0.0, squared=0.0, ticks=10)
     assert is_consistent(energy=120.0, explained=10.0, squared=0.0, ticks=10)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the known geometry: information of an image on them, correction of the tracker mesh, and the messages that carry both."""
+"""Errors of the known geometry: information of an image on them, correction of the tracker mesh,
+and the messages that carry both.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def test_corrected_mesh_is_displaced_and_keeps_the_covariance() -> None:
     mesh = mesh_of(panel_sigma_rad=PANEL_RAD, scale_sigma=SCALE)
     mean, covariance = np.array([0.5, -1.0, 0.3]), np.diag([0.04, 0.09, 0.25]) + 0.01
     corrected = GeometryCorrection(mean, covariance).applied(mesh)
-    np.testing.assert_allclose(corrected.vertices_m - mesh.vertices_m, np.tensordot(mean, mesh.modes_m, 1))
+    np.testing.assert_allclose(
+        corrected.vertices_m - mesh.vertices_m, np.tensordot(mean, mesh.modes_m, 1)
+    )
     for vertex in (0, 9, 20):
         before, after = mesh.modes_m[:, vertex], corrected.modes_m[:, vertex]
         np.testing.assert_allclose(after.T @ after, before.T @ covariance @ before, atol=1e-15)
@@ -81,7 +85,9 @@ def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_
     def seen(of: TrackerMesh, number: int) -> tuple[np.ndarray, GeometryInformation]:
         pose, light = random_view(rng, 1.5, CAMERA)
         pyramid = Pyramid(scene.image(pose, light, number), CAMERA)
-        found = tracking.refine_from_prior(pyramid, of, perturbed(pose, rng, 0.005, np.deg2rad(0.7)))
+        found = tracking.refine_from_prior(
+            pyramid, of, perturbed(pose, rng, 0.005, np.deg2rad(0.7))
+        )
         assert found is not None
         return tracking.pose_error(found[0].pose, pose), found[0].geometry
 
@@ -94,7 +100,9 @@ def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_
     np.testing.assert_allclose(mean[:2], true[:2], atol=0.4)
     assert np.all(np.sqrt(np.diag(covariance)[:2]) < 0.35)
     corrected = mesh.corrected(mean, covariance)
-    assert max(float(np.linalg.norm(seen(corrected, 20 + n)[0][3:])) for n in range(2)) < np.deg2rad(0.2)
+    assert max(
+        float(np.linalg.norm(seen(corrected, 20 + n)[0][3:])) for n in range(2)
+    ) < np.deg2rad(0.2)
 
 
 def image_of(pixels: np.ndarray, tick: int) -> Image:
@@ -110,7 +118,9 @@ def test_perception_publishes_what_new_views_tell_and_tracks_on_after_a_correcti
     light = Light((-0.5, -0.4, -1.0))
     found = tracking.refine_from_prior(Pyramid(scene.image(pose, light, 0), CAMERA), mesh, pose)
     assert found is not None
-    perception._tracks = (PoseTrack(*found, age=7),)  # in place of an acquisition; the next view is a new one
+    perception._tracks = (
+        PoseTrack(*found, age=7),
+    )  # in place of an acquisition; the next view is a new one
     measured = []
     for number in range(1, 4):
         sighting = look(perception, image_of(scene.image(pose, light, number), number), None)
@@ -158,7 +168,11 @@ def test_perception_publishes_what_new_views_tell_and_tracks_on_after_a_correcti
 def test_malformed_estimate_is_refused(changes: dict[str, tuple[float, ...]], text: str) -> None:
     mesh = mesh_of(panel_sigma_rad=PANEL_RAD, scale_sigma=SCALE)
     perception = ModelPerception(CAMERA, mesh)
-    values = {"sigmas": (1.0,) * 3, "values": (0.0,) * 3, "covariance": tuple(np.eye(3).ravel().tolist())}
+    values = {
+        "sigmas": (1.0,) * 3,
+        "values": (0.0,) * 3,
+        "covariance": tuple(np.eye(3).ravel().tolist()),
+    }
     estimate = GeometryEstimate(names=("a", "b", "c"), views=1, coverage=0.1, **(values | changes))
     refused = apply_geometry(perception, estimate)
     assert refused is not None

@@ -27,7 +27,9 @@ def tick(number: int, controllers: dict[str, str] = BOTH, revision: int = 0) -> 
     return Tick(tick=number, revision=revision, images=False, chasers=(0,), controllers=controllers)
 
 
-def command(number: int, commander: str = "controller", instance: str = "c1", term: int = 1, **changes: Any):
+def command(
+    number: int, commander: str = "controller", instance: str = "c1", term: int = 1, **changes: Any
+):
     return WrenchCommand(
         tick=number,
         chaser=0,
@@ -83,7 +85,9 @@ def test_terms_of_controllers_differ_and_increase() -> None:
         ((), (), False),
     ],
 )
-def test_majority_of_live_chasers(granted: tuple[int, ...], live: tuple[int, ...], expected: bool) -> None:
+def test_majority_of_live_chasers(
+    granted: tuple[int, ...], live: tuple[int, ...], expected: bool
+) -> None:
     assert is_majority(granted, live) is expected
 
 
@@ -92,7 +96,9 @@ def test_lease_covers_the_shortest_lease_and_two_ticks() -> None:
     assert lease_ticks(2.0) == 2
 
 
-def test_controller_precedes_standby_and_keeps_the_lease_while_it_commands(grantor: LeaseGrantor) -> None:
+def test_controller_precedes_standby_and_keeps_the_lease_while_it_commands(
+    grantor: LeaseGrantor,
+) -> None:
     assert (grantor.holder, grantor.instance, grantor.term, grantor.until_tick) == (
         "controller",
         "c1",
@@ -107,7 +113,12 @@ def test_silent_holder_loses_the_lease_to_the_other_and_back(grantor: LeaseGrant
     fly(grantor, 0, 20)
     assert stated(grantor, tick(21)).holder == "controller"
     lease = stated(grantor, tick(22))
-    assert (lease.holder, lease.term, lease.from_tick, lease.until_tick) == ("standby", 2, 22, 22 + FIRST - 1)
+    assert (lease.holder, lease.term, lease.from_tick, lease.until_tick) == (
+        "standby",
+        2,
+        22,
+        22 + FIRST - 1,
+    )
     assert "stale term" in str(grantor.refusal(command(22)))
     lease = stated(grantor, tick(22 + FIRST))
     assert (lease.holder, lease.term) == ("controller", 3)
@@ -120,7 +131,9 @@ def test_lost_holder_loses_the_lease_within_the_tick(grantor: LeaseGrantor) -> N
     lease = stated(grantor, tick(5, {}, revision=2))
     assert (lease.holder, lease.until_tick) == ("", 4)
     assert "no controller holds" in str(grantor.refusal(command(5, "standby", "s1", 2)))
-    assert stated(grantor, tick(6, {"controller": "c2"})).term == 3  # started again: another instance
+    assert (
+        stated(grantor, tick(6, {"controller": "c2"})).term == 3
+    )  # started again: another instance
 
 
 def test_only_controller_keeps_its_lease_without_a_command(grantor: LeaseGrantor) -> None:
@@ -162,7 +175,9 @@ def test_executed_command_of_a_higher_term_raises_the_lease(grantor: LeaseGranto
     assert "stale" in str(grantor.refusal(command(2, term=3)))
 
 
-def test_lease_given_back_goes_to_the_other_unless_it_was_renewed_since(grantor: LeaseGrantor) -> None:
+def test_lease_given_back_goes_to_the_other_unless_it_was_renewed_since(
+    grantor: LeaseGrantor,
+) -> None:
     fly(grantor, 0, 5)
     grantor.give_back(command(4, mode="yield"))  # late
     assert stated(grantor, tick(6)).holder == "controller"
@@ -173,7 +188,9 @@ def test_lease_given_back_goes_to_the_other_unless_it_was_renewed_since(grantor:
 
 def test_repeated_expiry_doubles_the_lease() -> None:
     def hand_overs(grantor: LeaseGrantor, start: int, stalls: list[int]) -> tuple[int, int]:
-        """Command in ten ticks, then miss some, and again; return the number of changes, and the next tick."""
+        """Command in ten ticks, then miss some, and again; return the number of changes, and the
+        next tick.
+        """
         number, changes = start, 0
         for missed in stalls:
             for _ in range(10):

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damping law of a latched chaser without a controller: it takes energy, and noise at rest fires nothing."""
+"""Damping law of a latched chaser without a controller: it takes energy, and noise at rest fires
+nothing.
+"""
 
 from __future__ import annotations
 

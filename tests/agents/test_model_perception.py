@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Perception `model`: acquisition without a prior, tracking of a turning target, loss, ambiguous shapes."""
+"""Perception `model`: acquisition without a prior, tracking of a turning target, loss, ambiguous
+shapes.
+"""
 
 import itertools
 import zlib
@@ -20,7 +22,15 @@ from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_world.rendering.background import Light
-from markerless_cases import BOXES, Scene, backlit_view, mesh_of, perturbed, random_view, satellite_image
+from markerless_cases import (
+    BOXES,
+    Scene,
+    backlit_view,
+    mesh_of,
+    perturbed,
+    random_view,
+    satellite_image,
+)
 from source_tree import ROOT
 
 CAMERA = Camera.from_hfov(480, 270, np.deg2rad(60.0))
@@ -35,7 +45,9 @@ def acquisition():
 
 
 def angle_deg(solution, pose):
-    return np.rad2deg(rotations.angle_between(solution.q_irf_trf_wxyz, rotations.from_matrix(pose.rotation)))
+    return np.rad2deg(
+        rotations.angle_between(solution.q_irf_trf_wxyz, rotations.from_matrix(pose.rotation))
+    )
 
 
 def test_acquires_without_a_prior_and_accepts_no_wrong_pose(acquisition):
@@ -44,13 +56,17 @@ def test_acquires_without_a_prior_and_accepts_no_wrong_pose(acquisition):
     for number in range(3):
         pose, light = random_view(rng, rng.uniform(1.5, 3.0), CAMERA)
         alignments = acquisition.find(scene.image(pose, light, number))
-        errors = [np.rad2deg(np.linalg.norm(tracking.pose_error(a.pose, pose)[3:])) for a, _ in alignments]
+        errors = [
+            np.rad2deg(np.linalg.norm(tracking.pose_error(a.pose, pose)[3:])) for a, _ in alignments
+        ]
         assert not errors or min(errors) < 2.0
         found += bool(errors) and errors[0] < 2.0
     assert found >= 2
 
 
-@pytest.mark.parametrize("image", [SPACE, np.full((270, 480), 200, np.uint8)], ids=["space", "white"])
+@pytest.mark.parametrize(
+    "image", [SPACE, np.full((270, 480), 200, np.uint8)], ids=["space", "white"]
+)
 def test_nothing_is_acquired_without_a_target(acquisition, image):
     assert acquisition.find(image) == ()
 
@@ -70,10 +86,14 @@ def test_target_that_leaves_the_image_is_acquired():
 
 def drifting(number, pose):
     turn = rotations.to_matrix(rotations.exp(np.array([0.001, 0.002, 0.0015]) * number))
-    return PoseInCamera(pose.position + 5e-4 * number * np.array([1.0, 0.0, -2.0]), turn @ pose.rotation)
+    return PoseInCamera(
+        pose.position + 5e-4 * number * np.array([1.0, 0.0, -2.0]), turn @ pose.rotation
+    )
 
 
-def test_turning_target_is_acquired_over_images_tracked_lost_in_the_dark_and_acquired_again(acquisition):
+def test_turning_target_is_acquired_over_images_tracked_lost_in_the_dark_and_acquired_again(
+    acquisition,
+):
     scene, perception = Scene(CAMERA), ModelPerception(CAMERA, mesh_of(), acquisition)
     pose, _ = random_view(np.random.default_rng(3), 2.0, CAMERA)
     light = Light((-0.5, -0.4, -1.0))
@@ -98,7 +118,9 @@ def test_turning_target_is_acquired_over_images_tracked_lost_in_the_dark_and_acq
     assert [seen() for _ in range(3)] == [1] * 3
 
 
-def test_lost_target_is_seen_again_from_the_expected_pose_without_a_search(acquisition, monkeypatch):
+def test_lost_target_is_seen_again_from_the_expected_pose_without_a_search(
+    acquisition, monkeypatch
+):
     def search(pyramid):
         raise AssertionError("no acquisition is expected")
 
@@ -155,8 +177,11 @@ def test_symmetric_target_gives_hypotheses_of_which_one_is_right():
     boxes = (BOXES[0], Box((0.16, 1.2, 0.012), shade=0.25))
     scene, perception = Scene(CAMERA, boxes=boxes), ModelPerception(CAMERA, mesh_of(boxes))
     pose, light = random_view(np.random.default_rng(12), 2.5, CAMERA)
-    # Found in the 20th image; three hypotheses then catch up with those that waited by one image in three.
-    found = (perception.estimate(scene.image(pose, light, number)).solutions for number in range(90))
+    # Found in the 20th image; three hypotheses then catch up with those that waited by one image in
+    # three.
+    found = (
+        perception.estimate(scene.image(pose, light, number)).solutions for number in range(90)
+    )
     for solutions in itertools.islice((s for s in found if s), 2):
         assert 2 <= len(solutions) <= 4
         assert min(angle_deg(s, pose) for s in solutions) < 2.0
@@ -164,9 +189,13 @@ def test_symmetric_target_gives_hypotheses_of_which_one_is_right():
 
 
 def test_scenario_selects_it_and_other_images_are_refused():
-    perception = make_perception(load_scenario(ROOT / "scenarios/single.toml", ["perception.name=model"]))
+    perception = make_perception(
+        load_scenario(ROOT / "scenarios/single.toml", ["perception.name=model"])
+    )
     assert isinstance(perception, ModelPerception)
-    with pytest.raises(ValueError, match=r"expected a uint8 image of \(720, 1280\), got uint8 \(270, 480\)"):
+    with pytest.raises(
+        ValueError, match=r"expected a uint8 image of \(720, 1280\), got uint8 \(270, 480\)"
+    ):
         perception.estimate(SPACE)
 
 
@@ -185,7 +214,9 @@ def test_satellite_is_tracked_as_known_with_the_uncertainty_of_its_joints_and_sc
         "target.knowledge.panel_deg=1.0",
         "target.knowledge.scale_share=0.01",
     ]
-    target = load_scenario(ROOT / "scenarios/single.toml", [*changes, "perception.name=model"]).target
+    target = load_scenario(
+        ROOT / "scenarios/single.toml", [*changes, "perception.name=model"]
+    ).target
     mesh, known = tracker_mesh(target), target.known_mesh()
     assert known is not None
     assert len(mesh.triangles) == known.triangle_count
@@ -200,12 +231,15 @@ def test_satellite_is_tracked_as_known_with_the_uncertainty_of_its_joints_and_sc
         mesh.vertices_m[tip]
         - min(known.joints.values(), key=lambda j: np.linalg.norm(mesh.vertices_m[tip] - j))
     )
-    assert np.linalg.norm(turns[:, tip], axis=1).max() == pytest.approx(np.deg2rad(1.0) * arm, rel=0.02)
+    assert np.linalg.norm(turns[:, tip], axis=1).max() == pytest.approx(
+        np.deg2rad(1.0) * arm, rel=0.02
+    )
 
 
 def test_search_for_the_sun_behind_a_target_is_spread_over_images(monkeypatch):
-    """A start on the shaded side of a target, where synthetic views in directions all around are compared: 39 views of about a
-    millisecond took twice the time of an image, and were stated as a quarter of it."""
+    """A start on the shaded side of a target, where synthetic views in directions all around are
+    compared: 39 views of about a millisecond took twice the time of an image, and were stated as a
+    quarter of it."""
     wide = Camera.from_hfov(960, 540, np.deg2rad(60.0))
     mesh = TrackerMesh.of_mesh(satellite("geo_servicer"), 0.0, 0.0)
     rng = np.random.default_rng([zlib.crc32(b"backlit"), 254])
@@ -245,6 +279,8 @@ def test_backlit_target_is_tracked_while_it_turns(number):
         moved = PoseInCamera(pose.position, turn @ pose.rotation)
         near = perturbed(moved, rng, 0.003, np.deg2rad(0.3))
         expected = near.position, rotations.from_matrix(near.rotation)
-        lost.append(not perception.estimate(satellite_image(moved, light, number), expected).solutions)
+        lost.append(
+            not perception.estimate(satellite_image(moved, light, number), expected).solutions
+        )
     assert False in lost
     assert not any(lost[lost.index(False) :])

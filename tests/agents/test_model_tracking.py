@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking by shape from a prior: accuracy, consistency of the covariance, gate, background, distortion."""
+"""Tracking by shape from a prior: accuracy, consistency of the covariance, gate, background,
+distortion.
+"""
 
 import zlib
 from dataclasses import replace
@@ -43,7 +45,9 @@ def track(scene, mesh, pose, light, prior, number=0):
 
 
 def tracked_errors(scene, meshes, range_m, seed):
-    """Return errors (views, 2) in mm and deg, and the normalized squared errors of views that pass the gate."""
+    """Return errors (views, 2) in mm and deg, and the normalized squared errors of views that pass
+    the gate.
+    """
     rng = np.random.default_rng(seed)
     errors, nees = [], []
     for number, mesh in enumerate(meshes):
@@ -58,7 +62,8 @@ def tracked_errors(scene, meshes, range_m, seed):
 
 # Bounds: about twice the worst of the views.
 @pytest.mark.parametrize(
-    ("range_m", "distortion", "mm", "deg"), [(3.0, (), 8.0, 0.5), (3.0, LENS, 8.0, 0.5), (8.0, (), 80.0, 1.5)]
+    ("range_m", "distortion", "mm", "deg"),
+    [(3.0, (), 8.0, 0.5), (3.0, LENS, 8.0, 0.5), (8.0, (), 80.0, 1.5)],
 )
 def test_aligned_pose_is_accurate_and_its_covariance_consistent(range_m, distortion, mm, deg):
     scene = Scene(Camera.from_hfov(*SIZE, np.deg2rad(60.0), distortion=distortion))
@@ -75,7 +80,9 @@ def test_geometry_modes_cover_the_errors_of_a_wrong_mesh():
         for _ in range(6)
     ]
     scene = Scene(CAMERA)
-    errors, considered = tracked_errors(scene, [mesh_of(b, np.deg2rad(0.5), 0.003) for b in wrong], 3.0, 7)
+    errors, considered = tracked_errors(
+        scene, [mesh_of(b, np.deg2rad(0.5), 0.003) for b in wrong], 3.0, 7
+    )
     _, ignored = tracked_errors(scene, [mesh_of(b) for b in wrong], 3.0, 7)
     assert errors[:, 0].max() < 30.0
     assert errors[:, 1].max() < 1.0
@@ -88,7 +95,8 @@ def test_geometry_modes_cover_the_errors_of_a_wrong_mesh():
     [
         # Shadows on wrinkled foil, which the mesh does not have, around the nozzle.
         ((0.0008, 0.0745, 0.4967), (0.5002, 0.5001, -0.4998, 0.5), (-0.058, -0.662, -0.747)),
-        # A side in the shade with a radiator, on which the coarser level turns the pose away by a degree.
+        # A side in the shade with a radiator, on which the coarser level turns the pose away by a
+        # degree.
         ((-0.0004, 0.0734, 0.5025), (0.4994, 0.5003, 0.5003, -0.4999), (0.03, -0.692, 0.721)),
     ],
 )
@@ -108,7 +116,9 @@ def test_docking_port_that_fills_the_image_is_tracked(position, q, sun):
 
 @pytest.mark.parametrize("number", [85, 254])
 def test_sun_behind_a_target_is_estimated_from_its_rims(number):
-    """Views of benchmarks/markerless.py, `backlit`: 0.5 and 0.7 deg off with light from everywhere, or with a sun in front."""
+    """Views of benchmarks/markerless.py, `backlit`: 0.5 and 0.7 deg off with light from everywhere,
+    or with a sun in front.
+    """
     rng = np.random.default_rng([zlib.crc32(b"backlit"), number])
     pose, lit = backlit_view(rng, WIDE)
     image, sun = satellite_image(pose, lit, number), np.array(lit.to_sun_w)
@@ -138,10 +148,19 @@ def test_gate_rejects_a_wrong_attitude_and_images_without_the_target():
     scene = Scene(CAMERA)
     for number in range(4):
         pose, light = random_view(rng, 3.0, CAMERA)
-        found = track(scene, mesh_of(), pose, light, perturbed(pose, rng, 0.0, np.deg2rad(60.0)), number)
-        error = np.rad2deg(np.linalg.norm(tracking.pose_error(found.pose, pose)[3:])) if found else np.inf
+        found = track(
+            scene, mesh_of(), pose, light, perturbed(pose, rng, 0.0, np.deg2rad(60.0)), number
+        )
+        error = (
+            np.rad2deg(np.linalg.norm(tracking.pose_error(found.pose, pose)[3:]))
+            if found
+            else np.inf
+        )
         assert error < 2.0 or not tracking.is_valid(found)
-        for image in (np.full((270, 480), 4, np.uint8), rng.integers(0, 255, (270, 480), dtype=np.uint8)):
+        for image in (
+            np.full((270, 480), 4, np.uint8),
+            rng.integers(0, 255, (270, 480), dtype=np.uint8),
+        ):
             pyramid = Pyramid(image, CAMERA)
             levels = tracking.levels_of(pyramid, mesh_of(), pose)
             assert not tracking.is_valid(
@@ -159,7 +178,9 @@ def test_several_starts_recover_a_prior_outside_of_the_basin():
         pyramid = Pyramid(scene.image(pose, light, number), CAMERA)
         starts = [prior, *tracking.starts_around(prior)]
         found = result_of(tracking.start_steps(pyramid, mesh_of(), starts, lighting_of(light)))
-        recovered += found is not None and np.linalg.norm(tracking.pose_error(found.pose, pose)[:3]) < 5e-3
+        recovered += (
+            found is not None and np.linalg.norm(tracking.pose_error(found.pose, pose)[:3]) < 5e-3
+        )
     assert recovered == 5
 
 
@@ -193,7 +214,10 @@ def test_target_behind_the_camera_or_out_of_the_image_has_no_levels():
     pyramid = Pyramid(np.zeros((270, 480), np.uint8), CAMERA)
     pose, _ = random_view(np.random.default_rng(1), 3.0, CAMERA)
     for position in ([0.0, 0.0, -3.0], [9.0, 0.0, 3.0]):
-        assert tracking.levels_of(pyramid, mesh_of(), type(pose)(np.array(position), pose.rotation)) == ()
+        assert (
+            tracking.levels_of(pyramid, mesh_of(), type(pose)(np.array(position), pose.rotation))
+            == ()
+        )
 
 
 @pytest.mark.parametrize(
@@ -224,7 +248,9 @@ def test_backlit_target_without_an_observable_attitude_is_rejected():
     for number in range(6):
         pose, _ = random_view(rng, 3.0, CAMERA)
         light = Light((0.1, 0.2, 1.0), sun=0.65, ambient=0.1)
-        found = track(scene, mesh_of(), pose, light, perturbed(pose, rng, 0.003, np.deg2rad(0.3)), number)
+        found = track(
+            scene, mesh_of(), pose, light, perturbed(pose, rng, 0.003, np.deg2rad(0.3)), number
+        )
         if tracking.is_valid(found):
             tracked += 1
             assert np.rad2deg(np.linalg.norm(tracking.pose_error(found.pose, pose)[3:])) < 2.0
@@ -245,7 +271,8 @@ def errors_of(found, pose):
 
 
 def test_pose_is_refined_until_it_settles() -> None:
-    # The light of a coarse pose that is 4 degrees wrong left a pose that passed the gate between the start and the truth.
+    # The light of a coarse pose that is 4 degrees wrong left a pose that passed the gate between
+    # the start and the truth.
     rng = drawn(b"gate", 1934)
     pose, light = random_view(rng, rng.uniform(1.0, 3.0), WIDE)
     prior = perturbed(pose, rng, rng.uniform(0.0, 0.05), np.deg2rad(rng.uniform(0.0, 12.0)))
@@ -264,9 +291,15 @@ def test_grid_of_solar_cells_that_the_mesh_does_not_have_does_not_turn_the_pose(
     for number in (12, 39, 68):
         rng = drawn(b"exact_1m", number)
         pose, light = random_view(rng, 1.0, WIDE)
-        prior, pyramid = perturbed(pose, rng, *OFF), Pyramid(satellite_image(pose, light, number), WIDE)
+        prior, pyramid = (
+            perturbed(pose, rng, *OFF),
+            Pyramid(satellite_image(pose, light, number), WIDE),
+        )
         errors.append(
-            [errors_of(tracking.refine_from_prior(pyramid, m, prior), pose)[1] for m in (mesh, without)]
+            [
+                errors_of(tracking.refine_from_prior(pyramid, m, prior), pose)[1]
+                for m in (mesh, without)
+            ]
         )
     with_borders, as_before = np.mean(errors, axis=0)
     assert with_borders < 0.06

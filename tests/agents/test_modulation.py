@@ -25,7 +25,9 @@ class Bench:
     """A modulator of tetra12 and what its pulses give."""
 
     def __init__(self, rate_hz: int, **modulation: Any) -> None:
-        s = mission(time={"rate_hz": rate_hz, "image_hz": rate_hz}, chaser={"modulation": modulation})
+        s = mission(
+            time={"rate_hz": rate_hz, "image_hz": rate_hz}, chaser={"modulation": modulation}
+        )
         self.timing, self.layout = s.timing, s.chaser.thrusters
         self.full = thrusts_max(self.layout)
         self.least = self.full * [t.min_on_s for t in self.layout]
@@ -54,7 +56,9 @@ class Bench:
 @given(seed=st.integers(0, 2**31))
 @quick
 def test_within_any_second_one_minimum_pulse_of_what_was_asked_for(rate_hz: int, seed: int) -> None:
-    """Thrusts that stay a second each; a second begins with a carrier period, which no tick splits there."""
+    """Thrusts that stay a second each; a second begins with a carrier period, which no tick splits
+    there.
+    """
     bench, rng = Bench(rate_hz), np.random.default_rng(seed)
     thrusts = np.zeros(len(bench.full))
     for tick in range(8 * rate_hz):
@@ -71,7 +75,9 @@ def test_within_any_second_one_minimum_pulse_of_what_was_asked_for(rate_hz: int,
 @given(seed=st.integers(0, 2**31))
 @quick
 def test_nothing_is_lost_when_every_tick_asks_for_something_else(rate_hz: int, seed: int) -> None:
-    """The account bounds the difference for ever: one minimum pulse and what a period's change can be."""
+    """The account bounds the difference for ever: one minimum pulse and what a period's change can
+    be.
+    """
     bench, rng = Bench(rate_hz), np.random.default_rng(seed)
     ticks = 6 * rate_hz
     for tick in range(ticks):
@@ -80,14 +86,17 @@ def test_nothing_is_lost_when_every_tick_asks_for_something_else(rate_hz: int, s
     assert np.all(np.abs(difference) <= bench.least + 0.6 * bench.full * 0.1)
 
 
-@pytest.mark.parametrize(("rate_hz", "carrier_hz"), [(10, 10), (15, 10), (30, 10), (15, 15), (30, 15)])
+@pytest.mark.parametrize(
+    ("rate_hz", "carrier_hz"), [(10, 10), (15, 10), (30, 10), (15, 15), (30, 15)]
+)
 @given(seed=st.integers(0, 2**31))
 @quick
 def test_off_time_beyond_a_minimum_pulse_follows_a_later_demand(
     rate_hz: int, carrier_hz: int, seed: int
 ) -> None:
-    """Thrusts new every tick: given less asked, over any second, is within a minimum pulse but for what the thrusts of
-    the last period of either end have changed within it. Where a tick is a period nothing has."""
+    """Thrusts new every tick: given less asked, over any second, is within a minimum pulse but for
+    what the thrusts of the last period of either end have changed within it. Where a tick is a
+    period nothing has."""
     bench, rng = Bench(rate_hz, carrier_hz=carrier_hz), np.random.default_rng(seed)
     level = bench.full * rng.uniform(0.0, 0.7, len(bench.full))
     thrusts = [level * rng.uniform(0.8, 1.2, len(level)) for _ in range(5 * rate_hz)]
@@ -114,7 +123,9 @@ def test_off_time_beyond_a_minimum_pulse_follows_a_later_demand(
 
 @given(seed=st.integers(0, 2**31), rate_hz=st.sampled_from(RATES))
 @quick
-def test_pulses_are_whole_steps_centred_long_enough_and_one_a_period(seed: int, rate_hz: int) -> None:
+def test_pulses_are_whole_steps_centred_long_enough_and_one_a_period(
+    seed: int, rate_hz: int
+) -> None:
     bench, rng = Bench(rate_hz), np.random.default_rng(seed)
     for tick in range(2 * rate_hz):
         bench.tick(tick, bench.full * rng.uniform(0.0, 1.0, len(bench.full)))
@@ -140,7 +151,9 @@ def test_full_thrust_is_full_thrust(rate_hz: int) -> None:
 
 
 def test_too_little_waits_until_it_is_worth_a_pulse() -> None:
-    """1 % of full thrust: a minimum pulse of 10 ms every ten periods of 100 ms, the first when half of it is owed."""
+    """1 % of full thrust: a minimum pulse of 10 ms every ten periods of 100 ms, the first when half
+    of it is owed.
+    """
     bench = Bench(10)
     times = []
     for tick in range(40):
@@ -177,7 +190,9 @@ def test_a_thruster_asked_for_too_much_is_not_behind_for_ever() -> None:
     bench = Bench(10)
     for tick in range(20):
         bench.tick(tick, bench.full * 2.0)
-    widths = [sum(p.close_ns - p.open_ns for p in bench.tick(20 + k, bench.full * 0.0)) for k in range(4)]
+    widths = [
+        sum(p.close_ns - p.open_ns for p in bench.tick(20 + k, bench.full * 0.0)) for k in range(4)
+    ]
     assert widths[-1] == 0
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose from rendered images: accuracy, consistency of the covariance, and images that should give nothing."""
+"""Pose from rendered images: accuracy, consistency of the covariance, and images that should give
+nothing.
+"""
 
 import numpy as np
 import pytest
@@ -41,8 +43,14 @@ class Scene:
         generator = np.random.default_rng(seed)
         for number in range(count):
             z = generator.uniform(near_m, far_m)
-            px = generator.uniform([0.3, 0.3], [0.7, 0.7]) * (self.camera.width_px, self.camera.height_px)
-            ideal = (px - (self.camera.cx_px, self.camera.cy_px)) / (self.camera.fx_px, self.camera.fy_px)
+            px = generator.uniform([0.3, 0.3], [0.7, 0.7]) * (
+                self.camera.width_px,
+                self.camera.height_px,
+            )
+            ideal = (px - (self.camera.cx_px, self.camera.cy_px)) / (
+                self.camera.fx_px,
+                self.camera.fy_px,
+            )
             position, q = np.append(ideal, 1.0) * z, rotations.normalize(generator.normal(size=4))
             light = rotations.rotate(rotations.normalize(generator.normal(size=4)), [0.0, 0.0, 1.0])
             yield position, q, self.image(position, q, number, light)
@@ -86,13 +94,17 @@ def test_random_views(name, width, height, distortion, bounds):
     assert far.max() < bounds[1]
     assert np.median(turn) < bounds[2]
     assert turn.max() < bounds[3]
-    # Six degrees of freedom: conservative, because of the floor, but neither wild nor overconfident.
+    # Six degrees of freedom: conservative, because of the floor, but neither wild nor
+    # overconfident.
     assert 0.1 < np.mean(nees) < 7.0
 
 
 def test_corners_are_reported_where_they_are_in_the_image():
     scene = Scene("servicer", distortion=LENS)
-    position, q = np.array([0.1, -0.05, 0.9]), rotations.multiply(FACING, rotations.exp([0.3, 0.4, -0.2]))
+    position, q = (
+        np.array([0.1, -0.05, 0.9]),
+        rotations.multiply(FACING, rotations.exp([0.3, 0.4, -0.2])),
+    )
     sighting = scene.perception.estimate(scene.image(position, q))
     assert len(sighting.marker_ids) >= 8
     assert sighting.corners_px.shape == (len(sighting.marker_ids), 4, 2)
@@ -116,7 +128,9 @@ def test_fitted_sides_beat_contours_and_narrow_borders_do_not_bias_them():
         assert 0 in found.ids
         k = found.ids.tolist().index(0)
         px = found.corners_px[k : k + 1]
-        refined = corners.refine(image, scene.camera, px, 7, table.margin_share[[0]], table.outlined[[0]])
+        refined = corners.refine(
+            image, scene.camera, px, 7, table.margin_share[[0]], table.outlined[[0]]
+        )
         assert refined.good.all()
         truth = scene.camera.project(rotations.rotate(q, table.corners[0]) + position)
         outwards = truth - truth.mean(axis=0)
@@ -130,7 +144,9 @@ def test_fitted_sides_beat_contours_and_narrow_borders_do_not_bias_them():
 
 @pytest.mark.parametrize("distortion", [(), LENS])
 def test_corners_do_not_depend_on_the_place_of_a_side_between_pixels(distortion):
-    """Face-on without noise, moved by tenths of a pixel: an edge interpolated between pixels is off by up to 0.03 px."""
+    """Face-on without noise, moved by tenths of a pixel: an edge interpolated between pixels is off
+    by up to 0.03 px.
+    """
     scene = Scene("paper", 960, 540, distortion)
     table, margin = pnp.MarkerTable.of(scene.model), 0.5
     for tenths in range(0, 10, 3):
@@ -150,10 +166,15 @@ def test_corners_do_not_depend_on_the_place_of_a_side_between_pixels(distortion)
 
 @pytest.mark.parametrize("turn_rad", [0.4, 0.5])
 def test_a_bright_face_beside_a_border_does_not_move_corners(turn_rad):
-    """Beyond the border's outer edge is the brighter border of the adjacent face's marker: no fall, but a second rise."""
+    """Beyond the border's outer edge is the brighter border of the adjacent face's marker: no fall,
+    but a second rise.
+    """
     scene = Scene("paper", 960, 540)
     table = pnp.MarkerTable.of(scene.model)
-    q, position = rotations.multiply(FACING, rotations.exp([0.0, 0.0, turn_rad])), np.array([0.0, 0.0, 1.2])
+    q, position = (
+        rotations.multiply(FACING, rotations.exp([0.0, 0.0, turn_rad])),
+        np.array([0.0, 0.0, 1.2]),
+    )
     seen = [k for k in range(6) if rotations.rotate(q, table.normals[k]) @ position < -0.2]
     assert len(seen) == 2
     for side in (-1.0, 1.0):  # the sun lights one face, then the other
@@ -161,7 +182,9 @@ def test_a_bright_face_beside_a_border_does_not_move_corners(turn_rad):
         for k in seen:
             truth = scene.camera.project(rotations.rotate(q, table.corners[k]) + position)
             ends = table.outlined[[k]]
-            found = corners.refine(image, scene.camera, truth[None], 7, table.margin_share[[k]], ends)
+            found = corners.refine(
+                image, scene.camera, truth[None], 7, table.margin_share[[k]], ends
+            )
             assert found.good.all()
             assert np.abs(found.corners_px[0] - truth).max() < 0.25
 
@@ -175,7 +198,8 @@ def test_neighbours_beside_a_part_of_a_side_do_not_enlarge_far_markers():
         sighting = scene.perception.estimate(scene.image(position, q, number))
         each = [error_of(s, position, q) for s in sighting.solutions]
         squares = [
-            e @ np.linalg.solve(s.covariance, e) for e, s in zip(each, sighting.solutions, strict=True)
+            e @ np.linalg.solve(s.covariance, e)
+            for e, s in zip(each, sighting.solutions, strict=True)
         ]
         if each:
             errors.append(each[int(np.argmin(squares))])
@@ -187,7 +211,10 @@ def test_neighbours_beside_a_part_of_a_side_do_not_enlarge_far_markers():
 
 def test_a_prediction_changes_where_is_looked_but_not_what_is_found():
     scene = Scene("paper", 1280, 720)
-    position, q = np.array([0.1, 0.05, 1.0]), rotations.multiply(FACING, rotations.exp([0.2, 0.5, 0.3]))
+    position, q = (
+        np.array([0.1, 0.05, 1.0]),
+        rotations.multiply(FACING, rotations.exp([0.2, 0.5, 0.3])),
+    )
     image = scene.image(position, q)
     assert detect.region_of(scene.camera, scene.model, position, q) is not None
     plain = scene.perception.estimate(image)
@@ -206,7 +233,10 @@ def test_a_prediction_changes_where_is_looked_but_not_what_is_found():
 
 def test_estimates_repeat_bit_for_bit_and_keep_no_memory():
     scene = Scene("servicer")
-    position, q = np.array([0.0, 0.0, 1.0]), rotations.multiply(FACING, rotations.exp([0.2, 0.5, 0.3]))
+    position, q = (
+        np.array([0.0, 0.0, 1.0]),
+        rotations.multiply(FACING, rotations.exp([0.2, 0.5, 0.3])),
+    )
     image, other = scene.image(position, q), scene.image(position, FACING)
     before = image.copy()
     first = scene.perception.estimate(image)
@@ -223,7 +253,12 @@ def test_images_of_nothing_give_nothing(method):
     scene = Scene("servicer", method=method)
     noise = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     checks = (np.indices((480, 640)).sum(axis=0) // 40 % 2 * 255).astype(np.uint8)
-    for image in (np.zeros((480, 640), np.uint8), np.full((480, 640), 255, np.uint8), noise, checks):
+    for image in (
+        np.zeros((480, 640), np.uint8),
+        np.full((480, 640), 255, np.uint8),
+        noise,
+        checks,
+    ):
         sighting = scene.perception.estimate(image)
         assert sighting.solutions == ()
         assert len(sighting.marker_ids) == 0
@@ -260,7 +295,10 @@ def test_two_equal_targets_in_one_image_are_not_mixed_up():
 
 def test_a_second_copy_of_one_marker_is_thrown_out_by_the_others():
     scene = Scene("servicer", 1280, 720)
-    position, q = np.array([-0.2, 0.0, 1.0]), rotations.multiply(FACING, rotations.exp([0.0, 0.3, 0.2]))
+    position, q = (
+        np.array([-0.2, 0.0, 1.0]),
+        rotations.multiply(FACING, rotations.exp([0.0, 0.3, 0.2])),
+    )
     image = scene.image(position, q)
     marker = scene.model.markers[0]
     px = scene.camera.project(rotations.rotate(q, marker.corners_trf_m()) + position)
@@ -306,7 +344,10 @@ def test_false_ids_are_voted_out(seed, false_ones):
 def test_a_small_marker_far_away_gives_both_of_its_poses():
     camera, model = Camera.from_hfov(640, 480, HFOV), target_model("paper")
     table = pnp.MarkerTable.of(model)
-    position, q = np.array([0.0, 0.0, 3.0]), rotations.multiply(FACING, rotations.exp([0.0, 0.5, 0.0]))
+    position, q = (
+        np.array([0.0, 0.0, 3.0]),
+        rotations.multiply(FACING, rotations.exp([0.0, 0.5, 0.0])),
+    )
     px = camera.project_ideal(rotations.rotate(q, table.corners[:1]) + position)
     px += np.random.default_rng(2).normal(scale=0.05, size=px.shape)
     solutions, used = pnp.solve(camera, table, np.array([0]), px, np.ones(1))
@@ -334,7 +375,10 @@ def test_a_single_marker_at_a_grazing_angle_is_not_trusted():
     camera, model = Camera.from_hfov(1280, 720, HFOV), target_model("paper")
     table = pnp.MarkerTable.of(model)
     for angle, trusted in ((1.0, True), (1.45, False)):
-        position, q = np.array([0.0, 0.0, 1.0]), rotations.multiply(FACING, rotations.exp([0.0, angle, 0.0]))
+        position, q = (
+            np.array([0.0, 0.0, 1.0]),
+            rotations.multiply(FACING, rotations.exp([0.0, angle, 0.0])),
+        )
         px = camera.project_ideal(rotations.rotate(q, table.corners[:1]) + position)
         solutions, _ = pnp.solve(camera, table, np.array([0]), px, np.ones(1))
         assert bool(solutions) is trusted
@@ -342,11 +386,15 @@ def test_a_single_marker_at_a_grazing_angle_is_not_trusted():
 
 @pytest.mark.parametrize(("corners", "expected"), [(1, 1.0), (4, 0.5)])
 def test_covariance_matches_the_spread_of_the_solutions(corners: int, expected: float):
-    """Noise of 0.5 px, well above the floor, of markers as a whole or of every corner: the scatter of many solutions against
-    their covariance, which takes such noise as common to a marker's corners."""
+    """Noise of 0.5 px, well above the floor, of markers as a whole or of every corner: the scatter
+    of many solutions against their covariance, which takes such noise as common to a marker's
+    corners."""
     camera, model = Camera.from_hfov(640, 480, HFOV), target_model("servicer")
     table = pnp.MarkerTable.of(model)
-    position, q = np.array([0.05, 0.0, 1.2]), rotations.multiply(FACING, rotations.exp([0.1, 0.5, 0.3]))
+    position, q = (
+        np.array([0.05, 0.0, 1.2]),
+        rotations.multiply(FACING, rotations.exp([0.1, 0.5, 0.3])),
+    )
     rows = np.arange(12)
     exact = camera.project_ideal(rotations.rotate(q, table.corners[rows]) + position)
     generator = np.random.default_rng(4)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge to ROS 2, with zenoh-ros2-sdk, an independent implementation of rmw_zenoh's protocol, as the peer."""
+"""The bridge to ROS 2, with zenoh-ros2-sdk, an independent implementation of rmw_zenoh's protocol,
+as the peer.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,14 @@ import pytest
 from chaserdock_agents.chaser.lease_grantor import LeaseGrantor
 from chaserdock_agents.ros2 import conversion, process, services, wrench_control
 from chaserdock_agents.ros2.rmw_zenoh import Attachment, endpoint_token, topic_key
-from chaserdock_agents.ros2.types import GOTO, INTERFACES, SELECT_THRUSTER, TRIGGER, TYPES, type_hash
+from chaserdock_agents.ros2.types import (
+    GOTO,
+    INTERFACES,
+    SELECT_THRUSTER,
+    TRIGGER,
+    TYPES,
+    type_hash,
+)
 from chaserdock_protocol import topics
 from chaserdock_protocol.lease_holder import PATIENCE_TICKS, LeaseHolder
 from chaserdock_protocol.messages import (
@@ -40,7 +49,11 @@ from message_samples import BY_TYPE
 from msgspec.structs import replace
 from zenoh_ros2_sdk import ROS2ServiceClient, ROS2Subscriber
 from zenoh_ros2_sdk import utils as sdk
-from zenoh_ros2_sdk.discovery import get_service_names_and_types, get_topic_info, get_topic_names_and_types
+from zenoh_ros2_sdk.discovery import (
+    get_service_names_and_types,
+    get_topic_info,
+    get_topic_names_and_types,
+)
 from zenoh_ros2_sdk.session import ZenohSession
 
 DOMAIN, WAIT_S = 7, 20.0
@@ -62,7 +75,7 @@ def wait_for(holds: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-# -- keys and hashes --------------------------------------------------------------------------------------
+# -- keys and hashes -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -70,9 +83,18 @@ def wait_for(holds: Callable[[], bool]) -> None:
     [
         # As ROS 2 installations with rmw_zenoh_cpp show them.
         ("std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
-        ("sensor_msgs/msg/Image", "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"),
-        ("nav_msgs/msg/Odometry", "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"),
-        ("tf2_msgs/msg/TFMessage", "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
+        (
+            "sensor_msgs/msg/Image",
+            "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
+        ),
+        (
+            "nav_msgs/msg/Odometry",
+            "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+        ),
+        (
+            "tf2_msgs/msg/TFMessage",
+            "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+        ),
         (TRIGGER, "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"),
     ],
 )
@@ -112,12 +134,14 @@ def test_attachment_is_inverse_and_damaged_ones_are_refused() -> None:
             Attachment.unpack(damaged)
 
 
-# -- on the network ---------------------------------------------------------------------------------------
+# -- on the network --------------------------------------------------------------------------------
 
 
 @dataclass
 class Mission:
-    """A world and a controller that do nothing but reply, a bridge in a thread, and what the bridge's status was."""
+    """A world and a controller that do nothing but reply, a bridge in a thread, and what the
+    bridge's status was.
+    """
 
     world: Node
     controller: Node
@@ -152,7 +176,12 @@ def mission() -> Iterator[Mission]:
     controller = Node("controller", "controller", Link("ros", (endpoint,)))
     scenario = flight_scenario_json(load_scenario(ROOT / "scenarios" / "two-chaser-tracking.toml"))
     mission = JoinReply(
-        accepted=True, reason="", run_id="r", mode="lockstep", scenario_json=scenario, source=world.source
+        accepted=True,
+        reason="",
+        run_id="r",
+        mode="lockstep",
+        scenario_json=scenario,
+        source=world.source,
     )
     world.declare_queryable(topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(mission))
     options = ProcessOptions(
@@ -182,7 +211,8 @@ def mission() -> Iterator[Mission]:
     session = ZenohSession.get_instance("127.0.0.1", ros_port)
     wait_for(
         lambda: (
-            len(get_service_names_and_types(DOMAIN, router_port=ros_port)) >= len(list(services.services(2)))
+            len(get_service_names_and_types(DOMAIN, router_port=ros_port))
+            >= len(list(services.services(2)))
         )
     )
     yield flown
@@ -217,7 +247,13 @@ def test_peer_reads_1000_images(mission: Mission) -> None:
     time.sleep(0.5)  # until the bridge knows the subscription
     for k, pixels in enumerate(data):
         image = replace(
-            sample, chaser=1, width_px=48, height_px=32, encoding="mono8", data=pixels, sim_time_ns=k
+            sample,
+            chaser=1,
+            width_px=48,
+            height_px=32,
+            encoding="mono8",
+            data=pixels,
+            sim_time_ns=k,
         )
         mission.world.publish(topics.IMAGE, image, 1)
     wait_for(lambda: len(read) >= 1000)
@@ -294,7 +330,11 @@ def test_peer_calls_services(
 def test_number_that_is_not_finite_is_refused(mission: Mission) -> None:
     mission.commands.clear()
     reply = call(
-        mission, "/chaser_0/goto", GOTO, "float64[3] offset_m", offset_m=np.array([np.nan, 0.0, 0.0])
+        mission,
+        "/chaser_0/goto",
+        GOTO,
+        "float64[3] offset_m",
+        offset_m=np.array([np.nan, 0.0, 0.0]),
     )
     assert not reply.success
     assert "offset_m holds nan" in reply.message
@@ -303,11 +343,13 @@ def test_number_that_is_not_finite_is_refused(mission: Mission) -> None:
 
 def test_bridge_sends_nothing_else_and_reads_no_truth() -> None:
     assert not any(topic.writer == "bridge" for topic in topics.TOPICS)
-    assert not any(topics.may_read("bridge", t) for t in topics.TOPICS if t.key.startswith("truth/"))
+    assert not any(
+        topics.may_read("bridge", t) for t in topics.TOPICS if t.key.startswith("truth/")
+    )
     assert (Path(process.__file__).read_text().count(".publish(")) == 1  # to ROS 2
 
 
-# -- in place of the controller ---------------------------------------------------------------------------
+# -- in place of the controller --------------------------------------------------------------------
 
 
 def wrench(frame: str = "chaser_1", force: tuple[float, float, float] = (1.0, -2.0, 3.0)) -> Any:
@@ -324,7 +366,12 @@ def test_wrench_becomes_a_command_of_the_newest_tick() -> None:
     assert command.force_N == (1.0, -2.0, 3.0)
     assert command.torque_N_m == BY_TYPE[topics.WRENCH.kind].torque_N_m  # type: ignore[attr-defined]
     assert (command.tick, command.effective_time_ns) == (9, timing.effective_ns(9))
-    assert (command.chaser, command.term, command.commander, command.instance) == (1, 3, "controller", "i1")
+    assert (command.chaser, command.term, command.commander, command.instance) == (
+        1,
+        3,
+        "controller",
+        "i1",
+    )
 
 
 @pytest.mark.parametrize(
@@ -413,7 +460,9 @@ def test_chasers_without_a_wrench_keep_their_leases_while_one_is_valid(
     assert [grantor.holder for grantor in flight.grantors] == ["standby"] * 3
 
 
-def test_replaced_process_ends_with_status_1_without_a_farewell(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replaced_process_ends_with_status_1_without_a_farewell(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     flight = ControlledFlight(monkeypatch)
     tick = Tick(tick=1, images=False, chasers=(0, 1, 2), controllers={"controller": "another"})
     received = iter(

@@ -64,7 +64,9 @@ def test_twist_is_in_the_axes_of_the_body_and_quaternion_scalar_last() -> None:
 
 
 def test_covariance_of_the_target_is_that_of_perturbed_poses() -> None:
-    """Linear maps of the state error, found by differences of poses and twists, applied to the state's covariance."""
+    """Linear maps of the state error, found by differences of poses and twists, applied to the
+    state's covariance.
+    """
     p = random_covariance(12)
     q0 = rotations.normalize(RNG.normal(size=4))
     velocity = RNG.normal(size=3)
@@ -102,7 +104,9 @@ def test_covariance_of_odometry_is_rotated() -> None:
         "attitude_covariance_rad2",
         "omega_covariance_rad2_s2",
     )
-    message = sample(m.Odometry, **{n: tuple(b.ravel().tolist()) for n, b in zip(names, blocks, strict=True)})
+    message = sample(
+        m.Odometry, **{n: tuple(b.ravel().tolist()) for n, b in zip(names, blocks, strict=True)}
+    )
     r = rotations.to_matrix(message.q_wxyz)
     ros = conversion.odometry(message)
     pose, twist = np.reshape(ros.pose.covariance, (6, 6)), np.reshape(ros.twist.covariance, (6, 6))
@@ -161,7 +165,11 @@ def test_plan_has_the_time_of_every_pose() -> None:
     first, second = conversion.path(message).poses
     assert (first.header.stamp.sec, first.header.stamp.nanosec) == (0, 800_000_000)
     assert (second.header.stamp.sec, second.header.stamp.nanosec) == (1, 50_000_000)
-    assert (second.pose.position.x, second.pose.position.y, second.pose.position.z) == (1.0, 2.0, 3.0)
+    assert (second.pose.position.x, second.pose.position.y, second.pose.position.z) == (
+        1.0,
+        2.0,
+        3.0,
+    )
     assert second.pose.orientation.x == 1.0
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test burns: they leave the motion of a healthy chaser as it is, reach every thruster in turn, and find the idle one that
-has failed."""
+"""Test burns: they leave the motion of a healthy chaser as it is, reach every thruster in turn, and
+find the idle one that has failed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ PERIOD_S, S = 0.1, 1_000_000_000
 
 
 class Bench:
-    """The self-test of a body's thrusters without a chaser; the caller adds the information of each burn."""
+    """The self-test of a body's thrusters without a chaser; the caller adds the information of each
+    burn.
+    """
 
     def __init__(self, body: str = "tetra12", every_s: float = 10.0) -> None:
         chaser = mission(body).chaser
@@ -33,7 +35,9 @@ class Bench:
         self.self_test = ThrusterSelfTest(self.allocator, self.least, every_s, sufficient=200.0)
         self.able = np.ones(len(self.full), dtype=np.bool_)
 
-    def burn(self, now_ns: int, can: Array | None = None, asked: Array | None = None) -> Array | None:
+    def burn(
+        self, now_ns: int, can: Array | None = None, asked: Array | None = None
+    ) -> Array | None:
         can, asked = self.full if can is None else can, 0.0 * self.full if asked is None else asked
         return self.self_test.schedule(now_ns, self.able & (can > 0.0), can, asked, PERIOD_S)
 
@@ -92,7 +96,9 @@ def test_burns_are_apart_and_only_where_there_is_room() -> None:
     assert Bench(every_s=0.0).burn(0) is None
 
 
-def fired(navigation: dict[str, float] | None = None, chaser: Any = None, **command_as: Any) -> set[int]:
+def fired(
+    navigation: dict[str, float] | None = None, chaser: Any = None, **command_as: Any
+) -> set[int]:
     """Return the thrusters that open within three seconds of zero commands."""
     s = mission(chaser=chaser or {}, navigation={"grade": "exact", **(navigation or {})})
     pilot, out = ThrusterController(s, 0), set()
@@ -122,9 +128,13 @@ def test_no_tests_near_contact_or_while_held() -> None:
 
 @pytest.mark.parametrize(("test_s", "finds"), [(10.0, True), (0.0, False)])
 def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -> None:
-    """Thruster 11 of tetra12 is not used at the paper's rates: without tests its failure stays undetected."""
+    """Thruster 11 of tetra12 is not used at the paper's rates: without tests its failure stays
+    undetected.
+    """
     failure = {"chaser": 0, "thruster": 11, "at_s": 8.0, "kind": "stuck_off"}
-    scenario = mission(duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure])
+    scenario = mission(
+        duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]
+    )
     record = record_flight(scenario, measurement_model(scenario, 0))
     reports = [what for _, _, what in record.thruster_events if "limits" not in what]
     assert reports == (["thruster 11 stuck off: detected, isolated"] if finds else [])

@@ -31,7 +31,11 @@ def scenario(jpeg_quality: int = 92) -> Scenario:
             "duration_s": 10.0,
             "navigation": {"grade": "exact"},
             "target": {"model": "servicer"},
-            "camera": {"width_px": WIDTH, "height_px": HEIGHT, "effects": {"jpeg_quality": jpeg_quality}},
+            "camera": {
+                "width_px": WIDTH,
+                "height_px": HEIGHT,
+                "effects": {"jpeg_quality": jpeg_quality},
+            },
             "chasers": [{"position_m": [-1.5, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],
         },
         "test",
@@ -97,12 +101,21 @@ BAD: list[tuple[str, Image]] = [
     ("a JPEG of another size", message(jpeg(NOISE[:-8]))),
     ("a JPEG on its side", message(jpeg(NOISE.T))),
     ("a JPEG, stated as smaller", message(JPEG, height_px=HEIGHT - 1)),
-    ("a JPEG that claims to be taller than it is", message(with_stated_size(JPEG, HEIGHT + 200, WIDTH))),
+    (
+        "a JPEG that claims to be taller than it is",
+        message(with_stated_size(JPEG, HEIGHT + 200, WIDTH)),
+    ),
     ("a JPEG that claims to be huge", message(with_stated_size(JPEG, 65_500, 65_500))),
-    ("a size that is right in itself and not the camera's", message(jpeg(NOISE[:-8]), height_px=HEIGHT - 8)),
+    (
+        "a size that is right in itself and not the camera's",
+        message(jpeg(NOISE[:-8]), height_px=HEIGHT - 8),
+    ),
     ("mono8 a byte short", message(NOISE.tobytes()[:-1], "mono8")),
     ("mono8 a byte long", message(NOISE.tobytes() + b"\x00", "mono8")),
-    ("mono8 of another camera", message(NOISE.tobytes(), "mono8", width_px=HEIGHT, height_px=WIDTH)),
+    (
+        "mono8 of another camera",
+        message(NOISE.tobytes(), "mono8", width_px=HEIGHT, height_px=WIDTH),
+    ),
     ("a JPEG as mono8", message(JPEG, "mono8")),
     ("raw numbers as JPEG", message(NOISE.tobytes())),
     ("a PNG as JPEG", message(cv2.imencode(".png", NOISE)[1].tobytes())),
@@ -110,7 +123,9 @@ BAD: list[tuple[str, Image]] = [
 
 
 @pytest.mark.parametrize(("what", "image"), BAD, ids=[b[0] for b in BAD])
-def test_bad_image_is_reported_and_gives_no_solution(perception: Perception, what: str, image: Image) -> None:
+def test_bad_image_is_reported_and_gives_no_solution(
+    perception: Perception, what: str, image: Image
+) -> None:
     sighting = checked(look(perception, image, None))
     assert sighting.status == "bad_image"
     assert sighting.solutions == ()
@@ -161,7 +176,9 @@ def test_mono8_image_has_one_byte_for_each_pixel(excess: int) -> None:
 def test_images_are_decoded_row_by_row() -> None:
     np.testing.assert_array_equal(decode_image(message(NOISE.tobytes(), "mono8")), NOISE)
     smooth = cv2.GaussianBlur(NOISE, (0, 0), 8.0)
-    np.testing.assert_allclose(decode_image(message(jpeg(smooth))).astype(int), smooth.astype(int), atol=6)
+    np.testing.assert_allclose(
+        decode_image(message(jpeg(smooth))).astype(int), smooth.astype(int), atol=6
+    )
 
 
 @pytest.mark.parametrize("jpeg_quality", [0, 92])
@@ -184,7 +201,9 @@ def test_the_target_is_seen_where_it_is(perception: Perception, jpeg_quality: in
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
 
 
-def test_where_it_looked_before_changes_nothing_but_the_time_it_takes(perception: Perception) -> None:
+def test_where_it_looked_before_changes_nothing_but_the_time_it_takes(
+    perception: Perception,
+) -> None:
     image, position, attitude = view()
     blind = look(perception, image, None)
     for predicted in (
@@ -217,7 +236,9 @@ def test_a_prediction_comes_from_the_best_solution_if_there_is_one(perception: P
     assert prediction_from(None) is None
     unseen = msgspec.structs.replace(seen, solutions=(), status="nothing")
     assert prediction_from(unseen) is None
-    expected = ExpectedPose(sim_time_ns=10**9, position_m=(0.0, 0.1, 2.0), q_wxyz=(0.0, 1.0, 0.0, 0.0))
+    expected = ExpectedPose(
+        sim_time_ns=10**9, position_m=(0.0, 0.1, 2.0), q_wxyz=(0.0, 1.0, 0.0, 0.0)
+    )
     for last, position_m in ((seen, seen.solutions[0].position_m), (unseen, expected.position_m)):
         predicted = prediction_from(last, expected, 10**9)
         assert predicted is not None

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster controller of a chaser: failures, isolation, reported force limits and impulses; the controller's use of them."""
+"""Thruster controller of a chaser: failures, isolation, reported force limits and impulses; the
+controller's use of them.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ def reporting(s: Scenario) -> tuple[ThrusterController, Callable[[Odometry], Thr
 def test_reported_failure_takes_effect_immediately(kind: str) -> None:
     factor = {"factor": 0.5} if kind == "weak" else {}
     s = mission(
-        thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.1, "kind": kind, "reported": True, **factor}]
+        thruster_failure=[
+            {"chaser": 0, "thruster": 4, "at_s": 0.1, "kind": kind, "reported": True, **factor}
+        ]
     )
     thrusters, observe = reporting(s)
     np.testing.assert_allclose(limits(observe(at_rest(s, 0))), box(s))
@@ -61,7 +65,9 @@ def test_reported_failure_takes_effect_immediately(kind: str) -> None:
     scale = limits(report) / box(s)
     assert np.ptp(scale) < 1e-12
     assert 0.5 < scale[0] < 1.0 or kind == "weak"
-    assert any(f"thruster 4 {kind.replace('_', ' ')}" in what for _, what, _ in thrusters.drain_events())
+    assert any(
+        f"thruster 4 {kind.replace('_', ' ')}" in what for _, what, _ in thrusters.drain_events()
+    )
     command = thrusters.add_pulses(passed_on(wrench(s, 2, 1.0)))
     assert (4 in {p.thruster for p in command.pulses}) is False or kind == "weak"
     assert command.isolated == report.isolated
@@ -77,7 +83,9 @@ def test_operator_isolates_and_restores_thruster() -> None:
     s = mission()
     thrusters = ThrusterController(s, 0)
     thrusters.observe(at_rest(s, 0))
-    thrusters.apply_command(wrench(s, 0, isolated=(3, 200)))  # thruster 200 does not exist and is ignored
+    thrusters.apply_command(
+        wrench(s, 0, isolated=(3, 200))
+    )  # thruster 200 does not exist and is ignored
     command = thrusters.add_pulses(passed_on(wrench(s, 0, 1.5)))
     assert command.isolated == (3,)
     assert 3 not in {p.thruster for p in command.pulses}
@@ -91,7 +99,9 @@ def test_operator_isolates_and_restores_thruster() -> None:
 
 def test_operator_restores_thruster_that_the_chaser_isolated() -> None:
     s = mission(
-        thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_off", "reported": True}]
+        thruster_failure=[
+            {"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_off", "reported": True}
+        ]
     )
     thrusters, observe = reporting(s)
     assert observe(at_rest(s, 0)).isolated == (4,)
@@ -103,7 +113,9 @@ def test_operator_restores_thruster_that_the_chaser_isolated() -> None:
 
 
 def test_failure_detection_is_off_while_held() -> None:
-    """Pulses without motion are a thruster failure in free flight, but not for a chaser that is held."""
+    """Pulses without motion are a thruster failure in free flight, but not for a chaser that is
+    held.
+    """
     for free in (True, False):
         s = mission()
         thrusters = ThrusterController(s, 0)
@@ -116,7 +128,9 @@ def test_failure_detection_is_off_while_held() -> None:
 
 
 def test_contact_force_is_not_attributed_to_thrusters() -> None:
-    """A force like that of the idle thruster 3 counts as its failure in free flight, but not during contact."""
+    """A force like that of the idle thruster 3 counts as its failure in free flight, but not during
+    contact.
+    """
     for touched in (False, True):
         s = mission()
         thrusters = ThrusterController(s, 0)
@@ -142,7 +156,8 @@ def test_reported_impulse_equals_commanded_impulse() -> None:
     for tick in range(31):
         total += thrusters.observe(at_rest(s, tick), touched=True).given_impulse_N_s
         thrusters.add_pulses(passed_on(wrench(s, tick, 0.5 if tick < 15 else 0.0)))
-    # 0.5 N for 1 s; each of the two firing thrusters is quantized to half its minimum impulse bit, 15 mN s.
+    # 0.5 N for 1 s; each of the two firing thrusters is quantized to half its minimum impulse bit,
+    # 15 mN s.
     np.testing.assert_allclose(total, [0.5, 0.0, 0.0], atol=0.03)
 
 
@@ -165,7 +180,9 @@ def test_prediction_by_impulse_equals_prediction_by_wrench() -> None:
     expected = predict_state(o, history.ahead(0, 0, 50_000_000), still, s.chaser)
     by_impulse = predict_state(o, ((0.05, commanded * 0.05 / 0.05),), still, s.chaser)
     np.testing.assert_allclose(by_impulse, expected, atol=1e-12)
-    np.testing.assert_allclose(predict_state(o, ((0.05, still),), commanded, s.chaser), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        predict_state(o, ((0.05, still),), commanded, s.chaser), expected, atol=1e-12
+    )
     assert predict_state(o, (), still, s.chaser)[3] == 0.1
 
 
@@ -202,8 +219,12 @@ def test_commanded_force_respects_reported_limits() -> None:
         ),
     ],
 )
-def test_operator_gets_reply_with_reason(command: dict[str, Any], accepted: bool, reason: str) -> None:
-    answer = ThrusterCommandHandler(mission()).command(OperatorCommand(command="isolate", **command), 2.0)
+def test_operator_gets_reply_with_reason(
+    command: dict[str, Any], accepted: bool, reason: str
+) -> None:
+    answer = ThrusterCommandHandler(mission()).command(
+        OperatorCommand(command="isolate", **command), 2.0
+    )
     assert (answer.accepted, reason in answer.reason) == (accepted, True)
 
 
@@ -215,7 +236,10 @@ def test_operator_commands_reach_the_chaser_and_persist() -> None:
     assert out.wrenches[0].isolated == (2,)
     back = OperatorCommand(command="restore", chaser=0, thruster=2)
     out = flight.step(TickInputs(1, 66_666_666, {0: odometry(tick=1)}, (), (back, back)))
-    assert [r.reason for r in out.replies] == ["thruster 2 restored", "thruster 2 is already restored"]
+    assert [r.reason for r in out.replies] == [
+        "thruster 2 restored",
+        "thruster 2 is already restored",
+    ]
     assert (out.wrenches[0].isolated, out.wrenches[0].trusted) == ((), (2,))
     ideal = ThrusterCommandHandler(mission(chaser={"actuation": "ideal"}))
     assert not ideal.command(OperatorCommand(command="isolate", chaser=0, thruster=2), 0.0).accepted
@@ -227,7 +251,9 @@ def test_stuck_thruster_is_isolated_within_half_a_second(thruster: int) -> None:
     failure = {"chaser": 0, "thruster": thruster, "at_s": 8.0, "kind": "stuck_on"}
     scenario = mission(duration_s=18.0, thruster_failure=[failure])
     record = record_flight(scenario, measurement_model(scenario, 0))
-    isolated_s = [c.effective_time_ns / 1e9 - 8.0 for c in record.commands_of(0) if c.isolated == (thruster,)]
+    isolated_s = [
+        c.effective_time_ns / 1e9 - 8.0 for c in record.commands_of(0) if c.isolated == (thruster,)
+    ]
     assert 0.0 < isolated_s[0] <= 0.5
     assert not [c for c in record.commands_of(0) if c.isolated not in ((), (thruster,))]
     late = record.time_s >= 8.0
@@ -238,7 +264,9 @@ def test_stuck_thruster_is_isolated_within_half_a_second(thruster: int) -> None:
 
 def test_commanded_thrusts_replace_the_allocation_except_of_isolated_thrusters() -> None:
     s = mission(
-        thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_off", "reported": True}]
+        thruster_failure=[
+            {"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_off", "reported": True}
+        ]
     )
     thrusters, observe = reporting(s)
     observe(at_rest(s, 0))

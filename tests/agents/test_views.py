@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearance of markers by kernel equals NumPy's plain formulae bit for bit on every instruction set."""
+"""Appearance of markers by kernel equals NumPy's plain formulae bit for bit on every instruction
+set.
+"""
 
 from __future__ import annotations
 
@@ -31,12 +33,18 @@ def _level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def poses(count: int) -> list[PoseInCamera]:
-    """Some far and in the image, some at its edge, some with the camera inside the target or it behind."""
+    """Some far and in the image, some at its edge, some with the camera inside the target or it
+    behind.
+    """
     rng = np.random.default_rng(5)
     out = []
     for k in range(count):
-        position = rng.uniform([-0.5, -0.4, 0.3], [0.5, 0.4, 2.0]) if k % 4 else rng.uniform(-0.3, 0.3, 3)
-        out.append(PoseInCamera(position, rotations.to_matrix(rotations.normalize(rng.normal(size=4)))))
+        position = (
+            rng.uniform([-0.5, -0.4, 0.3], [0.5, 0.4, 2.0]) if k % 4 else rng.uniform(-0.3, 0.3, 3)
+        )
+        out.append(
+            PoseInCamera(position, rotations.to_matrix(rotations.normalize(rng.normal(size=4))))
+        )
     return out
 
 
@@ -61,7 +69,9 @@ def test_errors_of_markers_and_points_are_those_of_numpy(name: str) -> None:
         found = views.marker_errors(CAMERA, table.corners, table.normals, pixels, pose)
         np.testing.assert_array_equal(found, expected)
         infinite += int(np.isinf(expected).sum())
-        squares = views.squared_errors(CAMERA, table.corners.reshape(-1, 3), pixels.reshape(-1, 2), pose)
+        squares = views.squared_errors(
+            CAMERA, table.corners.reshape(-1, 3), pixels.reshape(-1, 2), pose
+        )
         np.testing.assert_array_equal(squares, square.ravel())
     assert 0 < infinite < 300 * len(table.ids)
 
@@ -77,7 +87,9 @@ def test_markers_as_plain_as_one_are_those_of_numpy(name: str) -> None:
         size = np.abs(px[:, (1, 2, 3, 0)] - px).max(axis=-1).min(axis=-1)
         inside = ((px > MARGIN_PX) & (px < frame)).all(axis=(1, 2))
         cosines = -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)
-        plain = inside & (size >= 0.6 * size[row]) & (cosines >= max(0.3, 0.7 * float(cosines[row])))
+        plain = (
+            inside & (size >= 0.6 * size[row]) & (cosines >= max(0.3, 0.7 * float(cosines[row])))
+        )
         plain[row] = False
         expected: tuple[int, Any] = int(plain.sum()), float(cosines[row])
         assert views.count_visible_markers(CAMERA, table.surface, row, pose, MARGIN_PX) == expected
@@ -100,7 +112,10 @@ def test_a_region_is_the_box_around_the_target_grown() -> None:
         left, top = np.maximum(np.floor(low - grow), 0).astype(int)
         right, bottom = np.minimum(np.ceil(high + grow) + 1, (640, 480)).astype(int)
         if found is None:
-            assert min(right - left, bottom - top) < 16 or (right - left) * (bottom - top) > 0.7 * 640 * 480
+            assert (
+                min(right - left, bottom - top) < 16
+                or (right - left) * (bottom - top) > 0.7 * 640 * 480
+            )
             continue
         assert found == (left, top, right, bottom)
         some += 1

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flight software cannot hold ground truth: what a FlightScenario can contain, and what the flying packages import."""
+"""Flight software cannot hold ground truth: what a FlightScenario can contain, and what the flying
+packages import.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +92,11 @@ def test_no_ground_truth_is_reachable_in_a_flight_scenario() -> None:
 
 def test_the_walk_reaches_nested_fields_and_finds_truth() -> None:
     paths = {path for path, _ in fields_of(FlightScenario)}
-    assert {"chaser.thrusters.thrust_N", "docking.ports.axis", "target.geometry.markers.side_m"} <= paths
+    assert {
+        "chaser.thrusters.thrust_N",
+        "docking.ports.axis",
+        "target.geometry.markers.side_m",
+    } <= paths
     found = truth_in(Scenario)
     forbidden = FORBIDDEN_PATHS | {
         "seed",
@@ -113,7 +119,7 @@ def test_every_field_that_is_not_shared_is_known_to_be_truth_or_bookkeeping() ->
     assert only_full - {"extends", "steady_until_s", "world"} <= FORBIDDEN_ANYWHERE
 
 
-# -- values -----------------------------------------------------------------------------------------------
+# -- values ----------------------------------------------------------------------------------------
 
 TRUTH = {
     "seed": 77,
@@ -133,7 +139,9 @@ TRUTH = {
         "earth": {"direction": [0.0, 0.0, -1.0]},
         "effects": {"gain": 2.0, "read_noise": 9.0},
     },
-    "fault": [{"kind": "drop", "process": "chaser/0", "topic": "image", "at_s": 1.0, "duration_s": 2.0}],
+    "fault": [
+        {"kind": "drop", "process": "chaser/0", "topic": "image", "at_s": 1.0, "duration_s": 2.0}
+    ],
     "success": {"docked": [0], "max_collisions": 3},
 }
 CHASER = {"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
@@ -145,7 +153,9 @@ START = {
 
 
 def scenario(chaser: dict[str, Any], **values: Any) -> Scenario:
-    return parse_scenario({"name": "mine", "duration_s": 10.0, "chasers": [chaser], **values}, "test")
+    return parse_scenario(
+        {"name": "mine", "duration_s": 10.0, "chasers": [chaser], **values}, "test"
+    )
 
 
 def test_flight_scenario_does_not_depend_on_truth() -> None:
@@ -160,13 +170,23 @@ def test_flight_scenario_keeps_its_values_and_types(name: str) -> None:
     full = load_scenario(shipped_scenario(name))
     flight = flight_scenario(full)
     assert type(flight) is FlightScenario
-    assert {type(c) for c in flight.chasers} == {type(flight).model_fields["chasers"].annotation.__args__[0]}  # type: ignore[union-attr]
+    assert {type(c) for c in flight.chasers} == {
+        type(flight).model_fields["chasers"].annotation.__args__[0]
+    }  # type: ignore[union-attr]
     assert type(flight.target) is FlightScenario.model_fields["target"].annotation
     assert type(flight.camera) is FlightScenario.model_fields["camera"].annotation
     assert flight.camera_model() == full.camera_model()
     assert flight.target_model() == full.target_model()
-    assert (flight.timing, flight.chaser, flight.docking) == (full.timing, full.chaser, full.docking)
-    assert flight_scenario_from_json(flight_scenario_json(full), "test") == flight == flight_scenario(flight)
+    assert (flight.timing, flight.chaser, flight.docking) == (
+        full.timing,
+        full.chaser,
+        full.docking,
+    )
+    assert (
+        flight_scenario_from_json(flight_scenario_json(full), "test")
+        == flight
+        == flight_scenario(flight)
+    )
 
 
 def test_flight_software_refuses_a_full_scenario() -> None:
@@ -177,11 +197,13 @@ def test_flight_software_refuses_a_full_scenario() -> None:
 def test_error_in_a_flight_scenario_names_the_path() -> None:
     values = json.loads(flight_scenario_json(scenario(CHASER)))
     values["limits"]["min_distance_target_m"] = 5.0
-    with pytest.raises(ScenarioError, match=r"test: .*chasers.0.position_m: 1 m from the target, nearer"):
+    with pytest.raises(
+        ScenarioError, match=r"test: .*chasers.0.position_m: 1 m from the target, nearer"
+    ):
         flight_scenario_from_json(json.dumps(values), "test")
 
 
-# -- imports ----------------------------------------------------------------------------------------------
+# -- imports ---------------------------------------------------------------------------------------
 
 FULL_SCENARIO = {
     "Scenario", "load_scenario", "parse_scenario", "scenario_from_json", "mission", "loading", "Target", "Chaser",
@@ -197,7 +219,9 @@ RECORDER = Path("recorder/process.py")
 def test_flying_packages_do_not_load_the_full_scenario(path: Path) -> None:
     of_protocol = {name for name in imported(path) if name.startswith("chaserdock_protocol.")}
     found = {name.rpartition(".")[2] for name in of_protocol} & FULL_SCENARIO
-    used = {node.attr for node in ast.walk(tree_of(path)) if isinstance(node, ast.Attribute)} & FULL_SCENARIO
+    used = {
+        node.attr for node in ast.walk(tree_of(path)) if isinstance(node, ast.Attribute)
+    } & FULL_SCENARIO
     # The recorder stores the full scenario in the log, as text.
     recorder = path.parts[-2:] == RECORDER.parts
     assert found | used == ({"request_scenario"} if recorder else set())

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What no module may do with what comes from outside, and that nothing that waits is without a bound."""
+"""What no module may do with what comes from outside, and that nothing that waits is without a
+bound.
+"""
 
 from __future__ import annotations
 
@@ -42,14 +44,22 @@ def test_nothing_is_unpickled_or_evaluated(path: Path) -> None:
 
 
 def named(node: ast.AST) -> str:
-    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+    return (
+        node.attr
+        if isinstance(node, ast.Attribute)
+        else node.id
+        if isinstance(node, ast.Name)
+        else ""
+    )
 
 
 def unbounded_queues(path: Path) -> list[int]:
     """Lines that make a queue without a ``maxsize``, or hand on what makes one."""
     nodes = list(ast.walk(tree_of(path)))
     bounded = {
-        n.func for n in nodes if isinstance(n, ast.Call) and any(k.arg == "maxsize" for k in n.keywords)
+        n.func
+        for n in nodes
+        if isinstance(n, ast.Call) and any(k.arg == "maxsize" for k in n.keywords)
     }
     types = {m for n in nodes if isinstance(n, ast.Subscript) for m in ast.walk(n)}
     return [n.lineno for n in nodes if named(n) in QUEUES and n not in bounded | types]  # type: ignore[attr-defined]
@@ -64,8 +74,12 @@ def unbounded(kind: object, path: str) -> list[str]:
     """Places of a type that could hold any number of things."""
     if get_origin(kind) is Annotated:
         inner, *metas = get_args(kind)
-        bounded = any(isinstance(meta, msgspec.Meta) and meta.max_length is not None for meta in metas)
-        whole = any(isinstance(meta, msgspec.Meta) and None not in (meta.ge, meta.le) for meta in metas)
+        bounded = any(
+            isinstance(meta, msgspec.Meta) and meta.max_length is not None for meta in metas
+        )
+        whole = any(
+            isinstance(meta, msgspec.Meta) and None not in (meta.ge, meta.le) for meta in metas
+        )
         if inner in (str, bytes):
             return [] if bounded else [path]
         if inner is int:
@@ -81,7 +95,9 @@ def unbounded(kind: object, path: str) -> list[str]:
     if get_origin(kind) in (tuple,) or hasattr(kind, "__args__"):
         if all(isinstance(part, str) for part in get_args(kind)):  # Literal
             return []
-        return [p for part in get_args(kind) if part is not type(None) for p in unbounded(part, path)]
+        return [
+            p for part in get_args(kind) if part is not type(None) for p in unbounded(part, path)
+        ]
     return []
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Architecture rules: which packages import which, and that flight software cannot reach ground truth."""
+"""Architecture rules: which packages import which, and that flight software cannot reach ground
+truth.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ def test_there_are_no_import_cycles() -> None:
 )
 def test_one_module_imports_the_library(library: str, homes: set[str]) -> None:
     users = {
-        module_name(p) for _, p in MODULES if any(n.split(".")[0].startswith(library) for n in imported(p))
+        module_name(p)
+        for _, p in MODULES
+        if any(n.split(".")[0].startswith(library) for n in imported(p))
     }
     assert users == homes
 
@@ -92,7 +96,7 @@ def test_transport_depends_on_neither_faults_nor_scenario() -> None:
     assert "chaserdock_protocol.topics" in reached
 
 
-# -- the truth --------------------------------------------------------------------------------------------
+# -- the truth -------------------------------------------------------------------------------------
 
 TRUTHS = {name for name in vars(topics) if name.startswith("TRUTH")}
 
@@ -169,10 +173,29 @@ def test_flight_software_can_subscribe_its_inputs(node: Node) -> None:
 
 
 def test_processes_start_without_packages_that_only_some_flights_need() -> None:
-    """Each import here is one of every process of every flight: SciPy alone was 40 % of the start of the world."""
-    processes = ("world.process", "agents.chaser.process", "agents.recorder.process", "controller.process")
-    slow = ("scipy", "casadi", "matplotlib", "pyarrow", "pandas", "trimesh", "av", "viser", "cryptography")
+    """Each import here is one of every process of every flight: SciPy alone was 40 % of the start
+    of the world.
+    """
+    processes = (
+        "world.process",
+        "agents.chaser.process",
+        "agents.recorder.process",
+        "controller.process",
+    )
+    slow = (
+        "scipy",
+        "casadi",
+        "matplotlib",
+        "pyarrow",
+        "pandas",
+        "trimesh",
+        "av",
+        "viser",
+        "cryptography",
+    )
     program = f"import sys, {', '.join(f'chaserdock_{p}' for p in processes)}, chaserdock.launch.launcher\n"
     program += f"print([name for name in {slow} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "[]"

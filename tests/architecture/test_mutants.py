@@ -43,6 +43,8 @@ def test_a_change_is_applied_to_the_copy_only(tmp_path: Path) -> None:
     (tmp_path / change.file).parent.mkdir(parents=True)
     (tmp_path / change.file).write_text(source, encoding="utf-8")
     apply([change], tmp_path)
-    assert (tmp_path / change.file).read_text(encoding="utf-8") == source.replace(change.old, change.new)
+    assert (tmp_path / change.file).read_text(encoding="utf-8") == source.replace(
+        change.old, change.new
+    )
     assert (ROOT / change.file).read_text(encoding="utf-8") == source
     assert MUTANTS.is_relative_to(ROOT)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled kernels: the same bits from every instruction set, and one clear error where they cannot be had."""
+"""The compiled kernels: the same bits from every instruction set, and one clear error where they
+cannot be had.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def has(number: int) -> bool:
 
 
 @pytest.mark.parametrize("number", LEVELS)
-def test_every_instruction_set_gives_the_same_bits(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_instruction_set_gives_the_same_bits(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two chasers swapping head-on, one in a corridor: interior point, tilted planes, cone."""
     if not has(number):
         pytest.skip(f"this processor has no copy {number}")
@@ -87,12 +91,16 @@ def test_every_instruction_set_sees_the_same_bits(
     for quad, share in zip(quads, margin, strict=True):
         middle = quad.mean(axis=0)
         for scale, level in ((1.0 + 2.0 * share, 200), (1.0, 10)):
-            outline = np.rint(16.0 * camera.distort(middle + scale * (quad - middle))).astype(np.int32)
+            outline = np.rint(16.0 * camera.distort(middle + scale * (quad - middle))).astype(
+                np.int32
+            )
             cv2.fillConvexPoly(image, outline, level, cv2.LINE_AA, 4)
     image = np.asarray(cv2.GaussianBlur(image, (7, 7), 0.7), dtype=np.uint8)
     points = rng.uniform(-0.3, 0.3, (8, 3))
     truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
-    pixels = camera.project_ideal(points @ truth.rotation.T + truth.position) + rng.normal(0.0, 0.1, (8, 2))
+    pixels = camera.project_ideal(points @ truth.rotation.T + truth.position) + rng.normal(
+        0.0, 0.1, (8, 2)
+    )
     start = pose_at([0.0, 0.0, 1.2], [0.0, -1.6, 0.5])
 
     def seen() -> list[NDArray[Any]]:
@@ -112,7 +120,9 @@ def test_every_instruction_set_sees_the_same_bits(
 
 
 @pytest.mark.parametrize("number", LEVELS)
-def test_every_instruction_set_draws_the_same_image(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_instruction_set_draws_the_same_image(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if not has(number):
         pytest.skip(f"this processor has no copy {number}")
     renderer = Renderer(Camera.from_hfov(320, 240, 1.0), target_model("servicer"))
@@ -132,7 +142,9 @@ def test_every_instruction_set_draws_the_same_image(number: int, monkeypatch: py
 
 
 @pytest.mark.parametrize("number", LEVELS)
-def test_every_instruction_set_estimates_the_same_bits(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_instruction_set_estimates_the_same_bits(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Three chasers, as the covariance then ends within a vector."""
     if not has(number):
         pytest.skip(f"this processor has no copy {number}")
@@ -150,21 +162,29 @@ def test_every_instruction_set_estimates_the_same_bits(number: int, monkeypatch:
 
     expected = estimated()
     own = joint_native.function
-    monkeypatch.setattr(joint_kernels, "function", lambda name, result=None: own(name, result, number))
+    monkeypatch.setattr(
+        joint_kernels, "function", lambda name, result=None: own(name, result, number)
+    )
     for ours, theirs in zip(estimated(), expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("number", LEVELS)
-def test_every_instruction_set_certifies_the_same_bits(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_instruction_set_certifies_the_same_bits(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if not has(number):
         pytest.skip(f"this processor has no copy {number}")
     coast, rng = passive_safety.CoastModel(1.13e-3, 11000.0), np.random.default_rng(5)
-    states = np.concatenate([rng.normal(0.0, 50.0, (31, 3)), rng.normal(0.0, 0.05, (31, 3))], axis=1)
+    states = np.concatenate(
+        [rng.normal(0.0, 50.0, (31, 3)), rng.normal(0.0, 0.05, (31, 3))], axis=1
+    )
     spread = rng.normal(size=(6, 6)) * np.array([0.05] * 3 + [1e-4] * 3)[:, None]
     expected = coast.certify(states, spread @ spread.T, 0.75)
     own = native.function
-    monkeypatch.setattr(passive_safety, "function", lambda name, result=None: own(name, result, number))
+    monkeypatch.setattr(
+        passive_safety, "function", lambda name, result=None: own(name, result, number)
+    )
     assert coast.certify(states, spread @ spread.T, 0.75) == expected
 
 
@@ -173,11 +193,15 @@ def test_corners_that_lie_nowhere_are_not_good(corner: float) -> None:
     image = np.full((48, 64), 200, dtype=np.uint8)
     quads = np.array([[[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]]])
     quads[0, 2, 0] = corner
-    found = corners.refine(image, Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]), np.array([True]))
+    found = corners.refine(
+        image, Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]), np.array([True])
+    )
     assert not found.good.any()
     np.testing.assert_array_equal(found.corners_px, quads)
     with pytest.raises(ValueError, match="has no corners"):
-        corners.refine(image[:1], Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]), np.array([True]))
+        corners.refine(
+            image[:1], Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]), np.array([True])
+        )
 
 
 def pose_at(position: list[float], rotation_vector: list[float]) -> refine.PoseInCamera:
@@ -186,7 +210,9 @@ def pose_at(position: list[float], rotation_vector: list[float]) -> refine.PoseI
 
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 0.3, 2.0])
 def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
-    """The gradient by OpenCV's projection, which the kernel does not use; a start off by ``turn`` rad comes back."""
+    """The gradient by OpenCV's projection, which the kernel does not use; a start off by ``turn``
+    rad comes back.
+    """
     rng = np.random.default_rng(5)
     matrix = np.array([[600.0, 0.0, 320.0], [0.0, 590.0, 240.0], [0.0, 0.0, 1.0]])
     points = rng.uniform(-0.3, 0.3, (8, 3))
@@ -194,7 +220,9 @@ def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
     at = points @ truth.rotation.T + truth.position
     pixels = at[:, :2] / at[:, 2:] * [600.0, 590.0] + [320.0, 240.0] + rng.normal(0.0, 0.2, (8, 2))
     weight = np.repeat(rng.uniform(0.5, 1.0, 8), 2)
-    start = refine.PoseInCamera(truth.position, refine.rotation_matrix([0.0, turn, 0.0]) @ truth.rotation)
+    start = refine.PoseInCamera(
+        truth.position, refine.rotation_matrix([0.0, turn, 0.0]) @ truth.rotation
+    )
     pose = refine.refine(matrix, points, pixels, weight, start)
     assert pose is not None
     np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-14)
@@ -204,7 +232,9 @@ def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
     step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
     assert np.abs(step).max() < 1e-5
     assert (
-        refine.refine(matrix, points - [0.0, 0.0, 50.0], pixels, weight, pose_at([0, 0, 1], [0, 0, 0]))
+        refine.refine(
+            matrix, points - [0.0, 0.0, 50.0], pixels, weight, pose_at([0, 0, 1], [0, 0, 0])
+        )
         is None
     )
 
@@ -212,7 +242,9 @@ def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
 def copied(folder: Path) -> KernelLibrary:
     """A copy of the NMPC's sources and library, to be tampered with."""
     target = folder / "native"
-    shutil.copytree(nmpc_native.LIBRARY.path.parent, target, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        nmpc_native.LIBRARY.path.parent, target, ignore=shutil.ignore_patterns("__pycache__")
+    )
     return KernelLibrary(str(target / "__init__.py"))
 
 
@@ -243,7 +275,9 @@ def test_a_library_needs_no_other(folder: str) -> None:
 
 
 def test_rows_between_chasers_far_apart_are_left_out_only_where_none_is_reached() -> None:
-    """The quick test for a pair finds what the whole one finds: with a reach just above and just below the room."""
+    """The quick test for a pair finds what the whole one finds: with a reach just above and just
+    below the room.
+    """
     states = np.array([at_rest(np.array([-2.0, 2.0, 0.0])), at_rest(np.array([2.0, 2.0, 0.0]))])
     problem = fixed_problem(states, states[:, :3], d_target=0.0)
     frame = make_solver("rti", PARAMS, 2)._frame  # pyright: ignore[reportAttributeAccessIssue]
@@ -266,7 +300,9 @@ def test_working_memory_is_enough() -> None:
     corridors = np.tile([1.0, 0, 0, 0.5, 0.0], (n, d + 1, 1))
     boxes = np.tile(box_table((Box((0.2, 0.2, 0.2)), Box((0.1, 0.1, 0.1)))), (d + 1, 1, 1))
     shapes = {"boxes": boxes, "box_clearance_m": np.full(n, 0.3)}
-    problem = NmpcInput(**{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors, **shapes})
+    problem = NmpcInput(
+        **{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors, **shapes}
+    )
     solver = make_solver("rti", params, n)
     solver._workspace = guarded  # pyright: ignore[reportAttributeAccessIssue]
     plan = solver.solve(problem, 0.0)
@@ -296,9 +332,15 @@ def test_solvers_in_two_threads_plan_as_in_one() -> None:
 
 @pytest.mark.parametrize("folder", NATIVE_FOLDERS)
 def test_kernels_have_no_static_memory(folder: str) -> None:
-    """Static variables would be shared by threads; static constants and functions are not variables."""
+    """Static variables would be shared by threads; static constants and functions are not
+    variables.
+    """
     sources = [path for pattern in ("*.c", "*.h") for path in sorted((ROOT / folder).glob(pattern))]
     assert sources
     for path in sources:
-        for declaration in re.findall(r"^[^/\n]*\bstatic\b[^;{=(]*[;{=(]", path.read_text(), re.MULTILINE):
-            assert declaration.endswith("(") or " const " in declaration, f"{path.name}: {declaration}"
+        for declaration in re.findall(
+            r"^[^/\n]*\bstatic\b[^;{=(]*[;{=(]", path.read_text(), re.MULTILINE
+        ):
+            assert declaration.endswith("(") or " const " in declaration, (
+                f"{path.name}: {declaration}"
+            )

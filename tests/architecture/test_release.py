@@ -84,7 +84,9 @@ def test_a_release_has_the_version_of_the_citation() -> None:
 
 def test_every_target_is_built_and_every_kernel_expected() -> None:
     assert set(release.TARGETS) == set(TARGETS)
-    assert {f"{folder.partition('/')[2]}/kernels.so" for folder in NATIVE_FOLDERS} == release.KERNELS
+    assert {
+        f"{folder.partition('/')[2]}/kernels.so" for folder in NATIVE_FOLDERS
+    } == release.KERNELS
 
 
 def macho(
@@ -112,7 +114,10 @@ def wheel(folder: Path, platform: str, content: bytes, without: str = "") -> Pat
 
 
 def test_a_wheel_that_can_be_published_passes(tmp_path: Path) -> None:
-    assert release.check_wheel(wheel(tmp_path, "macosx_11_0_arm64", macho()), "1.0") == "macosx_11_0_arm64"
+    assert (
+        release.check_wheel(wheel(tmp_path, "macosx_11_0_arm64", macho()), "1.0")
+        == "macosx_11_0_arm64"
+    )
     linux = wheel(tmp_path, "manylinux_2_17_aarch64", b"")
     assert release.check_wheel(linux, "1.0") == "manylinux_2_17_aarch64"
 
@@ -122,12 +127,24 @@ def test_a_wheel_that_can_be_published_passes(tmp_path: Path) -> None:
     [
         ("linux_x86_64", b"", "", "1.0", "does not accept the platform"),
         ("manylinux_2_17_x86_64", b"", "", "1.1", "not version 1.1"),
-        ("manylinux_2_17_x86_64", b"", "chaserdock/shipped/single.toml", "1.0", "missing files.*single"),
+        (
+            "manylinux_2_17_x86_64",
+            b"",
+            "chaserdock/shipped/single.toml",
+            "1.0",
+            "missing files.*single",
+        ),
         ("manylinux_2_17_x86_64", b"", "chaserdock_models/native/kernels.so", "1.0", "libraries"),
         ("macosx_11_0_arm64", b"\x7fELF" + bytes(60), "", "1.0", "not a 64-bit Mach-O file"),
         ("macosx_11_0_arm64", macho(processor=0x01000007), "", "1.0", "does not load it"),
         ("macosx_11_0_arm64", macho(oldest=14 << 16), "", "1.0", "does not load it"),
-        ("macosx_11_0_arm64", macho(library="/opt/lib/libomp.dylib"), "", "1.0", "needs /opt/lib/libomp"),
+        (
+            "macosx_11_0_arm64",
+            macho(library="/opt/lib/libomp.dylib"),
+            "",
+            "1.0",
+            "needs /opt/lib/libomp",
+        ),
     ],
 )
 def test_a_wheel_that_must_not_be_published_is_refused(

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The C kernels under sanitizers: arbitrary floating-point input, and that the sanitizers and checks find faults.
+"""The C kernels under sanitizers: arbitrary floating-point input, and that the sanitizers and
+checks find faults.
 
 `python benchmarks/fuzz_kernels.py` does the same for longer.
 """
@@ -32,8 +33,12 @@ def test_every_kernel_has_a_fuzz_target(folder: str) -> None:
 @needs_gcc
 @pytest.mark.parametrize("folder", NATIVE_FOLDERS)
 def test_kernels_stand_any_floating_point_input(folder: str, tmp_path: Path) -> None:
-    """NaN, infinities and denormals among others: no access outside of arrays, no undefined operation, no endless loop."""
-    program = sanitizers.compile_program(sanitizers.PROGRAMS[folder], ROOT / folder, tmp_path, "-O0")
+    """NaN, infinities and denormals among others: no access outside of arrays, no undefined
+    operation, no endless loop.
+    """
+    program = sanitizers.compile_program(
+        sanitizers.PROGRAMS[folder], ROOT / folder, tmp_path, "-O0"
+    )
     assert [
         found
         for kernel in sanitizers.targets(program)

@@ -30,13 +30,17 @@ def test_packages_are_typed() -> None:
 
 
 def type_names(path: Path) -> Iterator[str]:
-    """Yield the public classes of a module, and its type aliases and type variables, which are assigned in CamelCase."""
+    """Yield the public classes of a module, and its type aliases and type variables, which are
+    assigned in CamelCase.
+    """
     tree = tree_of(path)
     yield from (n.name for n in ast.walk(tree) if isinstance(n, ast.ClassDef) and n.name[0] != "_")
     for node in tree.body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         names = [t.id for t in targets if isinstance(t, ast.Name)]
-        yield from (name for name in names if re.fullmatch(r"[A-Z][A-Za-z0-9]*[a-z][A-Za-z0-9]*", name))
+        yield from (
+            name for name in names if re.fullmatch(r"[A-Z][A-Za-z0-9]*[a-z][A-Za-z0-9]*", name)
+        )
 
 
 def test_no_name_of_a_class_or_type_is_used_for_two_things() -> None:

@@ -21,9 +21,14 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 
 @settings(max_examples=60, deadline=None)
 @given(
-    width=st.integers(1, 5), rows=st.integers(0, 60), held=st.integers(1, 200), seed=st.integers(0, 2**32 - 1)
+    width=st.integers(1, 5),
+    rows=st.integers(0, 60),
+    held=st.integers(1, 200),
+    seed=st.integers(0, 2**32 - 1),
 )
-def test_table_returns_added_rows_from_memory_and_file(width: int, rows: int, held: int, seed: int) -> None:
+def test_table_returns_added_rows_from_memory_and_file(
+    width: int, rows: int, held: int, seed: int
+) -> None:
     values = np.random.default_rng(seed).normal(size=(rows, width))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(columns, "_MAX_IN_MEMORY", held)

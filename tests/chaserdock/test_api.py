@@ -32,13 +32,19 @@ from chaserdock.launch import launcher
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 CAPTURE = ROOT / "tests" / "golden" / "capture.mcap"
-SMALL = {"camera": {"width_px": 480, "height_px": 270}, "settling_s": 2.0, "success": {"max_collisions": 0}}
+SMALL = {
+    "camera": {"width_px": 480, "height_px": 270},
+    "settling_s": 2.0,
+    "success": {"max_collisions": 0},
+}
 
 
 def test_import_is_light() -> None:
     heavy = ["zenoh", "pybullet", "cv2", "numpy", "pydantic", "pyarrow", "typer", "rich", "casadi"]
     program = f"import sys, chaserdock; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert done.stdout == "[]\n"
 
 
@@ -49,14 +55,23 @@ def test_public_names_exist() -> None:
         _ = cd.nothing  # type: ignore[attr-defined]
 
 
-def test_run_from_a_thread_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_run_from_a_thread_prints_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     before = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
     results: list[cd.RunResult] = []
     events: list[object] = []
 
     def fly() -> None:
         results.append(
-            cd.run("single", out=tmp_path / "run", seed=3, duration_s=3.0, on_event=events.append, **SMALL)
+            cd.run(
+                "single",
+                out=tmp_path / "run",
+                seed=3,
+                duration_s=3.0,
+                on_event=events.append,
+                **SMALL,
+            )
         )
 
     thread = threading.Thread(target=fly)
@@ -88,7 +103,9 @@ except KeyboardInterrupt:
 
 def test_keyboard_interrupt_ends_all_processes(tmp_path: Path) -> None:
     program = subprocess.Popen(
-        [sys.executable, "-c", _INTERRUPTED, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", _INTERRUPTED, str(tmp_path / "run")],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert program.stdout is not None
     assert program.stdout.readline() == "Start\n"
@@ -130,13 +147,16 @@ def test_interrupt_while_a_process_starts_leaves_none_running(
 
 def test_errors_are_exceptions_with_the_text_of_the_command_line(tmp_path: Path) -> None:
     with pytest.raises(
-        cd.ChaserdockError, match=r"nowhere: no such scenario file or shipped scenario; .*shipped: abort"
+        cd.ChaserdockError,
+        match=r"nowhere: no such scenario file or shipped scenario; .*shipped: abort",
     ):
         cd.run("nowhere")
     with pytest.raises(ScenarioError, match="widht_px"):
         cd.run("single", out=tmp_path / "run", camera={"widht_px": 640})
     assert not (tmp_path / "run").exists()
-    with pytest.raises(cd.ChaserdockError, match="camera: a value of type set cannot be set in a scenario"):
+    with pytest.raises(
+        cd.ChaserdockError, match="camera: a value of type set cannot be set in a scenario"
+    ):
         cd.load_scenario("single", camera={1, 2})
     with pytest.raises(LogError, match="nowhere"):
         cd.open_log(tmp_path / "nowhere")
@@ -147,7 +167,10 @@ def test_errors_are_exceptions_with_the_text_of_the_command_line(tmp_path: Path)
 
 def test_overrides_are_keywords_or_dotted_keys() -> None:
     by_keyword = cd.load_scenario(
-        "four-chaser-docking", duration_s=20, camera={"width_px": 640, "height_px": 480}, seed=np.int64(7)
+        "four-chaser-docking",
+        duration_s=20,
+        camera={"width_px": 640, "height_px": 480},
+        seed=np.int64(7),
     )
     by_key = cd.load_scenario(
         Path("scenarios") / "four-chaser-docking.toml"

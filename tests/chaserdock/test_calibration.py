@@ -9,7 +9,13 @@ from chaserdock_models.camera import Camera
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_world.rendering.lens import Lens
 
-from chaserdock.calibration.intrinsics import BadBoard, TooFew, board_of, calibrate, write_calibration
+from chaserdock.calibration.intrinsics import (
+    BadBoard,
+    TooFew,
+    board_of,
+    calibrate,
+    write_calibration,
+)
 
 SCENARIO = """
 name = "calibrated"
@@ -30,10 +36,14 @@ def board_images(board, count, seed=3):
     rows, columns = (6, 8)
     scale = 4000.0  # pixels a metre of the drawing
     if board.charuco is not None:
-        drawing = board.charuco.generateImage((round(columns * 0.03 * scale), round(rows * 0.03 * scale)))
+        drawing = board.charuco.generateImage(
+            (round(columns * 0.03 * scale), round(rows * 0.03 * scale))
+        )
         origin = 0.0
     else:
-        squares = (np.indices((board.size[1] + 1, board.size[0] + 1)).sum(axis=0) % 2 * 255).astype(np.uint8)
+        squares = (np.indices((board.size[1] + 1, board.size[0] + 1)).sum(axis=0) % 2 * 255).astype(
+            np.uint8
+        )
         drawing = np.kron(squares, np.ones((120, 120), np.uint8))
         origin = 0.03
     drawing = cv2.copyMakeBorder(drawing, 80, 80, 80, 80, cv2.BORDER_CONSTANT, value=255)
@@ -73,7 +83,9 @@ def test_calibration_recovers_the_camera_of_rendered_boards(kind, tmp_path):
     # A bent board: every corner is detected, at a wrong place.
     bent = images["13.png"]
     x, y = np.meshgrid(np.arange(640, dtype=np.float32), np.arange(480, dtype=np.float32))
-    images["bent.png"] = np.asarray(cv2.remap(bent, x + 6 * np.sin(y / 40), y, cv2.INTER_LINEAR), np.uint8)
+    images["bent.png"] = np.asarray(
+        cv2.remap(bent, x + 6 * np.sin(y / 40), y, cv2.INTER_LINEAR), np.uint8
+    )
     found = calibrate(images, board)
     assert found.excluded.keys() == {"empty.png", "small.png", "broken.png", "bent.png"}
     assert "outlier" in found.excluded["bent.png"]
@@ -82,11 +94,13 @@ def test_calibration_recovers_the_camera_of_rendered_boards(kind, tmp_path):
     matrix = found.matrix
     got = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     assert np.abs(np.subtract(got, truth)).max() < 2.5
-    # The decisive measure: projections over the image, except its corners, agree within half a pixel.
+    # The decisive measure: projections over the image, except its corners, agree within half a
+    # pixel.
     fx, fy, cx, cy = (float(v) for v in got)
     ours = Camera(640, 480, fx, fy, cx, cy, tuple(found.distortion.tolist()))
     rays = np.stack(
-        [*np.meshgrid(np.linspace(-0.3, 0.3, 9), np.linspace(-0.22, 0.22, 7)), np.ones((7, 9))], axis=-1
+        [*np.meshgrid(np.linspace(-0.3, 0.3, 9), np.linspace(-0.22, 0.22, 7)), np.ones((7, 9))],
+        axis=-1,
     )
     away = ours.project(rays) - TRUE.project(rays)
     assert np.linalg.norm(away - away.mean(axis=(0, 1)), axis=-1).max() < 0.5
@@ -102,6 +116,10 @@ def test_too_few_images_and_invalid_boards_raise_errors():
     board = board_of("charuco 8x6", 0.03, 0.022, "DICT_4X4_50")
     with pytest.raises(TooFew, match=r"0 usable[\s\S]*a\.png: 0 corners"):
         calibrate({"a.png": np.zeros((480, 640), np.uint8)}, board)
-    for wrong in (("charuco 2x6", 0.03, 0.02), ("checkers", 0.03, 0.02), ("charuco 8x6", 0.03, 0.04)):
+    for wrong in (
+        ("charuco 2x6", 0.03, 0.02),
+        ("checkers", 0.03, 0.02),
+        ("charuco 8x6", 0.03, 0.04),
+    ):
         with pytest.raises(BadBoard):
             board_of(*wrong, "DICT_4X4_50")

@@ -84,7 +84,8 @@ def campaign_of(text: str, folder: Path) -> Campaign:
 def test_grid_contains_every_combination_with_every_seed(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
     points = [
-        (r.varied["chasers.0.start_offset_m.0"], r.varied["controller.solver"], r.seed) for r in campaign.runs
+        (r.varied["chasers.0.start_offset_m.0"], r.varied["controller.solver"], r.seed)
+        for r in campaign.runs
     ]
     assert sorted(points) == sorted(
         (x, s, seed) for x in (-0.05, -0.3) for s in ("rti", "ipopt") for seed in (3, 5)
@@ -143,7 +144,8 @@ def test_invalid_file_raises_a_clear_error(tmp_path: Path, wrong: str, message: 
         | st.booleans()
         | st.text(st.characters(exclude_categories=("Cs",)), max_size=8),
         lambda inner: (
-            st.lists(inner, max_size=3) | st.dictionaries(st.text("ab_", min_size=1), inner, max_size=3)
+            st.lists(inner, max_size=3)
+            | st.dictionaries(st.text("ab_", min_size=1), inner, max_size=3)
         ),
     )
 )
@@ -154,7 +156,8 @@ def test_values_round_trip_through_toml(value: Any) -> None:
 
 
 def test_wilson_interval_equals_published_values() -> None:
-    # R. G. Newcombe, Statistics in Medicine 17 (1998), table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29.
+    # R. G. Newcombe, Statistics in Medicine 17 (1998), table I: 81 of 263, 15 of 148, 0 of 20, 1 of
+    # 29.
     published = (
         (81, 263, 0.2553, 0.3662),
         (15, 148, 0.0624, 0.1605),
@@ -205,7 +208,9 @@ def results_of(campaign: Campaign) -> list[tuple[Any, FinishedRun]]:
         out.append(
             (
                 run,
-                FinishedRun(run.name, 1 if bad else 0, summary(bad), "", f"/logs/{k}.mcap" if bad else None),
+                FinishedRun(
+                    run.name, 1 if bad else 0, summary(bad), "", f"/logs/{k}.mcap" if bad else None
+                ),
             )
         )
     return out
@@ -221,7 +226,9 @@ def test_row_holds_the_worst_chaser_and_no_wall_clock_values(tmp_path: Path) -> 
     assert not any("wall" in column for column in rows[0])
     assert math.isnan(rows[0]["estimate_max_position_error_m"])
     assert causes(rows) == [(cause_of("chaser 0: steady RMS: 0.01 m"), 4)]
-    crashed = row_of(campaign.runs[0], FinishedRun(campaign.runs[0].name, 2, None, "chaserdock: no port"))
+    crashed = row_of(
+        campaign.runs[0], FinishedRun(campaign.runs[0].name, 2, None, "chaserdock: no port")
+    )
     assert not crashed["success"]
     assert crashed["cause"] == "chaserdock: no port"
 
@@ -294,7 +301,10 @@ def test_bad_arguments_print_one_line_errors(tmp_path: Path) -> None:
     for arguments, message in (
         (("campaign", str(tmp_path / "none.toml")), "none.toml: cannot be read"),
         (("campaign", str(tmp_path / "c.toml"), "--only", "9"), "the runs are 0 to 3"),
-        (("campaign", str(tmp_path / "c.toml"), "--only", "1", "--jobs", "2"), "--only flies one run"),
+        (
+            ("campaign", str(tmp_path / "c.toml"), "--only", "1", "--jobs", "2"),
+            "--only flies one run",
+        ),
         (
             (
                 "campaign",
@@ -324,7 +334,9 @@ def table(folder: Path) -> list[dict[str, Any]]:
 def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -> None:
     file, here, there = tmp_path / "c.toml", tmp_path / "here", tmp_path / "there"
     file.write_text(TINY.replace(", -0.06, -0.08", ""))
-    first = chaserdock("campaign", str(file), "--out", str(here), "--jobs", "1", stdout=subprocess.DEVNULL)
+    first = chaserdock(
+        "campaign", str(file), "--out", str(here), "--jobs", "1", stdout=subprocess.DEVNULL
+    )
     deadline = time.monotonic() + 120
     while not list(here.glob("runs/*/result.json")) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -336,7 +348,9 @@ def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -
             child.send_signal(signal.SIGKILL)
     before = {p: p.stat().st_mtime_ns for p in here.glob("runs/*/result.json")}
     assert len(before) == 1
-    status, said = finished("campaign", str(file), "--out", str(here), "--jobs", "2", timeout_s=600.0)
+    status, said = finished(
+        "campaign", str(file), "--out", str(here), "--jobs", "2", timeout_s=600.0
+    )
     assert status == 0, said
     assert {p: p.stat().st_mtime_ns for p in before} == before
     assert len(table(here)) == len({row["digest"] for row in table(here)}) == 2
@@ -344,7 +358,9 @@ def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -
     from distributed import LocalCluster
 
     os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
-    cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
+    cluster: Any = LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=""
+    )
     with cluster:
         status, said = finished(
             "campaign",

@@ -30,7 +30,9 @@ def published() -> dict[str, list[tuple[int, RawSample]]]:
     """Return the messages of every process in the golden flight, with their ticks."""
     out: dict[str, list[tuple[int, RawSample]]] = {name: [] for name in PROCESSES}
     for record in read_log(LOG):
-        raw = RawSample(record.key, encoding_of(type(record.message)), codec.encode(record.message), 0)
+        raw = RawSample(
+            record.key, encoding_of(type(record.message)), codec.encode(record.message), 0
+        )
         for name in PROCESSES:
             if record.key.startswith(f"{name}/"):
                 out[name].append((record.message.tick, raw))
@@ -144,7 +146,9 @@ def check(
 @pytest.mark.parametrize("process", ["controller", "chaser/0"])
 def test_our_own_process_conforms(process: str) -> None:
     words = [sys.executable, "-m", "chaserdock", *process.split("/")]
-    status, out = check(process, *words, "-e", "{endpoint}", "--namespace", "{namespace}", ticks=100)
+    status, out = check(
+        process, *words, "-e", "{endpoint}", "--namespace", "{namespace}", ticks=100
+    )
     assert status == 0, out
     assert "conforms to the protocol; 18 ticks" in out
 
@@ -185,7 +189,10 @@ def test_faulty_process_is_detected(old: str, new: str, finding: str, tmp_path: 
 
 @pytest.mark.parametrize(
     ("process", "command", "complaint"),
-    [("chaser/7", "true", "chasers are 0 to 1"), ("controller", "/no/such/program", "cannot be run")],
+    [
+        ("chaser/7", "true", "chasers are 0 to 1"),
+        ("controller", "/no/such/program", "cannot be run"),
+    ],
 )
 def test_impossible_check_states_the_reason(process: str, command: str, complaint: str) -> None:
     status, out = check(process, command)

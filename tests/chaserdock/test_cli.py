@@ -86,7 +86,9 @@ def test_help_imports_no_heavy_module() -> None:
     assert result["loaded"] == []
     assert len(result["printed"]) == len(COMMANDS) + 1
     for path, text in result["printed"].items():
-        assert text.startswith(f"Usage: {path}".rstrip()) or f" {path} " in text.splitlines()[0], path
+        assert text.startswith(f"Usage: {path}".rstrip()) or f" {path} " in text.splitlines()[0], (
+            path
+        )
         assert "-h, --help" in text
 
 
@@ -104,7 +106,9 @@ def test_help_lists_every_command_in_its_group() -> None:
         "Datasets",
         "Setup",
     ]
-    assert [line.rstrip(":") for line in text.splitlines() if re.match(r"[A-Z][a-z ]+:$", line)] == [
+    assert [
+        line.rstrip(":") for line in text.splitlines() if re.match(r"[A-Z][a-z ]+:$", line)
+    ] == [
         "Options",
         *sections,
     ]
@@ -129,7 +133,9 @@ def test_closed_pipe_is_no_error() -> None:
 
 def test_cli_page_is_up_to_date() -> None:
     command = [sys.executable, str(ROOT / "docs" / "make_cli.py"), "--print"]
-    made = subprocess.run(command, capture_output=True, text=True, check=True, encoding="utf-8").stdout
+    made = subprocess.run(
+        command, capture_output=True, text=True, check=True, encoding="utf-8"
+    ).stdout
     page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
     assert page == made, "run: python docs/make_cli.py"
     for path in COMMANDS:
@@ -146,14 +152,21 @@ def completed(*words: str) -> list[str]:
     }
     program = "from chaserdock.cli.main import app; app(prog_name='chaserdock')"
     done = subprocess.run(
-        [sys.executable, "-c", program], env=env, cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-c", program],
+        env=env,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     return done.stdout.split()
 
 
 def test_completion() -> None:
     assert {"run", "report", "replay"} <= set(completed("chaserdock", "r"))
-    assert completed("chaserdock", "run", "four") == [n for n in shipped_names() if n.startswith("four")]
+    assert completed("chaserdock", "run", "four") == [
+        n for n in shipped_names() if n.startswith("four")
+    ]
     assert completed("chaserdock", "run", "scenarios/sin") == [
         "scenarios/single-thrusters.toml",
         "scenarios/single.toml",
@@ -184,7 +197,9 @@ def test_run_prints_json_lines_for_the_whole_flight(tmp_path: Path) -> None:
     assert status == last.status == (0 if last.summary["success"] else 1)
     assert last.summary == json.loads((out / "summary.json").read_text())
     notices = [line for line in lines if isinstance(line, EventNotice | CommandNotice)]
-    assert any(isinstance(n, EventNotice) and n.what.startswith("initialised by chaser 0") for n in notices)
+    assert any(
+        isinstance(n, EventNotice) and n.what.startswith("initialised by chaser 0") for n in notices
+    )
     progress = [line for line in lines if isinstance(line, Progress)]
     assert progress
     assert progress[-1].tick == 89
@@ -232,7 +247,9 @@ def test_run_refuses_a_port_in_use(tmp_path: Path) -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        status, output = finished("run", "single", "--out", str(tmp_path / "run"), "--port", str(port))
+        status, output = finished(
+            "run", "single", "--out", str(tmp_path / "run"), "--port", str(port)
+        )
     assert status == 2
     assert output == f"chaserdock: --port {port}: Address already in use; choose another port\n"
     assert not (tmp_path / "run").exists()

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compose builds the image and flies a short mission if a Docker engine runs; static checks of compose.yaml and Dockerfile."""
+"""Compose builds the image and flies a short mission if a Docker engine runs; static checks of
+compose.yaml and Dockerfile.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow(minutes=60)  # its building and flying is not this worker's: it starts first
 @pytest.mark.timeout(2400)
 def test_short_mission_by_compose(clone: Path) -> None:
-    """Mission succeeds with access control; exit status, file owners, absence of keys in the image and its size."""
+    """Mission succeeds with access control; exit status, file owners, absence of keys in the image
+    and its size.
+    """
     owner = (clone / "compose.yaml").stat()
     project = Project("two-chaser-tracking", " ".join(SHORT), clone)
     try:
@@ -67,7 +71,9 @@ def test_short_mission_by_compose(clone: Path) -> None:
         assert built.returncode == 0, (built.stdout + built.stderr)[-3000:]
         flown = project.compose("up", "--no-build", "--exit-code-from", "mission", timeout_s=900.0)
         said = flown.stdout + flown.stderr
-        kept = docker("run", "--rm", "--entrypoint", "find", "chaserdock", "/keys", "-type", "f").stdout
+        kept = docker(
+            "run", "--rm", "--entrypoint", "find", "chaserdock", "/keys", "-type", "f"
+        ).stdout
     finally:
         project.down()
     assert flown.returncode == 0, said[-5000:]
@@ -90,7 +96,9 @@ def test_short_mission_by_compose(clone: Path) -> None:
 
 
 def test_container_mounts_only_its_own_keys() -> None:
-    """Every service mounts one volume of keys, read-only; only the router, which creates them, mounts all."""
+    """Every service mounts one volume of keys, read-only; only the router, which creates them,
+    mounts all.
+    """
     service, mounts = "", {}
     for line in (ROOT / "compose.yaml").read_text(encoding="utf-8").splitlines():
         if found := re.match(r"  ([a-z0-9-]+):", line):
@@ -107,12 +115,16 @@ def test_container_mounts_only_its_own_keys() -> None:
 
 def test_file_in_the_repository_is_the_output_for_four_chasers() -> None:
     """Remedy: chaserdock compose --chasers 4 --standby --view > compose.yaml"""
-    assert (ROOT / "compose.yaml").read_text(encoding="utf-8") == compose_file(4, standby=True, view=True)
+    assert (ROOT / "compose.yaml").read_text(encoding="utf-8") == compose_file(
+        4, standby=True, view=True
+    )
 
 
 @pytest.mark.parametrize("chasers", range(1, 17))
 @pytest.mark.parametrize("more", [False, True])
-def test_generated_file_has_the_services_and_volumes_of_the_mission(chasers: int, more: bool) -> None:
+def test_generated_file_has_the_services_and_volumes_of_the_mission(
+    chasers: int, more: bool
+) -> None:
     project = YAML(typ="safe").load(compose_file(chasers, standby=more, view=more))
     members = {"router", "world", "controller", "recorder", "mission", "operator"}
     members |= {"standby", "viewer"} if more else set()
@@ -137,17 +149,27 @@ def test_number_of_chasers_is_limited_by_the_image(chasers: int) -> None:
 
 
 def test_build_context_contains_what_the_image_copies() -> None:
-    """Every source of a COPY instruction, or its top folder, is an exception in .dockerignore, which excludes everything else."""
-    instructions = re.findall(r"^COPY (?!--from)(.+) \S+$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    """Every source of a COPY instruction, or its top folder, is an exception in .dockerignore,
+    which excludes everything else.
+    """
+    instructions = re.findall(
+        r"^COPY (?!--from)(.+) \S+$", (ROOT / "Dockerfile").read_text(), re.MULTILINE
+    )
     copied = {source for line in instructions for source in line.split()}
-    context = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    context = {
+        line[1:]
+        for line in (ROOT / ".dockerignore").read_text().splitlines()
+        if line.startswith("!")
+    }
     sources = {source if source in context else source.partition("/")[0] for source in copied}
     assert {"chaserdock", "docker", "pyproject.toml"} <= sources
     assert sources == context
 
 
 def test_image_has_a_key_folder_per_process() -> None:
-    """A volume inherits the mode of the folder at its mount point; without that folder only root could write."""
+    """A volume inherits the mode of the folder at its mount point; without that folder only root
+    could write.
+    """
     found = re.search(
         r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 15\); do mkdir /keys",
         (ROOT / "Dockerfile").read_text(),

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The criteria ``success.reached``, ``success.detumbled`` and those of published rendezvous tasks: evaluation and validation."""
+"""The criteria ``success.reached``, ``success.detumbled`` and those of published rendezvous tasks:
+evaluation and validation.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,17 @@ def scenario(*overrides: str) -> Scenario:
 def flight(s: Scenario, chaser_m: np.ndarray, target_q: np.ndarray) -> Any:
     """Return a stub of a recorded flight with one row per second."""
     n = len(chaser_m)
-    target = SimpleNamespace(time_s=np.arange(n, dtype=float), position_m=np.zeros((n, 3)), q_wxyz=target_q)
+    target = SimpleNamespace(
+        time_s=np.arange(n, dtype=float), position_m=np.zeros((n, 3)), q_wxyz=target_q
+    )
     return SimpleNamespace(scenario=s, truth={"target": target, "chaser/0": SimpleNamespace(
         time_s=target.time_s, position_m=chaser_m)})  # fmt: skip
 
 
 def test_goal_counts_as_reached_from_when_the_chaser_stays() -> None:
-    """The goal rotates with the target. Passing through it and being there before the command do not count."""
+    """The goal rotates with the target. Passing through it and being there before the command do
+    not count.
+    """
     s, n = scenario(), 80
     turning = np.array([rotations.exp([0.0, 0.0, 0.01 * k]) for k in range(n)])
     goal = rotations.rotate(turning, np.tile([1.0, 0.0, 0.0], (n, 1)))
@@ -90,18 +96,27 @@ DETUMBLE = PATH.parent / "detumble-pair.toml"
 STEP_S = 0.1
 
 
-def stack_flight(speed_m_s: np.ndarray, omega_rad_s: np.ndarray, latched: tuple[int, ...] = (0,)) -> Any:
-    """Return a stub of a recorded flight of ``detumble-pair``: the stack of target and chaser 0 moves along +x with the speeds of
-    its centre (K,), and turns about +z with the rates (K,). Chaser 1 flies elsewhere, fast."""
+def stack_flight(
+    speed_m_s: np.ndarray, omega_rad_s: np.ndarray, latched: tuple[int, ...] = (0,)
+) -> Any:
+    """Return a stub of a recorded flight of ``detumble-pair``: the stack of target and chaser 0
+    moves along +x with the speeds of its centre (K,), and turns about +z with the rates (K,).
+    Chaser 1 flies elsewhere, fast."""
     n = len(speed_m_s)
-    times, still, zero = np.arange(n) * STEP_S, np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)), np.zeros((n, 3))
+    times, still, zero = (
+        np.arange(n) * STEP_S,
+        np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        np.zeros((n, 3)),
+    )
     target_kg, chaser_kg, apart_m = 150.0, 50.0, np.array([-1.0, 0.0, 0.0])
     turning = np.outer(omega_rad_s, [0.0, 0.0, 1.0])
     # The common centre is a quarter of the way to the chaser.
     origin = np.outer(speed_m_s, [1.0, 0.0, 0.0]) - np.cross(turning, apart_m / 4.0)
 
     def track(velocity: np.ndarray) -> Any:
-        return SimpleNamespace(time_s=times, velocity_m_s=velocity, q_wxyz=still, omega_rad_s=turning)
+        return SimpleNamespace(
+            time_s=times, velocity_m_s=velocity, q_wxyz=still, omega_rad_s=turning
+        )
 
     def drawn(name: str, mass_kg: float) -> Any:
         return SimpleNamespace(body=name, mass_kg=mass_kg, centre_of_mass_m=(0.0, 0.0, 0.0))
@@ -113,13 +128,19 @@ def stack_flight(speed_m_s: np.ndarray, omega_rad_s: np.ndarray, latched: tuple[
             "chaser/0": track(origin + np.cross(turning, apart_m)),
             "chaser/1": track(zero + 1.0),
         },
-        drawn=(drawn("target", target_kg), drawn("chaser/0", chaser_kg), drawn("chaser/1", chaser_kg)),
+        drawn=(
+            drawn("target", target_kg),
+            drawn("chaser/0", chaser_kg),
+            drawn("chaser/1", chaser_kg),
+        ),
         world=SimpleNamespace(latched=latched),
     )
 
 
 def test_the_stack_is_at_rest_from_when_speed_and_rate_stay_below_the_limits() -> None:
-    """Limits of 1 mm/s and 0.05 degrees/s; the speed is that of the common centre, which does not move when the stack turns."""
+    """Limits of 1 mm/s and 0.05 degrees/s; the speed is that of the common centre, which does not
+    move when the stack turns.
+    """
     speed, rate = np.full(100, 0.0009), np.full(100, np.radians(0.049))
     speed[:30], rate[:40] = 0.01, 0.1
     rate[60] = np.radians(0.051)
@@ -150,7 +171,9 @@ def test_a_stack_that_moves_at_the_end_violates_the_criterion(
 
 
 def test_a_released_chaser_is_no_part_of_the_stack() -> None:
-    """Without chaser 0 the speed is that of the target, whose centre circles the former common centre."""
+    """Without chaser 0 the speed is that of the target, whose centre circles the former common
+    centre.
+    """
     turning = np.full(20, np.radians(0.04))
     rest = stack_rest(stack_flight(np.zeros(20), turning, latched=()))
     assert rest is not None
@@ -180,13 +203,16 @@ AFRL, ARCH = (PATH.parent / f"{name}.toml" for name in ("afrl-docking", "arch-co
 def approach_flight(
     s: Scenario, offsets_m: np.ndarray, speeds_m_s: np.ndarray, abort_s: float | None = None
 ) -> Any:
-    """Return a stub of a recorded flight with one row per second: chaser 0 at offsets (K, 3), TRF of a target that is turned by 90
-    degrees about +z, at speeds (K,) relative to it."""
+    """Return a stub of a recorded flight with one row per second: chaser 0 at offsets (K, 3), TRF
+    of a target that is turned by 90 degrees about +z, at speeds (K,) relative to it."""
     n = len(offsets_m)
     turned = np.tile(rotations.exp([0.0, 0.0, np.pi / 2.0]), (n, 1))
     drift = np.tile([0.0, 0.0, 0.3], (n, 1))
     target = SimpleNamespace(
-        time_s=np.arange(n, dtype=float), position_m=np.ones((n, 3)), q_wxyz=turned, velocity_m_s=drift
+        time_s=np.arange(n, dtype=float),
+        position_m=np.ones((n, 3)),
+        q_wxyz=turned,
+        velocity_m_s=drift,
     )
     own = SimpleNamespace(
         time_s=target.time_s,
@@ -223,7 +249,12 @@ def test_speed_limit_of_afrl_holds_at_every_distance() -> None:
     s, distance = load_scenario(AFRL), np.linspace(150.0, 0.48, 60)
     limit = 0.2 + 2.0 * 0.001027 * (distance - 0.5)
     # On arrival the limit is that of the arrival, too, which is as large.
-    assert judged(approach_flight(s, inwards(distance), np.minimum(limit - 1e-6, 0.1999 + limit - 0.2))) == []
+    assert (
+        judged(
+            approach_flight(s, inwards(distance), np.minimum(limit - 1e-6, 0.1999 + limit - 0.2))
+        )
+        == []
+    )
     for row in (0, 30, 58):
         fast = limit - 1e-3
         fast[row] += 0.011
@@ -232,19 +263,26 @@ def test_speed_limit_of_afrl_holds_at_every_distance() -> None:
 
 
 def test_a_deputy_of_afrl_must_come_within_half_a_metre_slowly() -> None:
-    s, text = load_scenario(AFRL), "chaser 0 did not come within 0.5 m of the target at 0.2 m/s or less"
-    assert judged(approach_flight(s, inwards(np.linspace(100.0, 0.51, 50)), np.full(50, 0.1))) == [text]
-    slow = with_arrival(s, speed_m_s=0.05)
-    assert judged(approach_flight(slow, inwards(np.linspace(100.0, 0.49, 50)), np.full(50, 0.1))) == [
-        "chaser 0 did not come within 0.5 m of the target at 0.05 m/s or less"
+    s, text = (
+        load_scenario(AFRL),
+        "chaser 0 did not come within 0.5 m of the target at 0.2 m/s or less",
+    )
+    assert judged(approach_flight(s, inwards(np.linspace(100.0, 0.51, 50)), np.full(50, 0.1))) == [
+        text
     ]
-    found = rendezvous_of(approach_flight(s, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1)), 0)
+    slow = with_arrival(s, speed_m_s=0.05)
+    assert judged(
+        approach_flight(slow, inwards(np.linspace(100.0, 0.49, 50)), np.full(50, 0.1))
+    ) == ["chaser 0 did not come within 0.5 m of the target at 0.05 m/s or less"]
+    found = rendezvous_of(
+        approach_flight(s, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1)), 0
+    )
     assert found is not None
     assert (found["arrived_s"], found["arrived_speed_m_s"]) == (99.0, pytest.approx(0.1))
     early = with_arrival(s, within_s=98.0)
-    assert judged(approach_flight(early, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1))) == [
-        "chaser 0 came within 0.5 m of the target at 99.0 s, at most 98 s allowed"
-    ]
+    assert judged(
+        approach_flight(early, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1))
+    ) == ["chaser 0 came within 0.5 m of the target at 99.0 s, at most 98 s allowed"]
 
 
 def test_cone_and_speed_of_arch_comp_hold_nearby_and_until_the_abort() -> None:
@@ -252,7 +290,9 @@ def test_cone_and_speed_of_arch_comp_hold_nearby_and_until_the_abort() -> None:
     speed = np.where(distance <= 108.3, 0.054, 0.5)
     assert judged(approach_flight(s, inwards(distance, 29.0), speed)) == []
     (outside,) = judged(approach_flight(s, inwards(distance, 31.0), speed))
-    assert outside.startswith("chaser 0 was 31 degrees off the axis of success.approach_cone within 108.3 m")
+    assert outside.startswith(
+        "chaser 0 was 31 degrees off the axis of success.approach_cone within 108.3 m"
+    )
     offsets = inwards(distance, 29.0)
     offsets[distance > 109.0] = [900.0, 0.0, 0.0]
     assert judged(approach_flight(s, offsets, speed)) == []
@@ -275,7 +315,10 @@ def test_an_abort_must_stay_clear_of_the_box() -> None:
     assert failure.startswith(
         "chaser 0 came within a cube of half edge 0.19 m about the target after its abort"
     )
-    assert judged(approach_flight(s, np.vstack([inwards(distance), passing]), flown, abort_s=400.0)) == []
+    assert (
+        judged(approach_flight(s, np.vstack([inwards(distance), passing]), flown, abort_s=400.0))
+        == []
+    )
     early = np.vstack([inwards(distance), [[-0.1, 0.0, 0.0]], [[-3.0, 0.0, 0.0]]])
     assert judged(approach_flight(s, early, np.zeros(402), abort_s=401.0)) == []
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Datasets: labels agree with images and masks, layouts as published, scores, and one line for invalid input."""
+"""Datasets: labels agree with images and masks, layouts as published, scores, and one line for
+invalid input.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def drawn(vertices: NDArray[Any], triangles: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def drawn(
+    vertices: NDArray[Any], triangles: NDArray[Any], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
     """The mask of projected triangles, filled by OpenCV with subpixel corners."""
     mask = np.zeros(shape, np.uint8)
     for corners in np.rint(vertices[triangles] * 256.0).astype(np.int32):
@@ -74,20 +78,30 @@ def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
 
 
 def test_bop_layout_read_by_other_code_agrees_with_its_masks(exported: Path) -> None:
-    """Files as in the documentation of BOP, read with json, OpenCV and trimesh alone; the model projected by OpenCV."""
+    """Files as in the documentation of BOP, read with json, OpenCV and trimesh alone; the model
+    projected by OpenCV.
+    """
     root = exported / "bop"
     info = json.loads((root / "models/models_info.json").read_text())["1"]
     model = trimesh.load_mesh(str(root / "models/obj_000001.ply"))
     extent = np.ptp(model.vertices, axis=0)
     np.testing.assert_allclose([info[f"size_{a}"] for a in "xyz"], extent, atol=1e-3)
     assert 1000.0 < info["diameter"] < np.linalg.norm(extent)
-    assert sorted(p.name for p in root.iterdir()) == ["camera.json", "models", "models_eval", "train", "val"]
+    assert sorted(p.name for p in root.iterdir()) == [
+        "camera.json",
+        "models",
+        "models_eval",
+        "train",
+        "val",
+    ]
     for split, numbers in (("train", ["0", "1", "2"]), ("val", ["3"])):
         scene = root / split / "000000"
         gt = json.loads((scene / "scene_gt.json").read_text())
         assert list(gt) == numbers
         for number, (label,) in gt.items():
-            k = np.reshape(json.loads((scene / "scene_camera.json").read_text())[number]["cam_K"], (3, 3))
+            k = np.reshape(
+                json.loads((scene / "scene_camera.json").read_text())[number]["cam_K"], (3, 3)
+            )
             turn, at = np.reshape(label["cam_R_m2c"], (3, 3)), np.array(label["cam_t_m2c"])
             px, _ = cv2.projectPoints(model.vertices, cv2.Rodrigues(turn)[0], at, k, None)
             mask = grey(str(scene / f"mask/{int(number):06d}_000000.png")) > 0
@@ -98,7 +112,9 @@ def test_bop_layout_read_by_other_code_agrees_with_its_masks(exported: Path) -> 
             assert not np.any(visible & ~mask)
             left, top, width, height = gt_info["bbox_obj"]
             reach = np.array([px[:, 0].min(axis=0), px[:, 0].max(axis=0)])
-            np.testing.assert_allclose([[left, top], [left + width, top + height]], reach + 0.5, atol=1.6)
+            np.testing.assert_allclose(
+                [[left, top], [left + width, top + height]], reach + 0.5, atol=1.6
+            )
 
 
 def test_both_layouts_hold_the_same_images_and_labels(exported: Path) -> None:
@@ -133,7 +149,9 @@ def test_speed_plus_labels_and_distortion_agree_with_the_mask(tmp_path: Path) ->
         assert image[mask].mean() > 3.0 * image[~mask].mean()
 
 
-def test_equal_arguments_make_equal_datasets_and_another_seed_another(exported: Path, tmp_path: Path) -> None:
+def test_equal_arguments_make_equal_datasets_and_another_seed_another(
+    exported: Path, tmp_path: Path
+) -> None:
     export_dataset(scenario("seed=5"), tmp_path / "a", 1, LIMITS, ("speed+",), 0.0)
     export_dataset(scenario("seed=6"), tmp_path / "b", 1, LIMITS, ("speed+",), 0.0)
     name = "speedplus/synthetic/images/img000001.png"
@@ -192,11 +210,21 @@ def test_add_of_a_symmetric_target_ignores_what_cannot_be_seen() -> None:
     assert add_m(moved, still, unlike) == pytest.approx(0.005)
 
 
-def test_evaluate_scores_markers_in_both_layouts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_scores_markers_in_both_layouts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     made = tmp_path / "m"
     words = "--images 4 --range 0.8 1.0 --phase 0 60 --validation 0.75 --seed 2 --set camera.width_px=960 --set camera.height_px=540"
     app(
-        ["dataset", "single", *words.split(), "--out", str(made), "--set", 'target.model="servicer"'],
+        [
+            "dataset",
+            "single",
+            *words.split(),
+            "--out",
+            str(made),
+            "--set",
+            'target.model="servicer"',
+        ],
         standalone_mode=False,
     )
     assert "4 images of servicer, bop and speed+, seed 2" in capsys.readouterr().out
@@ -212,10 +240,16 @@ def test_evaluate_scores_markers_in_both_layouts(tmp_path: Path, capsys: pytest.
     assert "images 3, with a pose 3 (100.0%)" in capsys.readouterr().out
 
 
-def test_evaluate_scores_shapes_without_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """An acquisition, which a flight spreads over several images, ends in the image in which it begins."""
+def test_evaluate_scores_shapes_without_memory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An acquisition, which a flight spreads over several images, ends in the image in which it
+    begins.
+    """
     folder = tmp_path / "made"
-    export_dataset(scenario("seed=1"), folder, 3, ViewLimits((1.0, 2.0), 0.2, (20.0, 60.0)), ("speed+",), 1.0)
+    export_dataset(
+        scenario("seed=1"), folder, 3, ViewLimits((1.0, 2.0), 0.2, (20.0, 60.0)), ("speed+",), 1.0
+    )
     app(["evaluate", "perception", str(folder), "--json"], standalone_mode=False)
     figures = json.loads(capsys.readouterr().out)
     assert figures["perception"] == "model"
@@ -236,10 +270,22 @@ BROKEN = {
         lambda d: edited(d / "camera.json", "cameraMatrix", [[-1, 0, 1], [0, 1, 1], [0, 0, 1]]),
         "focal lengths must be positive",
     ),
-    "not JSON": (lambda d: (d / "synthetic/validation.json").write_text("{"), "validation.json: not JSON"),
-    "no list": (lambda d: (d / "synthetic/validation.json").write_text("{}"), "must contain a list"),
-    "quaternion": (lambda d: relabelled(d, "q_vbs2tango_true", [1, 1, 0, 0]), "must be a unit quaternion"),
-    "position": (lambda d: relabelled(d, "r_Vo2To_vbs_true", [0, "x", 1]), "must be 3 finite numbers"),
+    "not JSON": (
+        lambda d: (d / "synthetic/validation.json").write_text("{"),
+        "validation.json: not JSON",
+    ),
+    "no list": (
+        lambda d: (d / "synthetic/validation.json").write_text("{}"),
+        "must contain a list",
+    ),
+    "quaternion": (
+        lambda d: relabelled(d, "q_vbs2tango_true", [1, 1, 0, 0]),
+        "must be a unit quaternion",
+    ),
+    "position": (
+        lambda d: relabelled(d, "r_Vo2To_vbs_true", [0, "x", 1]),
+        "must be 3 finite numbers",
+    ),
     "missing image": (
         lambda d: (d / "synthetic/images/img000004.png").unlink(),
         "img000004.png: no such file",
@@ -249,7 +295,9 @@ BROKEN = {
         "img000004.png: not an image",
     ),
     "size": (
-        lambda d: cv2.imwrite(str(d / "synthetic/images/img000004.png"), np.zeros((9, 9), np.uint8)),
+        lambda d: cv2.imwrite(
+            str(d / "synthetic/images/img000004.png"), np.zeros((9, 9), np.uint8)
+        ),
         "9 x 9 pixels; the camera of the dataset has 480 x 270",
     ),
     "model": (lambda d: (d / "models/obj_000001.ply").write_text("ply"), "not a PLY model"),
@@ -282,10 +330,15 @@ def test_bad_dataset_is_one_line(
     shutil.copy(exported / "dataset.json", tmp_path)
     change, text = BROKEN[fault]
     change(root)
-    blind = SimpleNamespace(Blind=lambda camera, target: SimpleNamespace(estimate=lambda image: None))
+    blind = SimpleNamespace(
+        Blind=lambda camera, target: SimpleNamespace(estimate=lambda image: None)
+    )
     monkeypatch.setitem(sys.modules, "blind", blind)
     with pytest.raises(ChaserdockError) as caught:
-        app(["evaluate", "perception", str(root), "--perception", "blind:Blind"], standalone_mode=False)
+        app(
+            ["evaluate", "perception", str(root), "--perception", "blind:Blind"],
+            standalone_mode=False,
+        )
     assert text in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
     assert capsys.readouterr().out == ""

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documentation: builds strictly, needs no network, and says nothing that the repository contradicts."""
+"""The documentation: builds strictly, needs no network, and says nothing that the repository
+contradicts.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,10 @@ class Requests(HTMLParser):
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("docs") / "site"
     made = subprocess.run(
-        [sys.executable, str(DOCS / "make_site.py"), str(out)], capture_output=True, text=True, check=False
+        [sys.executable, str(DOCS / "make_site.py"), str(out)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert made.returncode == 0, made.stdout + made.stderr
     return out
@@ -123,12 +128,12 @@ def test_api_page_is_up_to_date() -> None:
 
 
 def test_documentation_of_releases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each tag's own make_site.py builds it into a folder with its name; versions.html lists them, newest first."""
+    """Each tag's own make_site.py builds it into a folder with its name; versions.html lists them,
+    newest first.
+    """
     clone = tmp_path / "clone"
     (clone / "docs").mkdir(parents=True)
-    script = (
-        "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'index.html').write_text('x')\n"
-    )
+    script = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'index.html').write_text('x')\n"
     (clone / "docs" / "make_site.py").write_text(script)
     own = ("-c", "user.name=test", "-c", "user.email=test@example.org")
     for command in (
@@ -201,7 +206,9 @@ def test_first_program_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[s
 
 
 def test_scenarios_in_the_docs_are_right() -> None:
-    """Every TOML example is TOML, and those that are a whole scenario, or sections of one, can be read as such."""
+    """Every TOML example is TOML, and those that are a whole scenario, or sections of one, can be
+    read as such.
+    """
     base = tomllib.loads((ROOT / "scenarios" / "single.toml").read_text())
     read = 0
     for page, block in fences("toml"):
@@ -221,9 +228,13 @@ def test_scenarios_in_the_docs_are_right() -> None:
 
 
 def test_commands_in_the_docs_exist() -> None:
-    """Every ``chaserdock COMMAND --option`` in a shell block is one that docs/cli.md, made from the program, has."""
+    """Every ``chaserdock COMMAND --option`` in a shell block is one that docs/cli.md, made from the
+    program, has.
+    """
     sections = re.split(r"^### ", (DOCS / "cli.md").read_text(encoding="utf-8"), flags=re.M)
-    options = {s.partition("\n")[0]: set(re.findall(r"`(--?[a-z][a-z-]*)`", s)) for s in sections[1:]}
+    options = {
+        s.partition("\n")[0]: set(re.findall(r"`(--?[a-z][a-z-]*)`", s)) for s in sections[1:]
+    }
     tried = 0
     for page, block in fences("sh"):
         for command in re.findall(r"\bchaserdock ([a-z][^\n|&#;]*)", block.replace("\\\n", " ")):
@@ -243,7 +254,9 @@ def test_benchmark_commands_in_the_docs_exist() -> None:
     tried = 0
     for page in (*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"):
         text = page.read_text(encoding="utf-8")
-        for folder, name, arguments in re.findall(r"python (benchmarks|docs)/([a-z]\w+)\.py([^`\n#]*)", text):
+        for folder, name, arguments in re.findall(
+            r"python (benchmarks|docs)/([a-z]\w+)\.py([^`\n#]*)", text
+        ):
             source = (ROOT / folder / f"{name}.py").read_text(encoding="utf-8") + shared
             for option in re.findall(r"--[a-z][a-z-]*", arguments):
                 assert f'"{option}"' in source, (page.name, name, option)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The physics engines agree in free flight, with thrusters and over a capture, and each is deterministic."""
+"""The physics engines agree in free flight, with thrusters and over a capture, and each is
+deterministic.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def flights(case: str, duration_s: float) -> tuple[EngineFlight, EngineFlight]:
 
 def distance_m(flight: EngineFlight, name: str) -> float:
     """How far a body has moved."""
-    return float(np.linalg.norm(flight.states[-1][name].position_m - flight.states[0][name].position_m))
+    return float(
+        np.linalg.norm(flight.states[-1][name].position_m - flight.states[0][name].position_m)
+    )
 
 
 def test_engines_agree_over_30_s_of_free_flight() -> None:
@@ -60,8 +64,12 @@ def test_engines_agree_over_a_capture_and_30_s_after_it() -> None:
     assert apart.position_m < 10 * MICRO
     assert apart.angle_rad < math.radians(1e-3)
     assert apart.force_N < 0.01
-    closing = [sum(tick["chaser/0"].closing_impulse_N_s for tick in f.loads) for f in (bullet, mujoco)]
-    assert closing[0] == pytest.approx(closing[1], rel=0.02)  # and the touch before it, against a spring
+    closing = [
+        sum(tick["chaser/0"].closing_impulse_N_s for tick in f.loads) for f in (bullet, mujoco)
+    ]
+    assert closing[0] == pytest.approx(
+        closing[1], rel=0.02
+    )  # and the touch before it, against a spring
     assert closing[0] > 0.05
     for flight in (bullet, mujoco):
         assert 0.0 <= flight.momentum_error < 1e-12

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The examples of docs/extend.md fly: a perception plugin, a solver plugin, and a foreign controller."""
+"""The examples of docs/extend.md fly: a perception plugin, a solver plugin, and a foreign
+controller.
+"""
 
 from __future__ import annotations
 
@@ -26,15 +28,18 @@ SHORT = ("duration_s=30.0", "settling_s=22.0", "camera.width_px=640", "camera.he
 
 
 def install(example: Path, folder: Path) -> dict[str, str]:
-    """Puts an example's module and entry points into ``folder``; the environment that finds them there.
+    """Puts an example's module and entry points into ``folder``; the environment that finds them
+    there.
 
-    What ``pip install --no-deps --target`` does, without the build back end, which is not at hand off line.
+    What ``pip install --no-deps --target`` does, without the build back end, which is not at hand
+    off line.
     """
     project = tomllib.loads((example / "pyproject.toml").read_text())
     for name in project["tool"]["hatch"]["build"]["targets"]["wheel"]["include"]:
         (folder / name).write_text((example / name).read_text())
     info = (
-        folder / f"{project['project']['name'].replace('-', '_')}-{project['project']['version']}.dist-info"
+        folder
+        / f"{project['project']['name'].replace('-', '_')}-{project['project']['version']}.dist-info"
     )
     info.mkdir()
     head = f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: {project['project']['version']}\n"
@@ -81,19 +86,25 @@ def test_missing_plugin_is_named(tmp_path: Path) -> None:
     assert "chaserdock.solvers" in said
 
 
-def test_estimator_of_the_docs_ignores_few_markers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimator_of_the_docs_ignores_few_markers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (tmp_path / "three_markers.py").write_text(code)
     info = tmp_path / "three_markers-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: three-markers\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[chaserdock.estimators]\nthree = three_markers:ThreeMarkers\n")
+    (info / "entry_points.txt").write_text(
+        "[chaserdock.estimators]\nthree = three_markers:ThreeMarkers\n"
+    )
     monkeypatch.syspath_prepend(str(tmp_path))
     scenario = load_scenario(ROOT / "scenarios/single.toml", ("estimator.name=three",))
     estimator = estimator_of(scenario)
     assert not isinstance(estimator, JointEstimator)
-    pose = PoseHypothesis(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6))
+    pose = PoseHypothesis(
+        np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6)
+    )
     eye = CameraPose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     assert estimator.update([Measurement(0, 0, (pose,), 2, eye)], 0).status == "none"
     assert estimator.accepted == 0
@@ -132,7 +143,9 @@ def test_foreign_controller_flies_to_success(tmp_path: Path) -> None:
         status, said = hand.output_of("world", timeout_s=300)
         assert status == 0, said
         assert hand.output_of("recorder")[0] == 0
-        assert hand.processes["foreign"].wait(timeout=30) == 0, (tmp_path / "foreign.txt").read_text()
+        assert hand.processes["foreign"].wait(timeout=30) == 0, (
+            tmp_path / "foreign.txt"
+        ).read_text()
     finally:
         hand.end()
         words.close()

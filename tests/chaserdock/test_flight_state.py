@@ -37,7 +37,11 @@ def tick(number: int) -> m.Tick:
 
 def odometry(chaser: int, number: int, x_m: float) -> m.Odometry:
     return m.Odometry(
-        chaser=chaser, tick=number, position_m=(x_m, 0.0, 0.0), q_wxyz=(1.0, 0.0, 0.0, 0.0), **AT_REST
+        chaser=chaser,
+        tick=number,
+        position_m=(x_m, 0.0, 0.0),
+        q_wxyz=(1.0, 0.0, 0.0, 0.0),
+        **AT_REST,
     )
 
 
@@ -79,7 +83,9 @@ def test_speed_since_start_and_over_last_seconds() -> None:
 def test_progress_is_complete_at_the_end_of_the_mission() -> None:
     state = flying_state()
     end_ns = round(SCENARIO.duration_s * 1e9)
-    state.update(m.MissionEnd(tick=1200, sim_time_ns=end_ns, reason="completed", complete=True), 25.0)
+    state.update(
+        m.MissionEnd(tick=1200, sim_time_ns=end_ns, reason="completed", complete=True), 25.0
+    )
     assert state.progress(25.0).sim_time_s == SCENARIO.duration_s
 
 
@@ -127,7 +133,9 @@ def test_missing_processes_are_named() -> None:
 
 
 def health(rejected: int, lost: int) -> m.Health:
-    return m.Health(process="chaser/0", rejected={"range": rejected} if rejected else {}, lost=lost, stale=0)
+    return m.Health(
+        process="chaser/0", rejected={"range": rejected} if rejected else {}, lost=lost, stale=0
+    )
 
 
 def test_rejected_and_lost_messages_are_reported_when_they_grow() -> None:
@@ -173,7 +181,9 @@ def test_failed_plan_is_reported_once_per_streak() -> None:
 
 
 def test_notices_as_text() -> None:
-    event = EventNotice(sim_time_s=3.0, process="world", level="warning", what="lost", detail="chaser/1")
+    event = EventNotice(
+        sim_time_s=3.0, process="world", level="warning", what="lost", detail="chaser/1"
+    )
     assert text_of(event) == "   3.00 s  WARNING: world: lost chaser/1"
     answer = CommandNotice(
         sim_time_s=60.0, command="approach", chaser=3, accepted=False, reason="no estimate"
@@ -185,7 +195,15 @@ def test_json_shows_one_object_per_line(capsys: pytest.CaptureFixture[str]) -> N
     reporter = ProgressReporter(SCENARIO, Show.json)
     address = MissionAddress(namespace="n", endpoint="tcp/127.0.0.1:1")
     reporter.report(
-        Start(scenario="a", seed=0, mode="lockstep", duration_s=1.0, chasers=2, folder="b", address=address)
+        Start(
+            scenario="a",
+            seed=0,
+            mode="lockstep",
+            duration_s=1.0,
+            chasers=2,
+            folder="b",
+            address=address,
+        )
     )
     reporter.update(tick(0))
     reporter.update(m.Event(process="world", level="error", what="gone", sim_time_ns=5_000_000_000))
@@ -196,15 +214,25 @@ def test_json_shows_one_object_per_line(capsys: pytest.CaptureFixture[str]) -> N
     reporter.close()
     out = capsys.readouterr()
     lines = [msgspec.json.decode(line, type=JsonLine) for line in out.out.splitlines()]
-    assert [type(line) for line in lines] == [Start, EventNotice, CommandNotice, EventNotice, Progress]
+    assert [type(line) for line in lines] == [
+        Start,
+        EventNotice,
+        CommandNotice,
+        EventNotice,
+        Progress,
+    ]
     assert json.loads(out.out.splitlines()[1])["type"] == "event"
     assert out.err == ""
 
 
 @pytest.mark.parametrize("show", [Show.text, Show.none])
-def test_text_goes_to_standard_error_or_nowhere(show: Show, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_goes_to_standard_error_or_nowhere(
+    show: Show, capsys: pytest.CaptureFixture[str]
+) -> None:
     reporter = ProgressReporter(SCENARIO, show)
-    reporter.update(m.Event(process="world", level="warning", what="gone", sim_time_ns=5_000_000_000))
+    reporter.update(
+        m.Event(process="world", level="warning", what="gone", sim_time_ns=5_000_000_000)
+    )
     reporter.close()
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -213,7 +241,9 @@ def test_text_goes_to_standard_error_or_nowhere(show: Show, capsys: pytest.Captu
 
 def test_terminal_shows_live_table(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
-    monkeypatch.setattr(progress, "Console", lambda stderr: Console(file=out, force_terminal=True, width=100))
+    monkeypatch.setattr(
+        progress, "Console", lambda stderr: Console(file=out, force_terminal=True, width=100)
+    )
     reporter = ProgressReporter(SCENARIO, Show.text)
     reporter.state = flying_state()
     reporter.update(odometry(1, 150, 0.02))

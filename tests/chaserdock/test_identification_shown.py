@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identified mass properties in a log: figure, report and viewer, beside the stated and the true values."""
+"""Identified mass properties in a log: figure, report and viewer, beside the stated and the true
+values.
+"""
 
 from __future__ import annotations
 
@@ -68,16 +70,27 @@ def made_log(path: Path, identified: int) -> Path:
 
     def put(topic: topics.Topic, place: Any, message: Any) -> None:
         writer.write(
-            topic.key_of(place), m.encoding_of(type(message)), encode(message), 10**18 + message.sim_time_ns
+            topic.key_of(place),
+            m.encoding_of(type(message)),
+            encode(message),
+            10**18 + message.sim_time_ns,
         )
 
     put(topics.TRUTH_DRAWN, None, drawn())
     for k in range(8):
         head: dict[str, Any] = {"seq": k, "tick": 15 * k, "sim_time_ns": k * 10**9}
-        rest: dict[str, Any] = {"velocity_m_s": (0, 0, 0), "q_wxyz": (1, 0, 0, 0), "omega_rad_s": (0, 0, 0)}
+        rest: dict[str, Any] = {
+            "velocity_m_s": (0, 0, 0),
+            "q_wxyz": (1, 0, 0, 0),
+            "omega_rad_s": (0, 0, 0),
+        }
         put(topics.TICK, None, m.Tick(**head, images=False, chasers=(0,)))
         for name, x in (("target", 0.0), ("chaser/0", -1.0)):
-            put(topics.TRUTH_BODY, name, m.BodyTruth(**head, **rest, body=name, position_m=(x, 0.0, 0.0)))
+            put(
+                topics.TRUTH_BODY,
+                name,
+                m.BodyTruth(**head, **rest, body=name, position_m=(x, 0.0, 0.0)),
+            )
         put(topics.TRUTH_WORLD, None, m.WorldTruth(**head, contacts=(), saturated=(), latched=(0,)))
         if k < identified:
             put(topics.STACK, None, stack_estimate(k))
@@ -110,7 +123,9 @@ def test_report_has_a_table_of_identified_stated_and_true_values(log: Path) -> N
     section = html[html.index('id="identified"') :]
     row = section[section.index("mass, kg") : section.index("centre x")]
     assert [
-        x for x in ("153.0 ± 1.5", "40", "150", "+2.0 sigma", "163.0 ± 1.5") if f">{x}</td>" not in row
+        x
+        for x in ("153.0 ± 1.5", "40", "150", "+2.0 sigma", "163.0 ± 1.5")
+        if f">{x}</td>" not in row
     ] == []
     assert "stack with chasers 0" in section
 
@@ -120,7 +135,9 @@ def test_viewer_shows_the_latest_values_and_their_convergence(log: Path) -> None
     at_end, at_begin = (text.mass_properties(mission.scenario, mission.at(t)) for t in (7.5, 1.5))
     assert "| mass, kg | 153.0 ± 1.5 | 40 | 150 | 163.0 ± 1.5 |" in at_end
     assert "| mass, kg | 162.0 ± 6.0 |" in at_begin
-    (plot,) = (p for p in plots.plots_of(1, True, [0], True) if p.curves[0][2] == "mass_sigma_percent")
+    (plot,) = (
+        p for p in plots.plots_of(1, True, [0], True) if p.curves[0][2] == "mass_sigma_percent"
+    )
     times, mass, centre, inertia = plots.points_of(plot, mission.history, 0.0, mission.end_s)
     assert times.size == 8
     assert mass[-1] == pytest.approx(100.0 * 1.5 / 153.0)

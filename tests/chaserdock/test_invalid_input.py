@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid command lines: one line on standard error that names the fault, status 2, nothing on standard output."""
+"""Invalid command lines: one line on standard error that names the fault, status 2, nothing on
+standard output.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +83,10 @@ INVALID = [
     ("chaser 0 --lease 0", "--lease"),
     ("chaser 0 --net-mode router", "'router' is not one of 'peer', 'client'"),
     ("chaser 0 -e nonsense", "--connect nonsense: must be PROTOCOL/HOST:PORT"),
-    ("chaser 0 -e tcp/127.0.0.1:99999", "--connect tcp/127.0.0.1:99999: must be PROTOCOL/HOST:PORT"),
+    (
+        "chaser 0 -e tcp/127.0.0.1:99999",
+        "--connect tcp/127.0.0.1:99999: must be PROTOCOL/HOST:PORT",
+    ),
     ("chaser 0 -e tcp/127.0.0.1:port", "--connect tcp/127.0.0.1:port"),
     ("chaser 0 -e ftp/127.0.0.1:21", "--connect ftp/127.0.0.1:21"),
     ("chaser 0 -c nowhere.json5", "--config nowhere.json5: no such file"),
@@ -136,7 +141,10 @@ INVALID = [
     ("log info nowhere.mcap", "nowhere.mcap"),
     ("log info", "Missing argument"),
     ("log recover {golden} --out {golden}", "already exists"),
-    ("log export {golden} --out {tmp} --format xls", "'xls' is not one of 'parquet', 'csv', 'rosbag2'"),
+    (
+        "log export {golden} --out {tmp} --format xls",
+        "'xls' is not one of 'parquet', 'csv', 'rosbag2'",
+    ),
     ("log tracks {golden} --out {tmp} --from nan", "--from"),
     ("log tracks {golden} --out {tmp} --from 5 --to 6", "contains no track between 5 and 6 s"),
     ("log play {golden} --speed nan", "--speed"),

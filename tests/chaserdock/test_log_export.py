@@ -29,7 +29,7 @@ from chaserdock.logs.tracks import write_tracks
 GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 
 
-# -- tables and tracks ------------------------------------------------------------------------------------
+# -- tables and tracks -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda t: t.key)
@@ -51,7 +51,9 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
             inner = whole[f"{table_name(topic)}_{name}"].to_pylist()
             assert [r["index"] for r in inner] == list(range(len(value)))
             first: Any = msgspec.to_builtins(value[0])
-            plain = {k: list(v) if isinstance(v, tuple) else v for k, v in first.items() if k in inner[0]}
+            plain = {
+                k: list(v) if isinstance(v, tuple) else v for k, v in first.items() if k in inner[0]
+            }
             assert plain
             assert all(inner[0][k] == v for k, v in plain.items())
         elif isinstance(value, msgspec.Struct):
@@ -65,7 +67,9 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
                 else:
                     assert [row[f"{name}_{part}_{axis}"] for axis in "xyz"] == list(whole_part)
         elif value == () and name not in row:
-            assert len(whole[f"{table_name(topic)}_{name}"]) == 0  # a list of structures, none this time
+            assert (
+                len(whole[f"{table_name(topic)}_{name}"]) == 0
+            )  # a list of structures, none this time
         elif isinstance(value, dict):
             assert json.loads(row[name]) == value
         elif isinstance(value, bytes):
@@ -138,10 +142,15 @@ def test_tracks_are_the_poses_in_tum_order(tmp_path: Path) -> None:
 def test_errors_equal_those_of_evo(tmp_path: Path) -> None:
     write_tracks(GOLDEN, tmp_path)
     errors = estimate_errors(load_flight(GOLDEN))
-    for relation, ours in (("trans_part", errors["position_m"]), ("angle_rad", errors["orientation_rad"])):
+    for relation, ours in (
+        ("trans_part", errors["position_m"]),
+        ("angle_rad", errors["orientation_rad"]),
+    ):
         result = tmp_path / f"{relation}.zip"
         tracks = [str(tmp_path / "target_truth.tum"), str(tmp_path / "target_estimate.tum")]
-        subprocess.run(["evo_ape", "tum", *tracks, "-r", relation, "--save_results", str(result)], check=True)
+        subprocess.run(
+            ["evo_ape", "tum", *tracks, "-r", relation, "--save_results", str(result)], check=True
+        )
         shutil.unpack_archive(result, tmp_path / relation)
         theirs = json.loads((tmp_path / relation / "stats.json").read_text())["rmse"]
         assert theirs == pytest.approx(float(np.sqrt(np.mean(ours**2))), rel=0.01)

@@ -19,7 +19,13 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.process import Rotation
 from chaserdock_protocol.recording import schema_migrations as upgrades
-from chaserdock_protocol.recording.log import LogError, LogWriter, count_messages, read_log, read_scenario
+from chaserdock_protocol.recording.log import (
+    LogError,
+    LogWriter,
+    count_messages,
+    read_log,
+    read_scenario,
+)
 from chaserdock_protocol.recording.scan import FileState, log_files, records, stored_messages
 from chaserdock_protocol.scenario import flight_scenario_json, scenario_from_json
 from chaserdock_protocol.transport import RawSample
@@ -43,12 +49,16 @@ def raws(log: Path) -> list[tuple[RawSample, Any]]:
             continue
         found = topics.topic_of_key(channel.topic)
         assert found is not None
-        raw = RawSample(channel.topic, channel.metadata["zenoh_encoding"], stored.data, stored.publish_time)
+        raw = RawSample(
+            channel.topic, channel.metadata["zenoh_encoding"], stored.data, stored.publish_time
+        )
         out.append((raw, upgrades.decode_logged(found[0].kind, raw.payload, raw.encoding)))
     return out
 
 
-def recorded(folder: Path, rotation: Rotation = ONE_FILE, viewer: bool = True, repeat: int = 1) -> Path:
+def recorded(
+    folder: Path, rotation: Rotation = ONE_FILE, viewer: bool = True, repeat: int = 1
+) -> Path:
     """The golden flight, recorded again without a network; ``repeat`` times over."""
     text, run = read_scenario(GOLDEN)
     scenario = scenario_from_json(text, "golden")
@@ -62,7 +72,7 @@ def recorded(folder: Path, rotation: Rotation = ONE_FILE, viewer: bool = True, r
     return folder
 
 
-# -- viewer layer -----------------------------------------------------------------------------------------
+# -- viewer layer ----------------------------------------------------------------------------------
 
 
 def test_viewer_layer_does_not_change_the_verbatim_layer(tmp_path: Path) -> None:
@@ -111,7 +121,7 @@ def test_viewer_layer_has_schemas_images_and_frames(tmp_path: Path) -> None:
     assert len(seen["/viewer/target/points foxglove.PointCloud"]) == 1
 
 
-# -- rotation ---------------------------------------------------------------------------------------------
+# -- rotation --------------------------------------------------------------------------------------
 
 
 def test_rotation_by_size_keeps_every_message(tmp_path: Path) -> None:
@@ -140,7 +150,7 @@ def test_folder_with_a_log_is_rejected(tmp_path: Path) -> None:
         recorded(tmp_path, Rotation(seconds=1.0))
 
 
-# -- disks and damage -------------------------------------------------------------------------------------
+# -- disks and damage ------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -164,7 +174,11 @@ def test_full_disk_is_an_error_and_written_chunks_stay_readable(tmp_path: Path, 
     path = tmp_path / "mission.mcap"
     assert path.stat().st_size <= size
     state = FileState()
-    kept = [s.data for channel, s in stored_messages(path, state) if not channel.topic.startswith("/viewer/")]
+    kept = [
+        s.data
+        for channel, s in stored_messages(path, state)
+        if not channel.topic.startswith("/viewer/")
+    ]
     assert kept == ([raw.payload for raw, _ in raws(GOLDEN)] * 20)[: len(kept)]
     assert (state.closed, state.cut_bytes) == (False, 0)
     assert size < 2_000_000 or kept  # a chunk is 1 MB at most
@@ -173,8 +187,13 @@ def test_full_disk_is_an_error_and_written_chunks_stay_readable(tmp_path: Path, 
 def test_closing_on_a_full_disk_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     writer = LogWriter(path, lambda: 0.0)
-    writer.write("recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=1)), 1)
-    with files_at_most(path.stat().st_size + 10), pytest.raises(LogError, match="cannot be written"):
+    writer.write(
+        "recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=1)), 1
+    )
+    with (
+        files_at_most(path.stat().st_size + 10),
+        pytest.raises(LogError, match="cannot be written"),
+    ):
         writer.close()
     assert list(read_log(path)) == []
 
@@ -239,11 +258,15 @@ def test_cut_anywhere_and_recovered(tmp_path: Path) -> None:
 
 
 def test_lost_chunk_is_detected_without_a_checksum(tmp_path: Path) -> None:
-    """A chunk that is cut out of a log whose writer was killed leaves a gap in the channels' numbering."""
+    """A chunk that is cut out of a log whose writer was killed leaves a gap in the channels'
+    numbering.
+    """
     path, ends = tmp_path / "a.mcap", []
     writer = LogWriter(path, lambda: 0.0)
     for k in range(30):
-        writer.write("recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=k)), 1)
+        writer.write(
+            "recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=k)), 1
+        )
         if k % 10 == 9:
             writer.flush()
             ends.append(path.stat().st_size)
@@ -257,7 +280,9 @@ def test_recovery_skips_nothing_where_only_the_summary_is_damaged(tmp_path: Path
     path = tmp_path / "a.mcap"
     writer = LogWriter(path, lambda: 0.0)
     for k in range(30):
-        writer.write("recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=k)), 1)
+        writer.write(
+            "recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=k)), 1
+        )
     writer.close()
     data = bytearray(path.read_bytes())
     end_of_data = 8 + sum(9 + len(content) for _, content in records(path)) + 9 + 4
@@ -282,15 +307,21 @@ def test_log_commands(tmp_path: Path) -> None:
     assert status == 0, said
     status, said = finished("log", "recover", str(cut), "--out", str(log))
     assert (status, "already exists; a log is never overwritten" in said) == (2, True)
-    status, said = finished("log", "export", str(tmp_path / "none.mcap"), "--out", str(tmp_path / "x"))
+    status, said = finished(
+        "log", "export", str(tmp_path / "none.mcap"), "--out", str(tmp_path / "x")
+    )
     assert (status, "Traceback" in said) == (2, False)
 
 
-# -- versions ---------------------------------------------------------------------------------------------
+# -- versions --------------------------------------------------------------------------------------
 
 
-def test_messages_of_older_versions_are_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if two versions ago odometry had had its attitude scalar last and its rate in degrees: it reads as today's."""
+def test_messages_of_older_versions_are_migrated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if two versions ago odometry had had its attitude scalar last and its rate in degrees: it
+    reads as today's.
+    """
     path = tmp_path / "old.mcap"
     now: Any = BY_TYPE[m.Odometry]
     old = msgspec.to_builtins(now)
@@ -309,7 +340,10 @@ def test_messages_of_older_versions_are_migrated(tmp_path: Path, monkeypatch: py
         return {**fields, "q_wxyz": (w, x, y, z)}
 
     def radians(fields: dict[str, Any]) -> dict[str, Any]:
-        return {**fields, "omega_rad_s": tuple(np.pi / 180.0 * v for v in fields.pop("omega_deg_s"))}
+        return {
+            **fields,
+            "omega_rad_s": tuple(np.pi / 180.0 * v for v in fields.pop("omega_deg_s")),
+        }
 
     rejected: Counter[str] = Counter()
     assert [r.sent_ns for r in read_log(path, rejected=rejected)] == [2]
@@ -323,7 +357,9 @@ def test_messages_of_older_versions_are_migrated(tmp_path: Path, monkeypatch: py
     assert first.omega_rad_s == pytest.approx(now.omega_rad_s)
     assert msgspec.structs.replace(first, omega_rad_s=now.omega_rad_s) == now
     with pytest.raises(codec.Rejected):  # on the wire only the present version is taken
-        codec.decode(m.Odometry, msgspec.msgpack.encode(old), "application/msgpack;chaserdock.Odometry.v2")
+        codec.decode(
+            m.Odometry, msgspec.msgpack.encode(old), "application/msgpack;chaserdock.Odometry.v2"
+        )
 
 
 def test_migrated_messages_are_validated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -333,7 +369,9 @@ def test_migrated_messages_are_validated(monkeypatch: pytest.MonkeyPatch) -> Non
         monkeypatch.setitem(upgrades.UPGRADES, ("RecorderAck", 1), lambda _, made=made: made)
         encoding = "application/msgpack;chaserdock.RecorderAck.v1"
         if made.get("tick") in (None, 1):
-            assert upgrades.decode_logged(m.RecorderAck, payload, encoding).tick == made.get("tick", -1)
+            assert upgrades.decode_logged(m.RecorderAck, payload, encoding).tick == made.get(
+                "tick", -1
+            )
         else:
             with pytest.raises(codec.Rejected, match="format"):
                 upgrades.decode_logged(m.RecorderAck, payload, encoding)
@@ -353,7 +391,10 @@ def test_info_counts_lost_and_rejected_messages(tmp_path: Path) -> None:
     writer.describe(scenario, {"run_id": run["run_id"]})
     for seq in (0, 1, 4, 5, 0, 1):  # two lost; then started again
         writer.write(
-            "recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(seq=seq, tick=seq)), 1
+            "recorder/ack",
+            m.encoding_of(m.RecorderAck),
+            codec.encode(m.RecorderAck(seq=seq, tick=seq)),
+            1,
         )
     for seq in (5, 6, 9):  # five sent before the recorder had subscribed; two lost
         presence = m.Presence(seq=seq, process="world", instance="a", heard={})

@@ -16,7 +16,9 @@ POINTS_PER_MM = 72.0 / 25.4
 
 
 def corners_mm(path: str, height_mm: float, downwards: bool) -> np.ndarray:
-    """Return the corners (n, 4, 2) of the rectangles of an SVG or PDF path, mm from the upper left corner."""
+    """Return the corners (n, 4, 2) of the rectangles of an SVG or PDF path, mm from the upper left
+    corner.
+    """
     numbers = re.findall(r"-?\d+(?:\.\d+)?", path)
     corners = np.array(numbers, dtype=float).reshape(-1, 4, 2) / POINTS_PER_MM
     if not downwards:
@@ -60,8 +62,12 @@ def test_svg_shows_every_marker_in_true_size(name: str, tmp_path: Path) -> None:
     sides_mm: dict[int, float] = {}
     px_per_mm = 8.0
     for file in files:
-        ((width, height),) = re.findall(r'<svg [^>]*width="([\d.]+)pt" height="([\d.]+)pt"', file.read_text())
-        assert (float(width) / POINTS_PER_MM, float(height) / POINTS_PER_MM) == pytest.approx((210.0, 297.0))
+        ((width, height),) = re.findall(
+            r'<svg [^>]*width="([\d.]+)pt" height="([\d.]+)pt"', file.read_text()
+        )
+        assert (float(width) / POINTS_PER_MM, float(height) / POINTS_PER_MM) == pytest.approx(
+            (210.0, 297.0)
+        )
         page = np.full((round(297 * px_per_mm), round(210 * px_per_mm)), 255, np.uint8)
         for x, y, w, h in rectangles_of(svg_rectangles(file, 297.0)) * px_per_mm:
             page[round(y) : round(y + h), round(x) : round(x + w)] = 0

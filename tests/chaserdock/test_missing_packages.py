@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Without a package that only some commands need, these say in one line what is missing; the others work."""
+"""Without a package that only some commands need, these say in one line what is missing; the others
+work.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,10 @@ main()
 
 def without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", _WITHOUT, package, *command], capture_output=True, text=True, check=False
+        [sys.executable, "-c", _WITHOUT, package, *command],
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
@@ -74,7 +79,9 @@ def test_pybullets_renderer_without_pybullet_names_another_one() -> None:
     )
     with (
         unittest.mock.patch.dict(sys.modules, {"pybullet": None}),
-        pytest.raises(MissingPackageError, match=r'camera.renderer = "pybullet" needs PyBullet.*"exact"'),
+        pytest.raises(
+            MissingPackageError, match=r'camera.renderer = "pybullet" needs PyBullet.*"exact"'
+        ),
     ):
         require_packages(scenario)
 
@@ -90,11 +97,21 @@ def test_other_commands_need_no_pybullet() -> None:
     [
         ("rosbags", "ros2", ("ros2",)),
         ("rosbags", "ros2", ("ros2", "--control")),
-        ("mujoco", "mujoco", ("run", "single", "--set", "world.engine=mujoco", "--out", "never-made")),
-        ("rosbags", "ros2", ("log", "export", GOLDEN, "--out", "never-made", "--format", "rosbag2")),
+        (
+            "mujoco",
+            "mujoco",
+            ("run", "single", "--set", "world.engine=mujoco", "--out", "never-made"),
+        ),
+        (
+            "rosbags",
+            "ros2",
+            ("log", "export", GOLDEN, "--out", "never-made", "--format", "rosbag2"),
+        ),
     ],
 )
-def test_a_command_without_its_extra_names_it(package: str, extra: str, command: tuple[str, ...]) -> None:
+def test_a_command_without_its_extra_names_it(
+    package: str, extra: str, command: tuple[str, ...]
+) -> None:
     done = without(package, *command)
     assert done.returncode == 2
     assert done.stderr == (
@@ -109,5 +126,9 @@ def test_pybullet_is_required_where_it_has_a_wheel_and_nowhere_else() -> None:
     assert pybullet.marker is not None
     here = {"sys_platform": "linux", "platform_machine": "x86_64", "python_version": "3.11"}
     assert pybullet.marker.evaluate(here)
-    for other in ({"sys_platform": "darwin"}, {"platform_machine": "aarch64"}, {"python_version": "3.12"}):
+    for other in (
+        {"sys_platform": "darwin"},
+        {"platform_machine": "aarch64"},
+        {"python_version": "3.12"},
+    ):
         assert not pybullet.marker.evaluate(here | other)

@@ -29,7 +29,7 @@ from chaserdock.launch.status import MissionStatus, expected
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-# -- keys -------------------------------------------------------------------------------------------------
+# -- keys ------------------------------------------------------------------------------------------
 
 
 def test_each_process_gets_its_own_key_and_the_authority_key_is_not_kept(tmp_path: Path) -> None:
@@ -78,7 +78,9 @@ def test_keys_are_not_overwritten_and_expire(tmp_path: Path) -> None:
         (["status", "-e", "tcp/127.0.0.1:1", "--duration", "0.5"], "no process found"),
     ],
 )
-def test_invalid_network_options_are_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
+def test_invalid_network_options_are_one_line(
+    arguments: list[str], words: str, tmp_path: Path
+) -> None:
     (tmp_path / "empty").mkdir()
     keys = make_keys(tmp_path / "keys")
     filled = [a.format(empty=tmp_path / "empty", keys=keys) for a in arguments]
@@ -88,7 +90,7 @@ def test_invalid_network_options_are_one_line(arguments: list[str], words: str, 
     assert len(said.strip().splitlines()) == 1
 
 
-# -- a mission --------------------------------------------------------------------------------------------
+# -- a mission -------------------------------------------------------------------------------------
 
 
 def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
@@ -96,7 +98,9 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
     endpoint = f"tls/127.0.0.1:{free_port()}"
     reach = ["-e", endpoint, "--lease", "10"]
-    short = sets(*SHORT, "duration_s=20.0")  # long enough for `status` and for the restart of the router
+    short = sets(
+        *SHORT, "duration_s=20.0"
+    )  # long enough for `status` and for the restart of the router
     processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(name: str, *arguments: str) -> None:
@@ -124,7 +128,9 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.1)
         wait_for_log(logs[0], 300_000, timeout_s=240.0)  # the solver may have to be compiled
-        status, said = finished("status", "--keys", str(keys), "-e", endpoint, "--json", timeout_s=60)
+        status, said = finished(
+            "status", "--keys", str(keys), "-e", endpoint, "--json", timeout_s=60
+        )
         assert status == 0, said
         seen = json.loads(said)
         assert set(seen["processes"]) == {
@@ -151,7 +157,8 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
             if process.poll() is None:
                 process.kill()
             process.wait()
-    # What was on its way when the router died is lost, and the recorder says so; the flight itself is a success.
+    # What was on its way when the router died is lost, and the recorder says so; the flight itself
+    # is a success.
     assert statuses.pop("recorder") in (0, 1), said_by
     assert set(statuses.values()) == {0}, said_by
     assert "denied" not in said_by["router"]  # no process tries what it may not do
@@ -170,7 +177,8 @@ def test_run_with_keys_equals_run_without(short_flight: Path, tmp_path: Path) ->
     status, said = run("two-chaser-tracking", tmp_path / "run", *SHORT, arguments=keys)
     assert status == 0, said
     digests = [
-        json.loads((f / "summary.json").read_text())["digest"] for f in (tmp_path / "run", short_flight)
+        json.loads((f / "summary.json").read_text())["digest"]
+        for f in (tmp_path / "run", short_flight)
     ]
     assert digests[0] == digests[1]
     words = (tmp_path / "run" / "processes" / "router.txt").read_text()
@@ -186,12 +194,14 @@ def test_run_with_missing_keys_is_rejected(tmp_path: Path) -> None:
     assert "it contains no keys; make a mission's keys with `chaserdock keys init" in said
     assert len(said.strip().splitlines()) == 1
     four = make_keys(tmp_path / "three")  # of three chasers
-    status, said = finished("run", "four-chaser-docking", "--keys", str(four), "--out", str(tmp_path / "out"))
+    status, said = finished(
+        "run", "four-chaser-docking", "--keys", str(four), "--out", str(tmp_path / "out")
+    )
     assert (status, "the keys of chaser-3 are missing" in said) == (2, True)
     assert not (tmp_path / "out").exists()
 
 
-# -- a container's main process ---------------------------------------------------------------------------
+# -- a container's main process --------------------------------------------------------------------
 
 
 def test_link_is_a_listening_or_connected_socket() -> None:
@@ -217,9 +227,13 @@ def test_health_check_needs_a_link_or_a_listening_router(tmp_path: Path) -> None
         environment = {
             **os.environ,
             "ROUTER": f"router:{port}",
-            "HEALTHY_SEEN": str(tmp_path / call),  # the first time in a container's life: it does not wait
+            "HEALTHY_SEEN": str(
+                tmp_path / call
+            ),  # the first time in a container's life: it does not wait
         }
-        return subprocess.run([ROOT / "docker" / "healthy"], env=environment, check=False).returncode
+        return subprocess.run(
+            [ROOT / "docker" / "healthy"], env=environment, check=False
+        ).returncode
 
     with socket.socket() as listening, socket.socket() as calling:
         listening.bind(("127.0.0.1", 0))
@@ -282,7 +296,9 @@ def test_container_forwards_a_signal_that_arrives_while_it_starts_its_process(
     before = [(number, signal.getsignal(number)) for number in (signal.SIGTERM, signal.SIGINT)]
     monkeypatch.setattr(container.subprocess, "Popen", Started)
     # Without its handler the signal would end the tests.
-    signal.signal(signal.SIGTERM, lambda number, frame: pytest.fail("the container has no handler yet"))
+    signal.signal(
+        signal.SIGTERM, lambda number, frame: pytest.fail("the container has no handler yet")
+    )
     try:
         assert container.run(["record"], "router", 7447) == -signal.SIGTERM
     finally:
@@ -291,12 +307,14 @@ def test_container_forwards_a_signal_that_arrives_while_it_starts_its_process(
     assert forwarded == [signal.SIGTERM]
 
 
-# -- status -----------------------------------------------------------------------------------------------
+# -- status ----------------------------------------------------------------------------------------
 
 
 def test_status_computes_speed_and_expected_processes() -> None:
     status = MissionStatus()
-    ticks = [Tick(tick=k, sim_time_ns=k * 500_000_000, images=True, chasers=(0, 2)) for k in range(4)]
+    ticks = [
+        Tick(tick=k, sim_time_ns=k * 500_000_000, images=True, chasers=(0, 2)) for k in range(4)
+    ]
     for tick in ticks:
         status.update(tick, 10.0 + tick.tick)
     assert status.speed == pytest.approx(0.5)

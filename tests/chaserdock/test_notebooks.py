@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The notebooks of examples/ execute without an error, and are stored with the outputs of an execution."""
+"""The notebooks of examples/ execute without an error, and are stored with the outputs of an
+execution.
+"""
 
 from __future__ import annotations
 
@@ -26,11 +28,15 @@ def code_cells(notebook: Any) -> list[Any]:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_is_stored_with_its_outputs(path: Path) -> None:
-    """Every cell that shows something has an output, and none is an error, a warning, or a path of the author's machine."""
+    """Every cell that shows something has an output, and none is an error, a warning, or a path of
+    the author's machine.
+    """
     notebook = nbformat.read(path, as_version=4)
     assert notebook.cells[0].source.startswith("# ")
     for cell in code_cells(notebook):
-        assert cell.outputs or cell.source.rstrip().endswith(";") or _shows_nothing(cell.source), cell.source
+        assert cell.outputs or cell.source.rstrip().endswith(";") or _shows_nothing(cell.source), (
+            cell.source
+        )
         for output in cell.outputs:
             assert output.output_type != "error"
             assert output.get("name") != "stderr", output.text
@@ -63,4 +69,8 @@ def test_notebook_executes(path: Path, tmp_path: Path) -> None:
 
 def _kind(output: Any) -> str:
     """Return what a figure, a value or a text is; not what it says."""
-    return "figure" if "image/png" in output.get("data", {}) else str(output.get("name", output.output_type))
+    return (
+        "figure"
+        if "image/png" in output.get("data", {})
+        else str(output.get("name", output.output_type))
+    )

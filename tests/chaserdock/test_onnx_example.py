@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ONNX example: a perfect network gives the true pose, a file of `model_file` runs in the command, errors are one line."""
+"""The ONNX example: a perfect network gives the true pose, a file of `model_file` runs in the
+command, errors are one line.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ def example(monkeypatch: pytest.MonkeyPatch) -> Any:
     for name in ("onnx_perception", "model_file"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return SimpleNamespace(
-        perception=importlib.import_module("onnx_perception"), files=importlib.import_module("model_file")
+        perception=importlib.import_module("onnx_perception"),
+        files=importlib.import_module("model_file"),
     )
 
 
@@ -53,8 +56,14 @@ def written(example: Any, path: Path, landmarks: np.ndarray) -> None:
     rng, weights = np.random.default_rng(1), []
     for side, inputs, outputs in example.files.FILTERS:
         weights.append((0.1 * rng.normal(size=(outputs, inputs, side, side)), np.zeros(outputs)))
-    flat = example.files.FILTERS[-1][2] * (example.perception.SIDE // 2 ** len(example.files.FILTERS)) ** 2
-    for inputs, outputs in ((flat, example.files.HIDDEN), (example.files.HIDDEN, 2 * len(landmarks))):
+    flat = (
+        example.files.FILTERS[-1][2]
+        * (example.perception.SIDE // 2 ** len(example.files.FILTERS)) ** 2
+    )
+    for inputs, outputs in (
+        (flat, example.files.HIDDEN),
+        (example.files.HIDDEN, 2 * len(landmarks)),
+    ):
         weights.append((0.05 * rng.normal(size=(inputs, outputs)), np.zeros(outputs)))
     facts = {
         "landmarks_m": json.dumps(landmarks.tolist()), "sigma": json.dumps([0.01] * 6), "most_rms": "0.05",
@@ -79,7 +88,9 @@ def test_perfect_landmarks_give_the_true_pose(
     perception = example.perception.OnnxPerception(data.camera, None)
     for item in data.images:
         image, label = read_grey(item.path, data.camera), item.label
-        at = data.camera.project(rotations.rotate(label.q_irf_trf_wxyz, landmarks) + label.position_irf_m)
+        at = data.camera.project(
+            rotations.rotate(label.q_irf_trf_wxyz, landmarks) + label.position_irf_m
+        )
         region = example.perception.find_region(image)
         assert region is not None
         patch, to_image = example.perception.crop(image, *region)
@@ -113,13 +124,23 @@ def test_network_file_runs_in_the_command(
 
 @pytest.mark.parametrize("content", [None, b"no network"])
 def test_missing_or_damaged_network_is_one_line(
-    content: bytes | None, dataset: Path, example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    content: bytes | None,
+    dataset: Path,
+    example: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path = tmp_path / "n.onnx"
     if content is not None:
         path.write_bytes(content)
     monkeypatch.setenv("CHASERDOCK_ONNX", str(path))
-    words = ["evaluate", "perception", str(dataset), "--perception", "onnx_perception:OnnxPerception"]
+    words = [
+        "evaluate",
+        "perception",
+        str(dataset),
+        "--perception",
+        "onnx_perception:OnnxPerception",
+    ]
     with pytest.raises(
         ChaserdockError, match=r"CHASERDOCK_ONNX .*n\.onnx: no network of train\.py"
     ) as caught:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plumes in the world and in the allocation: a chaser that brakes pushes the target, and prefers thrusters that do not."""
+"""Plumes in the world and in the allocation: a chaser that brakes pushes the target, and prefers
+thrusters that do not.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ THRUSTERS = [
     for corner in CORNERS
     for axis in range(3)
 ]
-"""Three at each corner of a cube: other than with twelve, most wrenches can be given in several ways."""
+"""Three at each corner of a cube: other than with twelve, most wrenches can be given in several
+ways.
+"""
 
 
 def scenario(**changes: Any) -> Scenario:
@@ -41,22 +45,34 @@ def scenario(**changes: Any) -> Scenario:
         "duration_s": 10.0,
         "plume": {},
         "chaser": {"actuation": "thrusters", "thrusters": THRUSTERS},
-        "target": {"motion": "torque_free", "velocity_m_s": [0.0, 0.0, 0.0], "omega_rad_s": [0.0, 0.0, 0.0]},
+        "target": {
+            "motion": "torque_free",
+            "velocity_m_s": [0.0, 0.0, 0.0],
+            "omega_rad_s": [0.0, 0.0, 0.0],
+        },
         "chasers": [{"position_m": [-1.0, 0.0, 0.0], "look_at": "target"}],
     }
     return parse_scenario(values | changes, "test")
 
 
 def fire_all(s: Scenario) -> tuple[Physics, float]:
-    """Open all thrusters for 0.5 s; return the physics after 0.6 s, and the momentum of all bodies along X."""
+    """Open all thrusters for 0.5 s; return the physics after 0.6 s, and the momentum of all bodies
+    along X.
+    """
     physics = Physics(s)
     actuators = {"chaser/0": make_actuators(s, 0)}
     pulses = tuple(
-        ThrusterPulse(thruster=k, open_ns=0, close_ns=500_000_000) for k in range(len(s.chaser.thrusters))
+        ThrusterPulse(thruster=k, open_ns=0, close_ns=500_000_000)
+        for k in range(len(s.chaser.thrusters))
     )
     zero = (0.0, 0.0, 0.0)
     command = ActuatorCommand(
-        chaser=0, effective_time_ns=0, source="command", force_N=zero, torque_N_m=zero, pulses=pulses
+        chaser=0,
+        effective_time_ns=0,
+        source="command",
+        force_N=zero,
+        torque_N_m=zero,
+        pulses=pulses,
     )
     actuators["chaser/0"].command(command, 0, 0)
     fly_to(round(0.6 * s.time.physics_hz), physics, actuators, 1.0 / s.time.physics_hz)
@@ -85,8 +101,16 @@ def test_allocation_fires_thrusters_at_the_target_only_where_it_must() -> None:
     s = flight_scenario(scenario())
     assert s.plume is not None
     q, zero, eye = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), tuple(np.eye(12).ravel().tolist())
-    own = Odometry(chaser=0, position_m=(-1.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero)
-    head = {"position_m": zero, "velocity_m_s": zero, "q_wxyz": q, "omega_rad_s": zero, "covariance": eye}
+    own = Odometry(
+        chaser=0, position_m=(-1.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero
+    )
+    head = {
+        "position_m": zero,
+        "velocity_m_s": zero,
+        "q_wxyz": q,
+        "omega_rad_s": zero,
+        "covariance": eye,
+    }
     target = TargetEstimate(status="tracking", accepted=(0,), rejected=(), **head)
     factors = PlumeAvoidance(s, s.plume).cost_factors(own, target)
     assert factors is not None
@@ -100,12 +124,16 @@ def test_allocation_fires_thrusters_at_the_target_only_where_it_must() -> None:
         plain, avoiding = (allocator.allocate(wrench, full, f) for f in (None, factors))
         if not (plain.exact and avoiding.exact):
             continue
-        np.testing.assert_allclose(wrench_matrix(s.chaser.thrusters) @ avoiding.thrusts_N, wrench, atol=1e-6)
+        np.testing.assert_allclose(
+            wrench_matrix(s.chaser.thrusters) @ avoiding.thrusts_N, wrench, atol=1e-6
+        )
         spared = plain.thrusts_N[towards].sum() - avoiding.thrusts_N[towards].sum()
         assert spared > -1e-4
         less += spared
     assert less > 0.05
-    far = Odometry(chaser=0, position_m=(-50.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero)
+    far = Odometry(
+        chaser=0, position_m=(-50.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero
+    )
     assert PlumeAvoidance(s, s.plume).cost_factors(far, target) is None
 
 
@@ -114,8 +142,16 @@ def test_allocation_spares_other_chasers_whose_poses_are_known() -> None:
     s = flight_scenario(scenario())
     assert s.plume is not None
     avoidance = PlumeAvoidance(s, s.plume)
-    own = Odometry(chaser=0, position_m=(-40.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero)
-    head = {"position_m": zero, "velocity_m_s": zero, "q_wxyz": q, "omega_rad_s": zero, "covariance": eye}
+    own = Odometry(
+        chaser=0, position_m=(-40.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero
+    )
+    head = {
+        "position_m": zero,
+        "velocity_m_s": zero,
+        "q_wxyz": q,
+        "omega_rad_s": zero,
+        "covariance": eye,
+    }
 
     def factors(*places: tuple[int, tuple[float, float, float]]) -> Any:
         relative = tuple(
@@ -129,7 +165,9 @@ def test_allocation_spares_other_chasers_whose_poses_are_known() -> None:
             )
             for i, place in places
         )
-        target = TargetEstimate(status="tracking", accepted=(0,), rejected=(), relative=relative, **head)
+        target = TargetEstimate(
+            status="tracking", accepted=(0,), rejected=(), relative=relative, **head
+        )
         return avoidance.cost_factors(own, target)
 
     assert (

@@ -46,19 +46,28 @@ def load_at(k: int, force_N: float) -> m.PortLoad:
     )
 
 
-def made_log(path: Path, forces_N: tuple[float, ...], measured: bool = True, **changes: Any) -> Path:
+def made_log(
+    path: Path, forces_N: tuple[float, ...], measured: bool = True, **changes: Any
+) -> Path:
     """A log of one chaser at rest with these peak forces, one a tick."""
     writer = LogWriter(path)
     writer.describe(scenario(**changes).model_dump_json(), {"mode": "lockstep"})
 
     def put(topic: topics.Topic, place: Any, message: Any) -> None:
         writer.write(
-            topic.key_of(place), m.encoding_of(type(message)), encode(message), 10**18 + message.sim_time_ns
+            topic.key_of(place),
+            m.encoding_of(type(message)),
+            encode(message),
+            10**18 + message.sim_time_ns,
         )
 
     for k, force_N in enumerate(forces_N):
         head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * TICK_NS}
-        rest: dict[str, Any] = {"velocity_m_s": (0, 0, 0), "q_wxyz": (1, 0, 0, 0), "omega_rad_s": (0, 0, 0)}
+        rest: dict[str, Any] = {
+            "velocity_m_s": (0, 0, 0),
+            "q_wxyz": (1, 0, 0, 0),
+            "omega_rad_s": (0, 0, 0),
+        }
         put(topics.TICK, None, m.Tick(**head, images=False, chasers=(0,)))
         for name, x in (("target", 0.0), ("chaser/0", -1.0)):
             put(
@@ -114,7 +123,9 @@ def limited(**limits: float) -> dict[str, Any]:
         ),
     ],
 )
-def test_exceeded_limits_are_failures(tmp_path: Path, limits: dict[str, float], failures: list[str]) -> None:
+def test_exceeded_limits_are_failures(
+    tmp_path: Path, limits: dict[str, float], failures: list[str]
+) -> None:
     result = summarize(made_log(tmp_path / "a.mcap", FORCES_N, **limited(**limits)))
     assert [x for x in result["failures"] if "port" in x] == failures
     peaks = result["chasers"]["0"]["capture"]["port_load"]

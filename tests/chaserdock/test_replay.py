@@ -29,18 +29,27 @@ from message_samples import BY_TYPE
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.replay.compare import compare, comparison_lines
-from chaserdock.replay.difference import Comparison, difference_lines, field_differences, first_difference
+from chaserdock.replay.difference import (
+    Comparison,
+    difference_lines,
+    field_differences,
+    first_difference,
+)
 from chaserdock.replay.run import replay
 
 FOLDER = Path(__file__).parents[1] / "golden"
 GOLDEN = FOLDER / "two-chasers.mcap"
 STAGES = ("perception", "fusion", "controller")
-REPLAYS = [(GOLDEN, s) for s in STAGES] + [(FOLDER / "capture.mcap", s) for s in ("fusion", "controller")]
+REPLAYS = [(GOLDEN, s) for s in STAGES] + [
+    (FOLDER / "capture.mcap", s) for s in ("fusion", "controller")
+]
 # Another kind of CPU differs in the last bits, and a plan's inputs magnify them; nothing else may.
 TOLERANCE = 1e-4
 
 
-def rewritten(source: Path, path: Path, change: Any = lambda record: record.message, **run_data: str) -> Path:
+def rewritten(
+    source: Path, path: Path, change: Any = lambda record: record.message, **run_data: str
+) -> Path:
     """A copy of a log, each message as ``change(record)`` has it; None leaves it out."""
     writer = LogWriter(path)
     scenario, run = read_scenario(source)
@@ -48,12 +57,14 @@ def rewritten(source: Path, path: Path, change: Any = lambda record: record.mess
     for record in read_log(source):
         message = change(record)
         if message is not None:
-            writer.write(record.key, m.encoding_of(type(message)), codec.encode(message), record.sent_ns)
+            writer.write(
+                record.key, m.encoding_of(type(message)), codec.encode(message), record.sent_ns
+            )
     writer.close()
     return path
 
 
-# -- golden logs ------------------------------------------------------------------------------------------
+# -- golden logs -----------------------------------------------------------------------------------
 
 
 def test_every_golden_log_is_replayed() -> None:
@@ -78,7 +89,9 @@ def test_replay_is_deterministic(through: str) -> None:
 def test_replay_does_not_depend_on_the_order_in_the_file(tmp_path: Path) -> None:
     """A recorder receives the processes in any order; here the keys are shuffled within a tick."""
     shuffled, path = (
-        sorted(read_log(GOLDEN), key=lambda r: r.message.tick * 1000 + zlib.crc32(r.key.encode()) % 7),
+        sorted(
+            read_log(GOLDEN), key=lambda r: r.message.tick * 1000 + zlib.crc32(r.key.encode()) % 7
+        ),
         tmp_path / "s.mcap",
     )
     writer = LogWriter(path)
@@ -90,14 +103,18 @@ def test_replay_does_not_depend_on_the_order_in_the_file(tmp_path: Path) -> None
 
 
 def test_replay_finds_a_change_in_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The filter's estimate moved by a tenth of a millimetre from half a second on: the diff says where and when."""
+    """The filter's estimate moved by a tenth of a millimetre from half a second on: the diff says
+    where and when.
+    """
     original = JointEstimator.update
 
     def changed(self: JointEstimator, inputs: JointInputs) -> Any:
         estimate = original(self, inputs)
         if inputs.time_ns < 500_000_000:
             return estimate
-        return dataclasses.replace(estimate, position_m=estimate.position_m + np.array([1e-4, 0.0, 0.0]))
+        return dataclasses.replace(
+            estimate, position_m=estimate.position_m + np.array([1e-4, 0.0, 0.0])
+        )
 
     monkeypatch.setattr(JointEstimator, "update", changed)
     found = replay(GOLDEN, "fusion", tolerance=1e-6)
@@ -114,7 +131,9 @@ def test_replay_finds_a_change_in_the_filter(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_override_changes_only_dependent_messages() -> None:
     """Other weights: other commands, the same estimate."""
-    found = {t.key: t for t in replay(GOLDEN, "controller", ("controller.weight_force=5.0",)).topics}
+    found = {
+        t.key: t for t in replay(GOLDEN, "controller", ("controller.weight_force=5.0",)).topics
+    }
     assert found["controller/chaser/0/wrench"].unequal > 10
     assert "force_N" in found["controller/chaser/0/wrench"].fields
     estimate = replay(GOLDEN, "fusion", ("controller.weight_force=5.0",)).topics
@@ -123,7 +142,11 @@ def test_override_changes_only_dependent_messages() -> None:
 
 def test_missing_and_extra_answers_are_reported(tmp_path: Path) -> None:
     def change(record: Record) -> Any:
-        if record.topic is topics.SIGHTING and record.message.chaser == 1 and record.message.tick == 5:
+        if (
+            record.topic is topics.SIGHTING
+            and record.message.chaser == 1
+            and record.message.tick == 5
+        ):
             return None
         return record.message
 
@@ -145,14 +168,18 @@ def test_operator_commands_are_replayed(tmp_path: Path) -> None:
         for r in read_log(source):
             writer.write(r.key, m.encoding_of(type(r.message)), codec.encode(r.message), r.sent_ns)
         if commanded:
-            writer.write("controller/operated", m.encoding_of(m.OperatorCommand), codec.encode(command), 1)
+            writer.write(
+                "controller/operated", m.encoding_of(m.OperatorCommand), codec.encode(command), 1
+            )
         writer.close()
         return path
 
     for commanded, extra in ((False, 0), (True, 1)):
         found = {
             t.key: t
-            for t in replay(with_command(tmp_path / f"{commanded}.mcap", commanded), "controller").topics
+            for t in replay(
+                with_command(tmp_path / f"{commanded}.mcap", commanded), "controller"
+            ).topics
         }
         # Today's reply has no recorded counterpart.
         assert found["controller/command"].alone == [0, extra]
@@ -182,7 +209,7 @@ def test_replay_command(tmp_path: Path) -> None:
         assert "Traceback" not in said
 
 
-# -- order ------------------------------------------------------------------------------------------------
+# -- order -----------------------------------------------------------------------------------------
 
 
 def test_by_tick_orders_messages_of_a_tick_for_the_stage() -> None:
@@ -216,11 +243,13 @@ def test_by_tick_orders_messages_of_a_tick_for_the_stage() -> None:
     ]
 
 
-# -- comparison -------------------------------------------------------------------------------------------
+# -- comparison ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "sample", [s for s in BY_TYPE.values() if isinstance(s, m.Message)], ids=lambda s: type(s).__name__
+    "sample",
+    [s for s in BY_TYPE.values() if isinstance(s, m.Message)],
+    ids=lambda s: type(s).__name__,
 )
 def test_every_changed_field_is_found(sample: m.Message) -> None:
     assert list(field_differences(sample, sample)) == []
@@ -286,7 +315,12 @@ def test_comparison_reports_first_and_largest_difference() -> None:
     topic = compared(ticks(50), ticks(50, x=0.5, jump_at=20))
     field = topic.fields["position_m"]
     assert (topic.compared, topic.unequal, topic.alone) == (50, 30, [0, 0])
-    assert (field.first_tick, field.first_time_s, field.first, field.largest) == (20, 2.0, (0.0, 0.5), 0.5)
+    assert (field.first_tick, field.first_time_s, field.first, field.largest) == (
+        20,
+        2.0,
+        (0.0, 0.5),
+        0.5,
+    )
     assert compared(ticks(50), ticks(50, x=0.5, jump_at=20), tolerance=0.5).equal
     assert not compared(ticks(50), ticks(50, x=0.5, jump_at=20), tolerance=0.49).equal
     assert compared(ticks(50), ticks(47)).alone == [3, 0]
@@ -306,7 +340,7 @@ def test_comparison_has_bounded_memory() -> None:
     assert found["both"].equal
 
 
-# -- two runs ---------------------------------------------------------------------------------------------
+# -- two runs --------------------------------------------------------------------------------------
 
 
 def test_equal_runs_compare_equal(tmp_path: Path) -> None:
@@ -318,7 +352,9 @@ def test_equal_runs_compare_equal(tmp_path: Path) -> None:
 
 
 def test_compare_reports_different_blas_kernels(tmp_path: Path) -> None:
-    one, other = (rewritten(GOLDEN, tmp_path / name, blas=name) for name in ("a Haswell", "a SkylakeX"))
+    one, other = (
+        rewritten(GOLDEN, tmp_path / name, blas=name) for name in ("a Haswell", "a SkylakeX")
+    )
     found = compare(one, other)
     assert comparison_lines(found) == [
         "different BLAS of recorder, whose results differ in the last bits: a Haswell; a SkylakeX",
@@ -343,7 +379,9 @@ def test_compare_names_the_process_whose_blas_differs(tmp_path: Path) -> None:
         return change
 
     names = ("a Haswell", "a SkylakeX")
-    one, other = (rewritten(GOLDEN, tmp_path / name, flown_with(name), blas="a Haswell") for name in names)
+    one, other = (
+        rewritten(GOLDEN, tmp_path / name, flown_with(name), blas="a Haswell") for name in names
+    )
     assert comparison_lines(compare(one, other))[:-1] == [
         "different BLAS of controller, whose results differ in the last bits: a Haswell; a SkylakeX"
     ]

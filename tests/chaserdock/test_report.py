@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures, report page and film of recorded flights: whole, cut short, or with hardly anything in them."""
+"""Figures, report page and film of recorded flights: whole, cut short, or with hardly anything in
+them.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,13 @@ from chaserdock.analysis.plots import MissingData
 from chaserdock.analysis.report import _chasers, _quantity, report_of, table, write_report
 from chaserdock.analysis.scene import scene_of
 from chaserdock.analysis.summary import summary_of, text_of, tracking_components, tracking_errors
-from chaserdock.analysis.time_series import OUTCOMES, ActuatorHistory, ImageOutcomes, Traces, load_traces
+from chaserdock.analysis.time_series import (
+    OUTCOMES,
+    ActuatorHistory,
+    ImageOutcomes,
+    Traces,
+    load_traces,
+)
 from chaserdock.analysis.video import _ExternalView, frames, wrapped, write_video
 
 TICK_NS = 1_000_000_000 // 15
@@ -56,19 +64,32 @@ SIZE: dict[str, Any] = {"width_px": 96, "height_px": 64}
 
 def put(writer: LogWriter, topic: topics.Topic, place: Any, message: Any) -> None:
     writer.write(
-        topic.key_of(place), m.encoding_of(type(message)), encode(message), 10**18 + message.sim_time_ns
+        topic.key_of(place),
+        m.encoding_of(type(message)),
+        encode(message),
+        10**18 + message.sim_time_ns,
     )
 
 
-def made_log(path: Path, ticks: int, seen: bool = False, chasers: int = 1, truth: bool = True) -> Path:
-    """A log with images of nothing: chaser i at -1 - i m, at rest, and a target that drifts along z."""
+def made_log(
+    path: Path, ticks: int, seen: bool = False, chasers: int = 1, truth: bool = True
+) -> Path:
+    """A log with images of nothing: chaser i at -1 - i m, at rest, and a target that drifts along
+    z.
+    """
     values = {"description": "made <&>", "duration_s": 2.0, "camera": SIZE}
-    names = [{"position_m": [-1.0 - i, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for i in range(chasers)]
+    names = [
+        {"position_m": [-1.0 - i, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for i in range(chasers)
+    ]
     writer = LogWriter(path)
     writer.describe(scenario(**values, chasers=names).model_dump_json(), {"mode": "lockstep"})
     for k in range(ticks):
         head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * TICK_NS}
-        rest: dict[str, Any] = {"velocity_m_s": (0, 0, 0), "q_wxyz": (1, 0, 0, 0), "omega_rad_s": (0, 0, 0)}
+        rest: dict[str, Any] = {
+            "velocity_m_s": (0, 0, 0),
+            "q_wxyz": (1, 0, 0, 0),
+            "omega_rad_s": (0, 0, 0),
+        }
         if truth:
             body = m.BodyTruth(**head, **rest, body="target", position_m=(0.0, 0.0, 0.03 * k / 15))
             put(writer, topics.TRUTH_BODY, "target", body)
@@ -126,7 +147,9 @@ class Page(HTMLParser):
 
 
 def checked(text: str) -> Page:
-    """A page that refers to nothing outside itself, has every id once and every target of its links."""
+    """A page that refers to nothing outside itself, has every id once and every target of its
+    links.
+    """
     page = Page(text)
     assert len(page.ids) == len(set(page.ids))
     for reference in page.references:
@@ -138,7 +161,10 @@ def checked(text: str) -> Page:
     assert "@import" not in text
     assert "default-src 'none'" in text
     # Not even a name space or a comment names a host, so nothing can be fetched by a slip.
-    assert re.findall(r"https?://[^\s\"'<]*", re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)) == []
+    assert (
+        re.findall(r"https?://[^\s\"'<]*", re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL))
+        == []
+    )
     return page
 
 
@@ -163,8 +189,12 @@ def test_replay_data_equal_the_recorded_motion(short_flight: Path, page: Page) -
     assert [c["id"] for c in data["chasers"]] == [0, 1]
     for body, name in ((data["target"], "target"), (data["chasers"][1], "chaser/1")):
         rows = np.searchsorted(truth[name].time_s, np.array(data["times"]) - 1e-3)
-        np.testing.assert_allclose(np.reshape(body["p"], (-1, 3)), truth[name].position_m[rows], atol=1e-4)
-        np.testing.assert_allclose(np.reshape(body["q"], (-1, 4)), truth[name].q_wxyz[rows], atol=1e-4)
+        np.testing.assert_allclose(
+            np.reshape(body["p"], (-1, 3)), truth[name].position_m[rows], atol=1e-4
+        )
+        np.testing.assert_allclose(
+            np.reshape(body["q"], (-1, 4)), truth[name].q_wxyz[rows], atol=1e-4
+        )
     assert set(data["images"]["chasers"]) == {"0", "1"}
     for urls in data["images"]["chasers"].values():
         assert len(urls) == len(data["images"]["times"]) > 0
@@ -222,14 +252,20 @@ def test_tables_escape_their_cells() -> None:
 def test_replay_runs_in_a_browser(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     page.write_text(report_of(made_log(tmp_path / "a.mcap", 5, chasers=2)), encoding="utf-8")
-    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000", "--dump-dom"]
+    options = [
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--virtual-time-budget=2000",
+        "--dump-dom",
+    ]
     command = ["chromium", *options, f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
     dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
     assert '<span id="replay-clock">0.0 s</span>' in dom
     assert re.search(r'<tr id="replay-row-1"><th[^>]*>chaser 1</th><td>–</td><td>2.000 m</td>', dom)  # noqa: RUF001
 
 
-# -- figures ------------------------------------------------------------------------------------------------
+# -- figures ---------------------------------------------------------------------------------------
 
 
 def test_figures_are_written_in_the_requested_format(tmp_path: Path) -> None:
@@ -273,7 +309,9 @@ def test_forces_over_several_ticks_are_means(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8)
     one, three = (load_traces(log, [0], every).inputs[0] for every in (1, 3))
     np.testing.assert_array_equal(three.edges_s, one.edges_s[::3])
-    np.testing.assert_allclose(three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(
+        three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12
+    )
 
 
 def test_thruster_figure_shows_duty_cycles(tmp_path: Path) -> None:
@@ -289,7 +327,9 @@ def test_thruster_figure_shows_duty_cycles(tmp_path: Path) -> None:
 
 
 def with_references(path: Path, shipped: str, phases: list[tuple[float, str]]) -> RecordedFlight:
-    """A flight of 20 s in a shipped scenario with these phases; the keep-out distance falls at 10 s and ends at 15 s."""
+    """A flight of 20 s in a shipped scenario with these phases; the keep-out distance falls at 10 s
+    and ends at 15 s.
+    """
     flight = load_flight(made_log(path, 301))
     flight.scenario = load_scenario(find_scenario(shipped))
     keep_out = np.array([[0.0, 0.75], [10.0, 0.5], [15.0, 0.0]])
@@ -311,8 +351,12 @@ def test_docking_figure_draws_the_limits_of_each_moment(tmp_path: Path) -> None:
     assert not [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
 
 
-def test_docking_figure_draws_the_docking_distance_of_chasers_without_a_port(tmp_path: Path) -> None:
-    flight = with_references(tmp_path / "a.mcap", "four-chaser-docking", [(0.0, "hold"), (5.0, "approach")])
+def test_docking_figure_draws_the_docking_distance_of_chasers_without_a_port(
+    tmp_path: Path,
+) -> None:
+    flight = with_references(
+        tmp_path / "a.mcap", "four-chaser-docking", [(0.0, "hold"), (5.0, "approach")]
+    )
     figure = docking(flight, load_traces(tmp_path / "a.mcap", [0]))
     assert [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
     ((begin_s, _, limit),) = speed_limits(flight, 0)
@@ -382,8 +426,18 @@ def test_figures_of_a_published_task_are_reported_and_part_of_the_line(tmp_path:
 
 
 def test_quantities_have_three_digits_and_no_exponent() -> None:
-    texts = [_quantity(value, "ms", 1e3) for value in (None, 0.0, 2.3e-5, 0.0851, 0.4, 2.3014, 71.0)]
-    assert texts == ["\N{EN DASH}", "0.00 ms", "0.0230 ms", "85.1 ms", "400 ms", "2301 ms", "71000 ms"]
+    texts = [
+        _quantity(value, "ms", 1e3) for value in (None, 0.0, 2.3e-5, 0.0851, 0.4, 2.3014, 71.0)
+    ]
+    assert texts == [
+        "\N{EN DASH}",
+        "0.00 ms",
+        "0.0230 ms",
+        "85.1 ms",
+        "400 ms",
+        "2301 ms",
+        "71000 ms",
+    ]
 
 
 def test_labels_of_a_distribution_do_not_touch() -> None:
@@ -396,7 +450,7 @@ def test_labels_of_a_distribution_do_not_touch() -> None:
     ]
 
 
-# -- images and video ---------------------------------------------------------------------------------------
+# -- images and video ------------------------------------------------------------------------------
 
 
 def test_images_are_paired_with_sightings_of_the_same_exposure(short_flight: Path) -> None:
@@ -431,7 +485,9 @@ def test_image_columns_fit_the_frame() -> None:
     ("azimuth", "elevation", "face"),
     [(0, 0, 0), (180, 0, 1), (90, 0, 2), (-90, 0, 3), (0, 90, 4), (0, -90, 5)],
 )
-def test_drawn_target_shows_its_markers(model: str, azimuth: float, elevation: float, face: int) -> None:
+def test_drawn_target_shows_its_markers(
+    model: str, azimuth: float, elevation: float, face: int
+) -> None:
     """Drawn face-on, a face shows exactly the markers on it, neither mirrored nor rotated."""
     wanted = target_model(model)
     scene = scene_of(scenario(target={"model": model}))
@@ -454,11 +510,15 @@ def test_drawn_target_shows_its_markers(model: str, azimuth: float, elevation: f
 def test_a_satellite_is_drawn_as_its_mesh() -> None:
     """With its panels beyond the body, and with its radiator before the wall that bears it."""
     flown = scenario(
-        target={"model": "geo_servicer"}, perception={"name": "model"}, chaser={"mesh": "chaser_body"}
+        target={"model": "geo_servicer"},
+        perception={"name": "model"},
+        chaser={"mesh": "chaser_body"},
     )
     scene = scene_of(flown)
     corners = np.concatenate([face.corners_m for face in scene.target])
-    np.testing.assert_allclose([corners[:, 1].min(), corners[:, 1].max()], [-0.6387, 0.6393], atol=1e-3)
+    np.testing.assert_allclose(
+        [corners[:, 1].min(), corners[:, 1].max()], [-0.6387, 0.6393], atol=1e-3
+    )
     assert len(scene.chaser) > 100
     view = Viewpoint(np.zeros(3), 2.6, np.radians(-70.0), np.radians(35.0), 480, 400)
     pose = (np.zeros(3), rotations.IDENTITY)
@@ -466,7 +526,9 @@ def test_a_satellite_is_drawn_as_its_mesh() -> None:
     radiator = next(p for p in satellite("geo_servicer").parts if p.name == "radiator_south")
     centre, extent = radiator.vertices_m.mean(axis=0), 0.35 * np.ptp(radiator.vertices_m, axis=0)
     points = [
-        centre + np.array([sx * extent[0], -0.002, sz * extent[2]]) for sx in (-1, 0.5) for sz in (-1, 1)
+        centre + np.array([sx * extent[0], -0.002, sz * extent[2]])
+        for sx in (-1, 0.5)
+        for sz in (-1, 1)
     ]
     px, _ = view.project(np.array(points))
     levels = [image[round(y), round(x), 0] for x, y in px]
@@ -515,7 +577,10 @@ def test_video_of_an_interval(tmp_path: Path) -> None:
     """Frames cover the interval; an empty interval or one after the end raises an error."""
     log = made_log(tmp_path / "a.mcap", 8)
     every = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180)]
-    part = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180, (every[2], every[5]))]
+    part = [
+        time_s
+        for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180, (every[2], every[5]))
+    ]
     assert part == pytest.approx(every[2:6])
     with pytest.raises(ChaserdockError, match="no length"):
         write_video(log, tmp_path / "a.webp", part_s=(2.0, 2.0))
@@ -532,7 +597,8 @@ def test_video_as_webp_and_gif(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "size", "fault"), [("a.avi", (320, 180), "must end in"), ("a.mp4", (321, 180), "must be even")]
+    ("name", "size", "fault"),
+    [("a.avi", (320, 180), "must end in"), ("a.mp4", (321, 180), "must be even")],
 )
 def test_invalid_video_format_is_rejected(
     tmp_path: Path, name: str, size: tuple[int, int], fault: str

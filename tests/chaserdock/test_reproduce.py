@@ -18,7 +18,13 @@ from harness import finished
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.study_cases import StudyCase, StudyError, StudyResult, line_of, read_lines
+from chaserdock.evaluation.study_cases import (
+    StudyCase,
+    StudyError,
+    StudyResult,
+    line_of,
+    read_lines,
+)
 from chaserdock.reproduce import main as reproduce_main
 from chaserdock.reproduce.content import pitch_rad, sections
 from chaserdock.reproduce.main import fly_plan
@@ -45,7 +51,14 @@ from chaserdock.reproduce.plan import (
 )
 from chaserdock.reproduce.provenance import Provenance, commit_of
 from chaserdock.reproduce.runner import MissionResult, ReproductionResults, code_digest, results_of
-from chaserdock.reproduce.tables import changes, comes_out, errors_of, over_two_minutes, spread, verdict
+from chaserdock.reproduce.tables import (
+    changes,
+    comes_out,
+    errors_of,
+    over_two_minutes,
+    spread,
+    verdict,
+)
 from chaserdock.reproduce.trends import trend_rows
 
 PATH = str(find_scenario(SCENARIO))
@@ -59,7 +72,7 @@ def scenario_of(case: StudyCase) -> Scenario:
     return load_scenario(Path(case.scenario), case.overrides)
 
 
-# -- the plan ---------------------------------------------------------------------------------------------
+# -- the plan --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("quick", [True, False])
@@ -90,7 +103,14 @@ def test_draws_have_the_same_starts_in_all_rows_within_the_bounds() -> None:
         if case.images:
             s = scenario_of(case)
             c, t = s.chasers[0], s.target
-            start = (c.start_offset_m, c.start_rotation_rad, t.q_wxyz, t.velocity_m_s, t.omega_rad_s, s.seed)
+            start = (
+                c.start_offset_m,
+                c.start_rotation_rad,
+                t.q_wxyz,
+                t.velocity_m_s,
+                t.omega_rad_s,
+                s.seed,
+            )
             starts.setdefault(case.name[-1], set()).add(start)
     assert {draw: len(found) for draw, found in starts.items()} == {"0": 1, "1": 1, "2": 1}
     assert len(set.union(*starts.values())) == 3
@@ -119,14 +139,21 @@ def test_paper_settings_equal_the_reference() -> None:
             assert (s.time.rate_hz, s.time.image_hz) == (30, 30)
             assert (s.camera.width_px, s.camera.height_px, s.camera.hfov_deg) == (1280, 720, 60.0)
             assert (t.model, s.navigation.grade) == ("paper", "exact")
-            assert (s.chaser.mass_kg, s.chaser.force_max_N, s.chaser.torque_max_N_m) == (30.0, 2.0, 0.05)
+            assert (s.chaser.mass_kg, s.chaser.force_max_N, s.chaser.torque_max_N_m) == (
+                30.0,
+                2.0,
+                0.05,
+            )
             assert s.chasers[0].position_m == (1.0, 0.0, 0.0)
             assert (s.perception.name, s.estimator.name, c.solver) == (perception, "paper", "open")
 
 
 def test_nominal_start_is_that_of_the_scenario() -> None:
     s = load_scenario(Path(PATH))
-    assert (s.target.velocity_m_s, s.target.omega_rad_s) == ((0.015, 0.0075, 0.03), (0.015, 0.045, 0.03))
+    assert (s.target.velocity_m_s, s.target.omega_rad_s) == (
+        (0.015, 0.0075, 0.03),
+        (0.015, 0.045, 0.03),
+    )
     assert s.chasers[0].start_offset_m == NOMINAL_OFFSET_M
     assert s.chasers[0].start_rotation_rad == NOMINAL_ROTATION_RAD
     assert math.hypot(0.42, 0.3927) == pytest.approx(0.575, abs=1e-4)
@@ -137,7 +164,11 @@ def test_missions_of_the_papers_chain_have_its_settings() -> None:
     assert len(chains) == 4
     for m in chains:
         s = load_scenario(find_scenario(m.scenario), m.overrides)
-        assert (s.navigation.grade, s.time.latency_s, s.controller.integrator) == ("exact", 0.0, "euler")
+        assert (s.navigation.grade, s.time.latency_s, s.controller.integrator) == (
+            "exact",
+            0.0,
+            "euler",
+        )
         assert (s.estimator.name, s.controller.solver, s.time.image_hz) == ("paper", "open", 30)
 
 
@@ -150,11 +181,13 @@ def test_default_settings_equal_the_scenario_defaults() -> None:
     assert ours.time.latency_s == pytest.approx(plain.time.latency_s, abs=1e-12)
 
 
-# -- arithmetic -------------------------------------------------------------------------------------------
+# -- arithmetic ------------------------------------------------------------------------------------
 
 
 @given(st.floats(0, 10), st.floats(0, 10), st.floats(1, PAPER_S))
-def test_mean_over_two_minutes_lies_between_its_parts(whole: float, steady: float, flown_s: float) -> None:
+def test_mean_over_two_minutes_lies_between_its_parts(
+    whole: float, steady: float, flown_s: float
+) -> None:
     value = over_two_minutes(whole, steady, flown_s)
     assert min(whole, steady) - 1e-12 <= value <= max(whole, steady) + 1e-12
     assert over_two_minutes(whole, steady, PAPER_S) == pytest.approx(whole)
@@ -202,7 +235,8 @@ def complete(p: ReproductionPlan) -> ReproductionResults:
     """Results with the errors of the paper's baseline everywhere."""
     errors = BASELINE.position_mse_m2, BASELINE.orientation_mse_rad2
     return ReproductionResults(
-        {c.name: result_of(c, *errors) for c in p.cases}, {m.name: mission_result(m) for m in p.missions}
+        {c.name: result_of(c, *errors) for c in p.cases},
+        {m.name: mission_result(m) for m in p.missions},
     )
 
 
@@ -239,7 +273,9 @@ def test_verdict_is_two_sided(ratio: float, text: str) -> None:
 
 @given(st.floats(1e-6, 1e6))
 def test_verdict_is_symmetric_in_smaller_and_larger(ratio: float) -> None:
-    assert (verdict(ratio) == "met") == (verdict(1.0 / ratio) == "met") == (1 / 1.35 <= ratio <= 1.35)
+    assert (
+        (verdict(ratio) == "met") == (verdict(1.0 / ratio) == "met") == (1 / 1.35 <= ratio <= 1.35)
+    )
 
 
 @pytest.mark.parametrize("band", [(0.0, 2.0), (1.1, 2.0), (0.5, 0.9)])
@@ -257,15 +293,21 @@ def test_spread_is_least_median_greatest() -> None:
 
 @pytest.mark.parametrize(
     "changed",
-    [{"min_distance_target_m": 0.34}, {"steady_position_mse_m2": 0.73}, {"steady_position_mse_m2": math.nan}],
+    [
+        {"min_distance_target_m": 0.34},
+        {"steady_position_mse_m2": 0.73},
+        {"steady_position_mse_m2": math.nan},
+    ],
 )
-def test_flight_fails_by_a_small_distance_or_without_coming_nearer(changed: dict[str, float]) -> None:
+def test_flight_fails_by_a_small_distance_or_without_coming_nearer(
+    changed: dict[str, float],
+) -> None:
     good = result_of(StudyCase(name="x", scenario=PATH), 1.0, 1.0)
     assert not errors_of(good).failed
     assert errors_of(msgspec.structs.replace(good, **changed)).failed
 
 
-# -- trends -----------------------------------------------------------------------------------------------
+# -- trends ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -311,14 +353,22 @@ def test_explanations_quote_measurements_or_say_unexplained() -> None:
         == f"Position {unexplained}; orientation {unexplained}. The paper states no spread."
     )
     assert found["alpha=60 %"] == "As for alpha=10 %."
-    for name, factor in (("alone/dt=1-30", 1.1), ("weights/dt=1-30", 1.01), ("delay/T=10/0.5", 1e3)):
+    for name, factor in (
+        ("alone/dt=1-30", 1.1),
+        ("weights/dt=1-30", 1.01),
+        ("delay/T=10/0.5", 1e3),
+    ):
         scale(results, name, factor)
     scale(results, table_name(CODE, BASELINE, 1), 1.5)
     found = explanations(results)
     assert "position +10.0 % alone, +1.0 % with stage weights times 0.33" in found["dt=1/30"]
-    assert found["T=10"].startswith("A late command gives as much: the controller alone has 0.0164 m^2, ")
+    assert found["T=10"].startswith(
+        "A late command gives as much: the controller alone has 0.0164 m^2, "
+    )
     assert "0.0164 if 0.3 s late, divergence if 0.5 s late, the paper 1.26." in found["T=10"]
-    assert found["alpha=10 %"].startswith("Position not separable from the start, which changes the baseline")
+    assert found["alpha=10 %"].startswith(
+        "Position not separable from the start, which changes the baseline"
+    )
     assert explanations(ReproductionResults({}, {}))["T=0.5"] == "Unexplained."
 
 
@@ -343,7 +393,7 @@ def test_row_labels_follow_the_paper() -> None:
     assert ROWS[-1].label == "dt=1/30, alpha=30 %"
 
 
-# -- the page ---------------------------------------------------------------------------------------------
+# -- the page --------------------------------------------------------------------------------------
 
 
 class _Checker(HTMLParser):
@@ -370,7 +420,8 @@ class _Checker(HTMLParser):
 
 def test_page_is_well_formed_and_escaped() -> None:
     section = PageSection(
-        "A <b> & c", ("text with <script> in `a < b`", Table(("a | b", "n"), (("x | <y>", "1"), ("z", "2"))))
+        "A <b> & c",
+        ("text with <script> in `a < b`", Table(("a | b", "n"), (("x | <y>", "1"), ("z", "2")))),
     )
     text = html("t & u", [section])
     checker = _Checker()
@@ -413,7 +464,7 @@ def test_page_reports_missing_results() -> None:
     assert not re.search(r"\d met", text)
 
 
-# -- flying -----------------------------------------------------------------------------------------------
+# -- flying ----------------------------------------------------------------------------------------
 
 
 def test_missing_solver_is_one_error_and_a_failed_status(
@@ -423,7 +474,9 @@ def test_missing_solver_is_one_error_and_a_failed_status(
     assert needs_open(case)
     monkeypatch.setattr(reproduce_main, "missing_part", lambda: "solver 'open' needs cargo")
     assert fly_plan(ReproductionPlan(True, 40.0, (case,), ()), tmp_path) == 1
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("chaserdock:")]
+    errors = [
+        line for line in capsys.readouterr().err.splitlines() if line.startswith("chaserdock:")
+    ]
     assert errors == ["chaserdock: the paper's chain was not flown: solver 'open' needs cargo"]
     assert "NOT COMPLETE: 1 of 1 flights" in (tmp_path / "reproduction.md").read_text()
 
@@ -474,11 +527,15 @@ def test_bad_input_prints_one_line_error(tmp_path: Path) -> None:
 
 
 def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A flight with small images, its lower bound, and a mission; a second call flies nothing and writes an equal page."""
+    """A flight with small images, its lower bound, and a mission; a second call flies nothing and
+    writes an equal page.
+    """
     small = ("camera.width_px=480", "camera.height_px=270", "time.rate_hz=15", "time.image_hz=15")
     short = (*small, "duration_s=21.0")
     cases = (
-        StudyCase(name=table_name(DEFAULT, BASELINE, 0), scenario=PATH, overrides=short, images=True),
+        StudyCase(
+            name=table_name(DEFAULT, BASELINE, 0), scenario=PATH, overrides=short, images=True
+        ),
         StudyCase(name="floor/0", scenario=PATH, overrides=short, floor=True),
     )
     mission = Mission(TRACKING, DEFAULT, (*small, "duration_s=3.0", "settling_s=2.0"))

@@ -43,7 +43,9 @@ def plain(value: Any) -> Any:
     if names is None:
         return value
     return {
-        name: plain(getattr(value, name)) for name in names if not name.startswith("_") and not name.isupper()
+        name: plain(getattr(value, name))
+        for name in names
+        if not name.startswith("_") and not name.isupper()
     }
 
 
@@ -61,7 +63,9 @@ def test_rosbags_reads_it_back_equal(bag: tuple[Path, dict[str, int]]) -> None:
     read: Stored = defaultdict(list)
     with AnyReader([bag[0]]) as reader:
         for connection, time_ns, data in reader.messages():
-            read[connection.topic].append((time_ns, plain(reader.deserialize(data, connection.msgtype))))
+            read[connection.topic].append(
+                (time_ns, plain(reader.deserialize(data, connection.msgtype)))
+            )
     whole = expected()
     assert Counter({topic: len(items) for topic, items in whole.items()}) == bag[1]
     for topic, items in whole.items():
@@ -80,12 +84,16 @@ def test_mcap_ros2_support_reads_it_back_equal(bag: tuple[Path, dict[str, int]])
         assert read[topic] == sorted(items, key=lambda item: item[0]), topic
 
 
-def test_images_are_those_of_the_log_and_optional(tmp_path: Path, bag: tuple[Path, dict[str, int]]) -> None:
+def test_images_are_those_of_the_log_and_optional(
+    tmp_path: Path, bag: tuple[Path, dict[str, int]]
+) -> None:
     assert bag[1]["/chaser_0/image"] == sum(
         r.topic is topics.IMAGE and r.place == "0" for r in open_log(GOLDEN).records()
     )
     without = export_bag(GOLDEN, tmp_path / "bag")
-    assert without == {t: n for t, n in bag[1].items() if not t.endswith(("/image", "/camera_info"))}
+    assert without == {
+        t: n for t, n in bag[1].items() if not t.endswith(("/image", "/camera_info"))
+    }
 
 
 def test_existing_folder_and_missing_extra_are_one_clear_error(
@@ -94,5 +102,7 @@ def test_existing_folder_and_missing_extra_are_one_clear_error(
     with pytest.raises(LogError, match="already exists; export into a new folder"):
         export_bag(GOLDEN, tmp_path)
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(MissingPackageError, match=r"rosbags is not installed; install chaserdock\[ros2\]"):
+    with pytest.raises(
+        MissingPackageError, match=r"rosbags is not installed; install chaserdock\[ros2\]"
+    ):
         export_bag(GOLDEN, tmp_path / "new")

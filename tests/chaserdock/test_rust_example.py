@@ -30,7 +30,10 @@ def compiled(source: Path, program: Path, *options: str) -> Path:
 
 def test_own_tests_pass(tmp_path: Path) -> None:
     done = subprocess.run(
-        [compiled(DECODER, tmp_path / "tests", "--test")], capture_output=True, text=True, check=False
+        [compiled(DECODER, tmp_path / "tests", "--test")],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout
     assert "2 passed" in done.stdout

@@ -63,7 +63,9 @@ def test_show_applies_overrides_and_can_be_limited_to_changes() -> None:
 
 
 def test_schema_prints_the_committed_schema() -> None:
-    committed = shipped_scenario("single").with_name("scenario.schema.json").read_text(encoding="utf-8")
+    committed = (
+        shipped_scenario("single").with_name("scenario.schema.json").read_text(encoding="utf-8")
+    )
     assert call("schema")[1] == committed
 
 

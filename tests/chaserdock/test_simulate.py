@@ -18,7 +18,14 @@ from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, chaserdock, finished
 
 from chaserdock.cli.simulate import simulate
-from chaserdock.simulation.campaign import Swarm, UnflownSeed, fly_seed, fly_seeds, shrink_result, write_case
+from chaserdock.simulation.campaign import (
+    Swarm,
+    UnflownSeed,
+    fly_seed,
+    fly_seeds,
+    shrink_result,
+    write_case,
+)
 from chaserdock.simulation.invariants import Invariants
 from chaserdock.simulation.swarm import draw_case, fly_case
 
@@ -49,7 +56,9 @@ def bad(tmp_path: Path) -> Path:
 
 def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    status, text = finished("simulate", str(good), "--seeds", "1:2", "--jobs", "2", "--out", str(out))
+    status, text = finished(
+        "simulate", str(good), "--seeds", "1:2", "--jobs", "2", "--out", str(out)
+    )
     assert status == 0, text
     assert "2 seeds in" in text
     assert not out.exists()
@@ -57,7 +66,9 @@ def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Pat
 
 @pytest.mark.parametrize("options", [(), ("--seeds", "1:2")], ids=["one", "seeds"])
 @pytest.mark.parametrize("out", ["good.toml", "good.toml/below"])
-def test_out_must_be_a_folder_that_can_be_written(out: str, options: tuple[str, ...], good: Path) -> None:
+def test_out_must_be_a_folder_that_can_be_written(
+    out: str, options: tuple[str, ...], good: Path
+) -> None:
     status, text = finished("simulate", str(good), *options, "--out", str(good.parent / out))
     assert status == 2
     (line,) = text.splitlines()
@@ -80,14 +91,18 @@ def test_options_of_seeds_need_seeds(good: Path) -> None:
 
 def test_a_seed_that_cannot_be_flown_does_not_end_the_others(good: Path) -> None:
     """A goto beside the only distance that the limits allow is refused."""
-    text = good.read_text() + "limits = {min_distance_target_m = 1.0, max_reference_distance_m = 1.0}\n"
+    text = (
+        good.read_text()
+        + "limits = {min_distance_target_m = 1.0, max_reference_distance_m = 1.0}\n"
+    )
     good.write_text(text)
     base = load_scenario(good)
     cases = [draw_case("good", s, base) for s in range(60)]
     wrong = next(
         s
         for s in range(59)
-        if "goto" in {e["command"] for e in cases[s].get("timeline", ())} and "timeline" not in cases[s + 1]
+        if "goto" in {e["command"] for e in cases[s].get("timeline", ())}
+        and "timeline" not in cases[s + 1]
     )
     status, text = finished("simulate", str(good), "--seeds", f"{wrong}:{wrong + 1}")
     assert status == 1
@@ -148,7 +163,9 @@ def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_pat
     ],
     ids=["nothing", "lie", "truth"],
 )
-def test_a_case_is_as_honest_as_the_scenario_that_it_extends(keys: str, honest: bool, good: Path) -> None:
+def test_a_case_is_as_honest_as_the_scenario_that_it_extends(
+    keys: str, honest: bool, good: Path
+) -> None:
     good.write_text(good.read_text() + keys)
     assert fly_case({"extends": str(good), "duration_s": 0.3}, 0).honest == honest
 
@@ -159,7 +176,9 @@ def test_a_case_inherits_thruster_failures() -> None:
     assert not fly_case(case, 0).honest
 
 
-def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_may_end_at_the_first_violation(
+    good: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(checks: Invariants, tick: Tick) -> None:
         checks._tick = tick.tick
         if tick.tick == 3:
@@ -173,7 +192,9 @@ def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest
         assert result.sim_time_s == pytest.approx(end_s)
 
 
-def test_cases_of_two_scenarios_have_files_of_their_own(good: Path, bad: Path, tmp_path: Path) -> None:
+def test_cases_of_two_scenarios_have_files_of_their_own(
+    good: Path, bad: Path, tmp_path: Path
+) -> None:
     results = [fly_seed(Swarm(str(path)), 2) for path in (good, bad)]
     paths = [write_case(result, tmp_path / "out") for result in results]
     assert [path.name for path in paths] == ["good-seed-2.toml", "bad-seed-2.toml"]
@@ -201,7 +222,9 @@ def test_ctrl_c_ends_flights_on_several_processes_at_once() -> None:
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=30.0)
     finally:
-        for left in (*psutil.Process(process.pid).children(), process) if process.poll() is None else ():
+        for left in (
+            (*psutil.Process(process.pid).children(), process) if process.poll() is None else ()
+        ):
             left.kill()
     assert process.returncode == 130
     assert out.startswith(b"0 seeds in")

@@ -103,7 +103,9 @@ def test_a_run_that_never_ends_is_stopped() -> None:
     assert not task.error
 
 
-def test_a_task_that_never_waits_for_a_later_time_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_task_that_never_waits_for_a_later_time_is_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(scheduler_module, "MOST_EVENTS", 1000)
     scheduler = Scheduler(0)
 
@@ -137,7 +139,9 @@ def test_ticks_at_one_virtual_time_go_on(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("timeout_s", [1e-300, 1e-17, 1.7e-15])
 def test_a_wait_below_the_resolution_of_virtual_time_passes(timeout_s: float) -> None:
-    """The clock of a process may be finer than virtual time: with an offset of -30 s at 17.8 s it is."""
+    """The clock of a process may be finer than virtual time: with an offset of -30 s at 17.8 s it
+    is.
+    """
 
     def work(scheduler: Scheduler) -> None:
         scheduler.pause(17.8)
@@ -164,7 +168,7 @@ def test_key_expressions_match_as_in_zenoh(expression: str, key: str, found: boo
     assert matches(expression, key) is found
 
 
-# -- conditions -------------------------------------------------------------------------------------------------
+# -- conditions ------------------------------------------------------------------------------------
 
 
 TICK: Any = BY_TYPE[Tick]
@@ -191,7 +195,9 @@ def arrivals(
         scheduler.pause(1.0)
         world.publish(topics.TICK, TICK)  # mission time begins
         for k in range(number):
-            scheduler.call_at(scheduler.now_s + 0.01 * k, lambda k=k: recorder.publish(topics.ACK, ack(k)))
+            scheduler.call_at(
+                scheduler.now_s + 0.01 * k, lambda k=k: recorder.publish(topics.ACK, ack(k))
+            )
         begin_s = scheduler.now_s
         while (received := world.receive(5.0)) is not None:
             got.append((received.message.tick, scheduler.now_s - begin_s))
@@ -218,7 +224,9 @@ def test_loss_duplication_and_overtaking_happen_at_their_shares() -> None:
 
 def test_nothing_is_lost_or_reordered_in_lockstep() -> None:
     cut = {"at_s": 0.5, "duration_s": 1.0, "processes": ["world"]}
-    got = arrivals(mode="lockstep", loss=0.5, duplicate=0.5, reorder=0.5, latency_s=0.01, partition=[cut])
+    got = arrivals(
+        mode="lockstep", loss=0.5, duplicate=0.5, reorder=0.5, latency_s=0.01, partition=[cut]
+    )
     assert [tick for tick, _ in got] == list(range(200))
     assert got[60][1] == pytest.approx(1.5, abs=0.02)
 
@@ -270,7 +278,9 @@ def test_clocks_of_processes_differ_by_offset_and_drift() -> None:
         section = SimulationSection.model_validate(
             {"clock": [{"process": "world", "offset_s": 5.0, "drift": 0.02}]}
         )
-        host = Node("world", "world", Link(network=SimulatedNetwork(scheduler, section, 0, True))).host
+        host = Node(
+            "world", "world", Link(network=SimulatedNetwork(scheduler, section, 0, True))
+        ).host
         begin_s = host.now_s()
         assert begin_s == 5.0
         host.sleep(1.02)

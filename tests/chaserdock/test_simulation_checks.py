@@ -91,13 +91,17 @@ def killed(tmp_path: Path) -> Scenario:
 
 
 def test_recorder_may_be_the_window_of_ticks_behind() -> None:
-    """Four chasers with ports and thrusters publish 54 messages a tick, 476 of which waited in `detumble`."""
+    """Four chasers with ports and thrusters publish 54 messages a tick, 476 of which waited in
+    `detumble`.
+    """
     assert 476 < queue_limit("recorder", 1619, 30) < 600
     assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
 
 
 def test_messages_of_ticks_that_are_opened_at_once_may_wait() -> None:
-    """Seed 357 of `fault-drill`: 459 messages of 30 ticks of a world that had been frozen waited for the recorder."""
+    """Seed 357 of `fault-drill`: 459 messages of 30 ticks of a world that had been frozen waited
+    for the recorder.
+    """
     assert 459 < queue_limit("recorder", 3000, 250, missed_ticks=30) < 600
     assert queue_limit("controller", 3000, 250, missed_ticks=30) == 400
     assert queue_limit("controller", 30_000, 250, missed_ticks=30) == 3600
@@ -112,7 +116,17 @@ def test_messages_of_ticks_that_are_opened_at_once_may_wait() -> None:
             {"world", "controller", "chaser/0", "recorder"},
         ),
         (
-            {"fault": [{"kind": "flood", "process": "chaser/0", "topic": "sighting", "copies": 5, **WHILE}]},
+            {
+                "fault": [
+                    {
+                        "kind": "flood",
+                        "process": "chaser/0",
+                        "topic": "sighting",
+                        "copies": 5,
+                        **WHILE,
+                    }
+                ]
+            },
             {"world", "chaser/0", "chaser/1"},
         ),
         (
@@ -132,7 +146,9 @@ def test_queues_grow_for_a_reader_that_falls_behind_only(
     log.tick(249)
     names = ("world", "controller", "chaser/0", "chaser/1", "recorder")
     traffic = Traffic(
-        queues={f"{name} {k}": cast(Any, SimpleNamespace(most=1000)) for k, name in enumerate(names)}
+        queues={
+            f"{name} {k}": cast(Any, SimpleNamespace(most=1000)) for k, name in enumerate(names)
+        }
     )
     check_queues(log.checks, SimulatedFlight(tmp_path, {}, {}, (), "", 25.0, traffic), 5000)
     assert {v.text.split(":")[0] for v in log.checks.violations} == readers
@@ -160,10 +176,12 @@ def test_queue_of_the_recorder_grows_while_a_process_catches_up(
     assert log.found == found
 
 
-# -- cases ------------------------------------------------------------------------------------------------------
+# -- cases -----------------------------------------------------------------------------------------
 
 
-def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario, tmp_path: Path) -> None:
+def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(
+    scenario: Scenario, tmp_path: Path
+) -> None:
     kinds, modes, sections = set(), set(), set()
     for seed in range(150):
         case = draw_case("fault-drill", seed, scenario)
@@ -179,10 +197,21 @@ def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario,
         sections |= case.keys() | case["simulation"].keys()
     assert kinds == set(KINDS)
     assert modes == {"lockstep", "realtime"}
-    assert sections >= {"truth", "timeline", "partition", "slow", "clock", "loss", "duplicate", "reorder"}
+    assert sections >= {
+        "truth",
+        "timeline",
+        "partition",
+        "slow",
+        "clock",
+        "loss",
+        "duplicate",
+        "reorder",
+    }
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem
+)
 def test_seeds_draw_valid_variants_of_every_shipped_scenario(path: Path, tmp_path: Path) -> None:
     base = load_scenario(path)
     for seed in range(15):
@@ -191,8 +220,12 @@ def test_seeds_draw_valid_variants_of_every_shipped_scenario(path: Path, tmp_pat
         load_scenario(tmp_path / "case.toml")
 
 
-def test_one_seed_in_four_has_the_time_to_dock_after_its_last_disturbance(scenario: Scenario) -> None:
-    ends_s = {seed: draw_case("fault-drill", seed, scenario).get("duration_s", 25.0) for seed in range(40)}
+def test_one_seed_in_four_has_the_time_to_dock_after_its_last_disturbance(
+    scenario: Scenario,
+) -> None:
+    ends_s = {
+        seed: draw_case("fault-drill", seed, scenario).get("duration_s", 25.0) for seed in range(40)
+    }
     assert {seed for seed, end_s in ends_s.items() if end_s > 25.0} == set(range(0, 40, 4))
     for seed in range(0, 40, 4):
         case = draw_case("fault-drill", seed, scenario)
@@ -216,7 +249,9 @@ def test_seeds_draw_faults_of_latches_where_there_are_ports(tmp_path: Path) -> N
     assert len(chasers) > 1
 
 
-def test_seeds_draw_thruster_failures_and_lost_device_messages_where_there_are_any(tmp_path: Path) -> None:
+def test_seeds_draw_thruster_failures_and_lost_device_messages_where_there_are_any(
+    tmp_path: Path,
+) -> None:
     capture = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
     kinds, topics_of = set(), set()
     for seed in range(60):
@@ -225,10 +260,16 @@ def test_seeds_draw_thruster_failures_and_lost_device_messages_where_there_are_a
         path.write_text(toml_document(case))
         loaded = load_scenario(path)
         kinds |= {f.kind for f in loaded.thruster_failure}
-        lost = [f for f in loaded.fault if f.topic in ("docking", "thrusters") and f.kind != "flood"]
+        lost = [
+            f for f in loaded.fault if f.topic in ("docking", "thrusters") and f.kind != "flood"
+        ]
         topics_of |= {(f.process, f.topic) for f in lost}
     assert kinds == {"stuck_off", "stuck_on", "weak"}
-    assert topics_of == {("controller", "thrusters"), ("controller", "docking"), ("chaser/0", "docking")}
+    assert topics_of == {
+        ("controller", "thrusters"),
+        ("controller", "docking"),
+        ("chaser/0", "docking"),
+    }
 
 
 def documented_faults() -> set[str]:
@@ -239,17 +280,21 @@ def documented_faults() -> set[str]:
 
 
 def possible_faults() -> set[tuple[str, str, str]]:
-    """Return kind, role and topic of every fault that a mission with ports and thrusters can have; topic: empty if it has
-    none."""
+    """Return kind, role and topic of every fault that a mission with ports and thrusters can have;
+    topic: empty if it has none."""
     possible = set()
     for kind in get_args(FaultKind):
         drawn = draw_fault(kind, random.Random(0), 1, ports=(0,))
-        keys = {name: value for name, value in drawn.items() if name not in ("process", "peer", "topic")}
+        keys = {
+            name: value for name, value in drawn.items() if name not in ("process", "peer", "topic")
+        }
         for process, topic in itertools.product(
             ("world", "controller", "chaser/0", "recorder"), ("", *FAULTY_TOPICS)
         ):
             with suppress(ValidationError):
-                Fault.model_validate(keys | {"process": process} | ({"topic": topic} if topic else {}))
+                Fault.model_validate(
+                    keys | {"process": process} | ({"topic": topic} if topic else {})
+                )
                 possible.add((kind, role_of(process), topic))
     return possible
 
@@ -266,11 +311,13 @@ def test_seeds_draw_every_documented_fault_of_every_message() -> None:
 
 def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> None:
     path = tmp_path / "case.toml"
-    path.write_text(toml_document({"extends": "fault-drill", "timeline": [], "success": {"docked": []}}))
+    path.write_text(
+        toml_document({"extends": "fault-drill", "timeline": [], "success": {"docked": []}})
+    )
     assert load_scenario(path).timeline == ()
 
 
-# -- invariants -------------------------------------------------------------------------------------------------
+# -- invariants ------------------------------------------------------------------------------------
 
 
 class Log:
@@ -295,7 +342,9 @@ class Log:
         at: dict[str, Any] = {"tick": tick, "sim_time_ns": tick * 100_000_000, **changes}
         self.publish(topics.TICK, msgspec.structs.replace(BY_TYPE[Tick], chasers=chasers, **at))
 
-    def bodies(self, tick: int, *bodies: BodyTruth, contacts: tuple[tuple[str, str], ...] = ()) -> None:
+    def bodies(
+        self, tick: int, *bodies: BodyTruth, contacts: tuple[tuple[str, str], ...] = ()
+    ) -> None:
         for body in bodies:
             stamped = msgspec.structs.replace(body, tick=tick, sim_time_ns=tick * 100_000_000)
             self.publish(topics.TRUTH_BODY, stamped, body.body)
@@ -306,11 +355,15 @@ class Log:
         self.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=contacts, saturated=()))
 
     def flies(self, chaser: int, tick: int, term: int = 1, source: str = "command") -> None:
-        command = msgspec.structs.replace(ACTUATORS, chaser=chaser, tick=tick, term=term, source=source)
+        command = msgspec.structs.replace(
+            ACTUATORS, chaser=chaser, tick=tick, term=term, source=source
+        )
         self.publish(topics.ACTUATORS, command, chaser, f"chaser/{chaser}")
 
     def event(self, what: str, detail: str, process: str = "world", level: Any = "warning") -> None:
-        self.publish(topics.EVENT, Event(process=process, level=level, what=what, detail=detail), process)
+        self.publish(
+            topics.EVENT, Event(process=process, level=level, what=what, detail=detail), process
+        )
 
     @property
     def found(self) -> list[str]:
@@ -370,7 +423,9 @@ def test_a_chaser_that_flies_commands_again_is_judged_again(killed: Scenario, lo
     """From 3 s of flown commands on, and of a process that was lost, only if it takes part again."""
     log = Log(killed)
     log.tick(5)
-    log.event(*(("process lost", "chaser/1") if lost else ("actuators stopped", "chaser/1: no command")))
+    log.event(
+        *(("process lost", "chaser/1") if lost else ("actuators stopped", "chaser/1: no command"))
+    )
     for tick in range(6, 100):
         log.tick(tick, chasers=(0, 2, 3) if lost and tick < 50 else (0, 1, 2, 3))
         log.flies(1, tick, source="command" if tick >= 20 else "hold")
@@ -412,10 +467,15 @@ def test_momentum_changes_by_impulses_only(log: Log) -> None:
 
 
 def test_angular_momentum_changes_by_angular_impulses_only(log: Log) -> None:
-    drawn = DrawnBody(body="chaser/0", mass_kg=10.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
+    drawn = DrawnBody(
+        body="chaser/0", mass_kg=10.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0)
+    )
     log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
     log.bodies(1, body("chaser/0", 2.0))
-    turned: dict[str, Any] = {"omega_rad_s": (0.0, 0.0, 0.2), "angular_impulse_N_m_s": (0.0, 0.0, 0.1)}
+    turned: dict[str, Any] = {
+        "omega_rad_s": (0.0, 0.0, 0.2),
+        "angular_impulse_N_m_s": (0.0, 0.0, 0.1),
+    }
     log.bodies(2, body("chaser/0", 2.0, **turned))
     assert log.found == []
     log.bodies(3, body("chaser/0", 2.0, omega_rad_s=(0.0, 0.0, 0.3)))
@@ -431,7 +491,9 @@ def test_positions_follow_velocities(log: Log) -> None:
 
 
 def test_a_probe_in_contact_may_change_the_momentum(log: Log) -> None:
-    """Also without a new touch, as after a latch has opened: the docking sensor reports it in the same tick."""
+    """Also without a new touch, as after a latch has opened: the docking sensor reports it in the
+    same tick.
+    """
     drawn = DrawnBody(body="chaser/0", mass_kg=10.0, inertia_kg_m2=(1.0,) * 9)
     log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
     log.bodies(1, body("chaser/0", 2.0))
@@ -473,9 +535,17 @@ def test_leases_may_run_out_in_a_network_that_is_slow_against_a_tick(
 
 
 def test_published_commands_are_flown_unless_a_fault_lasts(tmp_path: Path) -> None:
-    drop = {"kind": "drop", "process": "chaser/1", "topic": "wrench", "at_s": 1.0, "duration_s": 4.0}
+    drop = {
+        "kind": "drop",
+        "process": "chaser/1",
+        "topic": "wrench",
+        "at_s": 1.0,
+        "duration_s": 4.0,
+    }
     blind = {"kind": "camera_off", "process": "chaser/1", "at_s": 1.0, "duration_s": 6.0}
-    log = Log(variant(tmp_path, fault=[drop, blind, {**drop, "process": "chaser/2", "duration_s": 6.0}]))
+    log = Log(
+        variant(tmp_path, fault=[drop, blind, {**drop, "process": "chaser/2", "duration_s": 6.0}])
+    )
     for tick in range(82):
         assert log.found == [], tick
         log.tick(tick)
@@ -511,7 +581,9 @@ def test_a_retreat_leads_to_the_nominal_place_when_it_has_turned(log: Log) -> No
         log.publish(topics.REFERENCE, reference, 0)
     assert log.found == []
     log.publish(
-        topics.REFERENCE, msgspec.structs.replace(sample, phase_time_s=9.0, offset_m=(-0.46, 0, 0)), 0
+        topics.REFERENCE,
+        msgspec.structs.replace(sample, phase_time_s=9.0, offset_m=(-0.46, 0, 0)),
+        0,
     )
     assert log.found == ["retreat leads away"]
 
@@ -536,7 +608,9 @@ def test_commands_are_the_inputs_of_their_plans(log: Log) -> None:
     log.publish(topics.PLAN, plan, 0)
     acting = msgspec.structs.replace(WRENCH, effective_time_ns=plan.sim_time_ns + 50_000_000)
     log.publish(topics.WRENCH, acting, 0)
-    log.publish(topics.WRENCH, msgspec.structs.replace(acting, mode="track", force_N=(0.0, 0.0, 0.0)), 0)
+    log.publish(
+        topics.WRENCH, msgspec.structs.replace(acting, mode="track", force_N=(0.0, 0.0, 0.0)), 0
+    )
     assert log.found == []
     late = msgspec.structs.replace(acting, effective_time_ns=plan.sim_time_ns + 150_000_000)
     log.publish(topics.WRENCH, late, 0)
@@ -569,7 +643,10 @@ def test_estimate_is_not_judged_while_a_thruster_pushes_the_target_unknown_to_al
 ) -> None:
     s = load_scenario(find_scenario("four-chaser-capture"))
     failure = ThrusterFailure(chaser=0, thruster=3, at_s=0.5, kind="stuck_on", reported=reported)
-    log, sample = Log(s.model_copy(update={"thruster_failure": (failure,)})), BY_TYPE[TargetEstimate]
+    log, sample = (
+        Log(s.model_copy(update={"thruster_failure": (failure,)})),
+        BY_TYPE[TargetEstimate],
+    )
     held = WorldTruth(tick=15, contacts=(), saturated=(), latched=(0,) if latched else ())
     stamps: Any = {"tick": 15, "sim_time_ns": 1_000_000_000}
     log.publish(topics.TRUTH_BODY, msgspec.structs.replace(body("target", 0.0), **stamps), "target")
@@ -596,7 +673,13 @@ def test_a_controller_names_damaged_sightings(
     fault: dict[str, Any], event: str, found: list[str], tmp_path: Path
 ) -> None:
     """Where it receives enough of them for one that is an invalid pose."""
-    damage = {"kind": "corrupt", "process": "controller", "topic": "sighting", "at_s": 1.0, "duration_s": 9.0}
+    damage = {
+        "kind": "corrupt",
+        "process": "controller",
+        "topic": "sighting",
+        "at_s": 1.0,
+        "duration_s": 9.0,
+    }
     log = Log(variant(tmp_path, fault=[{**damage, **fault}]))
     for tick in range(60):
         log.bodies(tick)
@@ -638,7 +721,9 @@ def test_a_healthy_thruster_is_not_suspected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("pause", "found"), [(1000, ["liveness"]), (150, [])])
-def test_a_chaser_without_a_controller_comes_to_rest(log: Log, pause: int, found: list[str]) -> None:
+def test_a_chaser_without_a_controller_comes_to_rest(
+    log: Log, pause: int, found: list[str]
+) -> None:
     for tick in range(250):
         log.tick(tick)
         log.flies(0, tick, source="hold" if tick == pause else "brake")
@@ -647,9 +732,13 @@ def test_a_chaser_without_a_controller_comes_to_rest(log: Log, pause: int, found
 
 @pytest.mark.parametrize(("every", "found"), [(10, []), (100, ["commands are flown"])])
 def test_commanded_force_opens_thrusters(every: int, found: list[str]) -> None:
-    """Twelve thrusters of 1.5 N give 1.8 N s in a carrier period; 1.5 N for 30 ticks of 15 Hz are 3 N s."""
+    """Twelve thrusters of 1.5 N give 1.8 N s in a carrier period; 1.5 N for 30 ticks of 15 Hz are 3
+    N s.
+    """
     log = Log(load_scenario(ROOT / "scenarios" / "docking-contact.toml"))
-    push: Any = msgspec.structs.replace(ACTUATORS, chaser=0, force_N=(1.5, 0.0, 0.0), torque_N_m=(0.0,) * 3)
+    push: Any = msgspec.structs.replace(
+        ACTUATORS, chaser=0, force_N=(1.5, 0.0, 0.0), torque_N_m=(0.0,) * 3
+    )
     pulse = ThrusterPulse(thruster=0, open_ns=0, close_ns=100_000_000)
     for tick in range(30):
         pulses = () if tick % every else (pulse,)
@@ -663,7 +752,9 @@ def test_a_latch_opens_for_a_retreat_only(log: Log, phase: str, found: list[str]
     for tick, latched in ((1, (0,)), (2, ())):
         reference: Any = msgspec.structs.replace(BY_TYPE[Reference], phase=phase)
         log.publish(topics.REFERENCE, reference, 0)
-        log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched))
+        log.publish(
+            topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched)
+        )
     assert log.found == found
 
 
@@ -682,7 +773,9 @@ def test_a_touched_target_may_change_its_energy(log: Log) -> None:
         turning = body("target", 0.01 * tick, 0.1, omega_rad_s=(0.0, 0.0, rate), tick=tick)
         log.publish(topics.TRUTH_BODY, turning, "target")
         latched = (0,) if tick == 1 else ()
-        log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched))
+        log.publish(
+            topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched)
+        )
     assert log.found == []
 
 
@@ -708,9 +801,14 @@ def test_latched_chasers_do_not_spin_the_stack_up(
     log.publish(topics.REFERENCE, reference, 0)
     for tick, rate in enumerate(rates):
         for name, x_m in (("target", 0.0), ("chaser/0", -1.0)):
-            moving: dict[str, Any] = {"omega_rad_s": (0, 0, rate), "velocity_m_s": (0, rate * (x_m + 0.5), 0)}
+            moving: dict[str, Any] = {
+                "omega_rad_s": (0, 0, rate),
+                "velocity_m_s": (0, rate * (x_m + 0.5), 0),
+            }
             log.publish(topics.TRUTH_BODY, body(name, x_m, **moving, tick=tick), name)
-        log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=(0,)))
+        log.publish(
+            topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=(0,))
+        )
     assert log.found == found
 
 
@@ -727,7 +825,9 @@ def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
     assert log.found[1:] == ["no superseded command"]
 
 
-def test_commands_may_be_older_than_the_ticks_that_a_frozen_world_opens_at_once(tmp_path: Path) -> None:
+def test_commands_may_be_older_than_the_ticks_that_a_frozen_world_opens_at_once(
+    tmp_path: Path,
+) -> None:
     log = Log(variant(tmp_path, simulation={"mode": "realtime", "latency_s": 0.01}))
     log.now_s = 1.0
     log.tick(20)
@@ -762,7 +862,9 @@ def test_chasers_fly_different_commanders_only_in_a_tick_in_which_a_controller_i
 
 
 def test_controllers_do_not_command_in_turn(killed: Scenario) -> None:
-    """A command that is flown late, and one of a tick in which a controller is lost, may be of the former commander."""
+    """A command that is flown late, and one of a tick in which a controller is lost, may be of the
+    former commander.
+    """
     log = Log(killed)
     log.tick(21, controllers={"controller": "c", "standby": "s"})
     log.tick(21, revision=1, controllers={"standby": "s"})
@@ -786,15 +888,31 @@ def test_controllers_do_not_command_in_turn(killed: Scenario) -> None:
         ({"simulation": {"mode": "realtime", "jitter_s": 0.001}}, True),
         ({"simulation": {"mode": "realtime", "loss": 0.01}}, False),
         ({"simulation": {"mode": "realtime", "jitter_s": 0.01}}, False),
-        ({"simulation": {"partition": [{"at_s": 1.0, "duration_s": 1.5, "processes": ["chaser/0"]}]}}, False),
+        (
+            {
+                "simulation": {
+                    "partition": [{"at_s": 1.0, "duration_s": 1.5, "processes": ["chaser/0"]}]
+                }
+            },
+            False,
+        ),
         ({"fault": [{"kind": "kill", "process": "controller", "at_s": 4.5}]}, False),
         ({"fault": [{"kind": "kill", "process": "chaser/1", "at_s": 0.5}]}, True),
         ({"fault": [{"kind": "kill", "process": "controller", "at_s": 5.5}]}, True),
-        ({"fault": [{"kind": "camera_off", "process": "chaser/1", "at_s": 4.5, "duration_s": 1.0}]}, True),
+        (
+            {
+                "fault": [
+                    {"kind": "camera_off", "process": "chaser/1", "at_s": 4.5, "duration_s": 1.0}
+                ]
+            },
+            True,
+        ),
     ],
 )
 def test_hand_over_has_a_cause(tmp_path: Path, keys: dict[str, Any], found: bool) -> None:
-    """At 5 s: a fault or partition that lasts, or ended in the last 3 s, or a network that loses or delays messages."""
+    """At 5 s: a fault or partition that lasts, or ended in the last 3 s, or a network that loses or
+    delays messages.
+    """
     log = Log(variant(tmp_path, **keys))
     for tick, term in ((48, 1), (49, 3), (50, 4), (51, 4)):
         log.tick(tick)
@@ -810,26 +928,41 @@ def test_invalid_messages_are_noticed(log: Log) -> None:
 
 WRONG = [
     (msgspec.structs.replace(WRENCH, expires_ns=900_000_000), "a lifetime of 0.1 s, 0.5 stated"),
-    (msgspec.structs.replace(WRENCH, force_N=(0.0, 2.1, 0.0)), "wrench of 1.050 of the body's limits"),
+    (
+        msgspec.structs.replace(WRENCH, force_N=(0.0, 2.1, 0.0)),
+        "wrench of 1.050 of the body's limits",
+    ),
     (msgspec.structs.replace(ACTUATORS, torque_N_m=(0.0, 0.0, -0.06)), "wrench of 1.200"),
     (
-        msgspec.structs.replace(ACTUATORS, pulses=(ThrusterPulse(thruster=0, open_ns=9, close_ns=19),)),
+        msgspec.structs.replace(
+            ACTUATORS, pulses=(ThrusterPulse(thruster=0, open_ns=9, close_ns=19),)
+        ),
         "pulse of thruster 0 from 9",
     ),
     (body("target", 0.0, q_wxyz=(1.0, 0.0, 0.0, 0.01)), "quaternion of length 1.00005"),
     (msgspec.structs.replace(BY_TYPE[Sighting], solutions=()), "status seen with 0 solutions"),
     (msgspec.structs.replace(BY_TYPE[TargetEstimate], rejected=(0,)), "both accepted and rejected"),
-    (msgspec.structs.replace(BY_TYPE[Reference], offset_m=(30.0, 0.0, 0.0)), "30.0 m from the target"),
-    (msgspec.structs.replace(BY_TYPE[Plan], positions_m=()), "plan of 1 stages with (0, 8, 6) numbers"),
+    (
+        msgspec.structs.replace(BY_TYPE[Reference], offset_m=(30.0, 0.0, 0.0)),
+        "30.0 m from the target",
+    ),
+    (
+        msgspec.structs.replace(BY_TYPE[Plan], positions_m=()),
+        "plan of 1 stages with (0, 8, 6) numbers",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("message", "text"), WRONG, ids=lambda x: type(x).__name__)
-def test_messages_with_impossible_values_are_found(message: Any, text: str, scenario: Scenario) -> None:
+def test_messages_with_impossible_values_are_found(
+    message: Any, text: str, scenario: Scenario
+) -> None:
     assert text in " ".join(defects_of(message, scenario))
 
 
-@pytest.mark.parametrize("kind", [WrenchCommand, ActuatorCommand, Sighting, TargetEstimate, Reference])
+@pytest.mark.parametrize(
+    "kind", [WrenchCommand, ActuatorCommand, Sighting, TargetEstimate, Reference]
+)
 def test_correct_messages_have_no_defects(kind: type, scenario: Scenario) -> None:
     message = {WrenchCommand: WRENCH, ActuatorCommand: ACTUATORS}.get(kind, BY_TYPE.get(kind))
     assert defects_of(message, scenario) == []
@@ -844,7 +977,9 @@ def test_covariances_are_symmetric_and_positive_semidefinite() -> None:
 def test_pulses_of_a_thruster_do_not_overlap() -> None:
     capture = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
     pulses = tuple(ThrusterPulse(thruster=j, open_ns=9 + 5 * j, close_ns=19) for j in (0, 1))
-    fired = msgspec.structs.replace(ACTUATORS, force_N=(0.0,) * 3, torque_N_m=(0.0,) * 3, pulses=pulses)
+    fired = msgspec.structs.replace(
+        ACTUATORS, force_N=(0.0,) * 3, torque_N_m=(0.0,) * 3, pulses=pulses
+    )
     assert defects_of(fired, capture) == []
     again = (*pulses, ThrusterPulse(thruster=1, open_ns=18, close_ns=25))
     assert defects_of(msgspec.structs.replace(fired, pulses=again), capture) == [
@@ -854,7 +989,8 @@ def test_pulses_of_a_thruster_do_not_overlap() -> None:
 
 def ended(log: Log, complete: bool = True) -> Log:
     log.publish(
-        topics.END, MissionEnd(tick=250, reason="completed" if complete else "no chaser", complete=complete)
+        topics.END,
+        MissionEnd(tick=250, reason="completed" if complete else "no chaser", complete=complete),
     )
     return log
 
@@ -883,7 +1019,9 @@ def test_a_complete_mission_lasts_as_long_as_the_scenario(log: Log) -> None:
         (0.4, "command", ["liveness"]),
     ],
 )
-def test_a_docked_chaser_is_at_its_docking_place(log: Log, x_m: float, source: str, found: list[str]) -> None:
+def test_a_docked_chaser_is_at_its_docking_place(
+    log: Log, x_m: float, source: str, found: list[str]
+) -> None:
     """Within 2 cm, unless it falls back."""
     at_end(log, "docked")
     log.bodies(249, body("target", 0.0), body("chaser/0", x_m))
@@ -911,7 +1049,12 @@ def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -
 @pytest.mark.parametrize(
     ("process", "level", "what", "without"),
     [
-        ("controller", "info", "chaser 0: hold (from approach: no chaser has seen the target for 3 s)", [3]),
+        (
+            "controller",
+            "info",
+            "chaser 0: hold (from approach: no chaser has seen the target for 3 s)",
+            [3],
+        ),
         ("controller", "info", "chaser 0: hold (from wait)", [0, 3]),
         ("controller", "warning", "chaser 3: odometry jumped by 2 mm", [0]),
         ("controller", "error", "solver error", []),
@@ -957,7 +1100,9 @@ def test_a_mission_has_the_time_of_an_approach_after_a_reason(
 def test_a_lost_chaser_in_the_way_keeps_others_from_docking(
     x_m: float, back: bool, state: str, killed: Scenario
 ) -> None:
-    """Seeds 984 and 1296 of `fault-drill`: it drifted within the distance that the others keep from it."""
+    """Seeds 984 and 1296 of `fault-drill`: it drifted within the distance that the others keep from
+    it.
+    """
     log = Log(killed)
     at_end(log, "approach")
     log.bodies(1, body("target", 0.0), body("chaser/0", -0.8), body("chaser/2", x_m))
@@ -987,7 +1132,10 @@ def test_a_chaser_that_falls_back_is_safe(killed: Scenario) -> None:
 def test_a_chaser_that_is_not_commanded_to_approach_may_hold(tmp_path: Path) -> None:
     approach = {"command": "approach", "at_s": 5.0}
     log = Log(
-        variant(tmp_path, timeline=[{**approach, "chasers": [0]}, {**approach, "at_s": 25.0, "chasers": [3]}])
+        variant(
+            tmp_path,
+            timeline=[{**approach, "chasers": [0]}, {**approach, "at_s": 25.0, "chasers": [3]}],
+        )
     )
     at_end(log, "hold")
     ended(log).checks.check_end({}, ())
@@ -1004,7 +1152,8 @@ def test_an_undisturbed_mission_docks(log: Log) -> None:
     log.event("no command", "for 2 s", "chaser/0")
     ended(log).checks.check_end({}, ())
     assert [str(v) for v in log.checks.violations] == [
-        f"liveness at 0.00 s: chaser/{i}: ends in phase hold, although nothing disturbed it" for i in (0, 3)
+        f"liveness at 0.00 s: chaser/{i}: ends in phase hold, although nothing disturbed it"
+        for i in (0, 3)
     ]
 
 
@@ -1030,7 +1179,7 @@ def test_covariance_is_judged_over_honest_flights_only() -> None:
     assert "mean NEES 13.00 over 30 flights" in str(inconsistency([result(high)] * 30))
 
 
-# -- shrinking --------------------------------------------------------------------------------------------------
+# -- shrinking -------------------------------------------------------------------------------------
 
 
 def test_shrinking_leaves_what_the_failure_needs(scenario: Scenario) -> None:
@@ -1060,7 +1209,11 @@ def test_shrinking_leaves_what_the_failure_needs(scenario: Scenario) -> None:
         calls += 1
         drops = [f for f in c["fault"] if f["kind"] == "drop" and f["process"] == "chaser/2"]
         long = any(f["duration_s"] >= 0.9 and f["at_s"] < c.get("duration_s", 25.0) for f in drops)
-        return drops[-1]["at_s"] + 1.86 if long and c.get("simulation", {}).get("loss", 0.0) > 0.0 else None
+        return (
+            drops[-1]["at_s"] + 1.86
+            if long and c.get("simulation", {}).get("loss", 0.0) > 0.0
+            else None
+        )
 
     *_, small = shrink(case, violation_s, violated_s=9.2, duration_s=25.0)
     assert case == original
@@ -1103,12 +1256,20 @@ def test_shrinking_simplifies_errors_of_clocks() -> None:
 
     def violation_s(c: Case) -> float | None:
         late = any(f["offset_s"] < -1.0 for f in c.get("fault", ()))
-        behind = any(k.get("offset_s", 0.0) < -100.0 for k in c.get("simulation", {}).get("clock", ()))
+        behind = any(
+            k.get("offset_s", 0.0) < -100.0 for k in c.get("simulation", {}).get("clock", ())
+        )
         return 20.0 if late and behind else None
 
     *_, small = shrink(case, violation_s, 20.0, 25.0)
     assert small["fault"] == [
-        {"kind": "clock_jump", "at_s": 0.1, "duration_s": 0.1, "process": "controller", "offset_s": -1.1}
+        {
+            "kind": "clock_jump",
+            "at_s": 0.1,
+            "duration_s": 0.1,
+            "process": "controller",
+            "offset_s": -1.1,
+        }
     ]
     assert small["simulation"] == {"clock": [{"process": "world", "offset_s": -131.0}]}
 
@@ -1134,7 +1295,9 @@ FLOOD = {
 }
 
 
-def test_shrinking_keeps_the_violation_not_only_its_invariant(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shrinking_keeps_the_violation_not_only_its_invariant(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A flight that is cut before its chasers can dock violates liveness, too."""
 
     def flown(case: Case, seed: int) -> SimulationResult:
@@ -1174,7 +1337,9 @@ def test_shrinking_takes_violations_that_differ_in_numbers_only_as_equal(
 ) -> None:
     def flown(case: Case, seed: int) -> SimulationResult:
         chaser = 2 if case["seed"] else 1
-        return a_result(case, Violation("no contact", 1.0, f"chaser/{chaser}: {len(case['fault'])}e-05 m"))
+        return a_result(
+            case, Violation("no contact", 1.0, f"chaser/{chaser}: {len(case['fault'])}e-05 m")
+        )
 
     monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
     case: Case = {"extends": "fault-drill", "fault": [FLOOD], "seed": 3}
@@ -1183,4 +1348,7 @@ def test_shrinking_takes_violations_that_differ_in_numbers_only_as_equal(
 
 
 def test_violations_print_as_one_line() -> None:
-    assert str(Violation("no contact", 1.25, "a and b: touch")) == "no contact at 1.25 s: a and b: touch"
+    assert (
+        str(Violation("no contact", 1.25, "a and b: touch"))
+        == "no contact at 1.25 s: a and b: touch"
+    )

@@ -11,7 +11,9 @@ from pathlib import Path
 import daqp
 from harness import ROOT
 
-without_symbols = runpy.run_path(str(ROOT / "docker" / "slim.py"), run_name="slim")["without_symbols"]
+without_symbols = runpy.run_path(str(ROOT / "docker" / "slim.py"), run_name="slim")[
+    "without_symbols"
+]
 
 
 def test_a_library_without_symbols_is_smaller_and_loads(tmp_path: Path) -> None:

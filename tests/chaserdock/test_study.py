@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller by itself: the offline loop, the perfect estimator, and the least possible transient."""
+"""The controller by itself: the offline loop, the perfect estimator, and the least possible
+transient.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +32,13 @@ def scenario(name: str, *overrides: str) -> Scenario:
     return load_scenario(SCENARIOS / f"{name}.toml", overrides)
 
 
-# -- the floor --------------------------------------------------------------------------------------------
+# -- the floor -------------------------------------------------------------------------------------
 
 
 def box_least_squares(matrix: np.ndarray, target: np.ndarray, bound: float) -> float:
-    """min |matrix u + target|^2 with |u| <= bound by an active set on the normal equations: no ipopt, no CasADi."""
+    """min |matrix u + target|^2 with |u| <= bound by an active set on the normal equations: no
+    ipopt, no CasADi.
+    """
     n = matrix.shape[1]
     u, fixed = np.zeros(n), np.zeros(n, dtype=bool)
     for _ in range(50 * n):
@@ -59,11 +63,19 @@ def box_least_squares(matrix: np.ndarray, target: np.ndarray, bound: float) -> f
     raise AssertionError("the independent solution did not settle")
 
 
-def condensed(error_m: float, speed_m_s: float, steps: int, h: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted errors at the Gauss points of a double integrator on one axis: matrix @ accelerations + target."""
+def condensed(
+    error_m: float, speed_m_s: float, steps: int, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted errors at the Gauss points of a double integrator on one axis: matrix @
+    accelerations + target.
+    """
     rows, target = [], []
     for k in range(steps):
-        for at, weight in ((0.5 - math.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + math.sqrt(0.15), 5 / 18)):
+        for at, weight in (
+            (0.5 - math.sqrt(0.15), 5 / 18),
+            (0.5, 8 / 18),
+            (0.5 + math.sqrt(0.15), 5 / 18),
+        ):
             t = (k + at) * h
             row = np.zeros(steps)
             for j in range(k):
@@ -84,22 +96,43 @@ def test_floor_is_the_independent_solution(
 ) -> None:
     steps, h, a = 25, 0.4, 2 / 30
     ours = least_square_integral(
-        np.array(error), np.array(speed), np.zeros((3 * steps + 1, 3)), np.tile(LEVEL, (steps, 1)), h, a
+        np.array(error),
+        np.array(speed),
+        np.zeros((3 * steps + 1, 3)),
+        np.tile(LEVEL, (steps, 1)),
+        h,
+        a,
     )
-    other = sum(box_least_squares(*condensed(e, v, steps, h), a) for e, v in zip(error, speed, strict=True))
+    other = sum(
+        box_least_squares(*condensed(e, v, steps, h), a) for e, v in zip(error, speed, strict=True)
+    )
     assert ours == pytest.approx(other, rel=1e-4, abs=1e-7)
 
 
-def straight(q: np.ndarray, direction: tuple[float, float, float], distance_m: float = 0.85) -> float:
+def straight(
+    q: np.ndarray, direction: tuple[float, float, float], distance_m: float = 0.85
+) -> float:
     steps, h = 300, 0.05
     start = distance_m * np.array(direction)
     references = np.zeros((3 * steps + 1, 3))
-    return least_square_integral(start, np.zeros(3), references, np.tile(q, (steps, 1)), h, 2 / 30) / 120
+    return (
+        least_square_integral(start, np.zeros(3), references, np.tile(q, (steps, 1)), h, 2 / 30)
+        / 120
+    )
 
 
 def test_floor_of_known_transients() -> None:
-    """Bang-bang, rest to rest: 0.767 d^2.5 / sqrt(a) over the time; the best is a little below. Notes: 1.63e-2, 1.25e-2."""
-    bang_bang = 2 * (1 - 1 / 3 + 1 / 20 + 1 / 20) / math.sqrt(4) * 0.85**2 * math.sqrt(0.85 / (2 / 30)) / 120
+    """Bang-bang, rest to rest: 0.767 d^2.5 / sqrt(a) over the time; the best is a little below.
+    Notes: 1.63e-2, 1.25e-2.
+    """
+    bang_bang = (
+        2
+        * (1 - 1 / 3 + 1 / 20 + 1 / 20)
+        / math.sqrt(4)
+        * 0.85**2
+        * math.sqrt(0.85 / (2 / 30))
+        / 120
+    )
     along = straight(LEVEL, (-1, 0, 0))
     assert along == pytest.approx(1.63e-2, rel=0.01)
     assert 0.98 * bang_bang < along < bang_bang
@@ -107,7 +140,9 @@ def test_floor_of_known_transients() -> None:
 
 
 def test_floor_knows_the_body_axes() -> None:
-    """Turned by 45 degrees two axes push together, sqrt(2) as strong; a roll about the way changes nothing."""
+    """Turned by 45 degrees two axes push together, sqrt(2) as strong; a roll about the way changes
+    nothing.
+    """
     along = straight(LEVEL, (-1, 0, 0))
     rolled = straight(rotations.exp([0.575, 0, 0]), (-1, 0, 0))
     turned = straight(rotations.exp([0, 0, math.pi / 4]), (-1, 0, 0))
@@ -117,11 +152,13 @@ def test_floor_knows_the_body_axes() -> None:
 
 def test_floor_refuses_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="references_m must have shape"):
-        least_square_integral(np.zeros(3), np.zeros(3), np.zeros((5, 3)), np.tile(LEVEL, (2, 1)), 0.1, 1.0)
+        least_square_integral(
+            np.zeros(3), np.zeros(3), np.zeros((5, 3)), np.tile(LEVEL, (2, 1)), 0.1, 1.0
+        )
     assert gauss_times(2, 0.1)[[1, 4, 6]] == pytest.approx([0.05, 0.15, 0.2])
 
 
-# -- the loop ---------------------------------------------------------------------------------------------
+# -- the loop --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["single", "collision-avoidance"])
@@ -144,7 +181,10 @@ def test_perfect_estimate_refuses_a_free_target() -> None:
 @pytest.fixture(scope="module")
 def baseline() -> StudyResult:
     case = StudyCase(
-        name="x", scenario=str(SCENARIOS / "paper-single.toml"), overrides=("duration_s=25.0",), floor=True
+        name="x",
+        scenario=str(SCENARIOS / "paper-single.toml"),
+        overrides=("duration_s=25.0",),
+        floor=True,
     )
     return fly_case(case)
 
@@ -158,9 +198,15 @@ def test_no_flight_is_better_than_the_floor(baseline: StudyResult) -> None:
 
 def test_study_with_images_flies_the_estimator(baseline: StudyResult) -> None:
     small = ("camera.width_px=480", "camera.height_px=270", "time.rate_hz=10", "time.image_hz=10")
-    blind = msgspec.structs.replace(baseline.case, overrides=("duration_s=21.0", *small), floor=False)
+    blind = msgspec.structs.replace(
+        baseline.case, overrides=("duration_s=21.0", *small), floor=False
+    )
     perfect, seen = fly_case(blind), fly_case(msgspec.structs.replace(blind, images=True))
-    assert seen.position_mse_m2 != perfect.position_mse_m2 == pytest.approx(seen.position_mse_m2, rel=0.5)
+    assert (
+        seen.position_mse_m2
+        != perfect.position_mse_m2
+        == pytest.approx(seen.position_mse_m2, rel=0.5)
+    )
     # From 1.85 m in front of the target to its reference pose at 1 m.
     assert seen.min_distance_target_m == pytest.approx(1.0, abs=0.15)
 
@@ -170,7 +216,9 @@ def test_delay_makes_long_horizons_fail_first() -> None:
 
     def worst(horizon_s: float, delay_s: float) -> float:
         s = scenario("paper-single", "duration_s=40.0", f"controller.horizon_s={horizon_s}")
-        return float(record_flight(s, solve_delay_s=lambda _: delay_s).position_error_m[-150:].max())
+        return float(
+            record_flight(s, solve_delay_s=lambda _: delay_s).position_error_m[-150:].max()
+        )
 
     assert worst(10.0, 0.1) < 0.02
     assert worst(3.0, 0.5) < 0.05

@@ -30,7 +30,9 @@ def documented() -> set[str]:
 
 def test_typed_summary_has_the_produced_fields() -> None:
     produced: dict[str, Any] = summarize(GOLDEN)
-    assert set(produced) | RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY == set(Summary.__struct_fields__)
+    assert set(produced) | RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY == set(
+        Summary.__struct_fields__
+    )
     assert Summary.from_dict(produced).digest == produced["digest"]
 
 
@@ -44,7 +46,9 @@ def test_documented_fields_equal_the_produced_fields() -> None:
 
 
 def test_estimate_is_judged_relative_to_each_chaser() -> None:
-    """A shift of one chaser's estimated pose by 5 mm is its error, and violates the criterion; a common drift does not."""
+    """A shift of one chaser's estimated pose by 5 mm is its error, and violates the criterion; a
+    common drift does not.
+    """
     flight = load_flight(GOLDEN)
     limits = flight.scenario.success.model_copy(update={"max_estimate_position_m": 0.003})
     scenario = flight.scenario.model_copy(update={"success": limits, "settling_s": 1.0})
@@ -59,7 +63,9 @@ def test_estimate_is_judged_relative_to_each_chaser() -> None:
     assert abs(error["position_rms_m"] - 0.005) < 0.002
     assert error["nees_mean"] > 5.0 * before["chasers"]["0"]["relative_estimate"]["nees_mean"]
     (failure,) = [f for f in after["failures"] if "estimated pose" in f]
-    assert failure.startswith("chaser 0: largest position error of its estimated pose relative to the target")
+    assert failure.startswith(
+        "chaser 0: largest position error of its estimated pose relative to the target"
+    )
 
     drifted = {"target": replace(flight.estimate, position_m=flight.estimate.position_m + 0.02)}
     common = summary_of(replace(flight, scenario=scenario, estimates=drifted))  # type: ignore[arg-type]

@@ -57,7 +57,10 @@ def test_target_file_is_embedded_in_the_scenario_and_detected(tmp_path):
     assert [m.id for m in model.markers] == [0, 1]
     assert model.markers[0].position_trf_m == pytest.approx((-0.1, -0.03, 0.02))
     camera = Camera.from_hfov(1280, 720, 1.0)
-    position, q = np.array([0.0, 0.0, 1.0]), rotations.multiply(FACING, rotations.exp([0.2, 0.1, 0.3]))
+    position, q = (
+        np.array([0.0, 0.0, 1.0]),
+        rotations.multiply(FACING, rotations.exp([0.2, 0.1, 0.3])),
+    )
     for renderer in (Renderer(camera, model), TinyRenderer(camera, model)):
         image = renderer.render(np.zeros(3), rotations.IDENTITY, position, q)
         sighting = Perception(camera, model).estimate(image)

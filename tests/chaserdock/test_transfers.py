@@ -30,7 +30,9 @@ def test_every_fourth_variation_is_symmetric_and_starts_are_safe(seed: int) -> N
         assert ahead @ place == pytest.approx(-np.linalg.norm(place))
         position, _ = scenario.start_pose(i)
         assert np.linalg.norm(position) > scenario.limits.min_distance_target_m
-    assert np.linalg.norm(np.array(watcher.position_m) - goal) > scenario.limits.min_distance_chasers_m
+    assert (
+        np.linalg.norm(np.array(watcher.position_m) - goal) > scenario.limits.min_distance_chasers_m
+    )
     assert avoidance(seed) == scenario
 
 
@@ -38,12 +40,16 @@ def test_swaps_differ_by_seed_and_seed_zero_is_exactly_head_on() -> None:
     assert all(c.start_offset_m == (0.0, 0.0, 0.0) for c in swap(0).chasers)
     assert swap(1) == swap(1)
     assert swap(1).chasers != swap(2).chasers
-    assert math.hypot(*swap(3).target.omega_rad_s) == pytest.approx(math.hypot(*swap(0).target.omega_rad_s))
+    assert math.hypot(*swap(3).target.omega_rad_s) == pytest.approx(
+        math.hypot(*swap(0).target.omega_rad_s)
+    )
 
 
 @pytest.mark.parametrize(("within_m", "reached"), [(0.02, True), (1e-6, False)])
 def test_figures_of_a_short_transfer(within_m: float, reached: bool) -> None:
-    """A transfer of 5 cm: least distances as in the scenario, reached at the end; an unmet tolerance is not reached."""
+    """A transfer of 5 cm: least distances as in the scenario, reached at the end; an unmet
+    tolerance is not reached.
+    """
     scenario = avoidance(0)
     (entry,) = scenario.timeline
     entry = entry.model_copy(update={"at_s": 1.0, "offset_m": (-1.05, 0.0, 0.0)})

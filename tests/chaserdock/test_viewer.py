@@ -71,7 +71,7 @@ def mission() -> LoggedMission:
     return LoggedMission(GOLDEN)
 
 
-# -- the present --------------------------------------------------------------------------------------------
+# -- the present -----------------------------------------------------------------------------------
 
 
 def test_tracking_error_compares_messages_of_one_tick(mission: LoggedMission) -> None:
@@ -99,20 +99,33 @@ def test_tracking_error_compares_messages_of_one_tick(mission: LoggedMission) ->
 
 
 def test_images_are_of_one_moment() -> None:
-    """While images arrive one by one, the newest exposure that all chasers have is shown; who is silent does not hold others up."""
+    """While images arrive one by one, the newest exposure that all chasers have is shown; who is
+    silent does not hold others up.
+    """
     state = MissionState.empty(3)
 
     def image(chaser: int, time_s: float, seen: bool = True) -> None:
         at: dict[str, Any] = {"chaser": chaser, "sim_time_ns": round(time_s * 1e9)}
-        state.update(topics.IMAGE, Image(width_px=1, height_px=1, encoding="mono8", data=b"0", **at))
+        state.update(
+            topics.IMAGE, Image(width_px=1, height_px=1, encoding="mono8", data=b"0", **at)
+        )
         if seen:
             state.update(
                 topics.SIGHTING,
-                Sighting(status="nothing", solutions=(), marker_ids=(), corners_px=(), rejected_ids=(), **at),
+                Sighting(
+                    status="nothing",
+                    solutions=(),
+                    marker_ids=(),
+                    corners_px=(),
+                    rejected_ids=(),
+                    **at,
+                ),
             )
 
     def shown() -> list[float | None]:
-        return [i.sim_time_ns / 1e9 if i is not None else None for i in state.images_of_one_moment()]
+        return [
+            i.sim_time_ns / 1e9 if i is not None else None for i in state.images_of_one_moment()
+        ]
 
     assert shown() == [None, None, None]
     for chaser in range(3):
@@ -135,7 +148,11 @@ def test_images_are_of_one_moment() -> None:
 def test_messages_of_unknown_chasers_are_ignored() -> None:
     state, history = MissionState.empty(1), History(1)
     stray = Odometry(
-        chaser=7, position_m=(0, 0, 0), velocity_m_s=(0, 0, 0), q_wxyz=UPRIGHT, omega_rad_s=(0, 0, 0)
+        chaser=7,
+        position_m=(0, 0, 0),
+        velocity_m_s=(0, 0, 0),
+        q_wxyz=UPRIGHT,
+        omega_rad_s=(0, 0, 0),
     )
     state.update(topics.ODOMETRY, stray)
     history.update(topics.ODOMETRY, stray, 0)
@@ -160,7 +177,7 @@ def test_faults_are_listed(mission: LoggedMission) -> None:
         assert text in listed
 
 
-# -- the past -----------------------------------------------------------------------------------------------
+# -- the past --------------------------------------------------------------------------------------
 
 
 @quick
@@ -203,13 +220,17 @@ def test_plot_without_data_can_be_drawn() -> None:
 
 def test_events_are_listed_newest_first_without_repetition() -> None:
     history = History(1)
-    history.update(topics.EVENT, Event(sim_time_ns=10**9, process="world", level="warning", what="late"), 0)
+    history.update(
+        topics.EVENT, Event(sim_time_ns=10**9, process="world", level="warning", what="late"), 0
+    )
     reply = CommandReply(
         sim_time_ns=2 * 10**9, command="approach", chaser=0, accepted=False, reason="why not"
     )
     for _ in range(3):
         history.update(topics.COMMAND, reply, 0)
-    history.update(topics.END, MissionEnd(sim_time_ns=3 * 10**9, reason="all flown", complete=True), 0)
+    history.update(
+        topics.END, MissionEnd(sim_time_ns=3 * 10**9, reason="all flown", complete=True), 0
+    )
     texts = [line.text for line in history.lines_until(2.5, 10)]
     assert texts == ["approach chaser 0: refused, why not", "world: late"]
     assert history.lines_until(9.0, 1)[0].text == "the mission has ended: all flown"
@@ -232,7 +253,7 @@ def test_latency_is_measured_from_image_to_command_of_its_tick(mission: LoggedMi
     assert len(mission.history.series["latency_ms", 1]) >= 17
 
 
-# -- a log --------------------------------------------------------------------------------------------------
+# -- a log -----------------------------------------------------------------------------------------
 
 
 def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
@@ -243,7 +264,13 @@ def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
         assert state.tick is not None
         assert state.tick.tick == tick
         for i, chaser in enumerate(state.chasers):
-            of_it = (chaser.odometry, chaser.reference, chaser.image, chaser.sighting, chaser.actuators)
+            of_it = (
+                chaser.odometry,
+                chaser.reference,
+                chaser.image,
+                chaser.sighting,
+                chaser.actuators,
+            )
             assert [(m.chaser, m.tick) for m in of_it if m is not None] == [(i, tick)] * 5
             assert chaser.image is not None
             assert chaser.sighting_in(chaser.image) is chaser.sighting
@@ -252,7 +279,9 @@ def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
         assert state.ended is None or tick == 17
     assert all(len(mission.history.series["position_error_mm", i]) >= 17 for i in (0, 1))
     assert len(mission.history.series["estimate_error_mm", None]) >= 17
-    assert "approach chaser 0: accepted, phase approach" in words.events(mission.history.lines_until(9.0, 99))
+    assert "approach chaser 0: accepted, phase approach" in words.events(
+        mission.history.lines_until(9.0, 99)
+    )
     table = words.chasers(mission.at(1.0), mission.history)
     assert table.count("| 1 |") == 2
     assert "| approach |" in table
@@ -260,8 +289,14 @@ def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
 
 
 def test_repeated_warnings_are_one_line_with_their_count() -> None:
-    repeated = [Line(10.0 - 0.1 * k, "warning", f"chaser 1: force of {k}.5 N exceeds 2 N") for k in range(30)]
-    other = [Line(5.0, "warning", "chaser 2: force of 3.5 N exceeds 2 N"), Line(1.0, "info", "started")]
+    repeated = [
+        Line(10.0 - 0.1 * k, "warning", f"chaser 1: force of {k}.5 N exceeds 2 N")
+        for k in range(30)
+    ]
+    other = [
+        Line(5.0, "warning", "chaser 2: force of 3.5 N exceeds 2 N"),
+        Line(1.0, "info", "started"),
+    ]
     shown = words.events([*repeated, *other], most=12).splitlines()
     assert len(shown) == 3
     assert "0.5 N exceeds 2 N (30 times since 7.10 s)" in shown[0]
@@ -315,7 +350,7 @@ def test_time_line_plays_to_its_end_and_follows_the_slider() -> None:
     assert not line.playing
 
 
-# -- shapes -------------------------------------------------------------------------------------------------
+# -- shapes ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["four-chaser-docking", "docking-contact"])
@@ -339,7 +374,9 @@ def test_corridor_covers_the_allowed_region() -> None:
     assert line is not None
     axis = np.array(held.chasers[0].position_m)
     along = line @ (axis / np.linalg.norm(axis))
-    assert (along.min(), along.max()) == pytest.approx((held.approach.dock_distance_m, 1.0), abs=1e-6)
+    assert (along.min(), along.max()) == pytest.approx(
+        (held.approach.dock_distance_m, 1.0), abs=1e-6
+    )
     captured = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
     tube = shapes.corridor_of(captured, 0)
     assert tube is not None
@@ -349,7 +386,7 @@ def test_corridor_covers_the_allowed_region() -> None:
     assert (gaps.min(), gaps.max()) == pytest.approx((0.0, captured.docking.entry_m), abs=1e-5)
 
 
-# -- the server and the network -----------------------------------------------------------------------------
+# -- the server and the network --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -471,7 +508,9 @@ def test_token_is_random_or_that_of_the_environment(monkeypatch: pytest.MonkeyPa
 
 def test_viewer_without_a_router_reports_it_and_can_be_stopped() -> None:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
-    process = chaserdock("view", "-m", "client", "-e", endpoint, stdout=PIPE, stderr=STDOUT, text=True)
+    process = chaserdock(
+        "view", "-m", "client", "-e", endpoint, stdout=PIPE, stderr=STDOUT, text=True
+    )
     try:
         assert process.stdout is not None
         assert process.stdout.readline().endswith("shows the mission; Ctrl-C ends this\n")
@@ -501,7 +540,10 @@ def test_access_rights_give_ground_truth_to_viewers_only(tmp_path: Path) -> None
     keys = make_keys(tmp_path / "keys")
     with router_with_rights(keys) as endpoint:
         world = Node("world", "world", client(keys, "world", endpoint))
-        nodes = {who: Node("viewer", "viewer", client(keys, who, endpoint)) for who in ("viewer", "operator")}
+        nodes = {
+            who: Node("viewer", "viewer", client(keys, who, endpoint))
+            for who in ("viewer", "operator")
+        }
         try:
             takers = {
                 (who, topic.key): node.subscribe_newest(

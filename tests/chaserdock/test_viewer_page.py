@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's page in a real browser: no external requests, moving scene, commands by click, no effect of a blocked
-browser on the flight."""
+"""The viewer's page in a real browser: no external requests, moving scene, commands by click, no
+effect of a blocked browser on the flight."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def wait_for(page: Page, text: str) -> None:
     page.locator(f"text=/{text}/").first.wait_for()
 
 
-# -- requests of the page -----------------------------------------------------------------------------
+# -- requests of the page --------------------------------------------------------------------------
 
 
 @needs_browser
@@ -68,7 +68,12 @@ def test_page_of_a_log_makes_no_external_requests() -> None:
         page.on("websocket", lambda socket: requested.append(socket.url))
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(f"{url}/?fixedDpr=0.3")
-        for text in ("two-chaser-tracking", "tracking", "approach chaser 0: accepted", "position error, mm"):
+        for text in (
+            "two-chaser-tracking",
+            "tracking",
+            "approach chaser 0: accepted",
+            "position error, mm",
+        ):
             wait_for(page, text)
         assert page.get_by_role("button", name="abort").count() == 0  # a log takes no commands
         page.get_by_role("button", name="to start").click()
@@ -82,7 +87,7 @@ def test_page_of_a_log_makes_no_external_requests() -> None:
     assert errors == []
 
 
-# -- a running mission --------------------------------------------------------------------------------------
+# -- a running mission -----------------------------------------------------------------------------
 
 
 def start_flight(hand: ByHand, out: Path, mode: str, *overrides: str) -> None:
@@ -132,21 +137,27 @@ def test_scene_moves_and_click_starts_docking(hand: ByHand, tmp_path: Path) -> N
         wait_for(page, "ended early")
     log = tmp_path / "mission.mcap"
     (asked,) = [
-        r.message for r in read_log(log, [topics.OPERATED.key_of()]) if r.message.command == "approach"
+        r.message
+        for r in read_log(log, [topics.OPERATED.key_of()])
+        if r.message.command == "approach"
     ]
     assert (asked.chaser, asked.operator) == (0, "viewer")
     aborted = [
-        r.message.chaser for r in read_log(log, [topics.OPERATED.key_of()]) if r.message.command == "abort"
+        r.message.chaser
+        for r in read_log(log, [topics.OPERATED.key_of()])
+        if r.message.command == "abort"
     ]
     assert aborted == [0]  # the other one was cancelled
     phases = [r.message.phase for r in read_log(log, [topics.REFERENCE.key_of(0)])]
     assert phases.index("approach") > phases.index("hold")
-    distances = [sum(x * x for x in r.message.offset_m) for r in read_log(log, [topics.REFERENCE.key_of(0)])]
+    distances = [
+        sum(x * x for x in r.message.offset_m) for r in read_log(log, [topics.REFERENCE.key_of(0)])
+    ]
     # Up to the abort, which lets the chaser go away again.
     assert distances[phases.index("abort") - 1] < distances[phases.index("approach")]
 
 
-# -- no effect on the flight -----------------------------------------------------------------------------
+# -- no effect on the flight -----------------------------------------------------------------------
 
 TABS = 10
 LOCKSTEP_S, REALTIME_S = 240, 150
@@ -196,7 +207,9 @@ def fly(hand: ByHand, out: Path, mode: str, seconds: int, *, watched: bool) -> P
 
 
 # Ten tabs without a graphics card take all of two cores for many minutes: on demand.
-ten_tabs = pytest.mark.skipif("CHASERDOCK_TEN_TABS" not in os.environ, reason="set CHASERDOCK_TEN_TABS=1")
+ten_tabs = pytest.mark.skipif(
+    "CHASERDOCK_TEN_TABS" not in os.environ, reason="set CHASERDOCK_TEN_TABS=1"
+)
 
 
 @ten_tabs
@@ -206,10 +219,15 @@ ten_tabs = pytest.mark.skipif("CHASERDOCK_TEN_TABS" not in os.environ, reason="s
 def test_lockstep_flight_is_equal_with_ten_frozen_tabs(hand: ByHand, tmp_path: Path) -> None:
     alone = load_flight(fly(hand, tmp_path / "alone", "lockstep", LOCKSTEP_S, watched=False))
     watched = load_flight(fly(hand, tmp_path / "watched", "lockstep", LOCKSTEP_S, watched=True))
-    assert alone.counts["controller/solver"] == watched.counts["controller/solver"] == 15 * LOCKSTEP_S
+    assert (
+        alone.counts["controller/solver"] == watched.counts["controller/solver"] == 15 * LOCKSTEP_S
+    )
     assert watched.digest == alone.digest
     # The number of presence messages before the recorder subscribed depends on the machine.
-    lost = [{key: n for key, n in f.lost.items() if not key.endswith("/presence")} for f in (alone, watched)]
+    lost = [
+        {key: n for key, n in f.lost.items() if not key.endswith("/presence")}
+        for f in (alone, watched)
+    ]
     assert lost[0] == lost[1]
 
 
@@ -226,8 +244,12 @@ def missed(log: Path) -> int:
 @needs_browser
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_realtime_flight_misses_no_more_deadlines_with_ten_frozen_tabs(hand: ByHand, tmp_path: Path) -> None:
-    """Flights alternate, because the machine's load varies. With the viewer at most 5 % more commands are missed."""
+def test_realtime_flight_misses_no_more_deadlines_with_ten_frozen_tabs(
+    hand: ByHand, tmp_path: Path
+) -> None:
+    """Flights alternate, because the machine's load varies. With the viewer at most 5 % more
+    commands are missed.
+    """
     commands = REALTIME_S * 15 * 2
     counts: dict[bool, list[int]] = {False: [], True: []}
     for turn in range(2):

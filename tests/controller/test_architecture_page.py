@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/architecture.md lists calls that exist, in the order of packages; docs/phases.md is generated."""
+"""docs/architecture.md lists calls that exist, in the order of packages; docs/phases.md is
+generated.
+"""
 
 from __future__ import annotations
 
@@ -47,6 +49,8 @@ def test_step_enters_each_package_once_in_the_listed_order() -> None:
 
 def test_the_phases_page_is_current() -> None:
     command = [sys.executable, str(ROOT / "docs" / "make_phases.py"), "--print"]
-    made = subprocess.run(command, capture_output=True, text=True, check=True, encoding="utf-8").stdout
+    made = subprocess.run(
+        command, capture_output=True, text=True, check=True, encoding="utf-8"
+    ).stdout
     committed = (ROOT / "docs" / "phases.md").read_text(encoding="utf-8")
     assert committed == made, "run: python docs/make_phases.py"

@@ -43,7 +43,9 @@ def client() -> BodyShape:
 @settings(deadline=None, max_examples=100)
 @given(st.lists(st.floats(-0.5, 0.5), min_size=5, max_size=5), st.integers(0, 2**32 - 1))
 def test_corrections_keep_the_inertia_physical(ratios: list[float], seed: int) -> None:
-    """A correction beyond what a body can have ends at the limit, and nearer to any inertia that a body can have."""
+    """A correction beyond what a body can have ends at the limit, and nearer to any inertia that a
+    body can have.
+    """
     error = np.array([*ratios, 0.01, 0.02, -0.03])
     shape = client().corrected(error)
     moments = np.linalg.eigvalsh(shape.inertia)
@@ -82,12 +84,16 @@ def test_covariance_of_a_shape_is_that_of_the_mass_properties() -> None:
     found = np.cov(np.array(rows).T)
     deviations = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
-        found / np.outer(deviations, deviations), expected / np.outer(deviations, deviations), atol=0.1
+        found / np.outer(deviations, deviations),
+        expected / np.outer(deviations, deviations),
+        atol=0.1,
     )
 
 
 @pytest.mark.parametrize(("mean_motion_rad_s", "tolerance"), [(0.0, 1e-6), (1.1e-3, 1e-5)])
-def test_the_transition_is_the_derivative_of_the_motion(mean_motion_rad_s: float, tolerance: float) -> None:
+def test_the_transition_is_the_derivative_of_the_motion(
+    mean_motion_rad_s: float, tolerance: float
+) -> None:
     shape, dt_s, e = client(), 0.1, 1e-5
 
     def moved(d: Array) -> tuple[Array, Array, Array, Array]:
@@ -105,7 +111,9 @@ def test_the_transition_is_the_derivative_of_the_motion(mean_motion_rad_s: float
 
 
 def test_the_motion_is_that_of_the_other_models() -> None:
-    """In free space that of ``mekf``; in an orbit that of the equations by which the chasers are predicted."""
+    """In free space that of ``mekf``; in an orbit that of the equations by which the chasers are
+    predicted.
+    """
     shape, body = client(), target_alone()
     rows = body.inertia_kg_m2.tolist()
     p = MekfParameters(
@@ -125,10 +133,14 @@ def test_the_motion_is_that_of_the_other_models() -> None:
         state = propagate(state, cw_wrench(n, state, 5.0, chaser.inertia), chaser, seconds / 1000)
     at = (np.zeros(3), np.zeros(3), MOTION[2], MOTION[3])
     for _ in range(20):
-        at, _ = motion.free_shape(at, seconds / 20, shape_of(np.diag(chaser.inertia), np.zeros(3)), n)
+        at, _ = motion.free_shape(
+            at, seconds / 20, shape_of(np.diag(chaser.inertia), np.zeros(3)), n
+        )
     np.testing.assert_allclose(at[2], state[6:10], atol=2e-5)
     np.testing.assert_allclose(at[3], state[10:], atol=5e-6)
-    free = propagate(np.concatenate([np.zeros(6), MOTION[2], MOTION[3]]), np.zeros(6), chaser, seconds)
+    free = propagate(
+        np.concatenate([np.zeros(6), MOTION[2], MOTION[3]]), np.zeros(6), chaser, seconds
+    )
     assert np.abs(free[10:] - state[10:]).max() > 1e-4
 
 
@@ -141,4 +153,6 @@ def test_a_shape_tells_nothing_of_mass_and_scale() -> None:
     assert np.sqrt(trace @ found.covariance @ trace) == pytest.approx(0.3 * 42.0, rel=1e-3)
     ratios, covariance = inertia_ratios(found)
     assert ratios == pytest.approx([client().inertia[row] for row in INERTIA_ROWS])
-    assert all(b < a for a, b in pairwise([np.trace(inertia_ratios(known)[1]), np.trace(covariance)]))
+    assert all(
+        b < a for a, b in pairwise([np.trace(inertia_ratios(known)[1]), np.trace(covariance)])
+    )

@@ -67,14 +67,18 @@ def test_solve_out_of_iterations_reports_budget_and_keeps_input_limits() -> None
     assert "budget" in short.status
     assert short.iterations.sum() <= 4
     assert np.all(np.abs(short.inputs) <= problem.input_max[:, None, :])
-    np.testing.assert_array_equal(short.inputs, make_solver("rti", PARAMS, 2, 4).solve(problem, 0.0).inputs)
+    np.testing.assert_array_equal(
+        short.inputs, make_solver("rti", PARAMS, 2, 4).solve(problem, 0.0).inputs
+    )
 
 
 def test_problem_without_active_constraints_needs_no_iteration() -> None:
     problem_at, states = far_start(1)
     states[:, :3] = problem_at(states, 0.0).references[:, 0, :3]
     states[:, 6:10] = problem_at(states, 0.0).references[:, 0, 3:]
-    assert make_solver("rti", PARAMS, 1, 0).solve(problem_at(states, 0.0), 0.0).status == ("solved",)
+    assert make_solver("rti", PARAMS, 1, 0).solve(problem_at(states, 0.0), 0.0).status == (
+        "solved",
+    )
 
 
 @dataclass
@@ -85,7 +89,9 @@ class Slow:
     max_iterations: int | None = None
     time_s: float = 0.0
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
+    def solve(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
+    ) -> NmpcPlan:
         self.inner.max_iterations = self.max_iterations
         plan = self.inner.solve(problem, shift_s, ids)
         self.time_s += SLOW_S * int(plan.iterations.sum())
@@ -101,10 +107,14 @@ def far(mission: Scenario, flight: ControllerCore, tick: int) -> TickOutputs:
 
 
 @pytest.mark.parametrize("realtime", [True, False])
-def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_never(realtime: bool) -> None:
+def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_never(
+    realtime: bool,
+) -> None:
     mission = scenario(controller={"solve_budget_s": 3 * SLOW_S})
     slow = Slow(None)
-    flight = ControllerCore(mission, lambda: slow.time_s, PerfectEstimator(mission.target), realtime)
+    flight = ControllerCore(
+        mission, lambda: slow.time_s, PerfectEstimator(mission.target), realtime
+    )
     slow.inner = flight.planning.solver
     flight.planning.solver = slow  # type: ignore[assignment]
     reports = [far(mission, flight, tick).solver for tick in range(4)]
@@ -120,7 +130,9 @@ def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_neve
 
 
 def test_seconds_go_with_a_solver_that_can_be_held_to_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ScenarioError, match=r"controller: solve_budget_s goes with the solver rti; ipopt"):
+    with pytest.raises(
+        ScenarioError, match=r"controller: solve_budget_s goes with the solver rti; ipopt"
+    ):
         scenario(controller={"solver": "ipopt", "solve_budget_s": 0.01})
     monkeypatch.setattr(planning, "make_solver", lambda *_: object())
     mission = scenario(controller={"solve_budget_s": 0.01})

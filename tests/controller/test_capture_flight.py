@@ -20,7 +20,9 @@ from chaserdock.evaluation.transfers import load_shipped
 
 
 def test_docking_meets_its_tolerances_and_backs_out_again() -> None:
-    """A seed with fast rates, noise of 2 mm and 0.1 degrees: 5 mm, 1.5 degrees, 1.2 cm/s; momentum to 1e-4."""
+    """A seed with fast rates, noise of 2 mm and 0.1 degrees: 5 mm, 1.5 degrees, 1.2 cm/s; momentum
+    to 1e-4.
+    """
     scenario = docking_scenario(1)
     flight = ConservationMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1)))
     for what, until, limit_s in (("approach", "verified", 60.0), ("abort", "hold", 30.0)):
@@ -36,7 +38,9 @@ def test_docking_meets_its_tolerances_and_backs_out_again() -> None:
                 assert out.wrenches[0].mode in ("coast", "pull")
                 assert out.target.status == "tracking"
                 truth = flight.physics.state(TARGET)
-                assert np.linalg.norm(np.array(out.target.velocity_m_s) - truth.velocity_m_s) < 0.005
+                assert (
+                    np.linalg.norm(np.array(out.target.velocity_m_s) - truth.velocity_m_s) < 0.005
+                )
     flight.close()
     assert flight.contacts == set()
     (touch,) = [t for t in flight.touches if t.latched]
@@ -50,7 +54,9 @@ def test_docking_meets_its_tolerances_and_backs_out_again() -> None:
 
 
 def test_a_slipping_latch_is_not_verified_and_a_stuck_one_is_not_pulled_at() -> None:
-    """The pull moves the chaser; it is to retreat, but the latch opens only 8 s after it has closed. It backs out alone."""
+    """The pull moves the chaser; it is to retreat, but the latch opens only 8 s after it has
+    closed. It backs out alone.
+    """
     fault = "fault=[{kind='latch_slip',at_s=1.0,duration_s=200.0,force_N=0.2,process='chaser/0'}]"
     scenario = docking_scenario(1, changes=(fault, "docking.entry_m=0.25", "docking.final_m=0.06"))
     flight = InProcessMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1)))
@@ -89,10 +95,14 @@ def test_a_slipping_latch_is_not_verified_and_a_stuck_one_is_not_pulled_at() -> 
 
 @pytest.mark.slow
 def test_a_thruster_that_failed_unknown_to_all_is_not_taken_for_a_latch_that_slips() -> None:
-    """Thruster 10 pulls, sticks shut and is not tested: the common body turns by another push than the one commanded."""
+    """Thruster 10 pulls, sticks shut and is not tested: the common body turns by another push than
+    the one commanded.
+    """
     failure = ("stuck_off", 10, 16.38)
     scenario = docking_scenario(10, failure=failure, changes=("chaser.thruster_test_s=0",))
-    outcome = dock(10, scenario, lambda s: measurement_model(s, 10, 0.002, math.radians(0.1), 0.1), failure)
+    outcome = dock(
+        10, scenario, lambda s: measurement_model(s, 10, 0.002, math.radians(0.1), 0.1), failure
+    )
     assert outcome.detection_delay_s() is None  # or the test tests nothing
     assert outcome.cause == "verified at the first attempt"
 
@@ -101,7 +111,9 @@ def test_a_thruster_that_failed_unknown_to_all_is_not_taken_for_a_latch_that_sli
 def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
     """The scenario as shipped, with noise in place of images."""
     scenario = load_shipped("four-chaser-capture")
-    flight = InProcessMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1), 0.1))
+    flight = InProcessMission(
+        scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1), 0.1)
+    )
     holding_on: dict[int, float] = {}
     while flight.time_s < scenario.duration_s and len(holding_on) < 3:
         flight.step()
@@ -112,7 +124,9 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
     assert flight.contacts == set()
     assert sorted(holding_on) == [0, 1, 3]
     assert abs(holding_on[0] - holding_on[3]) < 5.0
-    assert "chaser 1: wait (from hold: 2 are docking already)" in [what for _, _, what in flight.events]
+    assert "chaser 1: wait (from hold: 2 are docking already)" in [
+        what for _, _, what in flight.events
+    ]
     first_latch = min(t for t, _, what in flight.events if ": latched" in what)
     (its_turn,) = [t for t, _, what in flight.events if what.startswith("chaser 1: align")]
     assert its_turn == pytest.approx(first_latch, abs=0.1)
@@ -128,7 +142,10 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
         ({"docking": {"ports": []}}, "kind capture needs at least one of"),
         ({"docking": {"ports": [PORTS[0], PORTS[0]]}}, "chaser 0 has more than one"),
         ({"docking": {"ports": [PORTS[1]]}}, "docking.ports.0.chaser: there is no chaser 1"),
-        ({"docking": {"ports": [PORTS[0] | {"axis": [-0.98, 0.199, 0.0]}]}}, "degrees off the axis"),
+        (
+            {"docking": {"ports": [PORTS[0] | {"axis": [-0.98, 0.199, 0.0]}]}},
+            "degrees off the axis",
+        ),
         ({"docking": {"ports": [PORTS[0] | {"axis": [-2.0, 0.0, 0.0]}]}}, "must be of unit length"),
         ({"docking": {"final_m": 0.5}}, "must be less than entry_m"),
         ({"docking": {"contact_speed_m_s": 0.05}}, "must not exceed approach_speed_m_s"),
@@ -144,7 +161,9 @@ def test_a_docking_section_that_cannot_be_flown_is_refused(changes: dict, messag
 
 
 def test_probe_latches_on_the_adapter_ring_of_a_mesh() -> None:
-    """`markerless-capture` with measurements of 1 mm and 0.05 degrees in place of images, from the corridor's entry on."""
+    """`markerless-capture` with measurements of 1 mm and 0.05 degrees in place of images, from the
+    corridor's entry on.
+    """
     scenario = load_shipped(
         "markerless-capture",
         "docking.entry_m=0.12",

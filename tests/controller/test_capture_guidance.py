@@ -44,7 +44,9 @@ class Pilot:
             for i in range(len(self.scenario.chasers)):
                 position = at(self.guidance.chasers[i].move, self.now_s)[0]
                 self.guidance.update_tracking(i, self.now_s, 0.0, 0.0)
-                self.guidance.update_docking(i, self.now_s, senses(position, **self.observed.get(i, {})))
+                self.guidance.update_docking(
+                    i, self.now_s, senses(position, **self.observed.get(i, {}))
+                )
 
     def fly_to(self, phase: str, i: int = 0, limit_s: float = 80.0) -> None:
         begun_s = self.now_s
@@ -103,15 +105,24 @@ def test_the_approach_tapers_and_stays_on_the_axis() -> None:
 
 def test_a_preset_states_what_its_source_does_and_leaves_the_rest() -> None:
     default = Pilot().scenario.docking
-    soyuz = Pilot(docking={"final": {"preset": "soyuz"}, "tolerances": {"preset": "soyuz"}}).scenario.docking
+    soyuz = Pilot(
+        docking={"final": {"preset": "soyuz"}, "tolerances": {"preset": "soyuz"}}
+    ).scenario.docking
     assert soyuz.final == default.final.model_copy(update={"preset": "soyuz", "closing_m_s": 0.15})
-    assert soyuz.tolerances == default.tolerances.model_copy(update={"preset": "soyuz", "closing_m_s": 0.15})
+    assert soyuz.tolerances == default.tolerances.model_copy(
+        update={"preset": "soyuz", "closing_m_s": 0.15}
+    )
 
 
 def test_contact_conditions_of_a_preset_limit_the_final_approach() -> None:
     pilot = Pilot(docking={"final": {"preset": "idss", "lateral_m": 0.02}})
     final = pilot.scenario.docking.final
-    assert (final.lateral_m, final.angle_deg, final.closing_m_s, final.rate_deg_s) == (0.02, 4.0, 0.10, 0.20)
+    assert (final.lateral_m, final.angle_deg, final.closing_m_s, final.rate_deg_s) == (
+        0.02,
+        4.0,
+        0.10,
+        0.20,
+    )
     pilot.ask("approach")
     pilot.fly_to("final")
     pilot.observed[0] = {"angle_rad": np.radians(3.9), "rate_rad_s": np.radians(0.19)}
@@ -196,7 +207,9 @@ def test_a_latch_that_slips_under_the_pull_is_not_verified() -> None:
 
 
 def test_a_chaser_whose_latch_does_not_open_waits_at_its_port() -> None:
-    """For a second it takes the latch for slow; then it stays, and its way out begins when the latch opens."""
+    """For a second it takes the latch for slow; then it stays, and its way out begins when the
+    latch opens.
+    """
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to("verified")
@@ -209,7 +222,9 @@ def test_a_chaser_whose_latch_does_not_open_waits_at_its_port() -> None:
         for _ in range(round(seconds / DT_S)):
             pilot.now_s += DT_S
             machine.update_tracking(0, pilot.now_s, 0.0, 0.0)
-            machine.update_docking(0, pilot.now_s, replace(senses(place, latched=latched), sensed=sensed))
+            machine.update_docking(
+                0, pilot.now_s, replace(senses(place, latched=latched), sensed=sensed)
+            )
         return [event[2] for event in drain(machine)]
 
     assert observe(0.8, latched=True) == []
@@ -244,7 +259,9 @@ def test_the_pull_gives_back_the_impulse_that_it_takes() -> None:
 
 @pytest.mark.parametrize("phase", ["align", "approach", "final", "contact", "latched", "verified"])
 @pytest.mark.parametrize("what", ["abort", "retreat"])
-def test_from_every_phase_there_is_a_way_out_along_the_axis_and_in_again(phase: str, what: str) -> None:
+def test_from_every_phase_there_is_a_way_out_along_the_axis_and_in_again(
+    phase: str, what: str
+) -> None:
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to(phase)
@@ -282,7 +299,10 @@ def test_commands_that_do_not_fit_are_refused_with_the_reason() -> None:
 def test_of_two_operators_in_one_tick_the_first_counts_but_an_abort_always_does() -> None:
     pilot = Pilot()
     assert pilot.ask("approach", operator="ann")[0]
-    assert pilot.ask("retreat", operator="bob") == (False, "approach by ann came first in this tick")
+    assert pilot.ask("retreat", operator="bob") == (
+        False,
+        "approach by ann came first in this tick",
+    )
     assert pilot.ask("approach", operator="bob")[0]
     assert pilot.ask("abort", operator="bob")[0]
     assert pilot.ask("approach", operator="ann") == (False, "abort by bob came first in this tick")
@@ -331,7 +351,9 @@ def test_corridor_replaces_the_keep_out_only_for_the_chaser_in_it() -> None:
 
 @pytest.mark.parametrize(("phase", "pushed"), [("final", False), ("hold", True)])
 def test_uncertainty_pushes_no_chaser_out_of_its_corridor(phase: str, pushed: bool) -> None:
-    """Released from its port, with an uncertain pose, a chaser was planned around a larger keep-out, and left sideways."""
+    """Released from its port, with an uncertain pose, a chaser was planned around a larger
+    keep-out, and left sideways.
+    """
     pilot = Pilot()
     if phase != "hold":
         pilot.ask("approach")

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Operator commands through the whole controller: impossible ones are rejected with a reason, repeated ones change nothing."""
+"""Operator commands through the whole controller: impossible ones are rejected with a reason,
+repeated ones change nothing.
+"""
 
 from __future__ import annotations
 
@@ -46,15 +48,26 @@ def ask(flight: InProcessMission, *wishes: dict[str, Any]) -> list[tuple[bool, s
     ("wish", "reason"),
     [
         ({"command": "approach", "chaser": 7}, "there is no chaser 7; this mission has 0 to 0"),
-        ({"command": "isolate", "chaser": 7, "thruster": 0}, "there is no chaser 7; this mission has 0 to 0"),
+        (
+            {"command": "isolate", "chaser": 7, "thruster": 0},
+            "there is no chaser 7; this mission has 0 to 0",
+        ),
         ({"command": "isolate", "thruster": 12}, "isolate needs a thruster; this body has 0 to 11"),
-        ({"command": "approach", "expires_ns": 10**9}, "stale: the command expired at 1.00 s, now is 2.00 s"),
-        ({"command": "isolate", "thruster": 1, "expires_ns": 10**9}, "stale: the command expired at 1.00 s"),
+        (
+            {"command": "approach", "expires_ns": 10**9},
+            "stale: the command expired at 1.00 s, now is 2.00 s",
+        ),
+        (
+            {"command": "isolate", "thruster": 1, "expires_ns": 10**9},
+            "stale: the command expired at 1.00 s",
+        ),
         ({"command": "goto"}, "goto needs an offset"),
         ({"command": "goto", "offset_m": (0.1, 0.0, 0.0)}, "the offset is 0.1 m from the target"),
     ],
 )
-def test_impossible_values_are_refused(flight: InProcessMission, wish: dict[str, Any], reason: str) -> None:
+def test_impossible_values_are_refused(
+    flight: InProcessMission, wish: dict[str, Any], reason: str
+) -> None:
     ((accepted, why),) = ask(flight, wish)
     assert not accepted
     assert why.startswith(reason)
@@ -101,6 +114,8 @@ def test_of_two_operators_at_once_the_first_counts(
 
 
 def test_but_an_abort_always_does(flight: InProcessMission) -> None:
-    answers = ask(flight, {"command": "approach", "operator": "ann"}, {"command": "abort", "operator": "bob"})
+    answers = ask(
+        flight, {"command": "approach", "operator": "ann"}, {"command": "abort", "operator": "bob"}
+    )
     assert [accepted for accepted, _ in answers] == [True, True]
     assert flight.phase(0) == "abort"

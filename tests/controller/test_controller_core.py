@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controller core: chasers join, leave and latch between ticks; latency compensation; starts inside keep-out zones."""
+"""Controller core: chasers join, leave and latch between ticks; latency compensation; starts inside
+keep-out zones.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def three_chasers() -> Scenario:
     )
 
 
-def step(flight: ControllerCore, tick: int, present: tuple[int, ...], **more: object) -> TickOutputs:
+def step(
+    flight: ControllerCore, tick: int, present: tuple[int, ...], **more: object
+) -> TickOutputs:
     """Step with the chasers that are present, each at rest and 5 cm from its reference."""
     scenario, now_ns = flight.scenario, flight.scenario.timing.tick_time_ns(tick)
     here = {}
@@ -58,13 +62,19 @@ def step(flight: ControllerCore, tick: int, present: tuple[int, ...], **more: ob
     return flight.step(TickInputs(tick, now_ns, here, (), **more))  # type: ignore[arg-type]
 
 
-def test_joining_and_leaving_chasers_do_not_interrupt_planning(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every present chaser has a plan in every tick, including the first after a change; no solver is rebuilt."""
+def test_joining_and_leaving_chasers_do_not_interrupt_planning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every present chaser has a plan in every tick, including the first after a change; no solver
+    is rebuilt.
+    """
     mission = three_chasers()
     flight, single = (
         ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target)) for _ in range(2)
     )
-    monkeypatch.setattr(planning, "make_solver", lambda *_: pytest.fail("a solver was built in flight"))
+    monkeypatch.setattr(
+        planning, "make_solver", lambda *_: pytest.fail("a solver was built in flight")
+    )
     steady: dict[int, list[Array]] = {}
     for tick, present in enumerate([(0, 1, 2)] * 4 + [(0, 2)] * 4 + [(2,)] * 4 + [(0, 1, 2)] * 4):
         out = step(flight, tick, present)
@@ -76,7 +86,9 @@ def test_joining_and_leaving_chasers_do_not_interrupt_planning(monkeypatch: pyte
         steady.setdefault(2, []).append(np.array(out.wrenches[2].force_N))
     # The chasers are far apart: the plan of chaser 2 does not depend on the others.
     for tick, force in enumerate(steady[2]):
-        np.testing.assert_allclose(np.array(step(single, tick, (2,)).wrenches[2].force_N), force, atol=1e-6)
+        np.testing.assert_allclose(
+            np.array(step(single, tick, (2,)).wrenches[2].force_N), force, atol=1e-6
+        )
 
 
 def test_latched_chaser_coasts_while_the_other_is_planned() -> None:
@@ -116,7 +128,9 @@ def latency_error_m() -> float:
     return float(np.sqrt(np.mean(trace.position_error_m[trace.time_s >= 40.0] ** 2)))
 
 
-def test_latency_compensation_predicts_the_state_at_actuation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_latency_compensation_predicts_the_state_at_actuation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """With 0.2 s of latency tracking is as good as without; without the prediction it is not."""
     assert latency_error_m() < 5e-5
 
@@ -130,7 +144,9 @@ def test_latency_compensation_predicts_the_state_at_actuation(monkeypatch: pytes
 
 
 def test_chasers_leave_keep_out_zones_in_which_they_start() -> None:
-    """Chaser 0 starts 0.2 m from the target's centre, chasers 1 and 2 start 0.4 m apart with a limit of 0.6 m."""
+    """Chaser 0 starts 0.2 m from the target's centre, chasers 1 and 2 start 0.4 m apart with a
+    limit of 0.6 m.
+    """
     chasers = [
         {"position_m": p, "q_wxyz": [1.0, 0.0, 0.0, 0.0], "start_offset_m": o}
         for p, o in (

@@ -39,13 +39,23 @@ NEAR = {"approach": {"dock_distance_m": 0.25, "max_speed_m_s": 0.03}}
 @given(st.integers(0, 10_000))
 @quick
 def test_the_cone_is_the_one_that_the_solver_keeps(seed: int) -> None:
-    """Turned with the target, the row gives the solver the same room as the cone has in the target's frame."""
+    """Turned with the target, the row gives the solver the same room as the cone has in the
+    target's frame.
+    """
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
-    cone = cone_about(axis / np.linalg.norm(axis), rng.uniform(0.2, 0.8), 0.1, rng.uniform(0.1, 1.3))
-    target, q, offsets = rng.normal(size=3), rotations.normalize(rng.normal(size=4)), rng.normal(size=(2, 3))
+    cone = cone_about(
+        axis / np.linalg.norm(axis), rng.uniform(0.2, 0.8), 0.1, rng.uniform(0.1, 1.3)
+    )
+    target, q, offsets = (
+        rng.normal(size=3),
+        rotations.normalize(rng.normal(size=4)),
+        rng.normal(size=(2, 3)),
+    )
     places = target + rotations.rotate(q, offsets)
-    problem = fixed_problem(np.array([at_rest(p) for p in places]), places, d_target=0.0, d_chasers=0.0)
+    problem = fixed_problem(
+        np.array([at_rest(p) for p in places]), places, d_target=0.0, d_chasers=0.0
+    )
     rows = corridor_rows([None, cone], np.tile(q, (2, 1)))
     assert rows is not None
     assert not rows[0].any()
@@ -141,7 +151,12 @@ def test_by_capture_the_corridor_is_there_in_the_corridor_and_gone_when_latched(
         guidance._observed[0] = senses(at)
         seen[phase] = guidance.corridor(0) is not None
         assert guidance.corridor(1) is None
-    assert [phase for phase, there in seen.items() if there] == ["approach", "final", "contact", "retreat"]
+    assert [phase for phase, there in seen.items() if there] == [
+        "approach",
+        "final",
+        "contact",
+        "retreat",
+    ]
 
 
 def step(flight: ControllerCore, tick: int, **changes: Any) -> TickOutputs:
@@ -149,14 +164,18 @@ def step(flight: ControllerCore, tick: int, **changes: Any) -> TickOutputs:
     timing = flight.scenario.timing
     here = {
         0: odometry(0, tick, timing.tick_time_ns(tick), **changes),
-        1: odometry(1, tick, timing.tick_time_ns(tick), position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3),
+        1: odometry(
+            1, tick, timing.tick_time_ns(tick), position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3
+        ),
     }
     return flight.step(TickInputs(tick, timing.tick_time_ns(tick), here, ()))
 
 
 @pytest.mark.parametrize("order", ["approach", "hold"])
 def test_in_flight_the_plan_stays_in_the_corridor(order: Any) -> None:
-    """Pushed sideways at 6 cm/s near the edge: only with a corridor does a lazy plan brake hard enough."""
+    """Pushed sideways at 6 cm/s near the edge: only with a corridor does a lazy plan brake hard
+    enough.
+    """
     still = {"motion": "static", "model": "paper"}
     lazy = {"weight_position": 1.0, "weight_final_position": 1.0}
     timeline = [{"at_s": 0.0, "command": order, "chasers": [0]}]
@@ -168,17 +187,23 @@ def test_in_flight_the_plan_stays_in_the_corridor(order: Any) -> None:
         "q_wxyz": (1.0, 0.0, 0.0, 0.0),
         "omega_rad_s": (0.0, 0.0, 0.0),
     }
-    out = [step(flight, tick, **now) for tick in range(4)][-1]  # the same moment again: the plan converges
+    out = [step(flight, tick, **now) for tick in range(4)][
+        -1
+    ]  # the same moment again: the plan converges
     positions = np.reshape(out.plans[0].positions_m, (-1, 3))
     cone = cone_of(mission, 0)
     room = min(cone.room_m(p) for p in positions)
     assert out.solver is not None
     assert (room > -1e-3) == (order == "approach")
-    assert out.references[0].min_distance_target_m == pytest.approx(0.22 if order == "approach" else LIMIT_M)
+    assert out.references[0].min_distance_target_m == pytest.approx(
+        0.22 if order == "approach" else LIMIT_M
+    )
 
 
 def test_a_chaser_docks_nearer_than_the_others_may_come() -> None:
-    """The docking distance lies within the ball that everybody keeps; only the way in along the corridor leads there."""
+    """The docking distance lies within the ball that everybody keeps; only the way in along the
+    corridor leads there.
+    """
     timeline = [{"at_s": 1.0, "command": "approach", "chasers": [0]}]
     mission = scenario(duration_s=60.0, settling_s=1.0, timeline=timeline, **NEAR)
     trace = record_flight(mission)

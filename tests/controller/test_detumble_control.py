@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detumbling in flight, from latched chasers on: the stack stops and stays, or the command is refused with the figures."""
+"""Detumbling in flight, from latched chasers on: the stack stops and stays, or the command is
+refused with the figures.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def at_command(scenario: Scenario, *chasers: int) -> tuple[StackMission, list[Co
     mission = StackMission(scenario, RenderedImages(scenario))
     while mission.time_s < SETTLED_S:
         mission.step()
-    out = mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in chasers)).outputs
+    out = mission.step(
+        tuple(OperatorCommand(command="detumble", chaser=i) for i in chasers)
+    ).outputs
     assert out is not None
     return mission, out.replies
 
@@ -68,7 +72,9 @@ def test_no_thruster_fires_at_the_target() -> None:
         fired |= {p.thruster for c in commands.values() for p in c.pulses}
     mission.close()
     assert fired
-    assert all(thrusters[k].direction[0] > 0.0 for k in fired)  # each pushes its chaser towards the port
+    assert all(
+        thrusters[k].direction[0] > 0.0 for k in fired
+    )  # each pushes its chaser towards the port
 
 
 @pytest.mark.parametrize(
@@ -117,7 +123,10 @@ def test_hold_ends_the_detumbling_and_abort_releases_the_latch() -> None:
     ("changes", "message"),
     [
         (
-            ("docking.ports=[{chaser=0,position_m=[-0.5,0,-0.05],axis=[-1,0,0]}]", "success.latched=[]"),
+            (
+                "docking.ports=[{chaser=0,position_m=[-0.5,0,-0.05],axis=[-1,0,0]}]",
+                "success.latched=[]",
+            ),
             "has no port",
         ),
         (
@@ -142,7 +151,10 @@ def test_hold_ends_the_detumbling_and_abort_releases_the_latch() -> None:
             "docking.ports.0.force_limit_N: 0.05 N is less than the",
         ),
         (("target.inertia_products_kg_m2=[40.0,0.0,0.0]",), "too large for a body's inertia"),
-        (("target.inertia_products_kg_m2=[9.0,9.0,9.0]",), "no principal moment may exceed the sum"),
+        (
+            ("target.inertia_products_kg_m2=[9.0,9.0,9.0]",),
+            "no principal moment may exceed the sum",
+        ),
     ],
 )
 def test_a_scenario_that_cannot_be_flown_is_refused(changes: tuple[str, ...], message: str) -> None:
@@ -175,7 +187,9 @@ def test_exact_states_give_the_exact_momentum_whatever_the_weights(seed: int) ->
     for i in range(3):
         state = moving_with(moving, rng.normal(size=3), rotations.normalize(rng.normal(size=4)))
         fields = {
-            name: vector(getattr(state, name)) for name in Odometry.__struct_fields__ if hasattr(state, name)
+            name: vector(getattr(state, name))
+            for name in Odometry.__struct_fields__
+            if hasattr(state, name)
         }
         own[i] = Odometry(chaser=i, **fields)
     found = observed_motion(body, target, own, (1e-6, 1e-6))
@@ -184,7 +198,9 @@ def test_exact_states_give_the_exact_momentum_whatever_the_weights(seed: int) ->
 
 
 def test_the_body_of_a_stack_is_as_uncertain_as_the_masses_of_its_chasers() -> None:
-    """Ten per cent of a chaser's mass at a port 0.85 m from the middle move the common centre of mass by a centimetre."""
+    """Ten per cent of a chaser's mass at a port 0.85 m from the middle move the common centre of
+    mass by a centimetre.
+    """
     scenario = stack_scenario(0, (0, 3), ("perception.name=statistical",))
     with StackMission(scenario, RenderedImages(scenario)) as mission:
         for _ in range(20):

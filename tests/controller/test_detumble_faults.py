@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stack that loses a latch, a chaser or a thruster while it is stopped ends safe, with a named reason."""
+"""A stack that loses a latch, a chaser or a thruster while it is stopped ends safe, with a named
+reason.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,12 @@ from chaserdock_protocol.scenario import flight_scenario
 
 from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario, with_load_limits
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import ControlledStack, FlightEvents, fly_controlled, wrong_knowledge
+from chaserdock.evaluation.rigid_control import (
+    ControlledStack,
+    FlightEvents,
+    fly_controlled,
+    wrong_knowledge,
+)
 
 
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:
@@ -38,7 +45,9 @@ def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() ->
         record = mission.step()
         if record.outputs is not None and mission.phase(1) == "retreat":
             target, own = record.states["target"], record.states["chaser/1"]
-            places.append(rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m))
+            places.append(
+                rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
+            )
     assert places
     moved = places[-1] - places[0]
     assert mission.retreats(1) == ["from detumble: the latch opened"]
@@ -51,16 +60,23 @@ def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() ->
     mission.close()
 
 
-@pytest.mark.parametrize(("kind", "expected"), [("stuck_off", "stuck off"), ("stuck_on", "stuck on")])
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("stuck_off", "stuck off"), ("stuck_on", "stuck on")]
+)
 def test_a_stuck_thruster_is_found_on_the_stack_and_isolated(kind: str, expected: str) -> None:
     failure = f"thruster_failure=[{{chaser=0,thruster=2,at_s=1.0,kind='{kind}'}}]"
     flight = fly_controlled(stack_scenario(1, (0, 1, 2, 3), [*wrong_knowledge(1), failure]), 15.0)
     assert flight.time_s is not None
-    assert flight.failed == f"chaser 0: thruster 2 {expected}, seen in the motion of the stack, isolated"
+    assert (
+        flight.failed
+        == f"chaser 0: thruster 2 {expected}, seen in the motion of the stack, isolated"
+    )
 
 
 class WatchedMission(StackMission):
-    """A mission that a second controller follows from ``follow`` on; ``outputs`` of both for every tick since."""
+    """A mission that a second controller follows from ``follow`` on; ``outputs`` of both for every
+    tick since.
+    """
 
     follower: ControllerCore | None = None
     outputs: list[tuple[TickOutputs | None, TickOutputs]]
@@ -68,7 +84,10 @@ class WatchedMission(StackMission):
     def follow(self) -> None:
         """Let a standby join: it starts from the present state of the controller."""
         state = Checkpoint(self.controller, self._validation).save()
-        self.follower, self.outputs = ControllerCore(flight_scenario(self.scenario), lambda: 0.0), []
+        self.follower, self.outputs = (
+            ControllerCore(flight_scenario(self.scenario), lambda: 0.0),
+            [],
+        )
         Checkpoint(self.follower, self._validation).restore(state)
 
     def _control(self, inputs: TickInputs) -> TickOutputs | None:
@@ -82,7 +101,9 @@ class WatchedMission(StackMission):
 def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same(joins_s: float) -> None:
     """Also in the search for the first plan, while the stack coasts."""
     limits = "docking.ports.0.force_limit_N=3.0"
-    scenario = stack_scenario(1, (0, 3), [*wrong_knowledge(1, 0.1, False), "detumble.plan_s=6", limits])
+    scenario = stack_scenario(
+        1, (0, 3), [*wrong_knowledge(1, 0.1, False), "detumble.plan_s=6", limits]
+    )
     with WatchedMission(scenario, RenderedImages(scenario)) as mission:
         while mission.time_s < 1.5:
             mission.step()
@@ -125,7 +146,9 @@ def test_a_thruster_that_an_operator_restores_fires_again() -> None:
 
 def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
     flight = fly_controlled(
-        stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)), 15.0, events=FlightEvents(loss=(1.0, 1))
+        stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)),
+        15.0,
+        events=FlightEvents(loss=(1.0, 1)),
     )
     assert flight.time_s is not None
     assert flight.failed == ""
@@ -134,7 +157,9 @@ def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
 @pytest.mark.parametrize("count", [6, pytest.param(16, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("plan_s", [None, 13.5])
 def test_a_stack_of_many_chasers_is_stopped(count: int, plan_s: float | None) -> None:
-    """Up to four at each of four faces, side by side. Their thrusters stop it within a few seconds, or at less cost by a plan."""
+    """Up to four at each of four faces, side by side. Their thrusters stop it within a few seconds,
+    or at less cost by a plan.
+    """
     changes = wrong_knowledge(1) + ([] if plan_s is None else [f"detumble.plan_s={plan_s}"])
     four = stack_scenario(1, (0, 1, 2, 3), changes)
     ports, chasers = [], []
@@ -177,7 +202,9 @@ def test_a_stopped_stack_turns_to_its_commanded_attitude_and_keeps_it() -> None:
 
 
 def test_no_port_exceeds_its_limits_in_any_physics_step() -> None:
-    """Pulses of one carrier period do not last into the next one, in which others fire; with pulse scatter."""
+    """Pulses of one carrier period do not last into the next one, in which others fire; with pulse
+    scatter.
+    """
     scenario = with_load_limits(stack_scenario(0, (0, 1, 2, 3), wrong_knowledge(0)), 2.5, 0.9)
     stack = ControlledStack(scenario)
     before, peaks = np.linalg.norm(stack.state().motion.momentum), np.zeros(2)

@@ -85,7 +85,9 @@ def test_a_stack_turned_and_shifted_in_trf_has_turned_wrenches(seed: int) -> Non
     }
     body = stack_of(chasers)
     there = attach_bodies(body, [])
-    there = type(there)(body.mass_kg, turn @ body.inertia_kg_m2 @ turn.T, turn @ body.centre_trf_m + shift)
+    there = type(there)(
+        body.mass_kg, turn @ body.inertia_kg_m2 @ turn.T, turn @ body.centre_trf_m + shift
+    )
     w, v = (thruster_wrenches(b, c, BODY.thrusters) for b, c in ((body, chasers), (there, moved)))
     assert v[:3] == pytest.approx(turn @ w[:3], abs=1e-12)
     assert v[3:] == pytest.approx(turn @ w[3:], abs=1e-12)
@@ -96,9 +98,11 @@ def test_a_stack_turned_and_shifted_in_trf_has_turned_wrenches(seed: int) -> Non
 @example((0, 1), 467506)
 @example((0, 1, 3), 139313)
 def test_allocation_solves_the_linear_programme(chasers: tuple[int, ...], seed: int) -> None:
-    """Shortest time, and the least impulse within it, as by a simplex method; a little time is given up for much less thrust.
+    """Shortest time, and the least impulse within it, as by a simplex method; a little time is
+    given up for much less thrust.
 
-    The examples are always the same: on the border of what is possible, the two methods decide differently.
+    The examples are always the same: on the border of what is possible, the two methods decide
+    differently.
     """
     body, wrenches, limits = stack_thrusters(chasers)
     momentum = tumble(seed, body)

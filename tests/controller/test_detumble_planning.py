@@ -59,7 +59,9 @@ RATE_HZ, PERIOD_NS = 10, 100_000_000
 
 
 def first_plan(planner: StackPlanner, p: StackProblem) -> tuple[StackProblem, ActivePlan, int]:
-    """Coast until the planner has its first plan; return the problem, the plan, and the time at which it begins."""
+    """Coast until the planner has its first plan; return the problem, the plan, and the time at
+    which it begins.
+    """
     now_ns = 0
     while True:
         thrusts = planner.thrusts(p, now_ns)
@@ -73,7 +75,9 @@ def first_plan(planner: StackPlanner, p: StackProblem) -> tuple[StackProblem, Ac
 
 
 @pytest.mark.parametrize(("chasers", "seconds"), [((0, 1, 2, 3), 13.0), ((0, 3), 14.0)])
-def test_a_plan_stops_the_stack_cheaply_within_the_time(chasers: tuple[int, ...], seconds: float) -> None:
+def test_a_plan_stops_the_stack_cheaply_within_the_time(
+    chasers: tuple[int, ...], seconds: float
+) -> None:
     p, active, begin_ns = first_plan(StackPlanner(seconds, RATE_HZ), problem(3, chasers))
     plan = active.plan
     assert begin_ns < 1.5e9
@@ -114,7 +118,9 @@ def test_a_plan_in_flight_leaves_a_local_minimum() -> None:
 
 
 def test_a_tick_solves_few_programmes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first plan, its renewals, and a plan without a thruster that is lost: no tick takes longer than ten programmes."""
+    """The first plan, its renewals, and a plan without a thruster that is lost: no tick takes
+    longer than ten programmes.
+    """
     solved: list[int] = []
 
     def counted(p: StackProblem, plan: StackPlan, iterations: int) -> StackPlan:
@@ -144,7 +150,9 @@ def test_a_plan_turns_with_the_world() -> None:
     p = problem(1, (0, 3))
     turn = rotations.normalize(np.array([0.3, -0.5, 0.2, 0.7]))
     moved = StackProblem(
-        np.concatenate([rotations.rotate(turn, p.momentum[:3]), rotations.rotate(turn, p.momentum[3:])]),
+        np.concatenate(
+            [rotations.rotate(turn, p.momentum[:3]), rotations.rotate(turn, p.momentum[3:])]
+        ),
         rotations.multiply(turn, p.q_wxyz),
         p.inertia_kg_m2,
         p.wrenches,
@@ -170,7 +178,9 @@ def test_a_stack_at_rest_needs_no_plan_and_invalid_figures_are_refused() -> None
     assert plan_stop(rest, np.zeros((4, 24)), 0.5, 5).impulse_N_s == 0.0
     with pytest.raises(ValueError, match="step_s"):
         plan_stop(p, np.zeros((4, 24)), 0.0, 5)
-    nan = StackProblem(np.full(6, math.nan), p.q_wxyz, p.inertia_kg_m2, p.wrenches, p.limits_N, p.groups)
+    nan = StackProblem(
+        np.full(6, math.nan), p.q_wxyz, p.inertia_kg_m2, p.wrenches, p.limits_N, p.groups
+    )
     with pytest.raises(ValueError, match="finite"):
         plan_stop(nan, np.zeros((4, 24)), 0.5, 5)
 
@@ -178,12 +188,19 @@ def test_a_stack_at_rest_needs_no_plan_and_invalid_figures_are_refused() -> None
 def loads(seed: int, force_limit_N: float = np.inf):
     chasers = mounted((0, 1, 3))
     body, own = stack_of(chasers), wrench_matrix(BODY.thrusters)
-    wrenches = np.concatenate([c.wrench_to_stack(own, body.centre_trf_m) for c in chasers.values()], axis=1)
+    wrenches = np.concatenate(
+        [c.wrench_to_stack(own, body.centre_trf_m) for c in chasers.values()], axis=1
+    )
     rows = {i: (slice(12 * k, 12 * k + 12), own) for k, i in enumerate(chasers)}
     omega = np.random.default_rng(seed).normal(0.0, 0.1, 3)
     tips = {i: np.array(PORTS[i][0]) for i in chasers}
     limits = dict.fromkeys(chasers, (force_limit_N, np.inf))
-    return body, omega, wrenches, load_model(body, omega, wrenches, chasers, rows, BODY, tips, limits)
+    return (
+        body,
+        omega,
+        wrenches,
+        load_model(body, omega, wrenches, chasers, rows, BODY, tips, limits),
+    )
 
 
 @settings(deadline=None, max_examples=10)
@@ -194,10 +211,14 @@ def test_the_loads_of_all_ports_move_the_target(seed: int) -> None:
     thrusts = np.random.default_rng(seed).uniform(0.0, 1.5, 36)
     port = model.constant + model.by_thrust @ thrusts
     total = wrenches @ thrusts
-    alpha = np.linalg.solve(body.inertia_kg_m2, total[3:] - np.cross(omega, body.inertia_kg_m2 @ omega))
+    alpha = np.linalg.solve(
+        body.inertia_kg_m2, total[3:] - np.cross(omega, body.inertia_kg_m2 @ omega)
+    )
     alone = target_alone()
     arm = alone.centre_trf_m - body.centre_trf_m
-    acceleration = total[:3] / body.mass_kg + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
+    acceleration = (
+        total[:3] / body.mass_kg + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
+    )
     assert port[:, :3].sum(axis=0) == pytest.approx(alone.mass_kg * acceleration, abs=1e-9)
     torque = port[:, 3:].sum(axis=0)
     for row, i in zip(port, (0, 1, 3), strict=True):
@@ -208,11 +229,15 @@ def test_the_loads_of_all_ports_move_the_target(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_part_of_the_thrusters_that_fire_in_turn_exceeds_the_limit(seed: int) -> None:
-    """The most wanted fires first. Pulses end one after the other, so that any of the chosen thrusters may be open alone."""
+    """The most wanted fires first. Pulses end one after the other, so that any of the chosen
+    thrusters may be open alone.
+    """
     _, _, _, model = loads(1, force_limit_N=2.2)
 
     def largest_N(mask: Array) -> float:
-        return float(np.linalg.norm((model.constant + 1.5 * model.by_thrust @ mask)[:, :3], axis=1).max())
+        return float(
+            np.linalg.norm((model.constant + 1.5 * model.by_thrust @ mask)[:, :3], axis=1).max()
+        )
 
     wanted = np.random.default_rng(seed).uniform(0.1, 1.0, 36)
     chosen = fire_in_turn(model, wanted, np.full(36, 1.5))

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chaser's prediction model: CasADi's and the compiled one, against each other and against physics."""
+"""The chaser's prediction model: CasADi's and the compiled one, against each other and against
+physics.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,11 @@ def c_jacobians(x: Array, u: Array, h: float, integrator: str) -> tuple[Array, A
     """x_next (13,), A (12, 12), B (12, 6)."""
     states, mats = np.tile(x, (1, 2, 1)), np.empty((1, 1, 12, 12))
     roll_linearized(
-        model_of(params(integrator), h), states, np.ascontiguousarray(u[None, None]), np.ones((1, 6)), mats
+        model_of(params(integrator), h),
+        states,
+        np.ascontiguousarray(u[None, None]),
+        np.ones((1, 6)),
+        mats,
     )
     return states[0, 1], full_a(mats[0, 0, :, :6], h), mats[0, 0, :, 6:]
 
@@ -105,7 +111,11 @@ def test_jacobians_equal_casadis_in_the_tangent_space(integrator: str, seed: int
     lift = np.zeros((13, 12))
     lift[:6, :6], lift[6:10, 6:9], lift[10:, 9:] = np.eye(6), tangent(x[6:10]), np.eye(3)
     lower = np.zeros((12, 13))
-    lower[:6, :6], lower[6:9, 6:10], lower[9:, 10:] = np.eye(6), 4.0 * tangent(x_next[6:10]).T, np.eye(3)
+    lower[:6, :6], lower[6:9, 6:10], lower[9:, 10:] = (
+        np.eye(6),
+        4.0 * tangent(x_next[6:10]).T,
+        np.eye(3),
+    )
     out, a_mat, b_mat = c_jacobians(x, u, 0.1, integrator)
     np.testing.assert_allclose(out, x_next, rtol=0, atol=1e-13)
     np.testing.assert_allclose(a_mat, lower @ np.array(jac_x(x, u)) @ lift, rtol=0, atol=1e-12)
@@ -121,11 +131,15 @@ def test_jacobians_equal_finite_differences(seed: int, integrator: str) -> None:
     for j in range(12):
         plus = c_step(perturb(x, e * np.eye(12)[j]), u, 0.1, integrator)
         minus = c_step(perturb(x, -e * np.eye(12)[j]), u, 0.1, integrator)
-        np.testing.assert_allclose(a_mat[:, j], difference(plus, minus) / (2 * e), rtol=0, atol=2e-8)
+        np.testing.assert_allclose(
+            a_mat[:, j], difference(plus, minus) / (2 * e), rtol=0, atol=2e-8
+        )
     for j in range(6):
         plus = c_step(x, u + e * np.eye(6)[j], 0.1, integrator)
         minus = c_step(x, u - e * np.eye(6)[j], 0.1, integrator)
-        np.testing.assert_allclose(b_mat[:, j], difference(plus, minus) / (2 * e), rtol=0, atol=2e-8)
+        np.testing.assert_allclose(
+            b_mat[:, j], difference(plus, minus) / (2 * e), rtol=0, atol=2e-8
+        )
 
 
 def newton_euler(x: Array, u: Array) -> Array:
@@ -140,7 +154,9 @@ def newton_euler(x: Array, u: Array) -> Array:
 
 
 def integrate_finely(x: Array, u: Array, duration_s: float, steps: int) -> Array:
-    """Gragg's modified midpoint rule with Richardson extrapolation: another method than the package's."""
+    """Gragg's modified midpoint rule with Richardson extrapolation: another method than the
+    package's.
+    """
 
     def midpoint(n: int) -> Array:
         h = duration_s / n
@@ -189,7 +205,9 @@ def test_torque_free_motion_conserves_angular_momentum_and_energy() -> None:
     energy = x[10:] @ MATRIX @ x[10:]
     for _ in range(600):
         x = c_step(x, np.zeros(6), 0.1, "rk4")
-    np.testing.assert_allclose(rotations.rotate(x[6:10], MATRIX @ x[10:]), momentum, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        rotations.rotate(x[6:10], MATRIX @ x[10:]), momentum, rtol=0, atol=1e-6
+    )
     assert x[10:] @ MATRIX @ x[10:] == pytest.approx(energy, abs=1e-6)
 
 
@@ -239,7 +257,9 @@ def test_reference_keeps_its_pose_relative_to_the_target() -> None:
 @pytest.mark.parametrize("omega", [OMEGA, 10 * OMEGA])
 @pytest.mark.parametrize("closing", [0.0, 0.07])
 def test_feed_forward_alone_holds_the_reference(omega: Array, closing: float) -> None:
-    """Offsets shrink as o(t) = o(0) exp(-closing t); a chaser on the reference is flown open loop for 10 s."""
+    """Offsets shrink as o(t) = o(0) exp(-closing t); a chaser on the reference is flown open loop
+    for 10 s.
+    """
     offset, h, n = np.array([-1.0, 0.2, 0.3]), 0.02, 500
 
     def offsets(t: Array) -> Array:
@@ -263,4 +283,6 @@ def test_feed_forward_alone_holds_the_reference(omega: Array, closing: float) ->
 
 def test_feed_forward_refuses_a_massless_chaser() -> None:
     with pytest.raises(ValueError, match="mass_kg"):
-        feed_forward(OMEGA, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), Q_OFF, 0.0, INERTIA)
+        feed_forward(
+            OMEGA, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), Q_OFF, 0.0, INERTIA
+        )

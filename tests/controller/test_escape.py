@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passive safety enforced: aborts onto safe coasts, moves as slow as safe coasts need, and what a chaser does without them."""
+"""Passive safety enforced: aborts onto safe coasts, moves as slow as safe coasts need, and what a
+chaser does without them.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,11 @@ def scenario(**changes: Any) -> Scenario:
         "name": "test",
         "duration_s": 40.0,
         "orbit": {"altitude_m": 4e5},
-        "target": {"motion": "torque_free", "velocity_m_s": [0.0, 0.0, 0.0], "omega_rad_s": [0.0, 0.0, 0.0]},
+        "target": {
+            "motion": "torque_free",
+            "velocity_m_s": [0.0, 0.0, 0.0],
+            "omega_rad_s": [0.0, 0.0, 0.0],
+        },
         "approach": {"max_speed_m_s": 0.1},
         "limits": {
             "passive_safety": "enforce",
@@ -108,12 +114,16 @@ def test_escape_is_a_continuous_motion_that_needs_its_acceleration_only_while_it
         np.testing.assert_allclose((p[1] - p[0]) / h, v.mean(axis=0), atol=1e-7)
         np.testing.assert_allclose((v[1] - v[0]) / h, a.mean(axis=0), atol=2e-5)
     p, v, a = escape.at(np.array([600.0]))
-    gravity = np.array([3 * 1.131e-3**2 * p[0, 0] + 2 * 1.131e-3 * v[0, 1], -2 * 1.131e-3 * v[0, 0]])
+    gravity = np.array(
+        [3 * 1.131e-3**2 * p[0, 0] + 2 * 1.131e-3 * v[0, 1], -2 * 1.131e-3 * v[0, 0]]
+    )
     np.testing.assert_allclose(a[0, :2], gravity, rtol=2e-3, atol=1e-9)
 
 
 def test_moves_are_as_slow_as_a_safe_coast_needs() -> None:
-    """On V-bar a chaser that closes in at v passes at the height n d^2 / v above the target: nearer means slower."""
+    """On V-bar a chaser that closes in at v passes at the height n d^2 / v above the target: nearer
+    means slower.
+    """
     state = np.array([0.0, -30.0, 0.0, 0.0, 0.0, 0.0])
     found = planner(state)
     speeds = []
@@ -143,7 +153,9 @@ def test_final_corridor_is_exempt() -> None:
         "final_corridor_m": 31.0,
     }
     found = planner(state, limits=limits)
-    move = found.limited(0, lambda v: move_to(stay(state[:3], 0.0), (0.0, -3.0, 0.0), 0.0, v), 0.2, 0.0)
+    move = found.limited(
+        0, lambda v: move_to(stay(state[:3], 0.0), (0.0, -3.0, 0.0), 0.0, v), 0.2, 0.0
+    )
     assert move is not None
     assert move.duration_s == pytest.approx(1.875 * 27.0 / 0.2, rel=1e-6)
 
@@ -154,7 +166,9 @@ def holding(**changes: Any) -> PhaseMachine:
     place = np.array([0.0, -30.0, 0.0])
     machine.set_position(0, place)
     assert machine.escapes is not None
-    machine.escapes.relative[0] = RelativeState(np.concatenate([place, np.zeros(3)]), GOOD, at_rest())
+    machine.escapes.relative[0] = RelativeState(
+        np.concatenate([place, np.zeros(3)]), GOOD, at_rest()
+    )
     machine.drain_changes()
     return machine
 
@@ -188,7 +202,9 @@ def test_unsafe_chaser_in_the_final_corridor_continues() -> None:
 
 def test_goto_without_a_safe_move_is_refused() -> None:
     machine = holding()
-    refused = machine.command(OperatorCommand(command="goto", chaser=0, offset_m=(0.0, 30.0, 0.0)), 1.0)
+    refused = machine.command(
+        OperatorCommand(command="goto", chaser=0, offset_m=(0.0, 30.0, 0.0)), 1.0
+    )
     assert not refused.accepted
     assert "no speed makes the move passively safe" in refused.reason
     assert machine.command(

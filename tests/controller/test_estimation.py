@@ -61,7 +61,15 @@ def test_no_clock_and_no_global_randomness() -> None:
         "dataclasses",
         "functools",
     }
-    allowed |= {"chaserdock_controller", "itertools", "math", "msgspec", "numpy", "threadpoolctl", "typing"}
+    allowed |= {
+        "chaserdock_controller",
+        "itertools",
+        "math",
+        "msgspec",
+        "numpy",
+        "threadpoolctl",
+        "typing",
+    }
     files = sorted(Path(estimation.__file__).parent.rglob("*.py"))
     assert len(files) >= 14
     for file in files:

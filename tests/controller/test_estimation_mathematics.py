@@ -30,7 +30,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-# --- mathematics -----------------------------------------------------------------------------------
+# --- mathematics ----------------------------------------------------------------------------------
 
 
 @deterministic
@@ -51,7 +51,9 @@ def test_scalar_rotations_equal_the_shared_ones(a: np.ndarray, b: np.ndarray) ->
 @given(rotation_vectors, vectors)
 def test_right_jacobian_by_differences(phi: np.ndarray, d: np.ndarray) -> None:
     h = 1e-6
-    moved = [rot.multiply(rot.conjugate(rot.exp(phi)), rot.exp(phi + s * h * d)) for s in (1.0, -1.0)]
+    moved = [
+        rot.multiply(rot.conjugate(rot.exp(phi)), rot.exp(phi + s * h * d)) for s in (1.0, -1.0)
+    ]
     numeric = (rot.log(moved[0]) - rot.log(moved[1])) / (2 * h)
     np.testing.assert_allclose(scalar.right_jacobian(phi) @ d, numeric, atol=1e-8)
 
@@ -60,7 +62,9 @@ def test_small_angles_lose_nothing() -> None:
     for size in (0.0, 1e-12, 1e-6, 9.9e-5, 1.01e-4):
         phi = np.array([0.6, -0.8, 0.0]) * size
         np.testing.assert_allclose(scalar.log(scalar.exp(phi)), phi, rtol=1e-9, atol=1e-300)
-        np.testing.assert_allclose(scalar.right_jacobian(phi), np.eye(3) - 0.5 * rot.skew(phi), atol=1e-8)
+        np.testing.assert_allclose(
+            scalar.right_jacobian(phi), np.eye(3) - 0.5 * rot.skew(phi), atol=1e-8
+        )
 
 
 INERTIA = np.array([[2.0, 0.1, 0.0], [0.1, 3.0, -0.2], [0.0, -0.2, 4.0]])
@@ -82,7 +86,9 @@ def test_transition_by_differences(model: str) -> None:
         (qa, wa, _), (qb, wb, _) = step(d), step(-d)
         back = rot.conjugate(q)
         dtheta = rot.log(rot.multiply(back, qa)) - rot.log(rot.multiply(back, qb))
-        np.testing.assert_allclose(transition[:, i], np.concatenate([dtheta, wa - wb]) / (2 * h), atol=2e-6)
+        np.testing.assert_allclose(
+            transition[:, i], np.concatenate([dtheta, wa - wb]) / (2 * h), atol=2e-6
+        )
 
 
 def test_torque_free_against_a_fine_integration() -> None:
@@ -94,7 +100,9 @@ def test_torque_free_against_a_fine_integration() -> None:
         middle = w + 0.5 * dt * inverse @ -np.cross(w, inertia @ w)
         q = scalar.multiply(q, scalar.exp(middle * dt))
         w = w + dt * inverse @ -np.cross(middle, inertia @ middle)
-    got_q, got_w, _ = motion.torque_free(Q0, np.array([0.05, 0.6, 0.1]), 4.0, inertia, np.linalg.inv(inertia))
+    got_q, got_w, _ = motion.torque_free(
+        Q0, np.array([0.05, 0.6, 0.1]), 4.0, inertia, np.linalg.inv(inertia)
+    )
     assert float(rot.angle_between(q, got_q)) < 2e-6
     np.testing.assert_allclose(got_w, w, atol=2e-6)
     assert np.linalg.norm(got_w - [0.05, 0.6, 0.1]) > 0.02  # the rates did move
@@ -154,7 +162,10 @@ def test_measurement_jacobian_by_differences() -> None:
     for i in range(19):
         d = h * np.eye(19)[i]
         np.testing.assert_allclose(
-            (residual(-d) - residual(d)) / (2 * h), at_truth.jacobian[:, i], atol=1e-7, err_msg=str(i)
+            (residual(-d) - residual(d)) / (2 * h),
+            at_truth.jacobian[:, i],
+            atol=1e-7,
+            err_msg=str(i),
         )
 
 
@@ -162,18 +173,27 @@ def test_a_camera_with_errors_measures_what_its_images_show() -> None:
     """The same points of the target through the true camera, seen through the nominal camera."""
     errors = np.array([0.004, -0.006, 0.005, 0.002, -0.003, 0.001, 0.002])
     nominal = Camera.from_hfov(1280, 720, math.radians(60.0))
-    true = replace(nominal, fx_px=nominal.fx_px * (1.0 + errors[6]), fy_px=nominal.fy_px * (1.0 + errors[6]))
+    true = replace(
+        nominal, fx_px=nominal.fx_px * (1.0 + errors[6]), fy_px=nominal.fy_px * (1.0 + errors[6])
+    )
     position, q = EYE.position_m + rot.rotate(EYE.q_wxyz, [0.02, -0.03, 1.1]), Q0
-    points = 0.1 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    points = 0.1 * np.array(
+        [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float
+    )
     q_true = rot.multiply(EYE.q_wxyz, rot.exp(errors[:3]))
     lens = EYE.position_m + rot.rotate(EYE.q_wxyz, errors[3:6])
     pixels = true.project(rot.rotate_inverse(q_true, position + rot.rotate(q, points) - lens))
     seen = predict_measurement(EYE, position, q, errors)
     again = nominal.project(
-        rot.rotate_inverse(EYE.q_wxyz, seen.position_m + rot.rotate(seen.q_wxyz, points) - EYE.position_m)
+        rot.rotate_inverse(
+            EYE.q_wxyz, seen.position_m + rot.rotate(seen.q_wxyz, points) - EYE.position_m
+        )
     )
-    wrong = nominal.project(rot.rotate_inverse(EYE.q_wxyz, position + rot.rotate(q, points) - EYE.position_m))
-    # What is left is the depth within the target that a longer focal length changes: 0.2 % of 0.1 m.
+    wrong = nominal.project(
+        rot.rotate_inverse(EYE.q_wxyz, position + rot.rotate(q, points) - EYE.position_m)
+    )
+    # What is left is the depth within the target that a longer focal length changes: 0.2 % of 0.1
+    # m.
     assert np.abs(again - pixels).max() < 0.25
     assert np.abs(wrong - pixels).max() > 5.0
 
@@ -182,12 +202,15 @@ def test_a_camera_with_errors_measures_what_its_images_show() -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_correction_keeps_the_covariance_positive_and_shrinks_the_residual(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    # Within the linear range of attitude, where the residual must shrink: with sigmas up to 0.4 rad it grew in 3 % of seeds.
+    # Within the linear range of attitude, where the residual must shrink: with sigmas up to 0.4 rad
+    # it grew in 3 % of seeds.
     a = rng.normal(size=(19, 19)) * 10.0 ** rng.uniform(-4, -2, size=(19, 1))
     covariance = a @ a.T + 1e-12 * np.eye(19)
     branch = _branch(rng.normal(size=7) * 1e-3, covariance)
     pose = PoseHypothesis(
-        branch.position_m + rng.normal(size=3) * 0.01, rot.multiply(Q0, rot.exp(rng.normal(size=3) * 0.02)), R
+        branch.position_m + rng.normal(size=3) * 0.01,
+        rot.multiply(Q0, rot.exp(rng.normal(size=3) * 0.02)),
+        R,
     )
     before = innovate(branch, 7, EYE, pose, MekfParameters())
     after = correct(branch, before)
@@ -201,7 +224,7 @@ def test_gate_is_the_chi_square_quantile() -> None:
     assert pytest.approx(chi2.ppf(0.9999, 6), rel=1e-12) == GATE_CHI_SQUARE
 
 
-# --- geometry --------------------------------------------------------------------------------------
+# --- geometry -------------------------------------------------------------------------------------
 
 CAMERA_P = np.array([0.07, 0.0, 0.075])
 CAMERA_Q = rot.from_matrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
@@ -211,7 +234,9 @@ def test_to_world_geometry() -> None:
     # One metre ahead of a camera that looks along the chaser's X, a chaser turned by 90 degrees.
     q = rot.exp([0.0, 0.0, math.pi / 2])
     irf = rot.conjugate(CAMERA_Q)
-    h = to_world([5.0, 0.0, 0.0], q, CAMERA_P, CAMERA_Q, [0.0, 0.0, 1.0], irf, np.diag([1.0, 1, 9, 1, 1, 1]))
+    h = to_world(
+        [5.0, 0.0, 0.0], q, CAMERA_P, CAMERA_Q, [0.0, 0.0, 1.0], irf, np.diag([1.0, 1, 9, 1, 1, 1])
+    )
     np.testing.assert_allclose(h.position_m, [5.0, 1.07, 0.075], atol=1e-12)
     assert float(rot.angle_between(h.q_wxyz, q)) < 1e-12
     np.testing.assert_allclose(np.diag(h.covariance), [1, 9, 1, 1, 1, 1], atol=1e-12)
@@ -230,7 +255,9 @@ def test_to_world_covariance_by_differences() -> None:
             p + d[0:3], rot.multiply(q, rot.exp(d[3:6])), CAMERA_P, CAMERA_Q,
             pi + d[6:9], rot.multiply(qi, rot.exp(d[9:12])), ci,
         )  # fmt: skip
-        return np.concatenate([m.position_m, rot.log(rot.multiply(rot.conjugate(h.q_wxyz), m.q_wxyz))])
+        return np.concatenate(
+            [m.position_m, rot.log(rot.multiply(rot.conjugate(h.q_wxyz), m.q_wxyz))]
+        )
 
     j = np.column_stack([(moved(1e-6 * e) - moved(-1e-6 * e)) / 2e-6 for e in np.eye(12)])
     both = np.block([[co, np.zeros((6, 6))], [np.zeros((6, 6)), ci]])

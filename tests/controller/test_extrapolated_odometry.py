@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller extrapolates in place of lost odometry leaves out the thrust: no estimator may take it for a measurement."""
+"""What the controller extrapolates in place of lost odometry leaves out the thrust: no estimator
+may take it for a measurement.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ class Recorded:
 
 
 def test_estimators_of_the_target_alone_take_measured_odometry_only() -> None:
-    """A sighting whose odometry is lost becomes a measurement when that odometry arrives, not before."""
+    """A sighting whose odometry is lost becomes a measurement when that odometry arrives, not
+    before.
+    """
     flight = SyntheticFlight(scenario(), navigation("lab"), 2, 1)
     recorded = Recorded()
     stage = EstimationStage(scenario(), cast(Any, recorded))
@@ -74,7 +78,9 @@ def test_identification_of_the_stack_takes_measured_odometry_only() -> None:
         last, kept = chasers[-1], {i: odometry[i] for i in chasers[:-1]}
         moving = msgspec.structs.replace(odometry[last], velocity_m_s=(0.05, 0.0, 0.0))
         found = stage.run(
-            observation_of(1, {**kept, last: moving} if wrong else kept, (), {last: odometry[last]}),
+            observation_of(
+                1, {**kept, last: moving} if wrong else kept, (), {last: odometry[last]}
+            ),
             estimation,
         )
         assert found is not None

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Far range: measurements by range and bearing, speed limit by range, approach cone, hold points, and what scenarios are refused."""
+"""Far range: measurements by range and bearing, speed limit by range, approach cone, hold points,
+and what scenarios are refused.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,9 @@ def test_goto_keeps_the_speed_limit_by_range_all_along_its_way() -> None:
 def test_goto_out_of_the_approach_cone_is_refused() -> None:
     machine = PhaseMachine(flight_scenario(scenario()))
     machine.target_acquired(0.0)
-    refused = machine.command(OperatorCommand(command="goto", chaser=0, offset_m=(-50.0, 20.0, 0.0)), 0.0)
+    refused = machine.command(
+        OperatorCommand(command="goto", chaser=0, offset_m=(-50.0, 20.0, 0.0)), 0.0
+    )
     assert not refused.accepted
     assert "21.8 degrees off the approach axis; the approach cone has 10 degrees" in refused.reason
 
@@ -91,15 +95,27 @@ def test_goto_out_of_the_approach_cone_is_refused() -> None:
     ("changes", "message"),
     [
         (
-            {"timeline": [{"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-0.2, 0.0, 0.0]}]},
+            {
+                "timeline": [
+                    {"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-0.2, 0.0, 0.0]}
+                ]
+            },
             r"timeline\.0\.offset_m: 0\.2 m from the target, inside the keep-out of limits\.min_distance_target_m \(0\.35 m\)",
         ),
         (
-            {"timeline": [{"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-400.0, 0.0, 0.0]}]},
+            {
+                "timeline": [
+                    {"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-400.0, 0.0, 0.0]}
+                ]
+            },
             r"timeline\.0\.offset_m: 400 m from the target, farther than limits\.max_reference_distance_m",
         ),
         (
-            {"timeline": [{"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-50.0, 50.0, 0.0]}]},
+            {
+                "timeline": [
+                    {"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-50.0, 50.0, 0.0]}
+                ]
+            },
             r"timeline\.0\.offset_m: 45 degrees off the approach axis of chaser 0, outside approach\.cone_deg \(10 degrees\)",
         ),
         (
@@ -114,7 +130,9 @@ def test_goto_out_of_the_approach_cone_is_refused() -> None:
         ),
     ],
 )
-def test_invalid_scenarios_are_refused_in_one_clear_line(changes: dict[str, Any], message: str) -> None:
+def test_invalid_scenarios_are_refused_in_one_clear_line(
+    changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ScenarioError, match=message) as caught:
         scenario(**changes)
     assert str(caught.value).count("\n") <= 1

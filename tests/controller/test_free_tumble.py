@@ -10,7 +10,12 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint.prediction import predict_target
-from chaserdock_controller.estimation.joint.state import JointState, empty_state, start_shape, with_body
+from chaserdock_controller.estimation.joint.state import (
+    JointState,
+    empty_state,
+    start_shape,
+    with_body,
+)
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_controller.redundancy.serialization import decode, encode
 from chaserdock_protocol.scenario import Scenario, flight_scenario
@@ -22,9 +27,13 @@ from chaserdock.evaluation.rigid_control import wrong_knowledge
 
 
 def scenario_of(omega_deg_s: list[float], *more: str) -> Scenario:
-    """Return ``detumble`` with two chasers, and a target of which mass, inertia and centre are stated wrong."""
+    """Return ``detumble`` with two chasers, and a target of which mass, inertia and centre are
+    stated wrong.
+    """
     scenario = stack_scenario(1, [0, 1], [*wrong_knowledge(1), *more])
-    target = scenario.target.model_copy(update={"omega_rad_s": tuple(np.radians(omega_deg_s).tolist())})
+    target = scenario.target.model_copy(
+        update={"omega_rad_s": tuple(np.radians(omega_deg_s).tolist())}
+    )
     return scenario.model_copy(update={"target": target})
 
 
@@ -51,7 +60,11 @@ def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(tumble: TumbleO
     """The stated axes are right here, so that the target spins about an axis of the stated inertia."""
     axis = np.linalg.eigh(target_alone().inertia_kg_m2)[1][:, 2]
     values = "{target=true,mass_kg=150.0,inertia_kg_m2=[20.0,22.0,25.0,0.0,0.0,0.0]}"
-    changes = [f"truth.values=[{values}]", "target.inertia_kg_m2=[22.0,20.0,25.0]", f"seed={axis.size}"]
+    changes = [
+        f"truth.values=[{values}]",
+        "target.inertia_kg_m2=[22.0,20.0,25.0]",
+        f"seed={axis.size}",
+    ]
     spin = watch_tumble(scenario_of([0.0, 0.0, 7.0], *changes), 8.0)
     assert spin.ratio_error > 0.5 * spin.stated_error
     assert spin.ratio_nees < 20.5
@@ -62,11 +75,15 @@ def test_a_change_of_the_body_restarts_its_shape() -> None:
     flight = flight_scenario(scenario_of([4.0, -3.0, 5.0]))
     p = estimator_of(flight).parameters  # type: ignore[union-attr]
     state = msgspec.structs.replace(
-        start_shape(empty_state(0, 2), p.target), target_known=True, omega_rad_s=np.radians([4.0, -3.0, 5.0])
+        start_shape(empty_state(0, 2), p.target),
+        target_known=True,
+        omega_rad_s=np.radians([4.0, -3.0, 5.0]),
     )
     assert with_body(state, p.target) is state
     rows = tuple(tuple(row) for row in (1e-2 * np.eye(9)).tolist())
-    other = replace(p.target, inertia_ratios=((10.0, 0, 0), (0, 20.0, 0), (0, 0, 25.0)), body_covariance=rows)
+    other = replace(
+        p.target, inertia_ratios=((10.0, 0, 0), (0, 20.0, 0), (0, 0, 25.0)), body_covariance=rows
+    )
     after = with_body(state, other)
     assert after.shape is not None
     assert np.diag(after.shape.inertia) == pytest.approx(np.array([10.0, 20.0, 25.0]) / 55.0)

@@ -219,10 +219,14 @@ def test_an_approach_starts_on_its_line_only() -> None:
     guidance.update_tracking(0, end, 0.0, 0.0)
     answer = guidance.command(operator("approach"), end)
     assert not answer.accepted
-    assert answer.reason == "the reference is 0.50 m beside the approach line; retreat or goto first"
+    assert (
+        answer.reason == "the reference is 0.50 m beside the approach line; retreat or goto first"
+    )
     assert phases(guidance)[0] == "hold"
     guidance.command(operator("retreat"), end)
-    assert guidance.command(operator("approach"), end + guidance.chasers[0].move.duration_s).accepted
+    assert guidance.command(
+        operator("approach"), end + guidance.chasers[0].move.duration_s
+    ).accepted
 
 
 def test_an_approach_does_not_go_through_the_target() -> None:
@@ -289,7 +293,7 @@ def test_reference_is_smooth_and_slow_for_any_commands(
     assert guidance.chasers[1].phase == "hold"
 
 
-# -- the controller without a target ----------------------------------------------------------------------
+# -- the controller without a target ---------------------------------------------------------------
 
 
 def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
@@ -309,16 +313,20 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
             assert wrench.chaser == i
             assert wrench.effective_time_ns == timing.effective_ns(tick)
             assert wrench.expires_ns == wrench.sim_time_ns + 500_000_000
-            speed = rotations.rotate(here[i].q_wxyz, wrench.force_N) @ np.array(here[i].velocity_m_s)
+            speed = rotations.rotate(here[i].q_wxyz, wrench.force_N) @ np.array(
+                here[i].velocity_m_s
+            )
             assert speed < 0.0
         assert out.solver is not None
         assert out.solver.chasers == ()
         events = [(r.accepted, r.reason) for r in out.replies]
         assert events == ([(False, "the target has not been found yet")] if tick == 0 else [])
-    assert flight.step(TickInputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())).wrenches.keys() == {1}
+    assert flight.step(
+        TickInputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())
+    ).wrenches.keys() == {1}
 
 
-# -- when nobody sees the target ----------------------------------------------------------------------------
+# -- when nobody sees the target -------------------------------------------------------------------
 
 
 def blind_phases(seen: Callable[[float], bool], command: str = "") -> list[tuple[float, str, str]]:
@@ -349,7 +357,10 @@ def test_approach_holds_while_the_target_is_out_of_sight_and_continues() -> None
 
 
 def test_a_moment_without_sight_changes_nothing() -> None:
-    assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 7.9)] == ["hold", "approach"]
+    assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 7.9)] == [
+        "hold",
+        "approach",
+    ]
 
 
 def test_approach_holds_while_the_odometry_is_doubtful_and_continues() -> None:
@@ -396,7 +407,7 @@ def test_loss_of_sight_interrupts_approaches_only(
     assert next_phase(phase, Trigger.SIGHT_LOST, by_capture) is target
 
 
-# -- the transition table -----------------------------------------------------------------------------------
+# -- the transition table --------------------------------------------------------------------------
 
 
 def test_every_transition_is_unique() -> None:
@@ -416,9 +427,15 @@ def test_every_phase_can_be_entered_and_left() -> None:
 
 def test_abort_and_retreat_are_permitted_in_every_phase_with_a_known_target() -> None:
     for by_capture in (False, True):
-        for phase in {s for t in TRANSITIONS if t.by_capture in (None, by_capture) for s in t.sources}:
+        for phase in {
+            s for t in TRANSITIONS if t.by_capture in (None, by_capture) for s in t.sources
+        }:
             permitted = permitted_commands(phase, by_capture)
-            expected = set() if phase in (Phase.ACQUIRE, Phase.SEARCHING) else {"abort", "retreat"} - {phase}
+            expected = (
+                set()
+                if phase in (Phase.ACQUIRE, Phase.SEARCHING)
+                else {"abort", "retreat"} - {phase}
+            )
             assert expected <= set(permitted)
 
 

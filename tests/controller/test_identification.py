@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mathematics of the identification of a stack: its Jacobians, its covariances, and what detection of failures proves."""
+"""Mathematics of the identification of a stack: its Jacobians, its covariances, and what detection
+of failures proves.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from chaserdock_controller.estimation.identification.composite import (
     CompositeIdentification,
     IdentificationParameters,
 )
-from chaserdock_controller.estimation.identification.fault_recovery import FaultTolerantIdentification
+from chaserdock_controller.estimation.identification.fault_recovery import (
+    FaultTolerantIdentification,
+)
 from chaserdock_controller.estimation.mass_properties import (
     MassProperties,
     attach,
@@ -55,7 +59,9 @@ class Stack:
             arm = c.position_m - self.body.centre_trf_m
             turn = rotations.exp(noise * draw(0.0, ERRORS.attitude_noise_rad, 3))
             out[i] = BodyState(
-                self.position + rotations.rotate(self.q, arm) + noise * draw(0.0, ERRORS.position_noise_m, 3),
+                self.position
+                + rotations.rotate(self.q, arm)
+                + noise * draw(0.0, ERRORS.position_noise_m, 3),
                 self.velocity
                 + rotations.rotate(self.q, np.cross(self.omega, arm))
                 + noise * draw(0.0, ERRORS.velocity_noise_m_s, 3),
@@ -68,13 +74,17 @@ class Stack:
     def step(self, impulses: dict[int, Array]) -> None:
         wrench = np.zeros(6)
         for i, j in impulses.items():
-            own = np.array([(*t.direction, *np.cross(t.position_m, t.direction)) for t in BODY.thrusters]).T
+            own = np.array(
+                [(*t.direction, *np.cross(t.position_m, t.direction)) for t in BODY.thrusters]
+            ).T
             wrench += self.chasers[i].wrench_to_stack(own @ j, self.body.centre_trf_m)
         kick = rotations.rotate(self.q, wrench[:3]) / self.body.mass_kg
         turn = np.linalg.solve(self.body.inertia_kg_m2, wrench[3:])
         self.position = self.position + STEP_S * (self.velocity + kick / 2.0)
         self.velocity = self.velocity + kick
-        qs, omegas, _ = free_rotation(self.q, self.omega + turn / 2.0, self.body.inertia_kg_m2, STEP_S, 2)
+        qs, omegas, _ = free_rotation(
+            self.q, self.omega + turn / 2.0, self.body.inertia_kg_m2, STEP_S, 2
+        )
         self.q, self.omega = qs[1], omegas[1] + turn / 2.0
 
     def filter(self, target: TargetBody | None = None) -> CompositeIdentification:
@@ -121,7 +131,9 @@ def test_detaching_undoes_attaching(seed: int) -> None:
 
 
 def test_a_stack_is_as_uncertain_as_its_nonlinear_dependence_on_the_mass() -> None:
-    """Centre and ratios are known and the mass is 30 % wrong: the true stack is within its covariance."""
+    """Centre and ratios are known and the mass is 30 % wrong: the true stack is within its
+    covariance.
+    """
     true, chasers = target_alone(), mounted((0,))
     scale = np.diag([45.0**2, *[1e-6] * 3, *[1e-4] * 6])
     for share in (0.7, 1.3):
@@ -135,7 +147,9 @@ def test_a_stack_is_as_uncertain_as_its_nonlinear_dependence_on_the_mass() -> No
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_transition_is_the_derivative_of_the_prediction(seed: int) -> None:
-    """Shift the error state before a prediction, and compare the innovations of the exact state with those that follow."""
+    """Shift the error state before a prediction, and compare the innovations of the exact state
+    with those that follow.
+    """
     stack = Stack(seed)
     size = len(stack.filter().covariance)
     pulses = stack.pulses(0.4)
@@ -145,7 +159,16 @@ def test_the_transition_is_the_derivative_of_the_prediction(seed: int) -> None:
     states = stack.states(0.0)
     rng = np.random.default_rng(seed)
     scale = np.array(
-        [*[1e-4] * 3, *[1e-4] * 3, *[1e-4] * 6, 1e-2, *[1e-3] * 3, *[0.1] * 6, *[1e-4] * 12, *[1e-2] * 12]
+        [
+            *[1e-4] * 3,
+            *[1e-4] * 3,
+            *[1e-4] * 6,
+            1e-2,
+            *[1e-3] * 3,
+            *[0.1] * 6,
+            *[1e-4] * 12,
+            *[1e-2] * 12,
+        ]
     )
     assert len(scale) == size
     for _ in range(6):
@@ -163,7 +186,9 @@ def test_the_transition_is_the_derivative_of_the_prediction(seed: int) -> None:
         assert change == pytest.approx(innovation @ transition @ shift, abs=2e-7, rel=2e-3)
 
 
-def reference_innovation(seed: int, pulses: dict[int, Array], states: dict[int, BodyState]) -> Array:
+def reference_innovation(
+    seed: int, pulses: dict[int, Array], states: dict[int, BodyState]
+) -> Array:
     """Return the measurement matrix at the predicted state."""
     reference = Stack(seed).filter()
     reference.predict(pulses, STEP_S)
@@ -179,8 +204,8 @@ def run(
     failure: tuple[int, int, str] | None = None,
     at_s: float = 0.0,
 ):
-    """Identify a stack from pulses; ``failure``: chaser, thruster and kind, from ``at_s`` on until it is found. Return filter, mean
-    NIS and what was found with its time."""
+    """Identify a stack from pulses; ``failure``: chaser, thruster and kind, from ``at_s`` on until
+    it is found. Return filter, mean NIS and what was found with its time."""
     found, nis, faults = FaultTolerantIdentification(stack.filter(target), np.full(12, 1.5)), [], []
     suspects = np.ones(len(found.filter.usable), dtype=bool)
     pulses: dict[int, Array] = {}

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid input to the controller: one clear error before the flight; in flight an event and a safe command."""
+"""Invalid input to the controller: one clear error before the flight; in flight an event and a safe
+command.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_protocol import codec
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.messages import Odometry, OperatorCommand, PoseSolution, Sighting, encoding_of
+from chaserdock_protocol.messages import (
+    Odometry,
+    OperatorCommand,
+    PoseSolution,
+    Sighting,
+    encoding_of,
+)
 from chaserdock_protocol.scenario import Scenario, ScenarioError, parse_scenario
 from flight_cases import odometry, scenario
 
@@ -30,7 +38,10 @@ AT_START = [
     ({"controller": {"falloff": 1.1}}, "controller.falloff: "),
     ({"chaser": {"mass_kg": 0.0}}, "chaser.mass_kg: "),
     ({"chaser": {"inertia_kg_m2": [0.1, 0.1, 0.0]}}, "chaser.inertia_kg_m2"),
-    ({"limits": {"min_distance_target_m": 1.1}}, "chasers.0.position_m: 1 m from the target, nearer than"),
+    (
+        {"limits": {"min_distance_target_m": 1.1}},
+        "chasers.0.position_m: 1 m from the target, nearer than",
+    ),
     (
         {"limits": {"min_distance_chasers_m": 1.6}},
         "the positions of chasers.0 and chasers.1 are 1.56 m apart, nearer than",
@@ -71,12 +82,17 @@ def core_of(mission: Scenario) -> ControllerCore:
     return ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target))
 
 
-def step(flight: ControllerCore, tick: int, *commands: OperatorCommand, **changes: Any) -> TickOutputs:
+def step(
+    flight: ControllerCore, tick: int, *commands: OperatorCommand, **changes: Any
+) -> TickOutputs:
     """Step with the given odometry of chaser 0 and chaser 1 at its reference."""
     now_ns = flight.scenario.timing.tick_time_ns(tick)
     here = {
         0: odometry(
-            0, tick, now_ns, **({"position_m": (-1.0, 0.0, 0.0), "velocity_m_s": (0.0,) * 3} | changes)
+            0,
+            tick,
+            now_ns,
+            **({"position_m": (-1.0, 0.0, 0.0), "velocity_m_s": (0.0,) * 3} | changes),
         ),
         1: odometry(1, tick, now_ns, position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3),
     }
@@ -93,7 +109,10 @@ INVALID = [
 ]
 # Receivers check variances only.
 INVALID_COVARIANCES: list[tuple[dict[str, Any], str]] = [
-    ({"attitude_covariance_rad2": (1.0, 0.5, *(0.0,) * 7)}, "attitude_covariance_rad2 is not a covariance"),
+    (
+        {"attitude_covariance_rad2": (1.0, 0.5, *(0.0,) * 7)},
+        "attitude_covariance_rad2 is not a covariance",
+    ),
     (
         {"velocity_covariance_m2_s2": (1.0, 2.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0)},
         "velocity_covariance_m2_s2 is not a covariance",
@@ -102,7 +121,9 @@ INVALID_COVARIANCES: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "message"), [*INVALID, *INVALID_COVARIANCES])
-def test_invalid_odometry_makes_only_that_chaser_coast(changes: dict[str, Any], message: str) -> None:
+def test_invalid_odometry_makes_only_that_chaser_coast(
+    changes: dict[str, Any], message: str
+) -> None:
     """The codec already rejects most of these messages (below); the core is safe without it."""
     flight = core_of(scenario())
     assert step(flight, 0).wrenches[0].mode == "nmpc"
@@ -152,7 +173,11 @@ def test_unreachable_goto_is_rejected_with_reason() -> None:
 
 def solution(**changes: Any) -> PoseSolution:
     covariance = tuple((1e-6 * np.eye(6)).ravel().tolist())
-    values = {"position_m": (0.0, 0.0, 1.0), "q_wxyz": (1.0, 0.0, 0.0, 0.0), "covariance": covariance}
+    values = {
+        "position_m": (0.0, 0.0, 1.0),
+        "q_wxyz": (1.0, 0.0, 0.0, 0.0),
+        "covariance": covariance,
+    }
     return PoseSolution(**{**values, "reprojection_rms_px": 0.1, **changes})  # type: ignore[arg-type]
 
 
@@ -184,4 +209,6 @@ def test_invalid_solutions_of_a_sighting_are_dropped_with_an_event(
     )
     (checked,), events = valid_sightings([sample])
     assert checked.solutions == (sample.solutions if not reason else sample.solutions[1:])
-    assert events == ([("warning", f"chaser 2: invalid sighting, ignored: {reason}")] if reason else [])
+    assert events == (
+        [("warning", f"chaser 2: invalid sighting, ignored: {reason}")] if reason else []
+    )

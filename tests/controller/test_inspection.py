@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inspection: the flight around the target, and the fusion of the information of its images on the geometry."""
+"""Inspection: the flight around the target, and the fusion of the information of its images on the
+geometry.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.estimation.target_shape import FLOOR_SIGMAS, SeenPlace, ShapeFilter, view_cell
+from chaserdock_controller.estimation.target_shape import (
+    FLOOR_SIGMAS,
+    SeenPlace,
+    ShapeFilter,
+    view_cell,
+)
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import circuit
@@ -72,7 +79,9 @@ def test_chasers_inspect_together_keep_their_distance_face_the_target_and_hold_a
         guidance.update_tracking(i, end, 0.0, 0.0)
     assert [c.phase for c in guidance.chasers] == ["hold", "hold"]
     assert not any(c.faces for c in guidance.chasers)
-    np.testing.assert_allclose(at(guidance.chasers[0].move, end + 9.0)[0], [-1.1, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        at(guidance.chasers[0].move, end + 9.0)[0], [-1.1, 0.0, 0.0], atol=1e-9
+    )
 
 
 def test_inspection_is_refused_with_the_reason() -> None:
@@ -99,7 +108,9 @@ def test_inspection_is_refused_with_the_reason() -> None:
 
 
 def views(true: Array, count: int, seed: int) -> list[tuple[Array, Array, Array]]:
-    """Return directions, information and vectors of views that each measure three combinations of the parameters."""
+    """Return directions, information and vectors of views that each measure three combinations of
+    the parameters.
+    """
     rng = np.random.default_rng(seed)
     made = []
     for _ in range(count):
@@ -146,7 +157,9 @@ def test_a_direction_counts_once_and_a_contradiction_not_at_all() -> None:
 
 
 def place(at: Array, true: float, rng: np.random.Generator) -> SeenPlace:
-    """Return a place seen with a scale that is wrong by ``true`` of 0.3 % and a panel angle that is not."""
+    """Return a place seen with a scale that is wrong by ``true`` of 0.3 % and a panel angle that is
+    not.
+    """
     towards, by_errors = at / np.linalg.norm(at), np.zeros((3, 2))
     by_errors[:, 1] = 0.003 * at
     seen = at * (1.0 - 0.003 * true) + rng.normal(0.0, 2e-4, 3)
@@ -192,7 +205,9 @@ def test_a_baseline_counts_once_and_a_short_or_contradicting_one_not_at_all() ->
 
 @pytest.fixture(scope="module")
 def markerless() -> ControllerCore:
-    return ControllerCore(load_scenario(ROOT / "scenarios/markerless-docking.toml"), now_s=lambda: 0.0)
+    return ControllerCore(
+        load_scenario(ROOT / "scenarios/markerless-docking.toml"), now_s=lambda: 0.0
+    )
 
 
 def test_standby_takes_over_the_estimate(markerless: ControllerCore) -> None:

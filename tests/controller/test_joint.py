@@ -58,12 +58,16 @@ def random_state(seed: int, chasers: int = 2) -> JointState:
         empty_state(0, chasers), target_known=True, alive=np.ones(chasers, dtype=bool)
     )
     places = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.1]])[:chasers]
-    return inject(msgspec.structs.replace(state, positions_m=places), spread * rng.normal(size=len(spread)))
+    return inject(
+        msgspec.structs.replace(state, positions_m=places), spread * rng.normal(size=len(spread))
+    )
 
 
 def _spread() -> list[float]:
     return (
-        np.repeat([0.1, 0.05, 0.3, 0.1, 0.05, 0.005, 0.005, 0.02, 0.01, 0.001, 0.02, 0.01], 3).tolist()
+        np.repeat(
+            [0.1, 0.05, 0.3, 0.1, 0.05, 0.005, 0.005, 0.02, 0.01, 0.001, 0.02, 0.01], 3
+        ).tolist()
         + [0.01]
         + [0.3] * 6
     )
@@ -72,7 +76,9 @@ def _spread() -> list[float]:
 def fly(
     estimator: JointEstimator, flight: SyntheticFlight, seconds: float, change=lambda i: i
 ) -> list[float]:
-    """Fly for a time; return the NEES of all chasers every second of the second half. ``change`` replaces inputs."""
+    """Fly for a time; return the NEES of all chasers every second of the second half. ``change``
+    replaces inputs.
+    """
     nees, ticks = [], round(seconds / PERIOD_S)
     for k in range(ticks):
         estimator.update(change(flight.inputs()))
@@ -128,7 +134,9 @@ def test_jacobians_agree_with_finite_differences(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None:
     p = parameters(SCENARIO, navigation("orbit"))
-    state = msgspec.structs.replace(random_state(seed), covariance=np.zeros((TARGET + 2 * CHASER,) * 2))
+    state = msgspec.structs.replace(
+        random_state(seed), covariance=np.zeros((TARGET + 2 * CHASER,) * 2)
+    )
     impulses = np.random.default_rng(seed).normal(size=(2, 6)) * np.repeat([0.02, 0.002], 3)
     after = predict(state, round(PERIOD_S * 1e9), impulses, p)
     noise = after.covariance
@@ -150,7 +158,9 @@ def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None
 
 @pytest.mark.parametrize("chasers", [1, 2])
 def test_update_is_that_of_a_kalman_filter(chasers: int) -> None:
-    """Mean and covariance by the textbook's formulas, with the dense Jacobian of all measurements of a chaser."""
+    """Mean and covariance by the textbook's formulas, with the dense Jacobian of all measurements
+    of a chaser.
+    """
     p = parameters(SCENARIO, navigation("orbit"))
     rng = np.random.default_rng(chasers)
     size = TARGET + chasers * CHASER
@@ -188,7 +198,9 @@ def test_covariance_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match="2 chasers"):
         update(wrong, {}, {}, mounting_of(p.camera), p)
     with pytest.raises(ValueError, match="other numbers of chasers"):
-        predict(msgspec.structs.replace(state, alive=np.ones(1, dtype=bool)), 1, np.zeros((2, 6)), p)
+        predict(
+            msgspec.structs.replace(state, alive=np.ones(1, dtype=bool)), 1, np.zeros((2, 6)), p
+        )
 
 
 def test_gates_are_quantiles_of_chi_square() -> None:
@@ -198,7 +210,9 @@ def test_gates_are_quantiles_of_chi_square() -> None:
 
 @pytest.mark.parametrize(("grade", "chasers"), [("lab", 1), ("lab", 4), ("orbit", 2)])
 def test_relative_poses_are_consistent(grade: str, chasers: int) -> None:
-    """The mean NEES over flights is 6; errors that are constant in a flight make single flights vary."""
+    """The mean NEES over flights is 6; errors that are constant in a flight make single flights
+    vary.
+    """
     nees = []
     for seed in range(6):
         flight = SyntheticFlight(SCENARIO, navigation(grade), chasers, seed, disturbance=0.005)
@@ -225,19 +239,27 @@ def test_disturbances_are_estimated() -> None:
 def test_disturbance_moves_a_body_as_its_shifted_centre_of_mass_does() -> None:
     state, p = random_state(4), parameters(SCENARIO, navigation("lab"))
     commanded = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.03])
-    wrench, centre_m, omega = commanded + state.extra[0, :6], state.of(0, CENTRE), state.omegas_rad_s[0]
+    wrench, centre_m, omega = (
+        commanded + state.extra[0, :6],
+        state.of(0, CENTRE),
+        state.omegas_rad_s[0],
+    )
     torque = wrench[3:] - np.cross(centre_m, wrench[:3])
     inertia = np.diag(p.inertia)
     alpha = np.linalg.solve(inertia, torque - np.cross(omega, inertia @ omega))
     lag_m_s2 = np.cross(alpha, centre_m) + np.cross(omega, np.cross(omega, centre_m))
     expected = np.concatenate([wrench[:3] - p.body.mass_kg * lag_m_s2, torque])
     assert np.linalg.norm(expected - wrench) > 1e-3
-    np.testing.assert_allclose(commanded + disturbance(state, 0, commanded, p), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        commanded + disturbance(state, 0, commanded, p), expected, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("latched_at", [None, 20])
 def test_late_sightings_give_the_same_state(latched_at: int | None) -> None:
-    """Sightings that arrive up to half a second late, in any order, change nothing in the end, also from before a latch."""
+    """Sightings that arrive up to half a second late, in any order, change nothing in the end, also
+    from before a latch.
+    """
     rng = np.random.default_rng(5)
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 5)
     prompt, late = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
@@ -263,8 +285,8 @@ def test_late_sightings_give_the_same_state(latched_at: int | None) -> None:
 
 
 def test_late_odometry_counts_at_its_tick() -> None:
-    """Odometry that arrives two ticks late gives the same state as odometry that arrived in time. What is known already, or older
-    than the records, changes nothing."""
+    """Odometry that arrives two ticks late gives the same state as odometry that arrived in time.
+    What is known already, or older than the records, changes nothing."""
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 5)
     prompt, late = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
     measured, missing = [], flight.inputs()
@@ -286,8 +308,8 @@ def test_late_odometry_counts_at_its_tick() -> None:
 
 @pytest.mark.parametrize(("channel", "shift"), [("position", 0.05), ("velocity", 0.02)])
 def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) -> None:
-    """The position of chaser 1 jumps by 50 mm, or it states 20 mm/s too much: it is reported within a second, and the relative
-    pose stays good."""
+    """The position of chaser 1 jumps by 50 mm, or it states 20 mm/s too much: it is reported within
+    a second, and the relative pose stays good."""
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 7)
     estimator = estimator_for(flight.errors, 2)
     fly(estimator, flight, 10.0)
@@ -296,7 +318,9 @@ def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) 
 
     def lie(inputs: JointInputs) -> JointInputs:
         o = inputs.odometry[1]
-        wrong = msgspec.structs.replace(o, **{field: vector(np.add(getattr(o, field), [shift, 0.0, 0.0]))})
+        wrong = msgspec.structs.replace(
+            o, **{field: vector(np.add(getattr(o, field), [shift, 0.0, 0.0]))}
+        )
         return replace(inputs, odometry={**inputs.odometry, 1: wrong})
 
     estimator.drain_events()
@@ -310,8 +334,8 @@ def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) 
 
 
 def test_command_of_a_chaser_without_odometry_is_uncertain() -> None:
-    """A chaser whose odometry is missing flies by a plan that the controller does not know: its velocity is uncertain by as much
-    as its last command would change it."""
+    """A chaser whose odometry is missing flies by a plan that the controller does not know: its
+    velocity is uncertain by as much as its last command would change it."""
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 7)
     known, unknown = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
     for _ in range(30):
@@ -333,8 +357,9 @@ def test_command_of_a_chaser_without_odometry_is_uncertain() -> None:
 
 @pytest.mark.parametrize("turns", [True, False], ids=["all channels", "translation"])
 def test_chaser_that_contradicts_all_measurements_is_started_again(turns: bool) -> None:
-    """After a motion that nothing explained, odometry of a chaser that sees nothing is rejected, all or that of translation: within
-    two seconds its estimate starts again from the odometry, and is consistent with it from then on."""
+    """After a motion that nothing explained, odometry of a chaser that sees nothing is rejected,
+    all or that of translation: within two seconds its estimate starts again from the odometry, and
+    is consistent with it from then on."""
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 7)
     estimator = estimator_for(flight.errors, 2)
     fly(estimator, flight, 5.0)
@@ -359,20 +384,26 @@ def test_chaser_that_contradicts_all_measurements_is_started_again(turns: bool) 
     estimator.drain_events()
     fly(estimator, flight, 2.0, moved)
     texts = [e.text for e in estimator.drain_events()]
-    restart = "chaser 1: no measurement supported its estimate for 1 s; started again from its odometry"
+    restart = (
+        "chaser 1: no measurement supported its estimate for 1 s; started again from its odometry"
+    )
     assert texts.count(restart) == 1
     np.testing.assert_allclose(estimator.state.positions_m[1], stated[-1].position_m, atol=0.01)
     assert (estimator.state.rejections[1, 1:] < 5).all()
 
 
 def test_chaser_whose_sightings_and_pose_contradict_the_estimate_is_started_again() -> None:
-    """When odometry that was wrong from the start becomes right, the rates fit all the time, but support no pose."""
+    """When odometry that was wrong from the start becomes right, the rates fit all the time, but
+    support no pose.
+    """
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 3, 7)
     estimator = estimator_for(flight.errors, 3)
 
     def displaced(inputs: JointInputs) -> JointInputs:
         o = inputs.odometry[1]
-        elsewhere = msgspec.structs.replace(o, position_m=vector(np.add(o.position_m, [0.0, 0.0, 0.17])))
+        elsewhere = msgspec.structs.replace(
+            o, position_m=vector(np.add(o.position_m, [0.0, 0.0, 0.17]))
+        )
         return replace(inputs, odometry={**inputs.odometry, 1: elsewhere})
 
     fly(estimator, flight, 5.0, displaced)
@@ -385,7 +416,9 @@ def test_chaser_whose_sightings_and_pose_contradict_the_estimate_is_started_agai
 
 
 @pytest.mark.parametrize(("ticks", "follows"), [(1, False), (2, True)])
-def test_only_a_repeated_misfit_of_the_velocity_passes_for_a_force(ticks: int, follows: bool) -> None:
+def test_only_a_repeated_misfit_of_the_velocity_passes_for_a_force(
+    ticks: int, follows: bool
+) -> None:
     """A velocity 6 mm/s off in one tick is noise; in two ticks in a row it may be a stuck thruster."""
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 1, 4)
     estimator = estimator_for(flight.errors, 1)
@@ -395,7 +428,9 @@ def test_only_a_repeated_misfit_of_the_velocity_passes_for_a_force(ticks: int, f
         inputs = flight.inputs()
         o = inputs.odometry[0]
         if k < ticks:
-            o = msgspec.structs.replace(o, velocity_m_s=vector(np.add(o.velocity_m_s, [0.006, 0.0, 0.0])))
+            o = msgspec.structs.replace(
+                o, velocity_m_s=vector(np.add(o.velocity_m_s, [0.006, 0.0, 0.0]))
+            )
         estimator.update(replace(inputs, odometry={0: o}))
         flight.step()
         assert estimator.state is not None
@@ -411,7 +446,9 @@ def test_odometry_noisier_than_stated_is_reported() -> None:
     def overconfident(inputs: JointInputs) -> JointInputs:
         o = inputs.odometry[0]
         stated = vector(np.reshape(o.velocity_covariance_m2_s2, (3, 3)) / 9.0)
-        return replace(inputs, odometry={0: msgspec.structs.replace(o, velocity_covariance_m2_s2=stated)})
+        return replace(
+            inputs, odometry={0: msgspec.structs.replace(o, velocity_covariance_m2_s2=stated)}
+        )
 
     fly(estimator, flight, 8.0, overconfident)
     assert any("velocity is overconfident" in e.text for e in estimator.drain_events())
@@ -421,7 +458,9 @@ def test_odometry_noisier_than_stated_is_reported() -> None:
 
 
 def test_target_without_sightings_stays_predicted() -> None:
-    """After 20 s without sight the relative position is still within a few millimetres, and its covariance says so."""
+    """After 20 s without sight the relative position is still within a few millimetres, and its
+    covariance says so.
+    """
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 4, 11)
     estimator = estimator_for(flight.errors, 4)
     fly(estimator, flight, 20.0)
@@ -439,7 +478,9 @@ def test_ambiguous_start_is_resolved_by_a_clear_view(wrong_first: bool) -> None:
 
     def ambiguous(inputs: JointInputs) -> JointInputs:
         right = inputs.sightings[0].solutions[0]
-        other = msgspec.structs.replace(right, q_wxyz=vector(rotations.multiply(right.q_wxyz, flip)))
+        other = msgspec.structs.replace(
+            right, q_wxyz=vector(rotations.multiply(right.q_wxyz, flip))
+        )
         pair = (other, right) if wrong_first else (right, other)
         sighting = msgspec.structs.replace(inputs.sightings[0], solutions=pair, marker_ids=(0,))
         return replace(inputs, sightings=(sighting,))
@@ -464,7 +505,9 @@ def test_target_that_jumps_is_initialized_again() -> None:
     fly(estimator, flight, 2.0)
     assert estimator.reinitialisations == 1
     assert any(e.text.startswith("re-initialised by chaser") for e in estimator.drain_events())
-    assert np.linalg.norm(estimator.estimate_at(flight.time_ns).position_m - flight.target[:3]) < 0.01
+    assert (
+        np.linalg.norm(estimator.estimate_at(flight.time_ns).position_m - flight.target[:3]) < 0.01
+    )
 
 
 def test_pushed_target_without_sightings_is_lost_and_reacquired() -> None:
@@ -479,7 +522,9 @@ def test_pushed_target_without_sightings_is_lost_and_reacquired() -> None:
     assert estimator.estimate_at(flight.time_ns).status == "tracking"
     assert estimator.reinitialisations == 1
     texts = [e.text for e in estimator.drain_events()]
-    assert texts.index("lost") < next(i for i, t in enumerate(texts) if t.startswith("reacquired by chaser"))
+    assert texts.index("lost") < next(
+        i for i, t in enumerate(texts) if t.startswith("reacquired by chaser")
+    )
 
 
 def test_relative_pose_has_the_covariance_of_its_errors() -> None:

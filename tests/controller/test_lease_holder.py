@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which tick a controller commands, by the leases that chasers state; and the model check of the whole protocol."""
+"""Which tick a controller commands, by the leases that chasers state; and the model check of the
+whole protocol.
+"""
 
 from __future__ import annotations
 
@@ -45,15 +47,30 @@ def standby(*leases: Lease) -> LeaseHolder:
         ([lease(1, 5), lease(2, 5)], 7, {}, False),  # run out
         ([lease(2, 5)], 5, {}, False),
         ([lease(2, 5)], 5, {"chasers": (2,)}, True),  # the only one that takes part
-        ([lease(1, 5), lease(2, 5)], 5, {"controllers": {"controller": "c"}}, False),  # taken for lost
+        (
+            [lease(1, 5), lease(2, 5)],
+            5,
+            {"controllers": {"controller": "c"}},
+            False,
+        ),  # taken for lost
         ([lease(1, 5), lease(2, 5)], 5, {"controllers": {"standby": "s2"}}, False),  # another start
         ([lease(1, 5), lease(2, 5, instance="s2")], 5, {}, False),
         ([lease(1, 5), lease(2, 5, from_tick=5)], 4, {}, False),  # another's tick
-        ([lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)], 5, {}, False),  # another's revision
+        (
+            [lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)],
+            5,
+            {},
+            False,
+        ),  # another's revision
         ([lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)], 5, ALONE, True),
         ([lease(1, 5), lease(2, 5)], 6, {"since": {"chaser/2": 6}}, False),  # it may have forgotten
         ([lease(1, 5), lease(2, 5)], 6, {"since": {"standby": 6}}, False),
-        ([lease(1, 5), lease(2, 5)], 6, {"since": {"controller": 6, "standby": 5, "chaser/2": 5}}, True),
+        (
+            [lease(1, 5), lease(2, 5)],
+            6,
+            {"since": {"controller": 6, "standby": 5, "chaser/2": 5}},
+            True,
+        ),
     ],
 )
 def test_commander_of_a_tick(
@@ -65,7 +82,9 @@ def test_commander_of_a_tick(
     assert holder.commander_of(at) == (Commander("standby", "s", 2) if claimed else None)
 
 
-def test_chaser_that_is_lost_in_a_tick_still_counts_in_it_while_both_controllers_take_part() -> None:
+def test_chaser_that_is_lost_in_a_tick_still_counts_in_it_while_both_controllers_take_part() -> (
+    None
+):
     holder = standby(lease(1, 5))
     assert not holder.claim(tick(5, (0, 1), revision=1))
     holder.add_tick(tick(5, (0, 1)))
@@ -93,7 +112,9 @@ def test_commander_takes_the_highest_term_of_all() -> None:
 
 
 def test_commander_keeps_its_term_while_the_other_has_only_a_minority_or_later_ticks() -> None:
-    """A controller that was frozen finishes its tick after the other has read the leases of the next."""
+    """A controller that was frozen finishes its tick after the other has read the leases of the
+    next.
+    """
     holder = standby(*(lease(i, 5) for i in (0, 1, 2)))
     assert holder.claim(tick(5))
     assert holder.term == 2
@@ -103,8 +124,8 @@ def test_commander_keeps_its_term_while_the_other_has_only_a_minority_or_later_t
 
 
 def test_commander_that_returns_by_older_grants_takes_a_new_term() -> None:
-    """Seed 4136 of `fault-drill`: of chasers 1 and 2, 1 granted term 3 to the controller; then 0, cut off until then, was back with
-    its grant to the standby, and made a majority with 3."""
+    """Seed 4136 of `fault-drill`: of chasers 1 and 2, 1 granted term 3 to the controller; then 0,
+    cut off until then, was back with its grant to the standby, and made a majority with 3."""
     holder = standby(*(lease(i, 5, until_tick=20) for i in (0, 1, 2, 3)))
     assert holder.claim(tick(5, (0, 1, 2, 3)))
     holder.add(lease(1, 6, "controller", term=3, until_tick=20))
@@ -143,7 +164,9 @@ def test_minority_waits_then_gives_its_lease_back_and_counts_it_no_more() -> Non
 def test_minority_gives_its_lease_back_sooner_while_the_other_commands(
     renewed: tuple[int, ...], idle_ticks: int
 ) -> None:
-    """A long lease alone does not show that its holder still commands: a majority must have executed a command meanwhile."""
+    """A long lease alone does not show that its holder still commands: a majority must have
+    executed a command meanwhile.
+    """
     holder, mine = standby(*(lease(i, 4, "controller", term=1, until_tick=18) for i in (0, 1))), []
     for number in range(5, 6 + PATIENCE_TICKS):
         for i in (0, 1):
@@ -252,13 +275,17 @@ def test_model_finds_errors_of_a_chaser(
         walk(seed)
 
 
-def test_model_finds_a_controller_that_does_not_count_lost_chasers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_finds_a_controller_that_does_not_count_lost_chasers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(LeaseHolder, "_with_lost_chasers", lambda _, tick: tick)
     with pytest.raises(TwoCommanders, match="command it"):
         walk(21)
 
 
-def test_model_finds_a_chaser_that_does_not_ignore_older_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_finds_a_chaser_that_does_not_ignore_older_ticks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def chaser_tick(model: Model, chaser: Chaser, tick: Tick) -> None:
         chaser.tick = None
         in_order(model, chaser, tick)

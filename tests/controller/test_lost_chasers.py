@@ -40,7 +40,9 @@ STILL = (
 )
 
 
-def odometry(i: int, time_s: float, position_m: Any, velocity_m_s: Any = (0.0, 0.0, 0.0)) -> Odometry:
+def odometry(
+    i: int, time_s: float, position_m: Any, velocity_m_s: Any = (0.0, 0.0, 0.0)
+) -> Odometry:
     return Odometry(
         tick=round(time_s * 15),
         sim_time_ns=round(time_s * 1e9),
@@ -74,7 +76,9 @@ def test_loss_expiry_and_return_are_each_reported_once() -> None:
         now_s = 0.4 * k
         now = {0: odometry(0, now_s, Q[1:])}
         events += [(round(now_s, 1), *event) for event in lost.update(now, round(now_s * 1e9))]
-    assert [(level, text.split(":")[0]) for _, level, text in events] == [("warning", "chaser 1")] * 2
+    assert [(level, text.split(":")[0]) for _, level, text in events] == [
+        ("warning", "chaser 1")
+    ] * 2
     assert "lost" in events[0][2]
     assert "no obstacle any more" in events[1][2]
     assert events[0][0] == pytest.approx(0.4)
@@ -136,7 +140,8 @@ def test_lost_chaser_becomes_a_row_without_constraints_of_its_own(between: Any) 
 
 
 def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
-    """Return the least distance of chaser 0 from chaser 1, whose odometry ends after 1 s, and the events.
+    """Return the least distance of chaser 0 from chaser 1, whose odometry ends after 1 s, and the
+    events.
 
     ``blind`` removes lost chasers from the problem.
     """
@@ -178,7 +183,9 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
 
 
 def test_other_chasers_avoid_the_lost_chaser() -> None:
-    scenario = load_scenario(ROOT / "scenarios" / "two-chaser-tracking.toml", (*STILL, "timeline=[]"))
+    scenario = load_scenario(
+        ROOT / "scenarios" / "two-chaser-tracking.toml", (*STILL, "timeline=[]")
+    )
     limit_m = scenario.limits.min_distance_chasers_m
     avoiding_m, events = nearest_m(scenario, blind=False)
     blind_m, _ = nearest_m(scenario, blind=True)

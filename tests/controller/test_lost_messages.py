@@ -77,7 +77,7 @@ def lost(scenario: Scenario, tick: int) -> LostMessage:
     return LostMessage(tick, scenario.timing.tick_time_ns(tick))
 
 
-# -- chaser -------------------------------------------------------------------------------------------------
+# -- chaser ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -114,8 +114,13 @@ def actuated(published: list[tuple[Topic, Any]]) -> list[tuple[int, str]]:
 @pytest.mark.parametrize(
     ("how", "order"),
     [
-        # A controller commands a tick after the chaser has stated its lease, and so has received the tick.
-        *((how, order) for how in ("lost", "none", "expired") for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2))),
+        # A controller commands a tick after the chaser has stated its lease, and so has received
+        # the tick.
+        *(
+            (how, order)
+            for how in ("lost", "none", "expired")
+            for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2))
+        ),
         *(("lost", order) for order in ((1, 2, 0), (2, 0, 1), (2, 1, 0))),
     ],
 )
@@ -139,15 +144,21 @@ def test_chaser_without_command_actuates_once_per_tick(
     assert any(t is topics.EVENT for t, _ in published)
 
 
-@pytest.mark.parametrize(("ahead_s", "source"), [(0.3, "command"), (-0.3, "command"), (36.0, "hold")])
+@pytest.mark.parametrize(
+    ("ahead_s", "source"), [(0.3, "command"), (-0.3, "command"), (36.0, "hold")]
+)
 def test_wrong_clock_of_a_controller_delays_no_command(
     chaser: ChaserProcess, scenario: Scenario, ahead_s: float, source: str
 ) -> None:
-    """Commands act at the time of their tick; the thrusters of a chaser that took 36 s for it did not open until then."""
+    """Commands act at the time of their tick; the thrusters of a chaser that took 36 s for it did
+    not open until then.
+    """
     sent = wrench(scenario, 1)
     ahead_ns = round(ahead_s * 1e9)
     stamps = ("sim_time_ns", "effective_time_ns", "expires_ns")
-    sent = msgspec.structs.replace(sent, **{name: getattr(sent, name) + ahead_ns for name in stamps})
+    sent = msgspec.structs.replace(
+        sent, **{name: getattr(sent, name) + ahead_ns for name in stamps}
+    )
     published = deliver(chaser, topics.TICK, None, tick_of(scenario, 1, (0,)))
     published += deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
     published += deliver(chaser, topics.WRENCH, 0, sent)
@@ -159,7 +170,9 @@ def test_wrong_clock_of_a_controller_delays_no_command(
 def test_older_tick_changes_no_lease(chaser: ChaserProcess, scenario: Scenario) -> None:
     deliver(chaser, topics.TICK, None, tick_of(scenario, 9, (0,)))
     repeated = msgspec.structs.replace(tick_of(scenario, 9, (0,)), revision=1)
-    assert [m.revision for t, m in deliver(chaser, topics.TICK, None, repeated) if t is topics.LEASE] == [1]
+    assert [
+        m.revision for t, m in deliver(chaser, topics.TICK, None, repeated) if t is topics.LEASE
+    ] == [1]
     others = {"controllers": {"standby": "s"}}
     for older in (tick_of(scenario, 8, (0,)), tick_of(scenario, 9, (0,))):
         assert deliver(chaser, topics.TICK, None, msgspec.structs.replace(older, **others)) == []
@@ -180,7 +193,9 @@ def test_duplicate_image_is_ignored(chaser: ChaserProcess, scenario: Scenario) -
     assert chaser.node.counts.stale == 1
 
 
-def test_lost_odometry_is_extrapolated_and_braking_ends(chaser: ChaserProcess, scenario: Scenario) -> None:
+def test_lost_odometry_is_extrapolated_and_braking_ends(
+    chaser: ChaserProcess, scenario: Scenario
+) -> None:
     moving = msgspec.structs.replace(odometry(scenario, 0, 0), velocity_m_s=(0.5, 0.0, 0.0))
     deliver(chaser, topics.ODOMETRY, 0, moving)
     forces = {}
@@ -227,7 +242,9 @@ def plan(scenario: Scenario, tick: int) -> Plan:
     return Plan(tick=tick, sim_time_ns=now_ns, chaser=0, step_s=0.1, **empty)
 
 
-def test_older_plan_and_target_do_not_replace_newer(chaser: ChaserProcess, scenario: Scenario) -> None:
+def test_older_plan_and_target_do_not_replace_newer(
+    chaser: ChaserProcess, scenario: Scenario
+) -> None:
     """The command that they came with is flown with them, and the fallback goes on from there."""
     deliver(chaser, topics.TICK, None, tick_of(scenario, 2, (0,)))
     deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, 2))
@@ -241,7 +258,7 @@ def test_older_plan_and_target_do_not_replace_newer(chaser: ChaserProcess, scena
     assert chaser.node.counts.stale == 2
 
 
-# -- docking sensors and thrusters --------------------------------------------------------------------------
+# -- docking sensors and thrusters -----------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -281,7 +298,9 @@ def test_late_docking_status_replaces_an_assumed_one(capture: Scenario) -> None:
     deliver(chaser, topics.DOCKING, 0, docking(capture, 1))
     deliver(chaser, topics.DOCKING, 0, lost(capture, 3))
     deliver(chaser, topics.DOCKING, 0, docking(capture, 2, latched=True))
-    assert chaser.docking == msgspec.structs.replace(docking(capture, 3, latched=True), contact=False)
+    assert chaser.docking == msgspec.structs.replace(
+        docking(capture, 3, latched=True), contact=False
+    )
 
 
 def test_controller_keeps_the_newest_docking_status_and_thruster_report(capture: Scenario) -> None:
@@ -307,12 +326,14 @@ def test_controller_keeps_the_newest_docking_status_and_thruster_report(capture:
     assert taken.thrusters[0].tick == 2
 
 
-# -- controller ---------------------------------------------------------------------------------------------
+# -- controller ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def controller(scenario: Scenario) -> ControllerProcess:
-    made = ControllerProcess(ReplayNode("controller"), scenario, ControllerCore(scenario, lambda: 0.0))  # type: ignore[arg-type]
+    made = ControllerProcess(
+        ReplayNode("controller"), scenario, ControllerCore(scenario, lambda: 0.0)
+    )  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     made.standby.join("c")
     made.standby.update(tick_of(scenario, 0, (0, 1)))
@@ -354,12 +375,20 @@ def run_tick(
     chasers: int = 2,
 ) -> dict[int, WrenchCommand]:
     """Run a tick without some of its messages; return the commands by chaser."""
-    published = deliver(controller, topics.TICK, None, tick_of(scenario, tick, tuple(range(chasers))))
-    makers: dict[Topic, Any] = {topics.LEASE: lease, topics.ODOMETRY: odometry, topics.SIGHTING: sighting}
+    published = deliver(
+        controller, topics.TICK, None, tick_of(scenario, tick, tuple(range(chasers)))
+    )
+    makers: dict[Topic, Any] = {
+        topics.LEASE: lease,
+        topics.ODOMETRY: odometry,
+        topics.SIGHTING: sighting,
+    }
     for topic, make in makers.items():
         for i in range(chasers):
             missing = i in without.get(topic, set())
-            message: Message | LostMessage = lost(scenario, tick) if missing else make(scenario, i, tick)
+            message: Message | LostMessage = (
+                lost(scenario, tick) if missing else make(scenario, i, tick)
+            )
             published += deliver(controller, topic, i, message)
     return {m.chaser: m for t, m in published if t is topics.WRENCH}
 
@@ -375,7 +404,8 @@ def test_controller_commands_without_lost_odometry_or_sightings(
 
 
 def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
-    """In place of a lost odometry the controller takes its own prediction, and late odometry at its tick, whatever its time stamp is.
+    """In place of a lost odometry the controller takes its own prediction, and late odometry at its
+    tick, whatever its time stamp is.
 
     What the chaser sees meanwhile is a measurement.
     """
@@ -394,7 +424,9 @@ def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
         taken = inputs.take(tick_of(scenario, tick, (0, 1)), ())
         assert set(taken.odometry) == {0, 1}
         assert [(s.chaser, s.tick) for s in taken.sightings] == [(0, tick), (1, tick)]
-        assert {i: o.tick for i, o in taken.outdated.items()} == ({1: late.get(tick, 1)} if tick > 1 else {})
+        assert {i: o.tick for i, o in taken.outdated.items()} == (
+            {1: late.get(tick, 1)} if tick > 1 else {}
+        )
         core.step(taken)
         assert isinstance(core.estimator, JointEstimator)
         assert core.estimator.state is not None
@@ -403,7 +435,9 @@ def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
 
 
 def test_sightings_are_taken_in_the_order_of_chasers(scenario: Scenario) -> None:
-    """Two invalid sightings in a tick were reported in the order of their arrival, which differs from process to process."""
+    """Two invalid sightings in a tick were reported in the order of their arrival, which differs
+    from process to process.
+    """
     inputs = TickInputCollector(scenario)
     for i, tick in ((1, 2), (0, 2), (1, 1), (0, 1)):
         inputs.add_sighting(sighting(scenario, i, tick))
@@ -423,8 +457,12 @@ def test_chaser_without_recent_odometry_gets_no_command(
     controller: ControllerProcess, scenario: Scenario
 ) -> None:
     run_tick(controller, scenario, 1, {})
-    modes = [run_tick(controller, scenario, k, {topics.ODOMETRY: {1}})[1].mode for k in range(2, 10)]
-    assert [mode == "none" for mode in modes] == [False] * 5 + [True] * 3  # a command's lifetime is 0.5 s
+    modes = [
+        run_tick(controller, scenario, k, {topics.ODOMETRY: {1}})[1].mode for k in range(2, 10)
+    ]
+    assert [mode == "none" for mode in modes] == [False] * 5 + [
+        True
+    ] * 3  # a command's lifetime is 0.5 s
     assert run_tick(controller, scenario, 10, {})[1].mode != "none"
 
 
@@ -434,7 +472,9 @@ def test_chaser_without_any_odometry_gets_no_command(
     assert run_tick(controller, scenario, 1, {topics.ODOMETRY: {1}})[1].mode == "none"
 
 
-def test_tick_waits_until_a_loss_is_known(controller: ControllerProcess, scenario: Scenario) -> None:
+def test_tick_waits_until_a_loss_is_known(
+    controller: ControllerProcess, scenario: Scenario
+) -> None:
     deliver(controller, topics.TICK, None, tick_of(scenario, 1, (0,)))
     deliver(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
     deliver(controller, topics.SIGHTING, 0, sighting(scenario, 0, 1))

@@ -9,7 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation import Measurement, Mekf, MekfParameters, PaperEstimator, PoseHypothesis
+from chaserdock_controller.estimation import (
+    Measurement,
+    Mekf,
+    MekfParameters,
+    PaperEstimator,
+    PoseHypothesis,
+)
 from chaserdock_controller.estimation import motion_models as motion
 from chaserdock_controller.estimation.parameters import MODELS
 from chaserdock_controller.estimation.types import no_estimate
@@ -38,7 +44,7 @@ from flight_cases import scenario
 from hypothesis import given
 from hypothesis import strategies as st
 
-# --- consistency and accuracy ----------------------------------------------------------------------
+# --- consistency and accuracy ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("chasers", [1, 2, 4])
@@ -72,25 +78,31 @@ def test_filter_is_consistent_when_noise_matches_the_model(chasers: int) -> None
             e = f.update(group, ns(k))
             if k >= 30 and k % 10 == 9:
                 dtheta = rot.log(rot.multiply(rot.conjugate(e.q_wxyz), q))
-                d = np.concatenate([x - e.position_m, v - e.velocity_m_s, dtheta, w - e.omega_rad_s])
+                d = np.concatenate(
+                    [x - e.position_m, v - e.velocity_m_s, dtheta, w - e.omega_rad_s]
+                )
                 values.append(float(d @ np.linalg.solve(e.covariance, d)))
-    # 36 values, correlated in threes: at least 12 independent ones, whose mean has sigma sqrt(24 / 12).
+    # 36 values, correlated in threes: at least 12 independent ones, whose mean has sigma sqrt(24 /
+    # 12).
     assert 12 - 3 * math.sqrt(2) < np.mean(values) < 12 + 3 * math.sqrt(2)
 
 
 @pytest.mark.parametrize("chasers", [1, 2, 4])
 def test_flown_parameters_are_conservative(chasers: int) -> None:
-    """With the parameters of a scenario, constant true rates and white measurements, the mean NEES is about 1.5 of 12.
+    """With the parameters of a scenario, constant true rates and white measurements, the mean NEES
+    is about 1.5 of 12.
 
-    The flown parameters are not consistent but conservative: they contain process noise that the constant rates lack
-    (rates: 1.5 of 6) and errors that do not average out (``considered_ratio``; pose: 0.1 of 6).
+    The flown parameters are not consistent but conservative: they contain process noise that the
+    constant rates lack (rates: 1.5 of 6) and errors that do not average out (``considered_ratio``;
+    pose: 0.1 of 6).
     """
     values = []
     for seed in range(12):
         estimator = estimator_of(scenario(estimator={"name": "mekf"}))
         assert isinstance(estimator, Mekf)
         values.append(nees(fly(estimator, chasers, 10.0, seed)[-1]))
-    # Measured 1.64, 1.41 and 1.62 over 24 seeds, one value with a standard deviation of 1.1: three sigma for 12 values.
+    # Measured 1.64, 1.41 and 1.62 over 24 seeds, one value with a standard deviation of 1.1: three
+    # sigma for 12 values.
     assert 0.55 < np.mean(values) < 2.55
 
 
@@ -107,7 +119,9 @@ def test_covariance_shrinks_with_more_cameras() -> None:
     one, four = fly(Mekf(NO_BIAS), 1, 10.0)[-1], fly(Mekf(NO_BIAS), 4, 10.0)[-1]
     ratio = np.sqrt(np.diag(one.covariance) / np.diag(four.covariance))
     # Constant-velocity filter, n cameras: pose sigma goes with n^(-3/8), rate sigma with n^(-1/8).
-    np.testing.assert_allclose(ratio, np.tile(np.repeat([4 ** (3 / 8), 4 ** (1 / 8)], 3), 2), rtol=0.05)
+    np.testing.assert_allclose(
+        ratio, np.tile(np.repeat([4 ** (3 / 8), 4 ** (1 / 8)], 3), 2), rtol=0.05
+    )
     assert four.sightings == 4
 
 
@@ -157,7 +171,7 @@ def test_torque_free_target_is_followed() -> None:
     assert result["constant_rates"] > 5 * result["torque_free"]
 
 
-# --- order and time --------------------------------------------------------------------------------
+# --- order and time -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", [Mekf, PaperEstimator])
@@ -180,7 +194,13 @@ def test_late_measurements_end_in_the_same_state(shuffle: random.Random) -> None
     rng = np.random.default_rng(5)
     flip = np.array([0.0, 0.7, 0.0])
     sent = [
-        see(rng, c, ns(k), flip=flip if k < 3 else None, shift=np.full(3, 0.3) if (k, c) == (9, 1) else None)
+        see(
+            rng,
+            c,
+            ns(k),
+            flip=flip if k < 3 else None,
+            shift=np.full(3, 0.3) if (k, c) == (9, 1) else None,
+        )
         for k in range(20)
         for c in range(2)
     ]
@@ -202,10 +222,15 @@ LATCHED = (((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.5)), (0.3, -0.2, 0.1)
 
 
 def test_late_measurements_from_before_a_latch_are_propagated_without_it() -> None:
-    """Measurements that arrive a third of a second late end in the same state: those before the latch do not move as the composite."""
+    """Measurements that arrive a third of a second late end in the same state: those before the
+    latch do not move as the composite.
+    """
     states = []
     for delay in (0, 5):
-        rng, f = np.random.default_rng(3), Mekf(replace(MekfParameters(), motion_model="torque_free"))
+        rng, f = (
+            np.random.default_rng(3),
+            Mekf(replace(MekfParameters(), motion_model="torque_free")),
+        )
         sent = [see(rng, 0, ns(k)) for k in range(30)]
         for k in range(30 + delay):
             f.update(sent[max(0, k - delay) : k - delay + 1], ns(k))
@@ -229,7 +254,9 @@ def test_prediction_changes_the_body_at_the_latch() -> None:
     unseen = Measurement(0, ns(40), (), 0, eye_of(0, ns(40)))
     for found in (f.estimate_at(ns(40)), f.update([unseen], ns(40))):
         for value, right in zip(
-            (found.position_m, found.velocity_m_s, found.q_wxyz, found.omega_rad_s), expected, strict=True
+            (found.position_m, found.velocity_m_s, found.q_wxyz, found.omega_rad_s),
+            expected,
+            strict=True,
         ):
             np.testing.assert_allclose(value, right, atol=1e-12)
 
@@ -251,7 +278,9 @@ def test_late_early_duplicate_and_unusable_measurements_are_counted_and_ignored(
         replace(h, covariance=np.eye(5)),
     ]
     unusable = [replace(good, hypotheses=(x,)) for x in bad]
-    after = f.update([see(rng, 1, ns(2)), see(rng, 0, ns(70)), see(rng, 0, ns(59)), *unusable], ns(59))
+    after = f.update(
+        [see(rng, 1, ns(2)), see(rng, 0, ns(70)), see(rng, 0, ns(59)), *unusable], ns(59)
+    )
     assert same(before, after)
     assert (f.late_dropped, f.early_dropped, f.duplicates, f.invalid) == (1, 1, 1, 6)
     assert sum("unusable" in text for _, _, text in f.drain_events()) == 6

@@ -97,7 +97,9 @@ def test_faulty_first_camera_is_outvoted_by_cameras_at_other_times() -> None:
 @pytest.mark.parametrize("faulty", [0, 1, 2])
 @pytest.mark.parametrize("alone_s", [0, 1])
 def test_faulty_camera_among_three_is_gated_out(faulty: int, alone_s: int) -> None:
-    """20 cm and 15 degrees off all the time; also when it was the only one to see the target at first."""
+    """20 cm and 15 degrees off all the time; also when it was the only one to see the target at
+    first.
+    """
     f = Mekf()
     rng = np.random.default_rng(6)
     shift, turn = np.array([0.2, 0.0, 0.0]), np.array([0.0, 0.0, math.radians(15.0)])
@@ -121,13 +123,21 @@ def test_faulty_camera_among_three_is_gated_out(faulty: int, alone_s: int) -> No
 def test_faulty_camera_does_not_lead_while_the_prediction_is_vague() -> None:
     """All cameras return together after an outage that left a wide but not lost prediction."""
     f = Mekf(
-        replace(MekfParameters(), acceleration_noise_m_s2_sqrt_hz=3e-3, angular_noise_rad_s2_sqrt_hz=3e-3)
+        replace(
+            MekfParameters(),
+            acceleration_noise_m_s2_sqrt_hz=3e-3,
+            angular_noise_rad_s2_sqrt_hz=3e-3,
+        )
     )
     rng = np.random.default_rng(8)
     fly(f, 3, 4.0, seed=8)
     k = 12 * HZ
     assert f.estimate_at(ns(k)).status == "predicting"
-    group = [see(rng, 0, ns(k), shift=np.array([0.03, 0.0, 0.0])), see(rng, 1, ns(k)), see(rng, 2, ns(k))]
+    group = [
+        see(rng, 0, ns(k), shift=np.array([0.03, 0.0, 0.0])),
+        see(rng, 1, ns(k)),
+        see(rng, 2, ns(k)),
+    ]
     e = f.update(group, ns(k))
     assert e.rejected == (0,)
     assert e.sightings == 2
@@ -153,7 +163,9 @@ def test_a_jump_of_the_target_re_initialises_and_keeps_the_rates() -> None:
     rng = np.random.default_rng(10)
     fly(f, 2, 5.0, seed=10)
     jump = np.array([0.0, 0.5, 0.0])
-    states = [f.update([see(rng, c, ns(k), shift=jump) for c in range(2)], ns(k)) for k in range(75, 95)]
+    states = [
+        f.update([see(rng, c, ns(k), shift=jump) for c in range(2)], ns(k)) for k in range(75, 95)
+    ]
     assert [s.sightings for s in states] == [0] * 9 + [2] * 11
     assert states[8].status == "predicting"
     assert f.reinitialisations == 1
@@ -188,7 +200,9 @@ def test_an_ambiguous_start_is_resolved(wrong_first: bool, helper: str) -> None:
         if helper == "same exposure" or (helper == "later" and k >= 10):
             group.append(see(rng, 1, ns(k)))
         e = f.update(group, ns(k))
-        if helper != "same exposure" and k == 5:  # both attitudes are still open, and the covariance says so
+        if (
+            helper != "same exposure" and k == 5
+        ):  # both attitudes are still open, and the covariance says so
             assert math.sqrt(e.covariance[7, 7]) > math.radians(10.0)
     assert np.linalg.norm(errors(e)[6:9]) < math.radians(0.5)
     assert math.sqrt(e.covariance[7, 7]) < math.radians(1.0)

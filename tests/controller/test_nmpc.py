@@ -73,7 +73,11 @@ def test_symmetric_obstacle_is_passed(axis: int) -> None:
     start, goal = np.zeros(3), np.zeros(3)
     start[axis], goal[axis] = -1.0, 1.0
     flight = fly(
-        fresh("rti", 1), lambda x, _t: fixed_problem(x, goal[None]), np.array([at_rest(start)]), 1 / 15, 30.0
+        fresh("rti", 1),
+        lambda x, _t: fixed_problem(x, goal[None]),
+        np.array([at_rest(start)]),
+        1 / 15,
+        30.0,
     )
     assert flight.from_target() > D_MIN_M
     assert np.linalg.norm(flight.states[-1, 0, :3] - goal) < 0.05
@@ -121,7 +125,9 @@ def test_chasers_that_start_too_close_move_apart() -> None:
 
 def test_outer_bound_is_respected() -> None:
     """A chaser that coasts away is bounded by the tangent plane, as far as its thrust can."""
-    params = replace(PARAMS, max_reference_distance_m=1.0, weight_position=0.0, weight_final_position=0.0)
+    params = replace(
+        PARAMS, max_reference_distance_m=1.0, weight_position=0.0, weight_final_position=0.0
+    )
     state = at_rest(np.array([0.8, 1.0, 0.0]))
     state[3] = 0.05
     states = np.array([state])
@@ -138,7 +144,9 @@ def test_box_holds_exactly_from_any_start(seed: int, n: int) -> None:
     states[:, 6:10] = rotations.normalize(states[:, 6:10])
     states[:, 3:6] *= 0.1
     states[:, 10:] *= 0.1
-    problem = fixed_problem(states, rng.normal(size=(n, 3)), rotations.normalize(rng.normal(size=4)))
+    problem = fixed_problem(
+        states, rng.normal(size=(n, 3)), rotations.normalize(rng.normal(size=4))
+    )
     limits = PARAMS.input_limits() * rng.uniform(0.0, 1.0, size=(n, 6))
     limits[rng.random((n, 6)) < 0.2] = 0.0  # thrusters lost
     problem = replace(problem, input_max=limits)

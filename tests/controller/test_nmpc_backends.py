@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conformance of every NMPC back end; iteration budgets, approach cones and changing actuator limits."""
+"""Conformance of every NMPC back end; iteration budgets, approach cones and changing actuator
+limits.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,10 @@ def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
         corridors[...] = [-1.0, 0.0, 0.0, np.deg2rad(8.0), 0.0]
         problem = replace(problem, min_distance_target_m=np.zeros(1), corridors=corridors)
     problem = short(problem)
-    chosen, best = fresh(name, 1, SHORT_HORIZON), fresh("ipopt", 1, SHORT_HORIZON).solve(problem, 0.0)
+    chosen, best = (
+        fresh(name, 1, SHORT_HORIZON),
+        fresh("ipopt", 1, SHORT_HORIZON).solve(problem, 0.0),
+    )
     plan = chosen.solve(problem, 0.0)
     for _ in range(5):
         plan = chosen.solve(problem, 0.0)
@@ -70,7 +75,9 @@ def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
 
 
 def corridor_room(r: Array, corridor: Array) -> tuple[float, Array]:
-    """Return the clearance inside a corridor (5,) at r (3,) from the target, m, and its gradient, from the linearized row."""
+    """Return the clearance inside a corridor (5,) at r (3,) from the target, m, and its gradient,
+    from the linearized row.
+    """
     params = replace(PARAMS, horizon_s=0.1)
     problem = short(fixed_problem(at_rest(r)[None], r[None], d_target=0.0), 1)
     problem = replace(problem, corridors=np.tile(corridor, (1, 2, 1)))
@@ -83,7 +90,9 @@ def corridor_room(r: Array, corridor: Array) -> tuple[float, Array]:
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.integers(0, 10_000))
 def test_corridor_row_is_distance_to_the_cone(seed: int) -> None:
-    """The clearance is positive inside and zero on the surface; the row's normal equals finite differences."""
+    """The clearance is positive inside and zero on the surface; the row's normal equals finite
+    differences.
+    """
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
@@ -102,7 +111,9 @@ def test_corridor_row_is_distance_to_the_cone(seed: int) -> None:
 
 
 def test_docking_chaser_stays_in_corridor_and_the_other_outside_keep_out() -> None:
-    """Chaser 0 approaches to 0.2 m from beside its axis; chaser 1 has the same goal distance without a corridor."""
+    """Chaser 0 approaches to 0.2 m from beside its axis; chaser 1 has the same goal distance
+    without a corridor.
+    """
     states = np.array([at_rest(np.array([-1.0, 0.25, 0.0])), at_rest(np.array([1.0, 0.2, 0.0]))])
     goals = np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
     corridors = np.zeros((2, 31, 5))

@@ -70,7 +70,9 @@ def qp_data(problem: NmpcInput, u: Array) -> list[Qp]:
 
 
 def condensed(qp: Qp) -> tuple[Array, Array, Array]:
-    """Dense gradient, Hessian (6 D) and the maps (D+1, 12, 6 D) from inputs to states, by brute force."""
+    """Dense gradient, Hessian (6 D) and the maps (D+1, 12, 6 D) from inputs to states, by brute
+    force.
+    """
     mats, (q_pos, q_att, qx, r_diag, r, _) = qp.mats, qp.model
     d = len(mats)
     maps = np.zeros((d + 1, 12, 6 * d))
@@ -105,7 +107,9 @@ def test_riccati_minimizes_the_quadratic_model(seed: int) -> None:
     assert not answer.multipliers.any()
     gradient, hessian, maps = condensed(qp)
     expected = -np.linalg.solve(hessian, gradient)
-    np.testing.assert_allclose(answer.dw.ravel(), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(
+        answer.dw.ravel(), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected))
+    )
     np.testing.assert_allclose(answer.dx, maps @ answer.dw.ravel(), rtol=0, atol=1e-8)
 
 
@@ -137,7 +141,9 @@ def test_interior_point_meets_the_kkt_conditions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     states = np.array([at_rest(np.array([-0.25, 0.6, 0.0])), at_rest(np.array([0.25, 0.6, 0.05]))])
     states[:, 3:6] = rng.normal(scale=0.05, size=(2, 3))
-    problem = fixed_problem(states, np.array([[0.8, 0.5, 0], [-0.8, 0.5, 0.0]]), rotations.exp([0, 0, 0.7]))
+    problem = fixed_problem(
+        states, np.array([[0.8, 0.5, 0], [-0.8, 0.5, 0.0]]), rotations.exp([0, 0, 0.7])
+    )
     active = 0
     for qp in qp_data(problem, random_inputs(seed, 2, 0.3)):
         answer, n_rows = qp.solved(), len(qp.stage)
@@ -190,7 +196,10 @@ def test_free_solution_needs_no_interior_point() -> None:
         ({"force_max_N": -2.0}, "force_max_N"),
         ({"integrator": "heun"}, "integrator"),
         ({"max_reference_distance_m": 0.0}, "max_reference_distance_m"),
-        ({"inertia_kg_m2": ((1.0, 2.0, 0.0), (2.0, 1.0, 0.0), (0.0, 0.0, 1.0))}, "positive definite"),
+        (
+            {"inertia_kg_m2": ((1.0, 2.0, 0.0), (2.0, 1.0, 0.0), (0.0, 0.0, 1.0))},
+            "positive definite",
+        ),
         ({"inertia_kg_m2": ((1.0, 0.1, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))}, "symmetric"),
     ],
 )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clohessy-Wiltshire in the joint filter's prediction, and the wrench of an orbit that planning cancels."""
+"""Clohessy-Wiltshire in the joint filter's prediction, and the wrench of an orbit that planning
+cancels.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,13 @@ import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.prediction import predict
-from chaserdock_controller.estimation.joint.state import POSITION, VELOCITY, JointState, block, empty_state
+from chaserdock_controller.estimation.joint.state import (
+    POSITION,
+    VELOCITY,
+    JointState,
+    block,
+    empty_state,
+)
 from chaserdock_controller.estimation.stage import EstimationStage
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_models import rotations
@@ -31,7 +39,9 @@ def mission(*, in_orbit: bool = True) -> FlightScenario:
         "target": {"velocity_m_s": [0.0, 0.0, 0.0]},
         "chasers": [{"position_m": [-5.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],
     }
-    return flight_scenario(parse_scenario(values | ({"orbit": {"altitude_m": 4e5}} if in_orbit else {}), "x"))
+    return flight_scenario(
+        parse_scenario(values | ({"orbit": {"altitude_m": 4e5}} if in_orbit else {}), "x")
+    )
 
 
 def state_at(row: Array) -> JointState:
@@ -43,7 +53,9 @@ def state_at(row: Array) -> JointState:
     )  # fmt: skip
 
 
-def predicted(scenario: FlightScenario, state: JointState, ticks: int, period_s: float) -> JointState:
+def predicted(
+    scenario: FlightScenario, state: JointState, ticks: int, period_s: float
+) -> JointState:
     estimator = estimator_of(scenario)
     assert isinstance(estimator, JointEstimator)
     for k in range(1, ticks + 1):
@@ -67,7 +79,9 @@ def test_covariance_grows_with_the_transition_of_clohessy_wiltshire() -> None:
     scenario, seconds = mission(), 1.0
     assert scenario.orbit is not None
     start = state_at(STATE)
-    start.covariance[block(0), block(0)][VELOCITY, VELOCITY] = 1e4 * np.eye(3)  # outweighs the noise
+    start.covariance[block(0), block(0)][VELOCITY, VELOCITY] = 1e4 * np.eye(
+        3
+    )  # outweighs the noise
     end = predicted(scenario, start, 1, seconds)
     phi = cw_transition(scenario.orbit.elements.mean_motion_rad_s, seconds)
     found = end.covariance[block(0), block(0)]
@@ -86,7 +100,9 @@ def test_orbital_wrench_moves_a_free_body_by_clohessy_wiltshire() -> None:
     ).chaser  # fmt: skip
     wrench = cw_wrench(n, STATE, body.mass_kg, body.inertia)
     force = rotations.rotate(STATE[6:10], wrench[:3])
-    assert force / body.mass_kg == pytest.approx(cw_acceleration(n, STATE[:3], STATE[3:6]), abs=1e-15)
+    assert force / body.mass_kg == pytest.approx(
+        cw_acceleration(n, STATE[:3], STATE[3:6]), abs=1e-15
+    )
     end = propagate(STATE, wrench, body, 0.1)
     assert end[:6] == pytest.approx(cw_transition(n, 0.1) @ STATE[:6], abs=1e-8)
 
@@ -107,5 +123,7 @@ def test_planning_cancels_the_wrench_of_the_orbit() -> None:
     found = EstimationStage(scenario, estimator_of(scenario)).run(observation).disturbances[0]
     body = scenario.chaser
     mean_motion = scenario.orbit.elements.mean_motion_rad_s
-    assert found == pytest.approx(cw_wrench(mean_motion, STATE, body.mass_kg, body.inertia), rel=1e-6)
+    assert found == pytest.approx(
+        cw_wrench(mean_motion, STATE, body.mass_kg, body.inertia), rel=1e-6
+    )
     assert np.linalg.norm(found[:3]) > 5e-4

@@ -15,7 +15,12 @@ from chaserdock_controller.nmpc.coast_rows import COASTS
 from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
 from chaserdock_controller.nmpc.types import CoastSafety, NmpcPlan
 from chaserdock_models.passive_safety import CoastModel
-from chaserdock_protocol.scenario import FlightScenario, ScenarioError, flight_scenario, parse_scenario
+from chaserdock_protocol.scenario import (
+    FlightScenario,
+    ScenarioError,
+    flight_scenario,
+    parse_scenario,
+)
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
 
 
@@ -31,14 +36,18 @@ def mission(limits: dict[str, Any], **changes: Any) -> FlightScenario:
 
 
 def estimation(latched: frozenset[int] = frozenset()) -> TargetEstimation:
-    target = SimpleNamespace(position_m=np.array([1.0, 0.0, 0.0]), velocity_m_s=np.array([0.1, 0.0, 0.0]))
+    target = SimpleNamespace(
+        position_m=np.array([1.0, 0.0, 0.0]), velocity_m_s=np.array([0.1, 0.0, 0.0])
+    )
     covariance = {0: np.diag([1e-6] * 3 + [1e-10] * 3)}
     values = SimpleNamespace(at_effect=target, motion_covariances=covariance, latched=latched)
     return cast(TargetEstimation, values)
 
 
 def plan(closing_m_s: float) -> np.ndarray:
-    """Three states of a chaser 5 m behind the target of ``estimation``, which it follows and closes in on."""
+    """Three states of a chaser 5 m behind the target of ``estimation``, which it follows and closes
+    in on.
+    """
     states = np.zeros((1, 3, 13))
     speed = 0.1 + closing_m_s
     states[0, :, 0] = -4.0 + speed * 0.1 * np.arange(3)
@@ -53,7 +62,9 @@ def test_changes_are_logged_once_with_margin_and_time() -> None:
     assert [level for level, _ in first] == ["info"]
     assert "chaser 0: passively safe: without thrust it comes to 5.00 m" in first[0][1]
     assert monitor.update((0,), plan(0.0), estimation()) == ()
-    assert monitor.update((0,), plan(0.05), estimation(), 100_000_000) == ()  # not yet: it may be noise
+    assert (
+        monitor.update((0,), plan(0.05), estimation(), 100_000_000) == ()
+    )  # not yet: it may be noise
     ((level, text),) = monitor.update((0,), plan(0.05), estimation(), 1_100_000_000)
     assert level == "warning"
     assert "not passively safe" in text
@@ -64,12 +75,16 @@ def test_changes_are_logged_once_with_margin_and_time() -> None:
 
 def test_coast_lasts_two_orbits_or_as_long_as_stated() -> None:
     orbit = {"orbit": {"altitude_m": 4e5}}
-    assert PassiveSafetyMonitor(mission({}, **orbit)).duration_s == pytest.approx(2 * 5553.6, rel=1e-3)
+    assert PassiveSafetyMonitor(mission({}, **orbit)).duration_s == pytest.approx(
+        2 * 5553.6, rel=1e-3
+    )
     assert PassiveSafetyMonitor(mission({"passive_safety_s": 50.0}, **orbit)).duration_s == 50.0
 
 
 def test_monitor_needs_the_joint_estimator() -> None:
-    with pytest.raises(ScenarioError, match=r"limits.passive_safety: needs the covariance of estimator.name"):
+    with pytest.raises(
+        ScenarioError, match=r"limits.passive_safety: needs the covariance of estimator.name"
+    ):
         mission({"passive_safety": "monitor"}, estimator={"name": "mekf"})
 
 
@@ -104,14 +119,22 @@ WITH_COASTS = replace(PARAMS, coasts=COASTS, max_reference_distance_m=300.0)
 
 
 def fly(
-    coast: CoastModel, start: np.ndarray, goal: np.ndarray, covariance: np.ndarray, ticks: int, enforced: bool
+    coast: CoastModel,
+    start: np.ndarray,
+    goal: np.ndarray,
+    covariance: np.ndarray,
+    ticks: int,
+    enforced: bool,
 ) -> tuple[np.ndarray, list[float]]:
-    """Return the last position (3,) of a chaser that is sent to ``goal``, and the margin of its plan at each tick."""
+    """Return the last position (3,) of a chaser that is sent to ``goal``, and the margin of its
+    plan at each tick.
+    """
     solver, state, margins = fresh("rti", 1, WITH_COASTS), at_rest(start), []
     safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: covariance})
     for tick in range(ticks):
         problem = replace(
-            fixed_problem(state[None], goal[None], d_target=0.0), coast_safety=safety if enforced else None
+            fixed_problem(state[None], goal[None], d_target=0.0),
+            coast_safety=safety if enforced else None,
         )
         found = solver.solve(problem, PARAMS.dt_s if tick else 0.0)
         margins.append(coast.certify(found.states[0, :, :6], covariance, 0.75).margin_sigmas)
@@ -120,7 +143,9 @@ def fly(
 
 
 def test_plan_to_a_place_on_v_bar_is_bent_so_that_its_coasts_stay_outside() -> None:
-    """The transient at the end of the move leaves a drift towards the target; the enforced plan leaves none."""
+    """The transient at the end of the move leaves a drift towards the target; the enforced plan
+    leaves none.
+    """
     coast, goal = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S), np.array([0.0, -119.0, 0.0])
     covariance = np.diag([4e-3] * 3 + [1e-7] * 3)
     start = np.array([0.0, -120.0, 0.0])
@@ -142,8 +167,12 @@ def test_plan_that_heads_for_the_target_in_free_space_is_bent_aside_or_slowed() 
     assert min(bent[10:]) > SIGMAS
 
 
-def test_only_plans_that_are_not_safe_without_them_have_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A safe plan is that of the unrestricted problem to the last bit, and its certificate need not be computed again."""
+def test_only_plans_that_are_not_safe_without_them_have_rows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A safe plan is that of the unrestricted problem to the last bit, and its certificate need not
+    be computed again.
+    """
     coast, covariance = CoastModel(0.0, 600.0), np.diag([1e-6] * 3 + [1e-8] * 3)
     rows, restricted = coast_rows.coast_rows, []
 
@@ -176,17 +205,25 @@ def test_only_plans_that_are_not_safe_without_them_have_rows(monkeypatch: pytest
 
 
 def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:
-    """The distance of a state from a plane, over the deviation that the plane keeps, is the certified margin."""
+    """The distance of a state from a plane, over the deviation that the plane keeps, is the
+    certified margin.
+    """
     rng = np.random.default_rng(3)
     coast = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S)
     covariance = np.diag([1e-2] * 3 + [1e-8] * 3)
-    states = np.concatenate([rng.normal(0.0, 60.0, (40, 3)), rng.normal(0.0, 0.05, (40, 3))], axis=1)
+    states = np.concatenate(
+        [rng.normal(0.0, 60.0, (40, 3)), rng.normal(0.0, 0.05, (40, 3))], axis=1
+    )
     planes, wider = (coast.tangent_planes(states, covariance, 0.75, k, COASTS) for k in (0.0, 1.0))
     used = np.abs(planes[..., :6]).max(axis=2) > 0.0
     assert used[:, 0].all()
     room = np.einsum("mcj,mj->mc", planes[..., :6], states) - planes[..., 6]
-    margins = np.where(used, room / np.where(used, wider[..., 6] - planes[..., 6], 1.0), np.inf).min(axis=1)
-    np.testing.assert_allclose(margins, coast.closest(states, covariance, 0.75).margin_sigmas, rtol=1e-3)
+    margins = np.where(
+        used, room / np.where(used, wider[..., 6] - planes[..., 6], 1.0), np.inf
+    ).min(axis=1)
+    np.testing.assert_allclose(
+        margins, coast.closest(states, covariance, 0.75).margin_sigmas, rtol=1e-3
+    )
 
 
 def test_chasers_are_restricted_where_safety_is_enforced_once_they_count() -> None:

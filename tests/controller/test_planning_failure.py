@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller flies when the solver fails, or finds only degraded plans, next to a drifting target."""
+"""What the controller flies when the solver fails, or finds only degraded plans, next to a drifting
+target.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ class FailingSolver:
     def __init__(self, inner: NmpcSolver, change: Disturbed) -> None:
         self.inner, self.change, self.active = inner, change, False
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
+    def solve(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
+    ) -> NmpcPlan:
         plan = self.inner.solve(problem, shift_s, ids)
         return self.change(plan) if self.active else plan
 
@@ -154,7 +158,10 @@ def test_a_failed_solve_flies_the_shifted_plan(flight: InProcessMission, change:
     expected = np.reshape(plan.inputs, (-1, 6))[stage]
     np.testing.assert_allclose([*wrench.force_N, *wrench.torque_N_m], expected, atol=1e-5)
     assert modes(after) == ("nmpc", "nmpc")
-    assert (after.outputs.plans[0].tick, after.outputs.plans[0].inputs) == (wrench.tick, plan.inputs)
+    assert (after.outputs.plans[0].tick, after.outputs.plans[0].inputs) == (
+        wrench.tick,
+        plan.inputs,
+    )
     assert "chaser 0: no plan, flying its last plan" in warnings(flight)
     solver.active = False
     flight.step()
@@ -186,7 +193,9 @@ def test_a_failed_row_leaves_the_others_planned(flight: InProcessMission) -> Non
 
 
 @pytest.mark.parametrize("status", ["infeasible_relaxed", "budget"])
-def test_lasting_degraded_plans_make_a_chaser_retreat(flight: InProcessMission, status: str) -> None:
+def test_lasting_degraded_plans_make_a_chaser_retreat(
+    flight: InProcessMission, status: str
+) -> None:
     solver = install(flight, with_status(status, (0,)))
     fly_until(flight, 2.0)
     solver.active = True
@@ -195,7 +204,9 @@ def test_lasting_degraded_plans_make_a_chaser_retreat(flight: InProcessMission, 
     record = fly_until(flight, 2.2 + DEGRADED_S)[-1]
     assert modes(record) == ("nmpc", "nmpc")
     assert (flight.phase(0), flight.phase(1)) == ("retreat", "hold")
-    assert warnings(flight) == ["chaser 0: retreat (from approach: plans infeasible or over budget for 5 s)"]
+    assert warnings(flight) == [
+        "chaser 0: retreat (from approach: plans infeasible or over budget for 5 s)"
+    ]
     flight.step((OperatorCommand(command="approach", chaser=0),))
     assert flight.phase(0) == "retreat"
     fly_until(flight, flight.time_s + 3.0)
@@ -212,7 +223,11 @@ def test_lasting_degraded_plans_make_a_chaser_retreat(flight: InProcessMission, 
     ("change", "sound_each", "retreats"),
     [
         (breaks, 15, ["from approach: plans infeasible or over budget for 5 s"]),
-        (with_status("infeasible_relaxed"), 60, ["from approach: plans infeasible or over budget for 5 s"]),
+        (
+            with_status("infeasible_relaxed"),
+            60,
+            ["from approach: plans infeasible or over budget for 5 s"],
+        ),
         (with_status("infeasible_relaxed"), 2, []),
     ],
 )
@@ -247,10 +262,14 @@ def test_commands_without_a_plan_are_refused_with_the_reason(flight: InProcessMi
     ids=["without a plan", "degraded"],
 )
 def test_an_inspection_is_refused_while_planning_fails(change: Disturbed, reason: str) -> None:
-    with InProcessMission(mission(["timeline=[]", "chasers.1.position_m=[0.0, -3.5, 0.0]"])) as flight:
+    with InProcessMission(
+        mission(["timeline=[]", "chasers.1.position_m=[0.0, -3.5, 0.0]"])
+    ) as flight:
         solver = install(flight, change)
         fly_until(flight, 1.0)
-        assert replies_to(flight, OperatorCommand(command="inspect", chaser=0)) == [(True, "phase inspect")]
+        assert replies_to(flight, OperatorCommand(command="inspect", chaser=0)) == [
+            (True, "phase inspect")
+        ]
         solver.active = True
         fly_until(flight, 25.0)
         assert f"chaser 0: retreat (from inspect: {reason})" in warnings(flight)

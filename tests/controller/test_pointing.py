@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pointing: target search pattern, calibration manoeuvre, and the camera mounting that the filter estimates from it."""
+"""Pointing: target search pattern, calibration manoeuvre, and the camera mounting that the filter
+estimates from it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.estimation import CameraPose, Measurement, Mekf, MekfParameters, PoseHypothesis
+from chaserdock_controller.estimation import (
+    CameraPose,
+    Measurement,
+    Mekf,
+    MekfParameters,
+    PoseHypothesis,
+)
 from chaserdock_controller.estimation.camera_calibration import predict_measurement
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
@@ -62,7 +70,11 @@ def test_search_covers_50_degrees_within_14_seconds(azimuth: float, off_axis: fl
         yaw, pitch = search_angles(float(t), WIDTH, HEIGHT)
         x, y, z = rotations.rotate_inverse(rotations.exp([0.0, pitch, yaw]), direction).tolist()
         # One degree of margin for the size of the target.
-        if x > 0 and abs(math.atan2(y, x)) < WIDTH / 2 - 0.02 and abs(math.atan2(z, x)) < HEIGHT / 2 - 0.02:
+        if (
+            x > 0
+            and abs(math.atan2(y, x)) < WIDTH / 2 - 0.02
+            and abs(math.atan2(z, x)) < HEIGHT / 2 - 0.02
+        ):
             return
     pytest.fail(f"never seen: {math.degrees(azimuth):.0f}, {math.degrees(off_axis):.0f} deg")
 
@@ -71,7 +83,9 @@ def test_search_rings_grow_without_jumps_of_the_line_of_sight() -> None:
     at = np.array([search_angles(t, WIDTH, HEIGHT) for t in np.arange(0.0, 120.0, 0.05)])
     assert tuple(at[0]) == (0.0, 0.0)
     assert np.abs(np.diff(at, axis=0)).max() < math.radians(2.5)
-    largest = [np.abs(at[int(20 * a) : int(20 * b)]).max() for a, b in ((0, 14), (14, 40), (40, 80))]
+    largest = [
+        np.abs(at[int(20 * a) : int(20 * b)]).max() for a, b in ((0, 14), (14, 40), (40, 80))
+    ]
     assert largest[0] < largest[1] < largest[2] <= math.radians(170.0)
 
 
@@ -100,7 +114,9 @@ def test_paused_search_goes_on_where_it_stopped() -> None:
     for k in range(60):
         search.wrench(_odometry(0, k, x), 0.0, target, acquiring=k <= 30)
     wrench = search.wrench(_odometry(0, 60, x), 0.0, target, acquiring=False)
-    np.testing.assert_array_equal(wrench, search_wrench(_odometry(0, 60, x), s.chaser, CAMERA, q, 2.0))
+    np.testing.assert_array_equal(
+        wrench, search_wrench(_odometry(0, 60, x), s.chaser, CAMERA, q, 2.0)
+    )
 
 
 def test_chaser_tracks_search_pattern_within_torque_limit() -> None:
@@ -114,14 +130,19 @@ def test_chaser_tracks_search_pattern_within_torque_limit() -> None:
         u = search_wrench(own, body, CAMERA, np.array([1.0, 0.0, 0.0, 0.0]), t)
         assert np.abs(u[3:]).max() <= body.torque_max_N_m
         yaw, pitch = search_angles(t, WIDTH, HEIGHT)
-        worst = max(worst, float(rotations.angle_between(x[6:10], rotations.exp([0.0, pitch, yaw]))))
+        worst = max(
+            worst, float(rotations.angle_between(x[6:10], rotations.exp([0.0, pitch, yaw])))
+        )
         x = propagate(x, u, body, 1 / 15)
     assert worst < math.radians(12.0), math.degrees(worst)
     assert np.linalg.norm(x[3:6]) < 1e-3  # braked to rest
 
 
 @settings(derandomize=True, max_examples=40, deadline=None)
-@given(st.lists(st.floats(-3, 3), min_size=3, max_size=3), st.lists(st.floats(-1, 1), min_size=3, max_size=3))
+@given(
+    st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+    st.lists(st.floats(-1, 1), min_size=3, max_size=3),
+)
 def test_facing_uses_the_smallest_rotation(turn: list[float], direction: list[float]) -> None:
     if np.linalg.norm(direction) < 1e-3:
         return
@@ -173,7 +194,7 @@ def test_controller_without_sightings_searches_and_reports_it() -> None:
     assert any(torque)
 
 
-# --- calibration -----------------------------------------------------------------------------------
+# --- calibration ----------------------------------------------------------------------------------
 
 
 def test_calibration_manoeuvre_starts_and_ends_at_rest_with_target_in_view() -> None:
@@ -206,7 +227,9 @@ def test_calibrate_is_rejected_without_target_without_bias_states_and_outside_ho
 
 @pytest.mark.parametrize("seed", range(4))
 def test_mounting_rotation_is_observable_with_calibration_manoeuvre_only(seed: int) -> None:
-    """One camera, white noise of 1 mm and 0.2 degrees per image, mounting error of 0.3 degrees (one sigma)."""
+    """One camera, white noise of 1 mm and 0.2 degrees per image, mounting error of 0.3 degrees (one
+    sigma).
+    """
     residual_rad = {}
     for manoeuvre in (True, False):
         rng = np.random.default_rng(seed)

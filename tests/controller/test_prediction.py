@@ -18,7 +18,9 @@ LONG = Body(mass_kg=12.0, inertia_kg_m2=(0.1, 0.5, 0.55))
 
 
 def fine(x: Array, u: Array, body: Body, duration_s: float, steps: int = 4000) -> Array:
-    """The rigid body's equations by RK4 in small steps, written with vectors and nothing of the module's."""
+    """The rigid body's equations by RK4 in small steps, written with vectors and nothing of the
+    module's.
+    """
     moments, h = np.array(body.inertia), duration_s / steps
 
     def slope(s: Array) -> Array:
@@ -125,7 +127,9 @@ def test_forgetting_the_past_changes_nothing_from_then_on(
 
 
 def test_prediction_flies_the_commands_that_are_under_way() -> None:
-    """Two commands take effect between odometry and prediction, as with a latency of more than a tick."""
+    """Two commands take effect between odometry and prediction, as with a latency of more than a
+    tick.
+    """
     o = odometry(time_ns=1_000_000_000)
     history = CommandHistory()
     early = np.array([1.0, -0.5, 0.2, 0.01, -0.02, 0.005])
@@ -143,4 +147,6 @@ def test_without_commands_a_chaser_coasts() -> None:
     o = odometry(time_ns=5, omega_rad_s=(0.0, 0.0, 0.1))
     x = predict_state(o, CommandHistory().ahead(0, 5, 5 + 2_000_000_000), np.zeros(6), Body())
     np.testing.assert_allclose(x[:3], [1.06, 1.88, 3.0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(x[6:10], rotations.integrate(o.q_wxyz, [0, 0, 0.1], 2.0), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        x[6:10], rotations.integrate(o.q_wxyz, [0, 0, 0.1], 2.0), rtol=0, atol=1e-9
+    )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keep-out zones from the target's shape: signed distance, and plans that pass between panels and never through one."""
+"""Keep-out zones from the target's shape: signed distance, and plans that pass between panels and
+never through one.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ WITH_BOXES = replace(PARAMS, boxes=2)
 
 
 def fly(start: Array, goal: Array, ticks: int, omega_rad_s: Array) -> tuple[Array, float]:
-    """Return the last position (3,) and the least distance from the panels, which turn at a constant rate about the origin."""
+    """Return the last position (3,) and the least distance from the panels, which turn at a
+    constant rate about the origin.
+    """
     solver, state = fresh("rti", 1, WITH_BOXES), at_rest(start)
     table, times = box_table(PANELS), PARAMS.dt_s * np.arange(PARAMS.stages + 1)
     nearest = np.inf
@@ -115,7 +119,9 @@ def test_gaps_of_shapes_agree_with_the_kernel_and_are_at_most_the_distance() -> 
 
 
 def test_chaser_passes_between_turning_panels() -> None:
-    end, nearest = fly(np.array([-1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 250, np.array([0.02, 0.0, 0.0]))
+    end, nearest = fly(
+        np.array([-1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 250, np.array([0.02, 0.0, 0.0])
+    )
     np.testing.assert_allclose(end, [1.0, 0.0, 0.0], atol=0.02)
     assert nearest > CLEARANCE_M - 1e-3
 
@@ -123,7 +129,10 @@ def test_chaser_passes_between_turning_panels() -> None:
 @pytest.mark.parametrize("aside_m", [0.5, 0.9, 1.3])
 def test_chaser_never_flies_through_a_panel(aside_m: float) -> None:
     _, nearest = fly(
-        np.array([-1.0, aside_m, 0.0]), np.array([1.0, aside_m, 0.0]), 150, np.array([0.02, 0.01, 0.0])
+        np.array([-1.0, aside_m, 0.0]),
+        np.array([1.0, aside_m, 0.0]),
+        150,
+        np.array([0.02, 0.01, 0.0]),
     )
     assert nearest > CLEARANCE_M - 2e-3
 
@@ -133,7 +142,9 @@ ATTITUDES = np.array([[1.0, 0.0, 0.0, 0.0], rotations.exp(np.array([0.0, 0.0, np
 
 
 def fly_chasers(starts: Array, goals: Array, apart_m: float) -> float:
-    """Return the least gap between two chasers' cuboids on their way, with or without the distance of their shapes."""
+    """Return the least gap between two chasers' cuboids on their way, with or without the distance
+    of their shapes.
+    """
     solver, states, least = fresh("rti", 2), np.array([at_rest(p) for p in starts]), np.inf
     states[:, 6:10] = ATTITUDES
     for tick in range(250):
@@ -156,7 +167,8 @@ def fly_chasers(starts: Array, goals: Array, apart_m: float) -> float:
 
 
 def test_shapes_of_chasers_pass_each_other_at_their_distance() -> None:
-    # The second flies across the probe of the first: the centres stay 0.3 m apart on the straight line.
+    # The second flies across the probe of the first: the centres stay 0.3 m apart on the straight
+    # line.
     starts = np.array([[0.0, 0.0, 0.0], [0.3, -0.8, 0.02]])
     goals = np.array([[0.0, 0.0, 0.0], [0.3, 0.8, 0.02]])
     assert fly_chasers(starts, goals, 0.0) < 0.0
@@ -183,14 +195,19 @@ def test_probe_keeps_its_distance_from_a_panel() -> None:
 
 
 def test_planes_move_away_from_a_chaser_that_cannot_keep_its_own_distance() -> None:
-    """The first chaser is 1 cm too near to the target: its neighbour yields 1 cm more, and it has 1 cm more room."""
+    """The first chaser is 1 cm too near to the target: its neighbour yields 1 cm more, and it has 1
+    cm more room.
+    """
     places = np.array([[0.0, 0.34, 0.0], [0.0, 0.80, 0.0]])
     needed = {}
     for limit_m in (0.0, 0.35):
         problem = replace(
-            fixed_problem(np.array([at_rest(p) for p in places]), places), min_distance_chasers_m=0.35
+            fixed_problem(np.array([at_rest(p) for p in places]), places),
+            min_distance_chasers_m=0.35,
         )
-        problem = check_input(replace(problem, min_distance_target_m=np.array([limit_m, 0.0])), PARAMS, 2)
+        problem = check_input(
+            replace(problem, min_distance_target_m=np.array([limit_m, 0.0])), PARAMS, 2
+        )
         nodes = PARAMS.stages + 1
         rollout = np.repeat(problem.states[:, None], nodes, axis=1)
         rows = build_rows(problem, rollout, 25.0, np.full((2, nodes), 10.0))
@@ -216,7 +233,9 @@ def test_goto_into_a_panel_is_refused_and_places_that_the_sphere_forbade_are_not
     machine = PhaseMachine(scenario)
     machine.target_acquired(0.0)
     box = max(scenario.target.shape().boxes, key=lambda b: float(np.linalg.norm(b.position_m)))
-    refused = machine.command(OperatorCommand(command="goto", chaser=0, offset_m=box.position_m), 0.0)
+    refused = machine.command(
+        OperatorCommand(command="goto", chaser=0, offset_m=box.position_m), 0.0
+    )
     assert not refused.accepted
     assert "from the target's shape; allowed are at least 0.05 m" in refused.reason
     thin = int(np.argmin(box.size_m))
@@ -231,9 +250,12 @@ def test_goto_into_a_panel_is_refused_and_places_that_the_sphere_forbade_are_not
 
 
 def test_places_inside_the_shape_and_other_solvers_are_refused() -> None:
-    with pytest.raises(ScenarioError, match=r"limits\.min_distance_shape_m: needs controller\.solver"):
+    with pytest.raises(
+        ScenarioError, match=r"limits\.min_distance_shape_m: needs controller\.solver"
+    ):
         parse_scenario(with_shape() | {"controller": {"solver": "ipopt"}}, "test")
     with pytest.raises(
-        ScenarioError, match=r"chasers\.0\.position_m: .* from the target's shape there, nearer than"
+        ScenarioError,
+        match=r"chasers\.0\.position_m: .* from the target's shape there, nearer than",
     ):
         parse_scenario(with_shape(min_distance_shape_m=20.0), "test")

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of sightings by shape in the joint filter: they persist, while the stated covariance changes from image to image."""
+"""Errors of sightings by shape in the joint filter: they persist, while the stated covariance
+changes from image to image.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +30,16 @@ SPREAD, SPREAD_TIME_S = 0.5, 2.0
 
 
 class ShapeFlight(SyntheticFlight):
-    """A flight whose sightings state no markers, and have an error that persists for ``SHAPE.view_time_s``."""
+    """A flight whose sightings state no markers, and have an error that persists for
+    ``SHAPE.view_time_s``.
+    """
 
     def __init__(self, seed: int) -> None:
         super().__init__(SCENARIO, navigation("lab"), CHASERS, seed)
         self.view_rng = np.random.default_rng([seed, 1])
-        self.persistent = SHAPE.view_ratio * SIGHTING_SIGMAS * self.view_rng.normal(size=(CHASERS, 6))
+        self.persistent = (
+            SHAPE.view_ratio * SIGHTING_SIGMAS * self.view_rng.normal(size=(CHASERS, 6))
+        )
         self.logarithms = SPREAD * self.view_rng.normal(size=(CHASERS, 2))
 
     def inputs(self) -> JointInputs:
@@ -46,7 +52,9 @@ class ShapeFlight(SyntheticFlight):
         self.logarithms = fade * self.logarithms + more
         inputs = super().inputs()
         sightings = tuple(self._by_shape(s) for s in inputs.sightings)
-        return JointInputs(inputs.time_ns, inputs.odometry, sightings, self.impulses.copy(), inputs.covered_s)
+        return JointInputs(
+            inputs.time_ns, inputs.odometry, sightings, self.impulses.copy(), inputs.covered_s
+        )
 
     def _by_shape(self, sighting: Sighting) -> Sighting:
         error, scale = (
@@ -64,7 +72,9 @@ class ShapeFlight(SyntheticFlight):
 
 
 def target_nees(flight: ShapeFlight, noise: SightingNoise) -> tuple[float, float]:
-    """Fly; return the mean NEES of the target's position and of its rotation in the second half, 3 expected of each."""
+    """Fly; return the mean NEES of the target's position and of its rotation in the second half, 3
+    expected of each.
+    """
     estimator = JointEstimator(parameters(SCENARIO, flight.errors, shape=noise), CHASERS)
     values = []
     for k in range(round(FLIGHT_S / PERIOD_S)):
@@ -73,7 +83,9 @@ def target_nees(flight: ShapeFlight, noise: SightingNoise) -> tuple[float, float
             turn = rotations.multiply(rotations.conjugate(flight.target[6:10]), estimate.q_wxyz)
             e = np.concatenate([estimate.position_m - flight.target[:3], rotations.log(turn)])
             pose = estimate.covariance[np.ix_(POSE, POSE)]
-            values.append([e[p] @ np.linalg.solve(pose[p, p], e[p]) for p in (slice(0, 3), slice(3, 6))])
+            values.append(
+                [e[p] @ np.linalg.solve(pose[p, p], e[p]) for p in (slice(0, 3), slice(3, 6))]
+            )
         flight.step()
     position, rotation = np.mean(values, axis=0).tolist()
     return position, rotation
@@ -122,7 +134,9 @@ def test_an_invalid_covariance_does_not_change_the_units() -> None:
 
 @pytest.mark.parametrize(("sigmas", "follows"), [(3.0, True), (40.0, False)])
 def test_error_that_jumps_as_with_a_new_view_is_followed(sigmas: float, follows: bool) -> None:
-    """A jump by some stated sigmas per axis is a new view; a far larger one is a fault of the camera, and is reported."""
+    """A jump by some stated sigmas per axis is a new view; a far larger one is a fault of the
+    camera, and is reported.
+    """
     flight = ShapeFlight(3)
     estimator = JointEstimator(parameters(SCENARIO, flight.errors), CHASERS)
     ticks, jump_tick, rejections = round(15.0 / PERIOD_S), round(10.0 / PERIOD_S), []
@@ -141,11 +155,15 @@ def test_error_that_jumps_as_with_a_new_view_is_followed(sigmas: float, follows:
 
 
 def test_pushed_target_is_no_new_view() -> None:
-    """Where most cameras disagree with the estimate, the target has moved: its motion is followed as without this rule."""
+    """Where most cameras disagree with the estimate, the target has moved: its motion is followed
+    as without this rule.
+    """
     velocities: list[list[list[float]]] = []
     for rejections in (REJECTIONS, 1000):
         flight = ShapeFlight(2)
-        p = dataclasses.replace(parameters(SCENARIO, flight.errors), rejections_to_new_view=rejections)
+        p = dataclasses.replace(
+            parameters(SCENARIO, flight.errors), rejections_to_new_view=rejections
+        )
         estimator = JointEstimator(p, CHASERS)
         velocities.append([])
         for k in range(round(14.0 / PERIOD_S)):

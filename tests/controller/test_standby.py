@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller in another's shadow: what it waits for, what it takes over, and that it then knows the same."""
+"""A controller in another's shadow: what it waits for, what it takes over, and that it then knows
+the same.
+"""
 
 from __future__ import annotations
 
@@ -64,11 +66,15 @@ def ticks() -> dict[int, list[ReceivedMessage]]:
                 for i in message.chasers:
                     out.setdefault(message.tick, []).append(granted(message, i, "controller", 1))
             out.setdefault(message.tick, []).append(ReceivedMessage(r.topic, r.place, message, 0))
-    last = max(tick for tick, messages in out.items() if any(r.topic is topics.TICK for r in messages))
+    last = max(
+        tick for tick, messages in out.items() if any(r.topic is topics.TICK for r in messages)
+    )
     return {tick: messages for tick, messages in sorted(out.items()) if tick <= last}
 
 
-def member(scenario: Scenario, name: str, instance: str, realtime: bool = False) -> ControllerProcess:
+def member(
+    scenario: Scenario, name: str, instance: str, realtime: bool = False
+) -> ControllerProcess:
     core = ControllerCore(scenario, lambda: 0.0)
     process = ControllerProcess(cast(Node, ReplayNode(name)), scenario, core, realtime)
     process.heartbeat = cast(Any, SilentHeartbeat())
@@ -82,7 +88,11 @@ def deliver(process: ControllerProcess, *messages: ReceivedMessage) -> list[tupl
     for message in messages:
         node.put(message)
     before = None
-    while node._pending or before != (process.done_tick, len(process.standby._held), process.standby.leads):
+    while node._pending or before != (
+        process.done_tick,
+        len(process.standby._held),
+        process.standby.leads,
+    ):
         before = process.done_tick, len(process.standby._held), process.standby.leads
         process.listen()
     return [(t, m) for t, _, m in node.take_published()]
@@ -105,7 +115,9 @@ def outputs(published: list[tuple[Any, Any]]) -> list[Any]:
 def reassigned(
     messages: list[ReceivedMessage], holder: str, term: int, revision: int = 1
 ) -> list[ReceivedMessage]:
-    """Return a repeated tick, for which all chasers have granted their leases to the remaining controller."""
+    """Return a repeated tick, for which all chasers have granted their leases to the remaining
+    controller.
+    """
     tick = next(r.message for r in messages if r.topic is topics.TICK)
     tick = msgspec.structs.replace(tick, revision=revision, controllers={holder: BOTH[holder]})
     again = ReceivedMessage(topics.TICK, None, tick, 0)
@@ -129,7 +141,9 @@ def test_standby_is_silent_and_then_publishes_the_same(scenario: Scenario, ticks
             published = deliver(first, *ticks[tick])
             assert outputs(published)
             standby_output = deliver(
-                second, *ticks[tick], *(state_messages(published) if tick < 11 or received_state else [])
+                second,
+                *ticks[tick],
+                *(state_messages(published) if tick < 11 or received_state else []),
             )
             assert not outputs(standby_output)
         published_second = deliver(second, *reassigned(ticks[11], "standby", 2))
@@ -160,7 +174,9 @@ def test_in_lockstep_a_standby_waits_for_state_messages_and_keeps_the_order_of_t
     assert before == after
 
 
-def test_late_standby_restores_the_state_and_publishes_the_same(scenario: Scenario, ticks: Any) -> None:
+def test_late_standby_restores_the_state_and_publishes_the_same(
+    scenario: Scenario, ticks: Any
+) -> None:
     first, late = member(scenario, "controller", "c"), member(scenario, "standby", "s")
     state = None
     for tick in list(ticks)[:14]:
@@ -188,11 +204,16 @@ def test_standby_that_takes_over_without_state_reports_it_and_reinitializes(
     late = member(scenario, "standby", "s")
     assert not outputs(deliver(late, *ticks[9]))
     published = deliver(late, *reassigned(ticks[9], "standby", 2))
-    assert any(t is topics.EVENT and m.what.startswith("takes over without any state") for t, m in published)
+    assert any(
+        t is topics.EVENT and m.what.startswith("takes over without any state")
+        for t, m in published
+    )
     assert [m.tick for t, m in published if t is topics.WRENCH] == [9, 9]
 
 
-def test_standby_follows_the_operator_commands_of_the_commander(scenario: Scenario, ticks: Any) -> None:
+def test_standby_follows_the_operator_commands_of_the_commander(
+    scenario: Scenario, ticks: Any
+) -> None:
     first, second = member(scenario, "controller", "c"), member(scenario, "standby", "s")
     answers: list[Any] = []
     for tick in list(ticks)[:14]:
@@ -214,7 +235,9 @@ def held_by(messages: list[ReceivedMessage], holder: str, term: int) -> list[Rec
 
 
 def operated_by(instance: str, term: int, tick: int) -> ReceivedMessage:
-    """Return the message by which a start of ``controller`` reports that it executed an operator's command."""
+    """Return the message by which a start of ``controller`` reports that it executed an operator's
+    command.
+    """
     command = OperatorCommand(command="goto", chaser=0, offset_m=(-1.2, 0.0, 0.0))
     state = ControllerState(
         process="controller", instance=instance, term=term, tick=tick, operated=(command,)
@@ -222,8 +245,12 @@ def operated_by(instance: str, term: int, tick: int) -> ReceivedMessage:
     return ReceivedMessage(topics.STATE, None, state, 0)
 
 
-def test_operator_command_of_a_deposed_controller_is_ignored(scenario: Scenario, ticks: Any) -> None:
-    """The commander freezes with tick 4 open, and continues with it when the standby has taken over."""
+def test_operator_command_of_a_deposed_controller_is_ignored(
+    scenario: Scenario, ticks: Any
+) -> None:
+    """The commander freezes with tick 4 open, and continues with it when the standby has taken
+    over.
+    """
     second = member(scenario, "standby", "s", realtime=True)
     phases = second.core.guidance.chasers
     for tick in range(10):
@@ -252,7 +279,9 @@ def test_standby_that_takes_over_executes_the_last_operator_command_of_the_comma
     assert not any(m.operated for t, m in published if t is topics.STATE)
 
 
-def test_operator_request_waits_for_the_first_tick_of_a_new_commander(scenario: Scenario, ticks: Any) -> None:
+def test_operator_request_waits_for_the_first_tick_of_a_new_commander(
+    scenario: Scenario, ticks: Any
+) -> None:
     second = member(scenario, "standby", "s")
     answers: list[Any] = []
     for tick in range(4):  # without state messages of the commander
@@ -272,7 +301,7 @@ def test_operator_request_to_a_standby_is_refused(scenario: Scenario, ticks: Any
     ]
 
 
-# -- the state ----------------------------------------------------------------------------------------------
+# -- the state -------------------------------------------------------------------------------------
 
 
 def memory(scenario: Scenario) -> tuple[ControllerProcess, Checkpoint]:
@@ -280,7 +309,9 @@ def memory(scenario: Scenario) -> tuple[ControllerProcess, Checkpoint]:
     return one, one.checkpoint
 
 
-def test_a_restored_checkpoint_is_bounded_and_equals_the_saved_one(scenario: Scenario, ticks: Any) -> None:
+def test_a_restored_checkpoint_is_bounded_and_equals_the_saved_one(
+    scenario: Scenario, ticks: Any
+) -> None:
     one, saved = memory(scenario)
     other, restored = memory(scenario)
     for tick in list(ticks)[:20]:
@@ -297,7 +328,9 @@ def test_a_restored_checkpoint_is_bounded_and_equals_the_saved_one(scenario: Sce
 @pytest.mark.parametrize(
     "spoil", ["bytes", "unknown", "missing", "chasers", "type", "nan", "nan array", "shape"]
 )
-def test_an_invalid_checkpoint_is_refused_completely(scenario: Scenario, ticks: Any, spoil: str) -> None:
+def test_an_invalid_checkpoint_is_refused_completely(
+    scenario: Scenario, ticks: Any, spoil: str
+) -> None:
     one, saved = memory(scenario)
     for tick in list(ticks)[:5]:
         deliver(one, *ticks[tick])
@@ -335,7 +368,9 @@ class Sample(msgspec.Struct, forbid_unknown_fields=True):
     numbers: frozenset[int] = frozenset()
 
 
-@pytest.mark.parametrize("array", [np.arange(6.0).reshape(2, 3), np.zeros((0, 3)), np.array([np.pi])])
+@pytest.mark.parametrize(
+    "array", [np.arange(6.0).reshape(2, 3), np.zeros((0, 3)), np.array([np.pi])]
+)
 def test_decoding_returns_the_encoded_values(array: Array) -> None:
     glide = Glide(1.0, np.zeros(3), np.array([1.0, 0.0, 0.0]), (0.1,), (2.0,), (1.0, 1.0))
     command = OperatorCommand(command="hold", chaser=1)
@@ -361,10 +396,12 @@ def test_only_data_can_be_encoded(value: Any) -> None:
         encode(value)
 
 
-# -- whom it listens to -------------------------------------------------------------------------------------
+# -- whom it listens to ----------------------------------------------------------------------------
 
 
-def take(standby: HotStandby, number: int, holder: str, revision: int = 0, instance: str = "") -> None:
+def take(
+    standby: HotStandby, number: int, holder: str, revision: int = 0, instance: str = ""
+) -> None:
     """Let a controller know a tick and that the only chaser has granted its lease."""
     controllers = BOTH | ({holder: instance} if instance else {})
     tick = Tick(tick=number, revision=revision, images=False, chasers=(0,), controllers=controllers)

@@ -24,7 +24,9 @@ def composite(physics: Physics) -> TargetBody:
     a, b = physics.state(TARGET), physics.state("chaser/0")
     centre = rotations.rotate_inverse(a.q_wxyz, b.position_m - a.position_m)
     q = rotations.multiply(rotations.conjugate(a.q_wxyz), b.q_wxyz)
-    return attach_bodies(target_body(scenario()), [(CHASER_KG, np.array(CHASER_INERTIA), centre, q)])
+    return attach_bodies(
+        target_body(scenario()), [(CHASER_KG, np.array(CHASER_INERTIA), centre, q)]
+    )
 
 
 @pytest.fixture
@@ -59,9 +61,13 @@ def branch(s: BodyState) -> StateHypothesis:
 
 
 def test_a_captured_target_moves_as_predicted(captured: Physics) -> None:
-    """3 s ahead, at three times the paper's rates: 0.2 mm and 0.02 degrees; uniform motion is off by more than 1 cm."""
+    """3 s ahead, at three times the paper's rates: 0.2 mm and 0.02 degrees; uniform motion is off
+    by more than 1 cm.
+    """
     begin, body = captured.state(TARGET), composite(captured)
-    path = predict_path(body, begin.position_m, begin.velocity_m_s, begin.q_wxyz, begin.omega_rad_s, 0.05, 60)
+    path = predict_path(
+        body, begin.position_m, begin.velocity_m_s, begin.q_wxyz, begin.omega_rad_s, 0.05, 60
+    )
     estimated = predict(branch(begin), 3_000_000_000, parameters(body))
     captured.advance(3 * HZ, {})
     end = captured.state(TARGET)
@@ -95,7 +101,9 @@ def test_feed_forward_holds_a_place_on_a_body_with_its_centre_elsewhere() -> Non
     h, offset = 1e-3, np.array([0.0, 1.0, 0.2])
     path = predict_path(body, (0, 0, 0), (0.01, 0, 0), (1, 0, 0, 0), (0.05, 0.1, -0.1), h, 2)
     places = path.positions_m + rotations.rotate(path.q_wxyz, np.tile(offset, (3, 1)))
-    wanted = 17.8 * rotations.rotate_inverse(path.q_wxyz[1], (places[2] - 2 * places[1] + places[0]) / h**2)
+    wanted = 17.8 * rotations.rotate_inverse(
+        path.q_wxyz[1], (places[2] - 2 * places[1] + places[0]) / h**2
+    )
     inertia = np.diag([0.3, 0.4, 0.5])
     still = np.zeros(3)
     middle = (path.omega_rad_s[1], offset, still, still, (1, 0, 0, 0), 17.8, inertia)
@@ -157,4 +165,6 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
     f[6:, 6:] = turn
     centre = np.array(p.centre_of_mass_trf_m)
     state = (start.position_m, start.velocity_m_s, start.q_wxyz, start.omega_rad_s)
-    np.testing.assert_allclose(motion.about_centre(state, (q, w), f, centre, 0.5)[2], numeric, atol=2e-6)
+    np.testing.assert_allclose(
+        motion.about_centre(state, (q, w), f, centre, 0.5)[2], numeric, atol=2e-6
+    )

@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 
 @given(points, points, st.floats(0.0, 100.0), st.floats(0.01, 0.2))
 @quick
-def test_move_from_rest_is_straight_and_ends_at_rest(start: Any, goal: Any, now: float, speed: float) -> None:
+def test_move_from_rest_is_straight_and_ends_at_rest(
+    start: Any, goal: Any, now: float, speed: float
+) -> None:
     move = move_to(stay(start, 0.0), goal, now, speed)
     end = move.start_s + move.duration_s
     for t, place in ((now, start), (end, goal)):
@@ -38,7 +40,9 @@ def test_move_from_rest_is_straight_and_ends_at_rest(start: Any, goal: Any, now:
     path = np.subtract(goal, start)
     if np.linalg.norm(path) > 1e-3:
         along = (positions - start) @ path / (path @ path)
-        np.testing.assert_allclose(positions, np.add(start, along[:, None] * path), rtol=0, atol=1e-8)
+        np.testing.assert_allclose(
+            positions, np.add(start, along[:, None] * path), rtol=0, atol=1e-8
+        )
         assert np.all(np.diff(along) >= -1e-9)
 
 
@@ -47,14 +51,25 @@ def fastest(move: Move) -> float:
     return float(np.linalg.norm(move.at(times)[1], axis=1).max())
 
 
-@given(points, points, points, st.floats(0.0, 1.0), st.floats(0.01, 0.2), st.sampled_from([0.5, 1.0, 2.0]))
-@example((-1, 0, 0), (0, 0, 0.5), (-0.4, 0, 0), 0.2, 0.06, 0.5)  # a slower move begins during acceleration
+@given(
+    points,
+    points,
+    points,
+    st.floats(0.0, 1.0),
+    st.floats(0.01, 0.2),
+    st.sampled_from([0.5, 1.0, 2.0]),
+)
+@example(
+    (-1, 0, 0), (0, 0, 0.5), (-0.4, 0, 0), 0.2, 0.06, 0.5
+)  # a slower move begins during acceleration
 @example((0, 0, 0), (-0.6, 0, 0), (0, 0, 0), 0.21, 0.03, 1.0)  # reversed at peak acceleration
 @quick
 def test_move_that_replaces_another_is_smooth_with_bounded_speed(
     a: Any, b: Any, c: Any, share: float, speed: float, factor: float
 ) -> None:
-    """Position, velocity and acceleration are continuous; it ends at rest; speed and duration are bounded."""
+    """Position, velocity and acceleration are continuous; it ends at rest; speed and duration are
+    bounded.
+    """
     first = move_to(stay(a, 0.0), b, 0.0, speed)
     now = share * first.duration_s
     second = move_to(first, c, now, speed * factor)
@@ -67,12 +82,16 @@ def test_move_that_replaces_another_is_smooth_with_bounded_speed(
     stopping = fastest(stop(first, now))
     assert fastest(second) <= max(speed * factor, stopping) * 1.01
     assert stopping <= speed * 1.3
-    assert second.duration_s <= 10.0 + 3.0 * 1.875 * math.dist(p, at(first, now)[0]) / (speed * factor)
+    assert second.duration_s <= 10.0 + 3.0 * 1.875 * math.dist(p, at(first, now)[0]) / (
+        speed * factor
+    )
 
 
 @given(points, points, st.floats(0.0, 1.0))
 @quick
-def test_velocity_and_acceleration_are_the_positions_derivatives(a: Any, b: Any, share: float) -> None:
+def test_velocity_and_acceleration_are_the_positions_derivatives(
+    a: Any, b: Any, share: float
+) -> None:
     move = move_to(stay(a, 0.0), b, 3.0, 0.1)
     t, h = 3.0 + move.duration_s * (0.01 + 0.98 * share), 1e-3 * move.duration_s
     (p0, v0, _), (_, v, acc), (p1, v1, _) = at(move, t - h), at(move, t), at(move, t + h)

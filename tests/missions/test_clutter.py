@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many chasers exchange places at random in clutter: all arrive, and none comes nearer than the limits allow."""
+"""Many chasers exchange places at random in clutter: all arrive, and none comes nearer than the
+limits allow.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from chaserdock.evaluation.transfers import CLUTTER, DENSE_CLUTTER, clutter, fly
 
 
 @pytest.mark.parametrize("places_m", [CLUTTER, DENSE_CLUTTER])
-def test_random_places_keep_the_distances_of_the_limits(places_m: tuple[float, float, float]) -> None:
+def test_random_places_keep_the_distances_of_the_limits(
+    places_m: tuple[float, float, float],
+) -> None:
     scenario = clutter(7, places_m=places_m)
     for places in (
         np.array([c.position_m for c in scenario.chasers]),

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shipped detumbling mission, from free flight through capture to rest, with statistical perception, in one process."""
+"""A shipped detumbling mission, from free flight through capture to rest, with statistical
+perception, in one process.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ FLOWN = ("detumble-pair",)
 
 
 @pytest.fixture(scope="module", params=FLOWN)
-def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RecordedFlight:
+def flown(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> RecordedFlight:
     """Return a mission flown to its end, without failures of its processes."""
     out = tmp_path_factory.mktemp(request.param)
     changes = ("perception.name=statistical", "camera.width_px=320", "camera.height_px=180")
@@ -34,7 +38,9 @@ def test_the_client_is_captured_and_stopped(flown: RecordedFlight) -> None:
     assert result["success"], result["failures"]
     chasers = MISSIONS[flown.scenario.name]
     assert flown.world.latched == chasers
-    commanded_s = next(entry.at_s for entry in flown.scenario.timeline if entry.command == "detumble")
+    commanded_s = next(
+        entry.at_s for entry in flown.scenario.timeline if entry.command == "detumble"
+    )
     stack = result["stack"]
     assert commanded_s < stack["since_s"] < commanded_s + 8.0
     for i in chasers:
@@ -57,4 +63,6 @@ def test_missions_are_shipped_with_criteria_of_rest() -> None:
         scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
         assert scenario.success.detumbled is not None
         assert scenario.success.latched == chasers
-        assert any(entry.command == "detumble" and entry.chasers == chasers for entry in scenario.timeline)
+        assert any(
+            entry.command == "detumble" and entry.chasers == chasers for entry in scenario.timeline
+        )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Injected faults in complete missions with separate processes: deterministic in lock-step, logged, survived."""
+"""Injected faults in complete missions with separate processes: deterministic in lock-step, logged,
+survived.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,10 @@ def test_equal_faults_give_equal_digests_in_processes_and_simulated(tmp_path: Pa
     assert any(e.what == "process lost" and e.detail == "chaser/1" for e in flight.events)
     assert result["collisions"] == 0
     assert all(m["lost"] == 0 for m in result["messages"].values())
-    assert simulated_digest(DRILL[0], tmp_path / "simulated", *DRILL[1:], listed(*MANY)) == result["digest"]
+    assert (
+        simulated_digest(DRILL[0], tmp_path / "simulated", *DRILL[1:], listed(*MANY))
+        == result["digest"]
+    )
 
 
 def test_lockstep_trajectories_are_independent_of_frozen_processes(

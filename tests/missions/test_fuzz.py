@@ -41,7 +41,9 @@ def test_mutated_logs_raise_log_error_only() -> None:
 def test_equal_seed_makes_equal_mutations() -> None:
     payload = codec.encode(BY_TYPE[m.Odometry])
     one, other = random.Random(3), random.Random(3)
-    assert [mutate(payload, one) for _ in range(200)] == [mutate(payload, other) for _ in range(200)]
+    assert [mutate(payload, one) for _ in range(200)] == [
+        mutate(payload, other) for _ in range(200)
+    ]
 
 
 def test_check_finds_invalid_messages() -> None:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each process' answers to recorded inputs, against what it answered when the golden log was made.
 
-Recorded by ``tests/make_golden.py``. Compared with a tolerance, since another kind of CPU differs in the last bits.
+Recorded by ``tests/make_golden.py``. Compared with a tolerance, since another kind of CPU differs
+in the last bits.
 """
 
 from __future__ import annotations
@@ -119,5 +120,9 @@ def test_chaser_executes_the_command(scenario: Scenario, records: dict[type, lis
         assert refusal(command, command.chaser, body, before, command.sim_time_ns, due_ns) is None
         expected: ActuatorCommand = executed[command.chaser, command.tick]
         assert passed_on(command) == ActuatorCommand(
-            **{name: getattr(expected, name) for name in expected.__struct_fields__ if name != "seq"}
+            **{
+                name: getattr(expected, name)
+                for name in expected.__struct_fields__
+                if name != "seq"
+            }
         )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mission on four hosts (network namespaces joined by a bridge), with the shipped configuration files."""
+"""A mission on four hosts (network namespaces joined by a bridge), with the shipped configuration
+files.
+"""
 
 from __future__ import annotations
 
@@ -54,14 +56,21 @@ def hosts() -> Iterator[dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_mission_over_four_hosts_with_shipped_configuration(hosts: dict[str, str], tmp_path: Path) -> None:
-    """Router, world with controller, and each chaser run on separate hosts; only the router listens."""
+def test_mission_over_four_hosts_with_shipped_configuration(
+    hosts: dict[str, str], tmp_path: Path
+) -> None:
+    """Router, world with controller, and each chaser run on separate hosts; only the router
+    listens.
+    """
     file = tmp_path / "host.json5"
     shipped = (ROOT / "config" / "host.json5").read_text()
     file.write_text(shipped.replace("tcp/router:7447", f"tcp/{HOSTS['hub']}:7447"))
     runs = tmp_path / "runs"
     members = {
-        "router": ("hub", ["router", "--until", "operator", "-c", str(ROOT / "config" / "router.json5")]),
+        "router": (
+            "hub",
+            ["router", "--until", "operator", "-c", str(ROOT / "config" / "router.json5")],
+        ),
         "world": ("ground", ["world", "two-chaser-tracking", *sets(*SHORT), "-c", str(file)]),
         "controller": ("ground", ["controller", "-c", str(file)]),
         "chaser/0": ("sat-a", ["chaser", "0", "-c", str(file)]),
@@ -89,7 +98,9 @@ def test_mission_over_four_hosts_with_shipped_configuration(hosts: dict[str, str
                 stderr=subprocess.STDOUT,
             )
         deadline = time.monotonic() + 300
-        outputs = {n: p.communicate(timeout=deadline - time.monotonic())[0] for n, p in processes.items()}
+        outputs = {
+            n: p.communicate(timeout=deadline - time.monotonic())[0] for n, p in processes.items()
+        }
     finally:
         for process in processes.values():
             if process.poll() is None:

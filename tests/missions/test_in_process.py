@@ -77,14 +77,25 @@ def mission(**changes: object) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("perception", ["model", "default"])
-def test_chaser_that_does_not_see_a_target_without_markers_gets_its_expected_pose(perception: str) -> None:
-    changes = (*SMALL, "duration_s=3.0", "navigation={grade='exact'}", f"perception.name='{perception}'")
+def test_chaser_that_does_not_see_a_target_without_markers_gets_its_expected_pose(
+    perception: str,
+) -> None:
+    changes = (
+        *SMALL,
+        "duration_s=3.0",
+        "navigation={grade='exact'}",
+        f"perception.name='{perception}'",
+    )
     scenario = load_scenario(ROOT / "scenarios/two-chaser-tracking.toml", changes)
     measured, camera = measurement_model(scenario, 1), scenario.camera_model()
 
     def seen_by_0_only(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
         sighting = measured(chaser, tick, time_ns, states)
-        return sighting if chaser == 0 else msgspec.structs.replace(sighting, status="nothing", solutions=())
+        return (
+            sighting
+            if chaser == 0
+            else msgspec.structs.replace(sighting, status="nothing", solutions=())
+        )
 
     expected, compared = None, 0
     with InProcessMission(scenario, seen_by_0_only) as mission:
@@ -106,15 +117,23 @@ def test_chaser_that_does_not_see_a_target_without_markers_gets_its_expected_pos
 
 def test_odometry_errors_of_the_scenario_apply() -> None:
     scenario = parse_scenario(
-        mission(navigation={"grade": "exact", "position_bias_m": 0.01, "velocity_noise_m_s": 0.001}), "test"
+        mission(
+            navigation={"grade": "exact", "position_bias_m": 0.01, "velocity_noise_m_s": 0.001}
+        ),
+        "test",
     )
     with InProcessMission(scenario) as flight:
         records = list(flight.ticks())
-    offsets = [np.array(r.odometry[0].position_m) - r.states["chaser/0"].position_m for r in records]
+    offsets = [
+        np.array(r.odometry[0].position_m) - r.states["chaser/0"].position_m for r in records
+    ]
     assert np.linalg.norm(offsets[0]) > 1e-3
     np.testing.assert_allclose(offsets, np.tile(offsets[0], (len(offsets), 1)), atol=1e-12)
     assert (
-        np.std([r.odometry[0].velocity_m_s[0] - r.states["chaser/0"].velocity_m_s[0] for r in records]) > 5e-4
+        np.std(
+            [r.odometry[0].velocity_m_s[0] - r.states["chaser/0"].velocity_m_s[0] for r in records]
+        )
+        > 5e-4
     )
 
 
@@ -122,7 +141,9 @@ def test_equal_seeds_give_equal_flights() -> None:
     scenario = parse_scenario(mission(), "test")
     ends = []
     for _ in range(2):
-        with InProcessMission(scenario, measurement_model(scenario, 1, 0.002, 0.002, dropout=0.1)) as flight:
+        with InProcessMission(
+            scenario, measurement_model(scenario, 1, 0.002, 0.002, dropout=0.1)
+        ) as flight:
             records = list(flight.ticks())
             ends.append(flight.states()["chaser/0"].position_m)
             assert {len(r.sightings[0].solutions) for r in records} == {0, 1}

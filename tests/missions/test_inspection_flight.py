@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shipped inspection, shortened: its images, smaller, tell the geometry, and the trackers take it over."""
+"""The shipped inspection, shortened: its images, smaller, tell the geometry, and the trackers take
+it over.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,10 @@ def test_geometry_is_estimated_in_flight_and_corrects_the_trackers() -> None:
         ROOT / "scenarios/markerless-inspection.toml",
         ("duration_s=27.0", "camera.width_px=640", "camera.height_px=360", "inspection.speed_m_s=0.35", "timeline=[]"),
     )  # fmt: skip
-    cameras, perceptions = make_cameras(scenario), [make_perception(scenario) for _ in scenario.chasers]
+    cameras, perceptions = (
+        make_cameras(scenario),
+        [make_perception(scenario) for _ in scenario.chasers],
+    )
 
     def sighting(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
         return look(perceptions[chaser], cameras.image(chaser, tick, tick, time_ns, states), None)
@@ -49,7 +54,9 @@ def test_geometry_is_estimated_in_flight_and_corrects_the_trackers() -> None:
     scale, turns = true_geometry_errors(scenario)
     true = np.append(np.concatenate(list(turns.values())), scale) / last.sigmas[:-1]
     off = np.array(last.values[:-1]) / last.sigmas[:-1] - true
-    covariance = np.array(last.covariance).reshape(len(last.names), -1) / np.outer(last.sigmas, last.sigmas)
+    covariance = np.array(last.covariance).reshape(len(last.names), -1) / np.outer(
+        last.sigmas, last.sigmas
+    )
     assert off @ np.linalg.solve(covariance[:-1, :-1], off) < 4.0 * len(off)
     assert np.linalg.norm(off) < 0.6 * np.linalg.norm(true)
     assert np.trace(covariance) < np.trace(

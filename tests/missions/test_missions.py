@@ -80,7 +80,8 @@ def test_log_contains_every_topic_at_its_rate(short_flight: Path) -> None:
             assert 1 <= count <= 8, key
     recorded = {id(found[0]) for key in counts if (found := topic_of_key(key)) is not None}
     missing = {topic.key for topic in TOPICS if id(topic) not in recorded}
-    # No operator commands, thrusters, docking ports, standby, plumes or passive safety in this flight.
+    # No operator commands, thrusters, docking ports, standby, plumes or passive safety in this
+    # flight.
     ports = (topics.DOCKING, topics.TRUTH_LOAD, topics.STACK)
     absent = (
         topics.COMMAND,
@@ -145,7 +146,9 @@ def test_realtime_flight_completes(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["single", TWO])
 def test_tracking_mission_meets_its_criteria(scenario: str, tmp_path: Path) -> None:
-    """The scenario's criteria hold after 40 s already; the estimate is never off by more than 1 cm or 1 degree."""
+    """The scenario's criteria hold after 40 s already; the estimate is never off by more than 1 cm
+    or 1 degree.
+    """
     changes = ("duration_s=40.0", "camera.width_px=800", "camera.height_px=450")
     status, output = run(scenario, tmp_path / "run", *changes)
     assert status == 0, output
@@ -156,7 +159,9 @@ def test_tracking_mission_meets_its_criteria(scenario: str, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_collision_avoidance_mission(tmp_path: Path) -> None:
-    """Chaser 0 passes the target at 0.35 m or more within 60 s, guided by the sightings of chaser 1."""
+    """Chaser 0 passes the target at 0.35 m or more within 60 s, guided by the sightings of chaser
+    1.
+    """
     images = ("camera.width_px=640", "camera.height_px=360")
     status, output = run("collision-avoidance", tmp_path / "run", *images)
     assert status == 0, output

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A user's own mesh file flies as docs/howto-target.md describes: one chaser acquires it by its shape and approaches it."""
+"""A user's own mesh file flies as docs/howto-target.md describes: one chaser acquires it by its
+shape and approaches it.
+"""
 
 from __future__ import annotations
 
@@ -32,4 +34,6 @@ def test_own_mesh_is_acquired_by_a_single_chaser_and_drawn(tmp_path: Path) -> No
     log = open_log(tmp_path / "run")
     assert list(log.messages("controller/target"))[-1].status == "tracking"
     shape = np.concatenate([face.corners_m for face in scene_of(log.scenario).target])
-    np.testing.assert_allclose(shape.max(axis=0), satellite("geo_servicer").bounds_m()[1], atol=0.005)
+    np.testing.assert_allclose(
+        shape.max(axis=0), satellite("geo_servicer").bounds_m()[1], atol=0.005
+    )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Killed, frozen and duplicated processes, invalid scenarios and messages: no hang, no lost records, clear errors."""
+"""Killed, frozen and duplicated processes, invalid scenarios and messages: no hang, no lost
+records, clear errors.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,13 @@ import psutil
 import pytest
 import zenoh
 from chaserdock_protocol import codec, topics
-from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting, WrenchCommand, encoding_of
+from chaserdock_protocol.messages import (
+    Odometry,
+    PoseSolution,
+    Sighting,
+    WrenchCommand,
+    encoding_of,
+)
 from chaserdock_protocol.recording.log import read_log
 from chaserdock_protocol.transport import Link
 from chaserdock_protocol.transport.zenoh_network import zenoh_config
@@ -73,7 +81,9 @@ def test_world_reports_port_in_use() -> None:
 )
 def test_interrupt_ends_the_wait_for_a_router(arguments: tuple[str, ...]) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    process = chaserdock(*arguments, "-e", endpoint, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    process = chaserdock(
+        *arguments, "-e", endpoint, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
     try:
         assert process.stdout is not None
         assert any(b"Waiting for it" in line for line in process.stdout)
@@ -85,7 +95,9 @@ def test_interrupt_ends_the_wait_for_a_router(arguments: tuple[str, ...]) -> Non
 
 
 def test_chaser_and_operator_time_out_without_peers() -> None:
-    """A chaser without a world and an operator without a controller end with status 2 after ``--timeout``."""
+    """A chaser without a world and an operator without a controller end with status 2 after
+    ``--timeout``.
+    """
     elsewhere = ["-e", "tcp/127.0.0.1:9", "--namespace", "empty"]
     status, output = finished("chaser", "0", *elsewhere, "--timeout", "1", timeout_s=60)
     assert status == 2
@@ -117,7 +129,10 @@ def malformed_messages() -> list[tuple[str, bytes, str]]:
         chaser=0, status="nothing", solutions=(), marker_ids=(), corners_px=(), rejected_ids=()
     )
     turned = PoseSolution(
-        position_m=zero, q_wxyz=(1.0, 1.0, 0.0, 0.0), covariance=(0.0,) * 36, reprojection_rms_px=0.0
+        position_m=zero,
+        q_wxyz=(1.0, 1.0, 0.0, 0.0),
+        covariance=(0.0,) * 36,
+        reprojection_rms_px=0.0,
     )
     shape = msgspec.to_builtins(wrench) | {"force_N": [1.0, 2.0]}
     return [
@@ -136,7 +151,9 @@ def malformed_messages() -> list[tuple[str, bytes, str]]:
 
 
 def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path: Path) -> None:
-    """A second world, a duplicate or unknown chaser, malformed messages and invalid commands do not disturb the flight."""
+    """A second world, a duplicate or unknown chaser, malformed messages and invalid commands do not
+    disturb the flight.
+    """
     by_hand = ByHand.at_free_port("rejections")
     reach = ["--namespace", by_hand.namespace, "-e", by_hand.endpoint]
     log = tmp_path / "mission.mcap"
@@ -152,13 +169,18 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
             for key, payload, encoding in malformed_messages():
                 session.put(key, payload, encoding=encoding)
             status, output = finished("chaser", "7", *reach, timeout_s=60)
-            assert (status, "there is no chaser/7 in this mission; its chasers are 0 to 1" in output) == (
+            assert (
+                status,
+                "there is no chaser/7 in this mission; its chasers are 0 to 1" in output,
+            ) == (
                 2,
                 True,
             ), output
             status, output = finished("chaser", "1", *reach, timeout_s=60)
             assert (status, "chaser/1 is already running" in output) == (2, True), output
-            status, output = finished("world", "single", *reach, "-l", "tcp/127.0.0.1:0", timeout_s=60)
+            status, output = finished(
+                "world", "single", *reach, "-l", "tcp/127.0.0.1:0", timeout_s=60
+            )
             assert (status, "has a world already" in output) == (2, True), output
         status, output = finished("command", "approach", "0", *reach, timeout_s=60)
         assert (status, output.startswith("accepted")) == (0, True), output
@@ -187,7 +209,9 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
 
 def test_killed_recorder_leaves_readable_log(tmp_path: Path) -> None:
     """SIGKILL of the recorder loses at most the last second; the flight completes."""
-    mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*LONG, "duration_s=30.0"))
+    mission = chaserdock(
+        "run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*LONG, "duration_s=30.0")
+    )
     log = tmp_path / "run" / "mission.mcap"
     try:
         wait_for_log(log, FLYING_BYTES)
@@ -207,11 +231,15 @@ def test_killed_recorder_leaves_readable_log(tmp_path: Path) -> None:
     assert result["failures"]
 
 
-@pytest.mark.parametrize(("victim", "duration_s"), [(("controller",), 25.0), (("chaser", "1"), 14.0)])
+@pytest.mark.parametrize(
+    ("victim", "duration_s"), [(("controller",), 25.0), (("chaser", "1"), 14.0)]
+)
 def test_flight_continues_after_process_is_killed(
     victim: tuple[str, ...], duration_s: float, tmp_path: Path
 ) -> None:
-    """Without a controller the chasers brake and hold, for which they need time; without one chaser the other continues."""
+    """Without a controller the chasers brake and hold, for which they need time; without one chaser
+    the other continues.
+    """
     length = sets(*LONG, f"duration_s={duration_s}")
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *length)
     try:
@@ -235,10 +263,16 @@ def test_flight_continues_after_process_is_killed(
         apart = flight.truth["chaser/0"].velocity_m_s - flight.truth["target"].velocity_m_s
         speed = [float((v @ v) ** 0.5) for v in apart]
         assert speed[-1] < 0.2 * max(speed)
-        states = [e.what for e in flight.events if e.process == "chaser/0" and e.what.startswith("fallback")]
+        states = [
+            e.what
+            for e in flight.events
+            if e.process == "chaser/0" and e.what.startswith("fallback")
+        ]
         assert states[-1] == "fallback: hold"
         assert states == [
-            f"fallback: {what}" for what in ("plan", "brake", "hold") if f"fallback: {what}" in states
+            f"fallback: {what}"
+            for what in ("plan", "brake", "hold")
+            if f"fallback: {what}" in states
         ]
     else:
         assert ticks[-1].chasers == (0,)
@@ -266,13 +300,15 @@ def test_realtime_chaser_survives_frozen_controller(tmp_path: Path) -> None:
     assert 3 < len(fallback) < 60
     assert max(m.tick for m in executed if m.source == "command") > max(fallback) + 15
     result = summary(out)
-    events = [e["what"].partition(": ")[2] for e in result["events"] if e["what"].startswith("chaser/0")]
+    events = [
+        e["what"].partition(": ")[2] for e in result["events"] if e["what"].startswith("chaser/0")
+    ]
     assert [e for e in events if e.startswith("no command for")]
     assert [e for e in events if e.startswith("fallback: plan")]
     assert [e for e in events if e.startswith("fallback ends")]
-    # No stale command was executed: when a command was passed on, the newest odometry sent was at most 0.5 s (a command's
-    # lifetime) and 0.5 s (transport) later. Whether the resumed controller sends stale commands depends on load;
-    # tests/agents/test_command_gate.py tests their rejection.
+    # No stale command was executed: when a command was passed on, the newest odometry sent was at
+    # most 0.5 s (a command's lifetime) and 0.5 s (transport) later. Whether the resumed controller
+    # sends stale commands depends on load; tests/agents/test_command_gate.py tests their rejection.
     known = [
         (r.sent_ns, r.message.sim_time_ns)
         for r in read_log(out / "mission.mcap", ["world/chaser/0/odometry"])
@@ -315,10 +351,13 @@ def test_frozen_chaser_that_was_replaced_ends_when_it_wakes(tmp_path: Path) -> N
         assert hand.output_of("recorder")[0] == 0
     finally:
         hand.end()
-    instances = [r.message.instance for r in read_log(tmp_path / "mission.mcap", ["chaser/0/actuators"])]
+    instances = [
+        r.message.instance for r in read_log(tmp_path / "mission.mcap", ["chaser/0/actuators"])
+    ]
     first, last = instances[0], instances[-1]
     assert first != last
-    # What it sends before it reads of its successor, the world rejects (tests/world/test_tick_barrier.py).
+    # What it sends before it reads of its successor, the world rejects
+    # (tests/world/test_tick_barrier.py).
     assert instances[instances.index(last) :].count(first) <= 2
 
 
@@ -385,7 +424,9 @@ def test_process_that_hangs_before_the_first_tick_ends_run(
 ) -> None:
     start = launcher.Fleet.start
 
-    def start_suspended(self: launcher.Fleet, name: str, arguments: list[str], folder: Path) -> None:
+    def start_suspended(
+        self: launcher.Fleet, name: str, arguments: list[str], folder: Path
+    ) -> None:
         start(self, name, arguments, folder)
         if name == "chaser/1":
             self.children[-1].process.send_signal(signal.SIGSTOP)

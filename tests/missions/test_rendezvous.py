@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendezvous from far range: the estimate that passive safety needs, and the last leg to the verified latch."""
+"""Rendezvous from far range: the estimate that passive safety needs, and the last leg to the
+verified latch.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ def test_last_leg_starts_at_the_last_hold_point() -> None:
 
 
 def test_relative_velocity_at_200_m_is_known_well_enough_for_a_passively_safe_move() -> None:
-    """After 20 s: the errors agree with their covariance, and the move to the first hold point is not refused."""
+    """After 20 s: the errors agree with their covariance, and the move to the first hold point is
+    not refused.
+    """
     scenario = load_shipped("v-bar", "duration_s=40.0", "timeline=[]")
     with InProcessMission(scenario, RenderedImages(scenario)) as flight:
         record = flight.step()
@@ -56,7 +60,9 @@ def test_last_leg_of_v_bar_ends_with_a_verified_latch_and_a_hand_over_without_a_
 
 def test_target_at_a_kilometre_is_not_lost_by_the_error_of_the_mounting() -> None:
     """At 985 m the mounting of the camera (0.05 degrees) makes the position uncertain by 0.9 m."""
-    scenario = load_shipped("arch-comp-rendezvous", "duration_s=5.0", "timeline=[]", "settling_s=0.0")
+    scenario = load_shipped(
+        "arch-comp-rendezvous", "duration_s=5.0", "timeline=[]", "settling_s=0.0"
+    )
     with InProcessMission(scenario, RenderedImages(scenario)) as flight:
         while flight.tick < scenario.ticks:
             record = flight.step()

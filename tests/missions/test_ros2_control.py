@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node of ROS 2 in place of the controller: odometry in, wrenches out, in real time, both by zenoh-ros2-sdk."""
+"""A node of ROS 2 in place of the controller: odometry in, wrenches out, in real time, both by
+zenoh-ros2-sdk.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def xyz(v: Any) -> np.ndarray[Any, Any]:
 
 @pytest.mark.slow
 def test_node_of_ros_flies_a_chaser_to_a_point(tmp_path: Path) -> None:
-    """A PD law for 0.2 m along WRF's x from the start, at rest and without rotation; judged by the true state."""
+    """A PD law for 0.2 m along WRF's x from the start, at rest and without rotation; judged by the
+    true state.
+    """
     body = load_scenario(SCENARIO).chaser
     hand, ros_port, flown = ByHand.at_free_port("ros-control"), free_port(), tmp_path / "run"
     ros = f"tcp/127.0.0.1:{ros_port}"

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each shipped scenario, shortened: `chaserdock simulate` flies it as separate processes over Zenoh do, bit for bit."""
+"""Each shipped scenario, shortened: `chaserdock simulate` flies it as separate processes over Zenoh
+do, bit for bit.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,11 @@ def shortened(name: str) -> tuple[str, ...]:
     overrides = (f"duration_s={TICKS / scenario.time.rate_hz}", "settling_s=0.0", "timeline=[]")
     # A criterion of commands that are not given.
     overrides += ("success.reached=[]",) if scenario.success.reached else ()
-    small = () if scenario.camera.intrinsics is not None else ("camera.width_px=320", "camera.height_px=240")
+    small = (
+        ()
+        if scenario.camera.intrinsics is not None
+        else ("camera.width_px=320", "camera.height_px=240")
+    )
     return (*overrides, *small)
 
 
@@ -33,7 +39,9 @@ def test_scenarios_flown_elsewhere_are_shipped_and_compared_there() -> None:
     assert FLOWN_ELSEWHERE.keys() <= set(NAMES)
     for files in FLOWN_ELSEWHERE.values():
         for name in files.split(", "):
-            assert "simulated_digest(" in (ROOT / "tests" / "missions" / name).read_text(encoding="utf-8")
+            assert "simulated_digest(" in (ROOT / "tests" / "missions" / name).read_text(
+                encoding="utf-8"
+            )
 
 
 @pytest.mark.slow

@@ -38,7 +38,9 @@ def simulate_elsewhere(out: Path, *overrides: str, env: dict[str, str]) -> None:
         "simulate(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), tuple(sys.argv[3:]))"
     )
     arguments = [str(ROOT / "scenarios" / "fault-drill.toml"), str(out), *overrides]
-    subprocess.run([sys.executable, "-c", code, *arguments], env={**os.environ, **env}, cwd=ROOT, check=True)
+    subprocess.run(
+        [sys.executable, "-c", code, *arguments], env={**os.environ, **env}, cwd=ROOT, check=True
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,7 +82,9 @@ def test_a_seed_repeats_every_byte_for_any_hash_seed(tmp_path: Path) -> None:
     contents = []
     for k in range(2):
         simulate_elsewhere(tmp_path / str(k), *BRIEF, *_HARSH, env={"PYTHONHASHSEED": str(k)})
-        contents.append([(r.key, r.message, r.sent_ns) for r in read_log(tmp_path / str(k) / "mission.mcap")])
+        contents.append(
+            [(r.key, r.message, r.sent_ns) for r in read_log(tmp_path / str(k) / "mission.mcap")]
+        )
     assert len(contents[0]) > 500
     assert contents[0] == contents[1]
 
@@ -89,7 +93,9 @@ def test_a_seed_repeats_every_byte_for_any_hash_seed(tmp_path: Path) -> None:
 def test_chasers_fly_both_controllers_in_the_tick_in_which_the_commander_dies(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It dies after two of its four commands. Those of the standby are the same, so that no body moves otherwise."""
+    """It dies after two of its four commands. Those of the standby are the same, so that no body
+    moves otherwise.
+    """
     networks: list[SimulatedNetwork] = []
     dies_at, sent = 8, 0
 
@@ -137,7 +143,9 @@ def test_four_chasers_dock_along_the_same_paths_on_another_simd_level(tmp_path: 
     """The complete drill: 5 s at a distance, then an approach to the docking distance."""
     for name, env in (("native", {}), ("other", OTHER_SIMD)):
         simulate_elsewhere(tmp_path / name, env=env)
-    native, other = (load_flight(tmp_path / name / "mission.mcap").truth for name in ("native", "other"))
+    native, other = (
+        load_flight(tmp_path / name / "mission.mcap").truth for name in ("native", "other")
+    )
     separations_m = [
         np.linalg.norm(native[body].position_m - track.position_m, axis=1).max()
         for body, track in other.items()

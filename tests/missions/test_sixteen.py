@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario ``sixteen-chasers``: geometry of the formation, convergence without approaches below the limit."""
+"""The scenario ``sixteen-chasers``: geometry of the formation, convergence without approaches below
+the limit.
+"""
 
 from __future__ import annotations
 

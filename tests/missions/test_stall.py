@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No endless waits: a lost message, a process that hangs, a world that dies, and messages of a foreign publisher."""
+"""No endless waits: a lost message, a process that hangs, a world that dies, and messages of a
+foreign publisher.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def end_of(folder: Path) -> MissionEnd:
 
 
 def test_process_that_hangs_ends_the_mission_with_its_name(tmp_path: Path) -> None:
-    flight = simulated(tmp_path, "fault=[{kind='freeze',at_s=2.0,duration_s=900.0,process='chaser/1'}]")
+    flight = simulated(
+        tmp_path, "fault=[{kind='freeze',at_s=2.0,duration_s=900.0,process='chaser/1'}]"
+    )
     end = end_of(tmp_path)
     assert not end.complete
     assert end.reason.startswith("stalled: no progress for 60 s in tick 20: ")
@@ -83,7 +87,9 @@ def test_message_lost_in_lockstep_ends_the_mission_with_who_owes_what(
         made = new_queue(self)
         if self.name == "controller":
             put = made.put
-            monkeypatch.setattr(made, "put", lambda item, size: not is_lost(item) and put(item, size))
+            monkeypatch.setattr(
+                made, "put", lambda item, size: not is_lost(item) and put(item, size)
+            )
         return made
 
     monkeypatch.setattr(SimulatedHost, "new_queue", overflowing_queue)
@@ -114,12 +120,16 @@ def test_processes_notice_that_the_world_has_died_and_the_log_is_whole(
     assert ticks[-1] == 19
 
 
-def test_processes_notice_that_the_world_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_notice_that_the_world_hangs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def hang(self: World, tick: int) -> None:
         if tick == 20:
             self._node.host.sleep(900.0)
 
-    monkeypatch.setattr(World, "_open_tick", lambda self, tick: (hang(self, tick), open_tick(self, tick)))
+    monkeypatch.setattr(
+        World, "_open_tick", lambda self, tick: (hang(self, tick), open_tick(self, tick))
+    )
     flight = simulated(tmp_path, "duration_s=20.0")
     assert flight.stalled == ("world",)
     assert set(flight.statuses.values()) == {1}
@@ -127,7 +137,9 @@ def test_processes_notice_that_the_world_hangs(tmp_path: Path, monkeypatch: pyte
 
 @contextmanager
 def world_and_intruder(endpoint: str) -> Iterator[tuple[Node, Node]]:
-    """Open a node that replies as the world does, and another one that may publish on the world's keys."""
+    """Open a node that replies as the world does, and another one that may publish on the world's
+    keys.
+    """
     world, intruder = (Node("world", "world", Link("forged", (endpoint,))) for _ in range(2))
     try:
         mission = Membership(1, "forged", "lockstep", "{}", source=world.source)
@@ -156,7 +168,9 @@ FORGED = MissionEnd(reason="forged end", complete=False)
 def test_run_ignores_a_forged_end_and_names_its_publisher() -> None:
     hub, endpoint = open_hub("forged", 600_000)
     lines: list[JsonLine] = []
-    reporter = ProgressReporter(load_scenario(ROOT / "scenarios" / "single.toml"), Show.json, lines.append)
+    reporter = ProgressReporter(
+        load_scenario(ROOT / "scenarios" / "single.toml"), Show.json, lines.append
+    )
     with world_and_intruder(endpoint) as (world, intruder), ThreadPoolExecutor(1) as thread:
         try:
             failure = thread.submit(watch, Fleet(), hub, reporter, never, 60.0)
@@ -239,7 +253,11 @@ def test_foreign_messages_are_ignored_and_their_publisher_is_named(tmp_path: Pat
             status, output = by_hand.output_of(name)
             assert status == 0, f"{name}: {output}"
             if name != "world":
-                own = "operator: foreign publisher " if name == "judge" else f"{name}: foreign publisher: "
+                own = (
+                    "operator: foreign publisher "
+                    if name == "judge"
+                    else f"{name}: foreign publisher: "
+                )
                 assert f"{own}session {intruder} publishes on world/tick" in output
     finally:
         by_hand.end()

@@ -39,7 +39,9 @@ def truth_of(flight: RecordedFlight) -> dict[str, Any]:
 
 
 def check_leases(log: Path) -> None:
-    """Assert that each chaser executed only commands of the controller that it stated to hold its lease."""
+    """Assert that each chaser executed only commands of the controller that it stated to hold its
+    lease.
+    """
     holders: dict[tuple[int, int], set[str]] = {}
     executed: dict[tuple[int, int], set[str]] = {}
     for record in read_log(log):
@@ -47,7 +49,9 @@ def check_leases(log: Path) -> None:
         if isinstance(message, Lease):
             holders.setdefault((message.tick, message.chaser), set()).add(message.holder)
         elif isinstance(message, ActuatorCommand) and message.source == "command":
-            executed.setdefault((message.tick, message.chaser), set()).add(commander_of(message.term))
+            executed.setdefault((message.tick, message.chaser), set()).add(
+                commander_of(message.term)
+            )
     assert executed
     for at, commanders in executed.items():
         assert len(commanders) == 1, (at, commanders)
@@ -83,11 +87,15 @@ def test_takeover_from_killed_controller_leaves_trajectories_unchanged(
     assert replay(tmp_path / "killed" / "mission.mcap", "controller").equal
     overrides = (*WITH_STANDBY, f"fault=[{{{KILLED}}}]")
     assert simulated_digest(DRILL[0], tmp_path / "simulated", *overrides) == result["digest"]
-    assert not [e for e in killed.events if e.what.startswith(("fallback", "no command", "command refused"))]
+    assert not [
+        e for e in killed.events if e.what.startswith(("fallback", "no command", "command refused"))
+    ]
 
 
 def test_standby_keeps_leadership_after_controller_reconnects(tmp_path: Path) -> None:
-    status, cut, result = fly(tmp_path / "cut", 'kind="cut", at_s=1.5, duration_s=1.0, process="controller"')
+    status, cut, result = fly(
+        tmp_path / "cut", 'kind="cut", at_s=1.5, duration_s=1.0, process="controller"'
+    )
     assert status == 0, result["failures"]
     log = tmp_path / "cut" / "mission.mcap"
     takeovers = [e for e in cut.events if e.what == "hand-over"]
@@ -111,7 +119,9 @@ def test_resumed_controller_does_not_regain_leadership(tmp_path: Path) -> None:
     log = out / "mission.mcap"
     for i in range(4):
         terms = [
-            r.message.term for r in read_log(log, [f"chaser/{i}/actuators"]) if r.message.source == "command"
+            r.message.term
+            for r in read_log(log, [f"chaser/{i}/actuators"])
+            if r.message.source == "command"
         ]
         assert terms == sorted(terms)
         assert terms[-1] >= 2
@@ -135,7 +145,9 @@ def test_restarted_controller_stands_by_and_takes_over_again(tmp_path: Path) -> 
         first.kill()
         first.wait()
         by_hand.start("controller", "controller")
-        wait_for(log, lambda e: e.process == "controller" and e.what == "restored the leader's state")
+        wait_for(
+            log, lambda e: e.process == "controller" and e.what == "restored the leader's state"
+        )
         by_hand.processes["standby"].kill()
         for name in ("world", "controller", "recorder", *(f"chaser/{i}" for i in range(4))):
             status, output = by_hand.output_of(name)
@@ -145,7 +157,9 @@ def test_restarted_controller_stands_by_and_takes_over_again(tmp_path: Path) -> 
     assert commanders(log) == ["controller", "standby", "controller"]
     assert max(r.message.term for r in read_log(log, ["chaser/0/actuators"])) == 3
     flight = load_flight(log)
-    assert not [e for e in flight.events if e.what.startswith(("takes over without any state", "fallback"))]
+    assert not [
+        e for e in flight.events if e.what.startswith(("takes over without any state", "fallback"))
+    ]
     phases = [e.what for e in flight.events if "from" in e.what]
     assert len(phases) == 4  # once per chaser: no controller restarted from the initial phase
     assert flight.world.contacts == 0

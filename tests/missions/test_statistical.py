@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The perception ``statistical`` measures as the default perception does on rendered images of the same poses."""
+"""The perception ``statistical`` measures as the default perception does on rendered images of the
+same poses.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ RANGE_M = (0.4, 1.5)
 
 @dataclass
 class Measured:
-    """Of the images in which a perception measured a pose: errors, normalized squared errors, stated sigmas, markers."""
+    """Of the images in which a perception measured a pose: errors, normalized squared errors,
+    stated sigmas, markers.
+    """
 
     seen: list[bool] = field(default_factory=list)
     position_m: list[float] = field(default_factory=list)
@@ -41,7 +45,9 @@ def drawn_states(rng: np.random.Generator) -> States:
     """A target at any attitude before the camera of chaser 0."""
     zero, distance_m = np.zeros(3), rng.uniform(*RANGE_M)
     aside = rng.normal(size=2) * 0.08 * distance_m
-    target = BodyState(np.array([distance_m, *aside]), zero, rotations.exp(2.0 * rng.normal(size=3)), zero)
+    target = BodyState(
+        np.array([distance_m, *aside]), zero, rotations.exp(2.0 * rng.normal(size=3)), zero
+    )
     return {
         "chaser/0": BodyState(zero, zero, rotations.exp(0.03 * rng.normal(size=3)), zero),
         "target": target,
@@ -82,7 +88,9 @@ def both() -> tuple[Measured, Measured]:
     return measured
 
 
-def test_statistical_perception_sees_the_target_where_images_show_it(both: tuple[Measured, Measured]) -> None:
+def test_statistical_perception_sees_the_target_where_images_show_it(
+    both: tuple[Measured, Measured],
+) -> None:
     images, statistical = both
     assert np.mean(np.array(images.seen) == statistical.seen) > 0.96
     assert np.mean(statistical.markers) == pytest.approx(np.mean(images.markers), rel=0.15)

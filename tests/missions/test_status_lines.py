@@ -23,7 +23,9 @@ def test_every_member_prints_start_takeover_and_end(tmp_path: Path) -> None:
     for member in ("controller", "standby", "chaser/0", "recorder"):
         assert any(line.startswith(f"{member}: joined mission ") for line in lines), flight.output
     assert any(line.startswith("world: single, lockstep: waiting for") for line in lines)
-    (takeover,) = (line for line in lines if line.startswith("standby: ") and "commands in term" in line)
+    (takeover,) = (
+        line for line in lines if line.startswith("standby: ") and "commands in term" in line
+    )
     assert takeover.endswith(" s: commands in term 2")
     for member in ("standby", "chaser/0", "recorder"):
         assert lines.count(f"{member}: ended with status 0") == 1

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario ``swap`` with perfect state: pairs on head-on courses pass each other around the tumbling target."""
+"""The scenario ``swap`` with perfect state: pairs on head-on courses pass each other around the
+tumbling target.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         flight.guidance.machine.set_pending_goals(due)
         assert all(flight.guidance.machine.command(c, now_s).accepted for c in due)
         p, q = (a[0] for a in predict_target(at, velocity, [1.0, 0, 0, 0], omega, [now_s]))
-        exact = TargetState(round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ())
+        exact = TargetState(
+            round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ()
+        )
         ids = tuple(range(n))
         horizon = flight.guidance.references.horizon(ids, exact, target_body(scenario), frozenset())
         limits = dict.fromkeys(ids, nmpc_parameters(scenario).input_limits())
@@ -70,7 +74,9 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     return least, nearest, float(np.linalg.norm(states[:, :3] - ends, axis=-1).max())
 
 
-@pytest.mark.parametrize("seed", [0, 1, *[pytest.param(s, marks=pytest.mark.slow) for s in range(2, 10)]])
+@pytest.mark.parametrize(
+    "seed", [0, 1, *[pytest.param(s, marks=pytest.mark.slow) for s in range(2, 10)]]
+)
 def test_pairs_pass_each_other(seed: int) -> None:
     least, nearest, off = fly_swap(seed)
     assert least > 0.35

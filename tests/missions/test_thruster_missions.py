@@ -19,7 +19,9 @@ STUCK = (
 
 @pytest.fixture(scope="module")
 def stuck_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fly a chaser of which one thruster sticks on without a report, and of which an operator isolates another."""
+    """Fly a chaser of which one thruster sticks on without a report, and of which an operator
+    isolates another.
+    """
     out = tmp_path_factory.mktemp("thrusters") / "run"
     status, output = run("thruster-failure", out, *STUCK)
     assert status == 0, output
@@ -54,7 +56,8 @@ def test_log_contains_valve_commands_and_force_limits(stuck_flight: Path) -> Non
     assert [r.tick for r in reports] == list(range(len(reports)))
     assert reports[-1].thrusters[5] == "stuck_on"
     assert max(reports[-1].force_max_N) < max(reports[0].force_max_N)
-    # Thruster 5 fires at full thrust from its failure until its valve is closed, and not afterwards.
+    # Thruster 5 fires at full thrust from its failure until its valve is closed, and not
+    # afterwards.
     impulse_N_s = sum(m.thruster_impulse_N_s[5] for m in truths if m.sim_time_ns > 3.0e9)
     first = next(m.effective_time_ns for m in commands if m.isolated) / 1e9
     assert impulse_N_s == pytest.approx(1.5 * (first - 3.02), abs=1.5 * 0.012)

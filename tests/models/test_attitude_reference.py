@@ -11,7 +11,9 @@ from chaserdock_models.rotations import to_matrix
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("nominal", [(1.0, 0.0, 0.0), (0.0, 0.0, -2.0), (0.6, -0.3, 0.5), (0.1, 0.2, 1.5)])
+@pytest.mark.parametrize(
+    "nominal", [(1.0, 0.0, 0.0), (0.0, 0.0, -2.0), (0.6, -0.3, 0.5), (0.1, 0.2, 1.5)]
+)
 def test_attitude_turns_the_nominal_direction_to_that_of_the_offset(
     nominal: tuple[float, float, float],
 ) -> None:
@@ -24,4 +26,6 @@ def test_attitude_turns_the_nominal_direction_to_that_of_the_offset(
 
 def test_attitude_at_the_centre_is_the_nominal_one() -> None:
     q = np.array([0.5, 0.5, -0.5, 0.5])
-    np.testing.assert_allclose(facing_attitudes((1.0, 0.0, 0.0), q, [(0.0, 0.0, 0.0)])[0], q, atol=1e-12)
+    np.testing.assert_allclose(
+        facing_attitudes((1.0, 0.0, 0.0), q, [(0.0, 0.0, 0.0)])[0], q, atol=1e-12
+    )

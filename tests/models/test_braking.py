@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The braking wrench: opposes the motion, in body axes, within the limits of force and torque per axis."""
+"""The braking wrench: opposes the motion, in body axes, within the limits of force and torque per
+axis.
+"""
 
 from __future__ import annotations
 

@@ -40,7 +40,9 @@ def test_camera_pose_follows_the_chaser():
 def test_distortion_is_opencvs():
     camera = Camera.from_hfov(1280, 720, np.pi / 3.0, distortion=DISTORTION)
     points = np.random.default_rng(1).uniform([-0.4, -0.25, 0.8], [0.4, 0.25, 1.5], (200, 3))
-    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix(), np.array(DISTORTION))
+    expected, _ = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), camera.matrix(), np.array(DISTORTION)
+    )
     assert np.abs(camera.project(points) - np.reshape(expected, (-1, 2))).max() < 1e-9
 
 
@@ -63,7 +65,14 @@ def test_points_behind_the_camera_have_no_pixel():
     [{"width_px": 0}, {"fx_px": 0.0}, {"fy_px": float("nan")}, {"distortion": (0.1,)}],
 )
 def test_bad_cameras_are_refused(change):
-    values = {"width_px": 4, "height_px": 3, "fx_px": 1.0, "fy_px": 1.0, "cx_px": 0.0, "cy_px": 0.0} | change
+    values = {
+        "width_px": 4,
+        "height_px": 3,
+        "fx_px": 1.0,
+        "fy_px": 1.0,
+        "cx_px": 0.0,
+        "cy_px": 0.0,
+    } | change
     with pytest.raises(ValueError):  # noqa: PT011
         Camera(**values)
 

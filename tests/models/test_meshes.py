@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes and shipped satellites: closed surfaces, mass properties, geometry errors, boxes around parts."""
+"""Meshes and shipped satellites: closed surfaces, mass properties, geometry errors, boxes around
+parts.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def test_parts_are_closed_and_counter_clockwise(name: str, tolerance_m: float) -
     assert len(set(mesh.part_names)) == len(mesh.parts)
     assert {p.joint for p in mesh.parts if p.joint} == set(mesh.joints)
     soup = triangle_soup(mesh)
-    flat = np.cross(soup.corners_m[:, 1] - soup.corners_m[:, 0], soup.corners_m[:, 2] - soup.corners_m[:, 0])
+    flat = np.cross(
+        soup.corners_m[:, 1] - soup.corners_m[:, 0], soup.corners_m[:, 2] - soup.corners_m[:, 0]
+    )
     assert np.linalg.norm(flat, axis=1).min() > 0.0
     np.testing.assert_allclose(np.linalg.norm(soup.normals, axis=2), 1.0, atol=1e-12)
     assert np.einsum("ijk,ik->ij", soup.normals, flat).min() > 0.0
@@ -44,7 +48,12 @@ def test_hole_is_counted() -> None:
     assert open_edges(MeshPart("b", GREY, part.vertices_m, part.triangles[1:])) == 3
     assert (
         open_edges(
-            MeshPart("b", GREY, part.vertices_m, np.vstack([part.triangles[1:], part.triangles[:1, ::-1]]))
+            MeshPart(
+                "b",
+                GREY,
+                part.vertices_m,
+                np.vstack([part.triangles[1:], part.triangles[:1, ::-1]]),
+            )
         )
         == 6
     )
@@ -52,7 +61,9 @@ def test_hole_is_counted() -> None:
 
 def test_facets_stay_within_the_tolerance() -> None:
     for tolerance in (2e-4, 1e-3):
-        part = lathe("c", GREY, ((0, 0), (0.13, 0), (0.13, 0.1), (0, 0.1)), (0, 0, 0), (0, 0, 1), tolerance)
+        part = lathe(
+            "c", GREY, ((0, 0), (0.13, 0), (0.13, 0.1), (0, 0.1)), (0, 0, 0), (0, 0, 1), tolerance
+        )
         middles = part.vertices_m[part.triangles[:, :2]].mean(axis=1)[:, :2]
         radii = np.linalg.norm(middles, axis=1)
         assert 0.13 - tolerance <= radii[radii > 0.1].min() < 0.13 - 0.5 * tolerance
@@ -86,7 +97,9 @@ def test_mass_properties_of_a_displaced_cuboid_and_a_cylinder() -> None:
 def test_denser_parts_attract_the_centre_of_mass() -> None:
     heavy = Material("heavy", relative_density=3.0)
     parts = (box("a", GREY, (1, 1, 1), (0, 0, 0)), box("b", heavy, (1, 1, 1), (2, 0, 0)))
-    np.testing.assert_allclose(mass_properties(TriangleMesh("m", parts, {}), 1.0)[0], (1.5, 0, 0), atol=1e-9)
+    np.testing.assert_allclose(
+        mass_properties(TriangleMesh("m", parts, {}), 1.0)[0], (1.5, 0, 0), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", ["geo_servicer", "cubesat_12u"])
@@ -128,7 +141,9 @@ def test_parts_are_left_out_by_name() -> None:
 def test_boxes_enclose_their_parts_tightly() -> None:
     for part in satellite("geo_servicer").parts:
         around = box_around(part)
-        local = rotations.rotate_inverse(around.q_wxyz, part.vertices_m - np.array(around.position_m))
+        local = rotations.rotate_inverse(
+            around.q_wxyz, part.vertices_m - np.array(around.position_m)
+        )
         half = np.array(around.size_m) / 2.0
         np.testing.assert_allclose(local.max(axis=0), half, atol=1e-6)
         np.testing.assert_allclose(local.min(axis=0), -half, atol=1e-6)
@@ -147,7 +162,9 @@ def test_satellite_is_a_target_without_markers() -> None:
 def test_moved_scales_then_displaces() -> None:
     mesh = moved(satellite("chaser_body"), np.array([0.0, 0.0, 1.0]), np.array([2.0, 1.0, 1.0]))
     low, high = mesh.bounds_m()
-    np.testing.assert_allclose([low, high], [[-0.25, -0.125, 0.975], [0.25, 0.125, 1.025]], atol=1e-9)
+    np.testing.assert_allclose(
+        [low, high], [[-0.25, -0.125, 0.975], [0.25, 0.125, 1.025]], atol=1e-9
+    )
 
 
 def test_unknown_satellite_is_an_error() -> None:

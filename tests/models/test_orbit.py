@@ -54,7 +54,9 @@ SPEEDS = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 
 
 @given(ELEMENTS)
-def test_state_has_energy_momentum_and_eccentricity_of_its_elements(elements: OrbitalElements) -> None:
+def test_state_has_energy_momentum_and_eccentricity_of_its_elements(
+    elements: OrbitalElements,
+) -> None:
     state = state_of(elements)
     r, v, mu = state.position_m, state.velocity_m_s, EARTH_MU_M3_S2
     energy = v @ v / 2.0 - mu / np.linalg.norm(r)
@@ -79,7 +81,8 @@ def test_kepler_orbit_closes_after_its_period() -> None:
 
 
 def test_j2_turns_the_node_at_the_secular_rate() -> None:
-    # Vallado, equation 9-38: -3/2 J2 (R / p)^2 n cos i. Osculating and mean elements differ by a share of J2.
+    # Vallado, equation 9-38: -3/2 J2 (R / p)^2 n cos i. Osculating and mean elements differ by a
+    # share of J2.
     elements = OrbitalElements(7.0e6, 0.0, 0.9)
     end = propagate(state_of(elements), 3 * elements.period_s)
     momentum = np.cross(end.position_m, end.velocity_m_s)
@@ -138,7 +141,9 @@ def test_relative_motion_is_the_difference_of_two_orbits(
 
 @given(st.floats(1e-4, 1.5e-3), st.floats(-12000.0, 12000.0))
 def test_cw_transition_is_the_exponential_of_its_matrix(n: float, time_s: float) -> None:
-    scale = np.repeat([1.0, n], 3)  # positions in m, velocities in m/s over n: all entries of order one
+    scale = np.repeat(
+        [1.0, n], 3
+    )  # positions in m, velocities in m/s over n: all entries of order one
     phi = cw_transition(n, time_s) * scale / scale[:, None]
     expected = expm(cw_matrix(n) * time_s * scale / scale[:, None])
     assert phi == pytest.approx(expected, abs=1e-9)
@@ -151,11 +156,14 @@ def test_cw_transition_without_rate_is_free_motion_and_its_limit() -> None:
 
 
 def test_numerical_relative_motion_agrees_with_clohessy_wiltshire() -> None:
-    # On a circular orbit without J2 both hold up to terms of (distance / radius)^2: at 0.1 m, below 1e-9 m.
+    # On a circular orbit without J2 both hold up to terms of (distance / radius)^2: at 0.1 m, below
+    # 1e-9 m.
     elements = OrbitalElements(6.8e6, 0.0, 0.9)
     n, start = elements.mean_motion_rad_s, np.array([0.02, -0.01, 0.015])
     speed = np.array([1e-5, -2 * n * 0.02, 1e-5])
-    position, velocity = propagate_relative(state_of(elements), start, speed, elements.period_s, j2=0.0)
+    position, velocity = propagate_relative(
+        state_of(elements), start, speed, elements.period_s, j2=0.0
+    )
     expected = cw_transition(n, elements.period_s) @ np.concatenate([start, speed])
     assert position == pytest.approx(expected[:3], abs=1e-9)
     assert velocity == pytest.approx(expected[3:], abs=1e-12)
@@ -178,13 +186,22 @@ def test_relative_motion_agrees_with_basilisk() -> None:
             continue
         elements = OrbitalElements(**case["elements"])
         position, _ = propagate_relative(
-            state_of(elements), case["position_m"], case["velocity_m_s"], case["duration_s"], case["j2"]
+            state_of(elements),
+            case["position_m"],
+            case["velocity_m_s"],
+            case["duration_s"],
+            case["j2"],
         )
         assert math.dist(position, case["end_position_m"]) < 1e-3, case["name"]
 
 
 def test_rotation_against_hill_frame_is_the_inertial_rotation_seen_from_it() -> None:
-    moments, orbit, dt, steps = (0.2, 0.3, 0.4), state_of(OrbitalElements(6.9e6, 0.01, 0.6)), 2.0, 200
+    moments, orbit, dt, steps = (
+        (0.2, 0.3, 0.4),
+        state_of(OrbitalElements(6.9e6, 0.01, 0.6)),
+        2.0,
+        200,
+    )
     orbits = [orbit]
     for _ in range(2 * steps):
         orbits.append(propagate(orbits[-1], dt / 2))
@@ -193,7 +210,9 @@ def test_rotation_against_hill_frame_is_the_inertial_rotation_seen_from_it() -> 
 
     def derivative(s: np.ndarray, torque: Sequence[float]) -> np.ndarray:
         spin = 0.5 * rotations.multiply(s[:4], np.array([0.0, *s[4:]]))
-        return np.concatenate([spin, (torque - np.cross(s[4:], np.array(moments) * s[4:])) / moments])
+        return np.concatenate(
+            [spin, (torque - np.cross(s[4:], np.array(moments) * s[4:])) / moments]
+        )
 
     def relative(s: np.ndarray, at: int) -> np.ndarray:
         return derivative(s, relative_torque(frames[at], s[:4].tolist(), tuple(s[4:]), moments))
@@ -221,7 +240,8 @@ def test_rotation_against_hill_frame_is_the_inertial_rotation_seen_from_it() -> 
 
 
 def test_gravity_gradient_pulls_the_long_axis_to_the_vertical() -> None:
-    # A rod along x (small moment about x), tilted by a small angle about z: up = (cos, -sin, 0) in body axes.
+    # A rod along x (small moment about x), tilted by a small angle about z: up = (cos, -sin, 0) in
+    # body axes.
     up = (math.cos(0.1), -math.sin(0.1), 0.0)
     torque = gravity_gradient(7e6, up, (0.1, 1.0, 1.0))
     assert torque[2] < 0.0
@@ -259,4 +279,6 @@ def test_drag_opposes_the_motion_through_the_turning_atmosphere() -> None:
     acceleration = drag(state.position_m, state.velocity_m_s, 100.0)
     speed = np.linalg.norm(state.velocity_m_s) - 7.2921159e-5 * (EARTH_RADIUS_M + 4e5)
     assert acceleration @ state.velocity_m_s < 0
-    assert np.linalg.norm(acceleration) == pytest.approx(0.5 * 3.725e-12 * speed**2 / 100.0, rel=1e-6)
+    assert np.linalg.norm(acceleration) == pytest.approx(
+        0.5 * 3.725e-12 * speed**2 / 100.0, rel=1e-6
+    )

@@ -40,7 +40,8 @@ def test_distance_bounds_the_densely_sampled_coast(
     else:
         found = model.certify(state[None], covariance, 0.0)
         index = int(found.time_s / 0.5)
-        # The coast is not faster than 1.2 m/s here: within half a sample it moves by less than 0.3 m.
+        # The coast is not faster than 1.2 m/s here: within half a sample it moves by less than 0.3
+        # m.
         assert found.distance_m <= away[index] + 0.3
         assert found.distance_m >= away[index] - 0.4
 
@@ -49,7 +50,9 @@ def test_hold_in_free_space_is_safe_and_closing_is_not() -> None:
     model = CoastModel(0.0, 600.0)
     hold = model.certify(np.array([[-1.0, 0, 0, 0, 0, 0]]), SMALL, 0.35)
     assert hold.margin_sigmas > 3.0
-    closing = model.certify(np.array([[-1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0.01, 0, 0]]), SMALL, 0.35)
+    closing = model.certify(
+        np.array([[-1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0.01, 0, 0]]), SMALL, 0.35
+    )
     assert closing.margin_sigmas < 0.0
     assert (closing.loss, closing.distance_m) == (1, 0.0)
     assert closing.time_s == pytest.approx(100.0, abs=10.0)
@@ -59,16 +62,23 @@ def test_hold_above_the_target_drifts_back_without_hitting_it_and_hold_on_v_bar_
     model = CoastModel(N, TWO_ORBITS_S)
     along = model.certify(np.array([[0.0, -50.0, 0, 0, 0, 0]]), SMALL, 0.35)
     assert along.distance_m == pytest.approx(50.0, abs=1e-3)
-    # On V-bar a push towards the target (+Y) loops over its origin ahead of schedule: it returns near the target.
-    pushed = model.certify(np.array([[0.0, -10.0, 0, 0, 10.0 * N / (6.0 * math.pi), 0]]), SMALL, 0.35)
+    # On V-bar a push towards the target (+Y) loops over its origin ahead of schedule: it returns
+    # near the target.
+    pushed = model.certify(
+        np.array([[0.0, -10.0, 0, 0, 10.0 * N / (6.0 * math.pi), 0]]), SMALL, 0.35
+    )
     assert pushed.distance_m > 0.35  # this push goes backwards
     hit = model.certify(np.array([[0.0, -10.0, 0, 0, -10.0 * N / (6.0 * math.pi), 0]]), SMALL, 0.35)
     assert hit.margin_sigmas < 0.0
-    assert hit.time_s == pytest.approx(2.0 * math.pi / N, rel=0.02)  # after one orbit, at the target
+    assert hit.time_s == pytest.approx(
+        2.0 * math.pi / N, rel=0.02
+    )  # after one orbit, at the target
 
 
 def test_margin_in_sigmas_is_the_share_of_random_errors_that_enter() -> None:
-    """Nominal coasts two sigmas from the sphere enter it in 2.3 % of random errors: at the end, where the sphere is flat."""
+    """Nominal coasts two sigmas from the sphere enter it in 2.3 % of random errors: at the end,
+    where the sphere is flat.
+    """
     model, generator = CoastModel(0.0, 100.0), np.random.default_rng(3)
     covariance = np.diag([1e-2**2] * 3 + [2e-4**2] * 3)
     state = np.array([-20.0, 0.0, 0.0, 0.1, 0.0, 0.0])

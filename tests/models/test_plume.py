@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plumes of thrusters: the angle to a box is the smallest of all its points, and does not depend on the frame."""
+"""Plumes of thrusters: the angle to a box is the smallest of all its points, and does not depend on
+the frame.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,11 @@ def test_the_angle_is_the_same_in_every_frame(seed: int) -> None:
         ((2.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.0),
         ((0.1, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),  # inside
         ((2.0, 0.0, 0.0), (0.0, 0.0, 1.0), math.atan2(1.5, 0.5)),  # an edge
-        ((2.0, 0.0, 0.0), (1.0, 0.0, 0.0), math.pi - math.atan2(math.hypot(0.5, 0.5), 1.5)),  # behind it
+        (
+            (2.0, 0.0, 0.0),
+            (1.0, 0.0, 0.0),
+            math.pi - math.atan2(math.hypot(0.5, 0.5), 1.5),
+        ),  # behind it
         ((2.0, 0.0, 2.0), (-1.0, 0.0, 0.0), math.atan2(1.5, 2.5)),
     ],
 )
@@ -89,11 +95,15 @@ def test_a_plume_is_opposite_to_the_force() -> None:
 
 
 def test_plate_across_the_whole_cone_takes_up_the_thrust() -> None:
-    """Through any surface that closes the cone flows the whole axial momentum, whatever its distance."""
+    """Through any surface that closes the cone flows the whole axial momentum, whatever its
+    distance.
+    """
     flux = PlumeFlux(math.radians(40.0), 5.0)
     for distance in (0.5, 2.0):
         plate = panels_of([Box((0.01, 4.0, 4.0), (distance + 0.005, 0.0, 0.0))], parts=160)
-        wrench = plume_wrench(flux, plate, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]), np.array([0.7]), 10.0)
+        wrench = plume_wrench(
+            flux, plate, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]), np.array([0.7]), 10.0
+        )
         assert wrench[0] == pytest.approx(0.7, rel=5e-3)
         np.testing.assert_allclose(wrench[1:], 0.0, atol=1e-9)
 
@@ -125,7 +135,12 @@ def test_plume_wrench_turns_with_the_bodies(seed: int) -> None:
     thrust, reach_m = np.array([1.0]), 20.0
     plain = plume_wrench(flux, panels, nozzle[None], axis[None], thrust, reach_m)
     other = plume_wrench(
-        flux, turned, rotations.rotate(q, nozzle)[None], rotations.rotate(q, axis)[None], thrust, reach_m
+        flux,
+        turned,
+        rotations.rotate(q, nozzle)[None],
+        rotations.rotate(q, axis)[None],
+        thrust,
+        reach_m,
     )
     np.testing.assert_allclose(rotations.rotate(q, plain[:3]), other[:3], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(rotations.rotate(q, plain[3:]), other[3:], rtol=1e-7, atol=1e-9)

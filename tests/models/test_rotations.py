@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations: the group's axioms, the two ways of writing it, and the conventions (Hamilton, body to world)."""
+"""Rotations: the group's axioms, the two ways of writing it, and the conventions (Hamilton, body to
+world).
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,7 @@ def same_rotation(a: Array, b: Array, atol: float = 1e-13) -> None:
     close(a if a @ b > 0 else -a, b, atol)
 
 
-# -- the group --------------------------------------------------------------------------------------------
+# -- the group -------------------------------------------------------------------------------------
 
 
 @given(quaternions, quaternions, quaternions)
@@ -85,7 +87,7 @@ def test_quarter_turn_about_z_takes_body_x_to_world_y() -> None:
     close(rotations.rotate_inverse(q, [0.0, 1.0, 0.0]), [1.0, 0.0, 0.0], 1e-15)
 
 
-# -- the action on vectors --------------------------------------------------------------------------------
+# -- the action on vectors -------------------------------------------------------------------------
 
 
 @given(quaternions, quaternions, vectors)
@@ -122,7 +124,7 @@ def test_both_signs_are_the_same_rotation(q: Array, v: Array) -> None:
     assert rotations.angle_between(q, -q) < 1e-7
 
 
-# -- matrices ---------------------------------------------------------------------------------------------
+# -- matrices --------------------------------------------------------------------------------------
 
 
 @given(quaternions, quaternions, vectors)
@@ -168,7 +170,7 @@ def test_matrix_round_trip_at_every_pivot(q: tuple[float, ...]) -> None:
     same_rotation(back, unit, 1e-15)
 
 
-# -- exponential and logarithm ----------------------------------------------------------------------------
+# -- exponential and logarithm ---------------------------------------------------------------------
 
 
 @given(rotation_vectors())
@@ -188,7 +190,9 @@ def test_log_of_small_rotations_keeps_its_relative_accuracy(phi: Array) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("q", [(0.0, 0.6, -0.8, 0.0), (-0.0, 0.0, 0.0, 1.0), (1.0, 0, 0, 0), (-1.0, 0, 0, 0)])
+@pytest.mark.parametrize(
+    "q", [(0.0, 0.6, -0.8, 0.0), (-0.0, 0.0, 0.0, 1.0), (1.0, 0, 0, 0), (-1.0, 0, 0, 0)]
+)
 def test_log_at_half_a_turn_and_at_none(q: tuple[float, ...]) -> None:
     phi = rotations.log(q)
     close(np.linalg.norm(phi), np.pi if q[0] == 0.0 else 0.0, 1e-15)
@@ -228,7 +232,7 @@ def test_matrix_of_exp_is_the_matrix_exponential(phi: Array) -> None:
     close(rotations.to_matrix(rotations.exp(phi)), series, 1e-14)
 
 
-# -- angles -----------------------------------------------------------------------------------------------
+# -- angles ----------------------------------------------------------------------------------------
 
 
 @given(quaternions, rotation_vectors())
@@ -250,7 +254,7 @@ def test_angle_between_is_a_metric(a: Array, b: Array, c: Array) -> None:
     assert abs(left - ab) < 1e-13
 
 
-# -- integration ------------------------------------------------------------------------------------------
+# -- integration -----------------------------------------------------------------------------------
 
 
 @given(quaternions, vectors, st.floats(0.0, 2.0))
@@ -280,7 +284,7 @@ def test_integrate_is_a_one_parameter_group(q: Array, omega: Array, s: float, t:
     close(rotations.integrate(q, omega, 0.0), q, 0)
 
 
-# -- vectors, arrays, errors ------------------------------------------------------------------------------
+# -- vectors, arrays, errors -----------------------------------------------------------------------
 
 
 @given(vectors, vectors)
@@ -299,7 +303,9 @@ def test_arrays_give_bit_for_bit_what_single_ones_give(shape: tuple[int, ...]) -
     for place in np.ndindex(shape):
         close(rotations.multiply(a, b)[place], rotations.multiply(a[place], b[place]), 0)
         close(rotations.rotate(a, v)[place], rotations.rotate(a[place], v[place]), 0)
-        close(rotations.rotate_inverse(a, v)[place], rotations.rotate_inverse(a[place], v[place]), 0)
+        close(
+            rotations.rotate_inverse(a, v)[place], rotations.rotate_inverse(a[place], v[place]), 0
+        )
         close(rotations.to_matrix(a)[place], rotations.to_matrix(a[place]), 0)
         close(rotations.cross(v, a[..., 1:])[place], rotations.cross(v[place], a[place][1:]), 0)
         close(rotations.skew(v)[place], rotations.skew(v[place]), 0)

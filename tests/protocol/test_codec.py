@@ -89,7 +89,7 @@ def test_plain_msgpack_reads_and_writes_the_same(sample: msgspec.Struct) -> None
     assert codec.decode(type(sample), repacked(values)) == sample
 
 
-# -- what must not pass -----------------------------------------------------------------------------------
+# -- what must not pass ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sample", SAMPLES, ids=named)
@@ -134,7 +134,9 @@ def test_no_bytes_raise_anything_but_rejected(payload: bytes, kind: type[msgspec
 
 @given(st.sampled_from(SAMPLES), st.data())
 @quick
-def test_flipped_bytes_raise_nothing_but_rejected(sample: msgspec.Struct, data: st.DataObject) -> None:
+def test_flipped_bytes_raise_nothing_but_rejected(
+    sample: msgspec.Struct, data: st.DataObject
+) -> None:
     payload = bytearray(codec.encode(sample))
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
@@ -146,7 +148,11 @@ def places_of_floats(values: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any,
     if isinstance(values, float):
         return [path]
     items = (
-        values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
+        values.items()
+        if isinstance(values, dict)
+        else enumerate(values)
+        if isinstance(values, list)
+        else ()
     )
     return [place for key, value in items for place in places_of_floats(value, (*path, key))]
 
@@ -184,7 +190,12 @@ def test_every_quaternion_must_be_of_unit_length() -> None:
             if "q_wxyz" not in owner:
                 continue
             seen += 1
-            for bad in ([0.0] * 4, [1.0, 0.0, 0.0, 0.01], [1e10, 1e10, 0.0, 0.0], [0.5, 0.5, 0.5, 0.50001]):
+            for bad in (
+                [0.0] * 4,
+                [1.0, 0.0, 0.0, 0.01],
+                [1e10, 1e10, 0.0, 0.0],
+                [0.5, 0.5, 0.5, 0.50001],
+            ):
                 owner["q_wxyz"] = bad
                 assert rejection(type(sample), repacked(values)).reason == "not_unit_quaternion"
             owner["q_wxyz"] = [0.5, 0.5, 0.5, 0.5 + 1e-8]  # rounding passes
@@ -230,7 +241,9 @@ def test_every_quaternion_must_be_of_unit_length() -> None:
         (m.JoinReply, "mode", "fast"),
     ],
 )
-def test_wrong_types_shapes_and_ranges_are_rejected(kind: type[msgspec.Struct], field: str, bad: Any) -> None:
+def test_wrong_types_shapes_and_ranges_are_rejected(
+    kind: type[msgspec.Struct], field: str, bad: Any
+) -> None:
     values = plain(BY_TYPE[kind])
     assert field in values
     assert rejection(kind, repacked(values | {field: bad})).reason == "format"
@@ -271,7 +284,7 @@ def test_oversize_is_rejected_before_it_is_opened() -> None:
     assert codec.decode(m.Image, codec.encode(biggest)) == biggest
 
 
-# -- growing ----------------------------------------------------------------------------------------------
+# -- growing ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sample", SAMPLES, ids=named)
@@ -324,7 +337,9 @@ BAD = [math.nan, math.inf, -math.inf, 1e15, 1.1e15, -1e16, 1.7e308, -1.0, 0.0, 1
 
 
 def with_number(message: msgspec.Struct, at: int, value: float) -> tuple[msgspec.Struct, int]:
-    """The message with its ``at``-th float replaced, as it may be decoded; how many it has left to count."""
+    """The message with its ``at``-th float replaced, as it may be decoded; how many it has left to
+    count.
+    """
     for name in message.__struct_fields__:
         held = getattr(message, name)
         parts = held if isinstance(held, tuple) else (held,)
@@ -342,7 +357,9 @@ def with_number(message: msgspec.Struct, at: int, value: float) -> tuple[msgspec
 
 @pytest.mark.parametrize("kind", list(BY_TYPE), ids=lambda kind: kind.__name__)
 def test_fast_check_agrees_with_detailed_check(kind: type[msgspec.Struct]) -> None:
-    """Any of its floats bad: the whole check refuses with the words of the one that goes field by field, or neither does."""
+    """Any of its floats bad: the whole check refuses with the words of the one that goes field by
+    field, or neither does.
+    """
 
     def refusal(check: Callable[[msgspec.Struct], None], message: msgspec.Struct) -> str | None:
         try:

@@ -56,7 +56,9 @@ def message(kind: type[msgspec.Struct], tick: int, chaser: int = 0) -> Any:
 def heard(
     on: FaultLayer, topic: Topic, kind: type[msgspec.Struct], ticks: range, chaser: int = 0
 ) -> list[Any]:
-    """Return the ticks of the messages that arrive, one sent a tick; a LostMessage as the negative tick."""
+    """Return the ticks of the messages that arrive, one sent a tick; a LostMessage as the negative
+    tick.
+    """
     out = []
     for tick in ticks:
         sent = message(kind, tick, chaser)
@@ -67,7 +69,17 @@ def heard(
 
 def test_drop_lasts_as_long_as_it_should() -> None:
     on = layer("chaser/0", fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3))
-    assert heard(on, topics.WRENCH, WrenchCommand, range(7, 16)) == [7, 8, 9, -10, -11, -12, 13, 14, 15]
+    assert heard(on, topics.WRENCH, WrenchCommand, range(7, 16)) == [
+        7,
+        8,
+        9,
+        -10,
+        -11,
+        -12,
+        13,
+        14,
+        15,
+    ]
     assert on.count == {"drop": 3}
 
 
@@ -78,9 +90,16 @@ def test_in_real_time_nothing_stands_in_for_what_is_lost() -> None:
 
 
 def test_other_topics_and_processes_are_left_alone() -> None:
-    drop = fault(kind="drop", process="controller", topic="sighting", peer="chaser/1", duration_s=1.0)
+    drop = fault(
+        kind="drop", process="controller", topic="sighting", peer="chaser/1", duration_s=1.0
+    )
     ticks = range(9, 13)
-    assert heard(layer("controller", drop), topics.SIGHTING, Sighting, ticks, 1) == [9, -10, -11, -12]
+    assert heard(layer("controller", drop), topics.SIGHTING, Sighting, ticks, 1) == [
+        9,
+        -10,
+        -11,
+        -12,
+    ]
     assert heard(layer("controller", drop), topics.SIGHTING, Sighting, ticks, 2) == list(ticks)
     assert heard(layer("controller", drop), topics.ODOMETRY, Odometry, ticks, 1) == list(ticks)
     assert heard(layer("chaser/1", drop), topics.WRENCH, WrenchCommand, ticks, 1) == list(ticks)
@@ -88,24 +107,44 @@ def test_other_topics_and_processes_are_left_alone() -> None:
 
 def test_delay_keeps_the_order_of_a_key() -> None:
     on = layer(
-        "chaser/0", fault(kind="delay", process="chaser/0", topic="wrench", duration_s=0.3, delay_s=0.2)
+        "chaser/0",
+        fault(kind="delay", process="chaser/0", topic="wrench", duration_s=0.3, delay_s=0.2),
     )
-    assert heard(on, topics.WRENCH, WrenchCommand, range(9, 16)) == [9, -10, -11, 10, -12, 11, 13, 12, 14, 15]
+    assert heard(on, topics.WRENCH, WrenchCommand, range(9, 16)) == [
+        9,
+        -10,
+        -11,
+        10,
+        -12,
+        11,
+        13,
+        12,
+        14,
+        15,
+    ]
 
 
 def test_reorder_lets_one_overtake() -> None:
-    on = layer("controller", fault(kind="reorder", process="controller", topic="sighting", duration_s=0.1))
+    on = layer(
+        "controller", fault(kind="reorder", process="controller", topic="sighting", duration_s=0.1)
+    )
     assert heard(on, topics.SIGHTING, Sighting, range(9, 13)) == [9, -10, 11, 10, 12]
 
 
 def test_reorder_of_all_messages_swaps_pairs() -> None:
-    """Each held until its successor arrives, which is held as well, none would arrive before the end of the fault."""
-    on = layer("controller", fault(kind="reorder", process="controller", topic="sighting", duration_s=0.5))
+    """Each held until its successor arrives, which is held as well, none would arrive before the
+    end of the fault.
+    """
+    on = layer(
+        "controller", fault(kind="reorder", process="controller", topic="sighting", duration_s=0.5)
+    )
     assert heard(on, topics.SIGHTING, Sighting, range(9, 15)) == [9, -10, 11, 10, -12, 13, 12, -14]
 
 
 def test_duplicate() -> None:
-    on = layer("chaser/0", fault(kind="duplicate", process="chaser/0", topic="image", duration_s=0.2))
+    on = layer(
+        "chaser/0", fault(kind="duplicate", process="chaser/0", topic="image", duration_s=0.2)
+    )
     assert heard(on, topics.IMAGE, Image, range(9, 13)) == [9, 10, 10, 11, 11, 12]
 
 
@@ -117,11 +156,15 @@ def test_share_is_drawn_from_the_seed_and_the_tick_alone() -> None:
     assert one != heard(layer("chaser/0", drop, seed=1), topics.WRENCH, WrenchCommand, ticks)
     assert 240 < sum(tick < 0 for tick in one) < 360
     # Whatever came before: the same ticks are lost.
-    assert one[500:] == heard(layer("chaser/0", drop), topics.WRENCH, WrenchCommand, range(510, 1010))
+    assert one[500:] == heard(
+        layer("chaser/0", drop), topics.WRENCH, WrenchCommand, range(510, 1010)
+    )
 
 
 def test_corrupt_gives_nothing_or_a_sound_message() -> None:
-    on = layer("chaser/0", fault(kind="corrupt", process="chaser/0", topic="wrench", duration_s=50.0))
+    on = layer(
+        "chaser/0", fault(kind="corrupt", process="chaser/0", topic="wrench", duration_s=50.0)
+    )
     lost = changed = 0
     for tick in range(10, 500):
         sent = message(WrenchCommand, tick)
@@ -137,14 +180,18 @@ def test_corrupt_gives_nothing_or_a_sound_message() -> None:
 
 
 def test_message_of_a_damaged_sender_is_lost_in_lockstep_only() -> None:
-    """In real time the reader must refuse it; in lock-step the reader would wait for the true sender's."""
+    """In real time the reader must refuse it; in lock-step the reader would wait for the true
+    sender's.
+    """
     corrupt = fault(kind="corrupt", process="chaser/0", topic="wrench", duration_s=500.0)
     senders = {}
     for lockstep in (True, False):
         on = layer("chaser/0", corrupt, lockstep=lockstep)
         senders[lockstep] = set()
         for tick in range(10, 2000):
-            sent = msgspec.structs.replace(message(WrenchCommand, tick), commander="controller", instance="c")
+            sent = msgspec.structs.replace(
+                message(WrenchCommand, tick), commander="controller", instance="c"
+            )
             for came in on.incoming(topics.WRENCH, "0", sent, codec.encode(sent)):
                 if not isinstance(came, LostMessage):
                     senders[lockstep].add((came.commander, came.instance))
@@ -180,7 +227,9 @@ def test_cut_off_from_everybody() -> None:
 def test_messages_of_the_test_bed_are_never_faulty() -> None:
     on = layer("chaser/0", fault(kind="cut", process="chaser/0", duration_s=10.0))
     for topic, sample in ((topics.TICK, "Tick"), (topics.END, "MissionEnd")):
-        sent = msgspec.structs.replace(next(s for k, s in BY_TYPE.items() if k.__name__ == sample), tick=12)
+        sent = msgspec.structs.replace(
+            next(s for k, s in BY_TYPE.items() if k.__name__ == sample), tick=12
+        )
         assert on.incoming(topic, None, sent, codec.encode(sent)) == [sent]
 
 
@@ -190,7 +239,7 @@ def test_camera_off() -> None:
     assert heard(on, topics.ODOMETRY, Odometry, range(9, 13)) == [9, 10, 11, 12]
 
 
-# -- what a process says ------------------------------------------------------------------------------------
+# -- what a process says ---------------------------------------------------------------------------
 
 
 def published(on: FaultLayer, topic: Topic, sent: Any) -> list[Any]:
@@ -231,7 +280,9 @@ def test_odometry_lie_is_the_worlds_to_tell() -> None:
 
 
 def test_clock_jump_moves_stamps_and_not_ticks() -> None:
-    on = layer("controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=5.0))
+    on = layer(
+        "controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=5.0)
+    )
     sent = message(WrenchCommand, 12)
     (changed,) = published(on, topics.WRENCH, sent)
     assert changed.tick == 12
@@ -240,18 +291,21 @@ def test_clock_jump_moves_stamps_and_not_ticks() -> None:
         == changed.expires_ns - sent.expires_ns
         == 5_000_000_000
     )
-    back = layer("controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=-5.0))
+    back = layer(
+        "controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=-5.0)
+    )
     assert published(back, topics.WRENCH, sent)[0].sim_time_ns == 0
 
 
 def test_flood() -> None:
     on = layer(
-        "chaser/0", fault(kind="flood", process="chaser/0", topic="sighting", duration_s=1.0, copies=50)
+        "chaser/0",
+        fault(kind="flood", process="chaser/0", topic="sighting", duration_s=1.0, copies=50),
     )
     assert published(on, topics.SIGHTING, message(Sighting, 12)) == [message(Sighting, 12)] * 51
 
 
-# -- what happens to the process itself ----------------------------------------------------------------------
+# -- what happens to the process itself ------------------------------------------------------------
 
 
 def test_a_process_dies_once_before_anything_of_its_tick() -> None:
@@ -285,7 +339,9 @@ def test_freeze_stops_for_so_long() -> None:
 
 
 def test_begin_and_end_are_reported() -> None:
-    on = layer("world", fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3, share=0.5))
+    on = layer(
+        "world", fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3, share=0.5)
+    )
     changed = {tick: on.transitions_at(tick) for tick in range(20) if on.transitions_at(tick)}
     assert changed == {
         10: [("fault begins", "drop chaser/0, duration_s 0.3, topic wrench, share 0.5")],

@@ -34,8 +34,14 @@ BAD = [
     ('kind = "bomb", process = "controller"', "fault.0.kind"),
     ('kind = "kill", process = "world"', "kill cannot happen to world"),
     ('kind = "kill", process = "moon"', "'moon' is no process"),
-    ('kind = "kill", process = "chaser/7"', "there is no chaser/7; this mission has chaser/0 to chaser/3"),
-    ('kind = "cut", process = "chaser/0", peer = "chaser/9", duration_s = 1', "there is no chaser/9"),
+    (
+        'kind = "kill", process = "chaser/7"',
+        "there is no chaser/7; this mission has chaser/0 to chaser/3",
+    ),
+    (
+        'kind = "cut", process = "chaser/0", peer = "chaser/9", duration_s = 1',
+        "there is no chaser/9",
+    ),
     (
         'kind = "cut", process = "chaser/0", peer = "chaser/0", duration_s = 1',
         "receives no message that can be faulty from",
@@ -51,13 +57,22 @@ BAD = [
         'kind = "flood", process = "chaser/0", topic = "wrench", copies = 3, duration_s = 1',
         "publishes no wrench",
     ),
-    ('kind = "drop", process = "chaser/0", topic = "wrench", duration_s = 1, share = 1.5', "fault.0.share"),
+    (
+        'kind = "drop", process = "chaser/0", topic = "wrench", duration_s = 1, share = 1.5',
+        "fault.0.share",
+    ),
     (
         'kind = "camera_off", process = "chaser/0", duration_s = 1, share = 0.5',
         "share does not go with camera_off",
     ),
-    ('kind = "delay", process = "chaser/0", topic = "wrench", duration_s = 1', "delay needs delay_s"),
-    ('kind = "lying_sensor", process = "chaser/0", duration_s = 1', "needs offset_m or rotation_deg"),
+    (
+        'kind = "delay", process = "chaser/0", topic = "wrench", duration_s = 1',
+        "delay needs delay_s",
+    ),
+    (
+        'kind = "lying_sensor", process = "chaser/0", duration_s = 1',
+        "needs offset_m or rotation_deg",
+    ),
     (
         'kind = "drop", process = "controller", topic = "thrusters", duration_s = 1',
         "thrusters exist only with",
@@ -82,14 +97,20 @@ BAD_LATCHES = [
         'kind = "latch_open", process = "chaser/2", duration_s = 1',
         "fault.0: latch_open cannot happen to chaser/2, which has no port; see docking.kind and [[docking.ports]]",
     ),
-    ('kind = "latch_slip", process = "chaser/0", duration_s = 1', "latch_slip needs force_N or torque_N_m"),
+    (
+        'kind = "latch_slip", process = "chaser/0", duration_s = 1',
+        "latch_slip needs force_N or torque_N_m",
+    ),
     ('kind = "latch_slip", process = "chaser/0", duration_s = 1, force_N = 0', "fault.0.force_N"),
     ('kind = "latch_stuck", process = "chaser/0"', "latch_stuck needs duration_s"),
     (
         'kind = "latch_stuck", process = "chaser/0", duration_s = 1, force_N = 1',
         "force_N does not go with latch_stuck",
     ),
-    ('kind = "latch_open", process = "controller", duration_s = 1', "latch_open cannot happen to controller"),
+    (
+        'kind = "latch_open", process = "controller", duration_s = 1',
+        "latch_open cannot happen to controller",
+    ),
     ('kind = "latch_open", process = "chaser/9", duration_s = 1', "there is no chaser/9"),
 ]
 
@@ -111,8 +132,12 @@ def test_invalid_faults_of_latches_are_one_line(fault: str, words: str) -> None:
 
 
 def test_latches_need_ports() -> None:
-    with pytest.raises(ScenarioError, match="latch_stuck cannot happen to chaser/0, which has no port"):
-        load_scenario(DRILL, ('fault=[{kind="latch_stuck",process="chaser/0",at_s=1.0,duration_s=1.0}]',))
+    with pytest.raises(
+        ScenarioError, match="latch_stuck cannot happen to chaser/0, which has no port"
+    ):
+        load_scenario(
+            DRILL, ('fault=[{kind="latch_stuck",process="chaser/0",at_s=1.0,duration_s=1.0}]',)
+        )
     with pytest.raises(
         ScenarioError, match=r'truth.latch.strength_N: latches exist only with docking.kind = "'
     ):

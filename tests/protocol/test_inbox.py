@@ -11,7 +11,12 @@ from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 
 def test_queue_keeps_order_and_drops_when_full() -> None:
     inbox: BoundedQueue[str] = BoundedQueue(max_bytes=10)
-    assert [inbox.put(text, len(text)) for text in ("1234", "56789", "ab", "c")] == [True, True, False, True]
+    assert [inbox.put(text, len(text)) for text in ("1234", "56789", "ab", "c")] == [
+        True,
+        True,
+        False,
+        True,
+    ]
     assert inbox.dropped == 1
     assert [inbox.get(0), inbox.get(0)] == ["1234", "56789"]
     assert inbox.put("0123456789", 9)

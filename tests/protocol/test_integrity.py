@@ -41,7 +41,9 @@ def lying(odometry: Odometry, off_m: tuple[float, float, float], turn_rad: float
     return msgspec.structs.replace(
         odometry,
         position_m=vector(np.add(odometry.position_m, off_m)),
-        q_wxyz=vector(rotations.multiply(odometry.q_wxyz, rotations.exp(np.array([turn_rad, 0.0, 0.0])))),
+        q_wxyz=vector(
+            rotations.multiply(odometry.q_wxyz, rotations.exp(np.array([turn_rad, 0.0, 0.0])))
+        ),
     )
 
 
@@ -92,7 +94,9 @@ def test_agreement() -> None:
         now_s = tick / 16  # exact
         rejected = {2} if 30 <= tick < 60 or tick in (10, 12, 80) else set()
         seen = {0, 1, 2} if tick % 3 else {0, 2}
-        events_at += [(tick, level) for level, _ in agreement.update(now_s, seen - rejected, rejected)]
+        events_at += [
+            (tick, level) for level, _ in agreement.update(now_s, seen - rejected, rejected)
+        ]
     assert events_at == [(40, "warning"), (70, "info")]
 
 
@@ -102,7 +106,9 @@ def test_chaser_without_sightings_does_not_disagree() -> None:
 
 
 def test_odometry_is_doubtful_until_sightings_agree_since_it_was_interrupted() -> None:
-    """Sightings of chaser 1 disagree from 2 to 3 s and from 5 to 6 s; its odometry is interrupted until 1 s, and from 4 to 5 s."""
+    """Sightings of chaser 1 disagree from 2 to 3 s and from 5 to 6 s; its odometry is interrupted
+    until 1 s, and from 4 to 5 s.
+    """
     agreement, doubtful_at = SensorConsistency(), []
     for tick in range(160):
         now_s = tick / 16  # exact
@@ -110,7 +116,8 @@ def test_odometry_is_doubtful_until_sightings_agree_since_it_was_interrupted() -
         interrupted = {1} if now_s < 1.0 or 4.0 <= now_s < 5.0 else set()
         agreement.update(now_s, {0, 1} - rejected - interrupted, rejected, interrupted)
         doubtful_at += [now_s] if agreement.doubtful else []
-    # From 2 to 3 s, after a second of agreement, a camera fault is likelier: a jump of the odometry would have been noticed.
+    # From 2 to 3 s, after a second of agreement, a camera fault is likelier: a jump of the odometry
+    # would have been noticed.
     assert doubtful_at[0] == pytest.approx(5.0 + DISAGREES_S, abs=1 / 16)
     assert doubtful_at[-1] == pytest.approx(6.0 + AGREES_S, abs=1 / 16)
     assert len(doubtful_at) == (doubtful_at[-1] - doubtful_at[0]) * 16 + 1

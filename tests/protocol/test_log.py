@@ -50,7 +50,7 @@ def written(path: Path, ticks: int = 20) -> list[tuple[str, m.Message, int]]:
     return out
 
 
-# -- round trip -------------------------------------------------------------------------------------------
+# -- round trip ------------------------------------------------------------------------------------
 
 
 def test_messages_are_read_in_the_order_written(tmp_path: Path) -> None:
@@ -72,22 +72,30 @@ def test_a_log_states_the_blas_in_use(tmp_path: Path) -> None:
     code = "from chaserdock_protocol.recording.provenance import blas_in_use; print(blas_in_use())"
     environment = os.environ | {"OPENBLAS_CORETYPE": "Nehalem"}
     command = [sys.executable, "-c", code]
-    stated = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+    stated = subprocess.run(
+        command, env=environment, check=True, capture_output=True, text=True
+    ).stdout
     assert re.fullmatch(r"openblas \d+\.\d+\.\S+ Nehalem\n", stated)
 
 
 def librarys_writer(stream: Any, compressed: bool = True) -> Writer:
     compression = CompressionType.ZSTD if compressed else CompressionType.NONE
-    return Writer(stream, chunk_size=chunk_index.CHUNK_BYTES, compression=compression, enable_data_crcs=True)
+    return Writer(
+        stream, chunk_size=chunk_index.CHUNK_BYTES, compression=compression, enable_data_crcs=True
+    )
 
 
 @pytest.mark.parametrize("compressed", [True, False])
 def test_the_file_is_the_librarys_own_to_the_byte(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compressed: bool
 ) -> None:
-    """Full chunks and flushed ones, times that go back, both layers, channels that come late or stay empty."""
+    """Full chunks and flushed ones, times that go back, both layers, channels that come late or
+    stay empty.
+    """
     # If the library renames this attribute, replacing it has no effect.
-    private = {name: type(value).__name__ for name, value in vars(librarys_writer(io.BytesIO())).items()}
+    private = {
+        name: type(value).__name__ for name, value in vars(librarys_writer(io.BytesIO())).items()
+    }
     assert private["_Writer__chunk_indices"] == "list"
 
     def made(path: Path) -> bytes:
@@ -154,7 +162,9 @@ def test_keys_select_and_counts_count(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     expected = written(path, 7)
     wanted = [topics.TICK.key_of(), topics.ODOMETRY.key_of(1)]
-    assert [r.message for r in read_log(path, wanted)] == [x for key, x, _ in expected if key in wanted]
+    assert [r.message for r in read_log(path, wanted)] == [
+        x for key, x, _ in expected if key in wanted
+    ]
     assert list(read_log(path, [])) == []
     assert count_messages(path) == {
         "truth/body/chaser/0": 7,
@@ -177,7 +187,7 @@ def test_scenario_and_versions_lie_in_the_log(tmp_path: Path) -> None:
     assert data["version.numpy"].count(".") >= 1
 
 
-# -- other people's readers -------------------------------------------------------------------------------
+# -- other people's readers ------------------------------------------------------------------------
 
 
 def test_mcaps_own_reader_and_plain_msgpack_read_it_all(tmp_path: Path) -> None:
@@ -249,7 +259,7 @@ def test_log_digest_does_not_depend_on_the_wall_clock(tmp_path: Path) -> None:
     assert [r.message for r in read_log(a)] == [r.message for r in read_log(b)]
 
 
-# -- not everything is a good message ---------------------------------------------------------------------
+# -- not everything is a good message --------------------------------------------------------------
 
 GARBAGE = [
     b"",
@@ -275,7 +285,8 @@ def test_garbage_is_recorded_verbatim_counted_and_not_handed_out(tmp_path: Path)
     for payload in GARBAGE:
         writer.write(key, encoding, payload, 6)
     record(writer, topics.ODOMETRY, 0, good, 7)
-    # Those whose header cannot be read are counted as unreadable; a time below zero is read, and taken as zero.
+    # Those whose header cannot be read are counted as unreadable; a time below zero is read, and
+    # taken as zero.
     assert writer.messages == len(GARBAGE) + 2
     assert 7 <= writer.unreadable <= 9
     writer.close()
@@ -320,7 +331,7 @@ def test_foreign_keys_and_versions_are_kept_and_not_handed_out(tmp_path: Path) -
     ]
 
 
-# -- files ------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------
 
 
 def test_a_log_is_never_overwritten(tmp_path: Path) -> None:

@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 from chaserdock_protocol import messages as m
 from chaserdock_protocol import topics
-from chaserdock_protocol.recording.log import LogError, LogWriter, count_messages, read_log, read_scenario
+from chaserdock_protocol.recording.log import (
+    LogError,
+    LogWriter,
+    count_messages,
+    read_log,
+    read_scenario,
+)
 from chaserdock_protocol.recording.scan import FileState, records
 from log_samples import SCENARIO, Clock, flight, record
 
@@ -44,7 +50,9 @@ def test_a_flight_faster_than_the_clock_is_flushed_by_its_own_time(tmp_path: Pat
     # A time that cannot be is one flush, not one a message.
     for k in range(120, 134):
         wrong = k == 120
-        record(writer, topics.ACK, None, m.RecorderAck(tick=k, sim_time_ns=(10**18 if wrong else k)), 1)
+        record(
+            writer, topics.ACK, None, m.RecorderAck(tick=k, sim_time_ns=(10**18 if wrong else k)), 1
+        )
     assert sum(count_messages(path).values()) == 121
     writer.close()
 
@@ -61,7 +69,9 @@ def test_without_time_passing_nothing_is_flushed_and_flush_does(tmp_path: Path) 
 
 
 def test_a_log_cut_off_anywhere_yields_the_messages_before(tmp_path: Path) -> None:
-    """Cut at many places, inside and between records: never an error, never a wrong or repeated message."""
+    """Cut at many places, inside and between records: never an error, never a wrong or repeated
+    message.
+    """
     path, clock = tmp_path / "a.mcap", Clock()
     writer = LogWriter(path, clock)
     writer.describe(SCENARIO, {"run_id": "r1"})
@@ -76,7 +86,12 @@ def test_a_log_cut_off_anywhere_yields_the_messages_before(tmp_path: Path) -> No
     data, cut = path.read_bytes(), tmp_path / "cut.mcap"
     assert len(flushed) == 7
     sizes = [size for size, _ in flushed]
-    ends = {*range(sizes[0], len(data), 23), *sizes, *(s + 1 for s in sizes), *(s - 1 for s in sizes[1:])}
+    ends = {
+        *range(sizes[0], len(data), 23),
+        *sizes,
+        *(s + 1 for s in sizes),
+        *(s - 1 for s in sizes[1:]),
+    }
     for end in sorted(ends | set(range(len(data) - 120, len(data)))):
         cut.write_bytes(data[:end])
         records = [(r.key, r.message) for r in read_log(cut)]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mesh files as targets: what is read, what is refused with which line, and what the flight software receives of them."""
+"""Mesh files as targets: what is read, what is refused with which line, and what the flight
+software receives of them.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,8 @@ def test_units_origin_and_mirrored_nodes(tmp_path: Path) -> None:
     scene.add_geometry(trimesh.creation.box((0.4, 0.2, 0.1)), transform=mirror)
     scene.export(str(tmp_path / "mm.glb"))
     with pytest.raises(
-        ScenarioError, match=r"is 400 m long; .* if it is in millimetres, mesh_scale = 0\.001 makes it 0\.4 m"
+        ScenarioError,
+        match=r"is 400 m long; .* if it is in millimetres, mesh_scale = 0\.001 makes it 0\.4 m",
     ):
         read_mesh(tmp_path / "mm.glb")
     mesh = read_mesh(tmp_path / "mm.glb", 1e-3, (0.5, 0.0, 0.0)).mesh
@@ -78,14 +81,17 @@ def test_defects_are_one_line(tmp_path: Path) -> None:
     holed = ball(2)
     holed.update_faces(np.arange(len(holed.faces)) > 3)
     holed.export(str(tmp_path / "holed.glb"))
-    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 1]], process=False).export(
-        str(tmp_path / "flat.stl")
-    )
+    trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 1]], process=False
+    ).export(str(tmp_path / "flat.stl"))
     (tmp_path / "text.glb").write_bytes(b"hello")
     (tmp_path / "text.obj").write_text("hello\n")
     (tmp_path / "cut.glb").write_bytes(b"glTF\x02\x00\x00\x00\xff\xff")
     for name, message in (
-        ("holed.glb", r"part '\w+' has a hole: \d+ open edges, one near \(.*\) m; close its surface"),
+        (
+            "holed.glb",
+            r"part '\w+' has a hole: \d+ open edges, one near \(.*\) m; close its surface",
+        ),
         ("flat.stl", "encloses no volume; give it a thickness"),
         ("text.glb", "not a GLB mesh: it does not begin with 'glTF'"),
         ("text.obj", "contains no triangles"),
@@ -113,7 +119,9 @@ def test_large_meshes_are_decimated_with_their_deviation(tmp_path: Path) -> None
     ball(6).export(str(tmp_path / "ball.glb"))
     found = read_mesh(tmp_path / "ball.glb")
     assert 15_000 < found.mesh.triangle_count < 21_000
-    assert any("decimated from 81,920 to " in note and "largest deviation" in note for note in found.notes)
+    assert any(
+        "decimated from 81,920 to " in note and "largest deviation" in note for note in found.notes
+    )
     middles = np.linalg.norm(
         found.mesh.parts[0].vertices_m[found.mesh.parts[0].triangles].mean(axis=1), axis=1
     )
@@ -179,7 +187,9 @@ def test_scenario_does_not_need_the_file_any_more(servicer_file: Path, tmp_path:
 def test_markers_lie_on_shipped_and_own_meshes(servicer_file: Path) -> None:
     marker = "{id=3, side_m=0.1, position_m=[0.21, 0.0, 0.0], q_wxyz=[0.5, 0.5, 0.5, 0.5]}"
     for mesh in (str(servicer_file), "geo_servicer"):
-        geometry = f'target.geometry={{dictionary="DICT_4X4_50", mesh="{mesh}", markers=[{marker}]}}'
+        geometry = (
+            f'target.geometry={{dictionary="DICT_4X4_50", mesh="{mesh}", markers=[{marker}]}}'
+        )
         coarse = "target.knowledge.simplification_m=0.02"
         scenario = parse_scenario(good(), "test", (geometry, 'target.model="marked"', coarse))
         model = scenario.target_model()
@@ -211,10 +221,14 @@ def test_invalid_geometry_is_one_line(override: str, message: str) -> None:
 
 
 def test_renderer_and_centre_of_mass_are_checked(servicer_file: Path) -> None:
-    with pytest.raises(ScenarioError, match=r'camera.renderer = "pybullet" draws OBJ and STL files'):
+    with pytest.raises(
+        ScenarioError, match=r'camera.renderer = "pybullet" draws OBJ and STL files'
+    ):
         with_file(servicer_file, 'camera.renderer="pybullet"')
     free = 'target.motion="torque_free"'
     with_file(servicer_file, free)
-    with pytest.raises(ScenarioError, match=r"that of the mesh is \(0\.3, .*mesh_origin_m = \[") as caught:
+    with pytest.raises(
+        ScenarioError, match=r"that of the mesh is \(0\.3, .*mesh_origin_m = \["
+    ) as caught:
         with_file(servicer_file, free, "target.geometry.mesh_origin_m=[-0.3, 0.0, 0.0]")
     assert "\n" not in str(caught.value)

@@ -18,7 +18,8 @@ def with_mesh(*overrides: str) -> Scenario:
 
 def test_flight_software_receives_the_nominal_simplified_mesh() -> None:
     scenario = with_mesh(
-        'target.knowledge.missing=["dish", "antenna_whip"]', "target.knowledge.simplification_m=0.004"
+        'target.knowledge.missing=["dish", "antenna_whip"]',
+        "target.knowledge.simplification_m=0.004",
     )
     known = flight_scenario(scenario).target.known_mesh()
     assert known is not None
@@ -59,7 +60,10 @@ def test_inertia_is_that_of_the_mesh() -> None:
             'camera.renderer="pybullet"',
             "target.model: only camera.renderer = \"exact\" draws the mesh 'geo_servicer'",
         ),
-        ('perception.name="default"', "'default' needs markers; the target 'geo_servicer' has none"),
+        (
+            'perception.name="default"',
+            "'default' needs markers; the target 'geo_servicer' has none",
+        ),
         ('chaser.mesh="boat"', "chaser.mesh"),
     ],
 )
@@ -78,6 +82,7 @@ def test_knowledge_without_a_mesh_is_an_error() -> None:
 def test_chaser_mesh_needs_a_target_with_a_mesh() -> None:
     assert with_mesh('chaser.mesh="chaser_body"').chaser.mesh == "chaser_body"
     with pytest.raises(
-        ScenarioError, match=r"chaser\.mesh: drawn only with a target that has a mesh; 'paper' has none"
+        ScenarioError,
+        match=r"chaser\.mesh: drawn only with a target that has a mesh; 'paper' has none",
     ):
         parse_scenario(good(), "test", ('chaser.mesh="chaser_body"',))

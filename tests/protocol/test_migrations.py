@@ -26,9 +26,12 @@ PRESENT: dict[str, msgspec.Struct] = {
         BY_TYPE[m.BodyTruth], thruster_impulse_N_s=(0.5, 0.25), thruster_open_s=(0.125, 0.0)
     ),
     "Sighting": msgspec.structs.replace(BY_TYPE[m.Sighting], status="bad_image"),
-    "OperatorCommand": msgspec.structs.replace(BY_TYPE[m.OperatorCommand], command="isolate", thruster=3),
+    "OperatorCommand": msgspec.structs.replace(
+        BY_TYPE[m.OperatorCommand], command="isolate", thruster=3
+    ),
     "ControllerState": msgspec.structs.replace(
-        BY_TYPE[m.ControllerState], operated=(m.OperatorCommand(command="restore", chaser=1, thruster=2),)
+        BY_TYPE[m.ControllerState],
+        operated=(m.OperatorCommand(command="restore", chaser=1, thruster=2),),
     ),
 }
 OLD_NAMES: dict[str, dict[str, str]] = {
@@ -71,7 +74,9 @@ def kind_of(name: str) -> Any:
 
 def test_every_upgrade_has_a_case_and_every_version_an_upgrade() -> None:
     assert {name for name, _ in UPGRADES} == set(OLD_NAMES)
-    needed = {(kind.__name__, version) for kind, last in m.VERSION.items() for version in range(1, last)}
+    needed = {
+        (kind.__name__, version) for kind, last in m.VERSION.items() for version in range(1, last)
+    }
     assert set(UPGRADES) == needed
 
 
@@ -90,12 +95,18 @@ def test_old_ticks_without_names_list_the_only_controller() -> None:
     for controller, expected in ((True, {"controller": ""}), (False, {})):
         fields = {"images": False, "chasers": [0], "controller": controller}
         encoding = "application/msgpack;chaserdock.Tick.v2"
-        assert decode_logged(m.Tick, msgspec.msgpack.encode(fields), encoding).controllers == expected
+        assert (
+            decode_logged(m.Tick, msgspec.msgpack.encode(fields), encoding).controllers == expected
+        )
 
 
 def test_migrated_messages_are_validated() -> None:
     fields, encoding = version_1(PRESENT["BodyTruth"])
-    for changed in ({"jet_open_s": [float("nan")]}, {"q_wxyz": [1.0, 1.0, 0.0, 0.0]}, {"jet_open_s": "x"}):
+    for changed in (
+        {"jet_open_s": [float("nan")]},
+        {"q_wxyz": [1.0, 1.0, 0.0, 0.0]},
+        {"jet_open_s": "x"},
+    ):
         with pytest.raises(Rejected):
             decode_logged(m.BodyTruth, msgspec.msgpack.encode(fields | changed), encoding)
 
@@ -134,13 +145,16 @@ def test_every_renamed_type_exists_today() -> None:
     assert not set(schema_migrations._RENAMED_TYPES) & names
 
 
-# -- scenarios --------------------------------------------------------------------------------------------
+# -- scenarios -------------------------------------------------------------------------------------
 
 FORMAT_1: dict[str, Any] = {
     "name": "old",
     "time": {"picture_hz": 15, "rate_hz": 15},
     "chaser": {"jet_test_s": 2.0, "jet_faults_by_command": True, "mass_kg": 10.0},
-    "timeline": [{"at_s": 1.0, "command": "isolate", "jet": 3}, {"at_s": 2.0, "command": "approach"}],
+    "timeline": [
+        {"at_s": 1.0, "command": "isolate", "jet": 3},
+        {"at_s": 2.0, "command": "approach"},
+    ],
     "jet_failure": [{"jet": 1, "kind": "weak", "told": False}],
     "fault": [{"kind": "drop", "topic": "jets"}, {"kind": "drop", "topic": "wrench"}],
 }
@@ -149,7 +163,10 @@ FORMAT_3: dict[str, Any] = {
     "name": "old",
     "time": {"image_hz": 15, "rate_hz": 15},
     "chaser": {"thruster_test_s": 2.0, "thruster_faults_by_command": True, "mass_kg": 10.0},
-    "timeline": [{"at_s": 1.0, "command": "isolate", "thruster": 3}, {"at_s": 2.0, "command": "approach"}],
+    "timeline": [
+        {"at_s": 1.0, "command": "isolate", "thruster": 3},
+        {"at_s": 2.0, "command": "approach"},
+    ],
     "thruster_failure": [{"thruster": 1, "kind": "weak", "reported": False}],
     "fault": [{"kind": "drop", "topic": "thrusters"}, {"kind": "drop", "topic": "wrench"}],
     "navigation": {"grade": "exact"},
@@ -164,9 +181,20 @@ def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
     text = json.dumps(
         {
             "format": 2,
-            "odometry": {"position_noise_m": 0.003, "attitude_noise_deg": 0.05, "attitude_bias_deg": 0.0},
-            "camera": {"calibration_error": {"mounting_deg": 0.5, "centre_px": 1.0}, "width_px": 640},
-            "estimator": {"name": "mekf", "camera_bias_attitude_deg": 0.3, "camera_bias_position_m": 0.0},
+            "odometry": {
+                "position_noise_m": 0.003,
+                "attitude_noise_deg": 0.05,
+                "attitude_bias_deg": 0.0,
+            },
+            "camera": {
+                "calibration_error": {"mounting_deg": 0.5, "centre_px": 1.0},
+                "width_px": 640,
+            },
+            "estimator": {
+                "name": "mekf",
+                "camera_bias_attitude_deg": 0.3,
+                "camera_bias_position_m": 0.0,
+            },
         }
     )
     assert json.loads(migrated(text)) == {
@@ -201,7 +229,7 @@ def test_old_keys_are_named_with_their_present_names() -> None:
         assert any(line.startswith(path) and new in line for line in lines), path
 
 
-# -- a whole log ------------------------------------------------------------------------------------------
+# -- a whole log -----------------------------------------------------------------------------------
 
 
 def test_log_of_version_1_reads_as_present_messages(tmp_path: Path) -> None:

@@ -8,7 +8,12 @@ from dataclasses import asdict
 from typing import Any
 
 import pytest
-from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario, scenario_from_json
+from chaserdock_protocol.scenario import (
+    ScenarioError,
+    load_scenario,
+    parse_scenario,
+    scenario_from_json,
+)
 from chaserdock_protocol.scenario.navigation import GRADES, NavigationErrors, NavigationSection
 from harness import ROOT
 from scenario_samples import good
@@ -41,12 +46,16 @@ def test_exact_has_no_errors_and_lab_is_the_default() -> None:
 
 
 def test_poor_is_three_times_orbit() -> None:
-    assert GRADES["poor"] == pytest.approx({key: 3.0 * value for key, value in GRADES["orbit"].items()})
+    assert GRADES["poor"] == pytest.approx(
+        {key: 3.0 * value for key, value in GRADES["orbit"].items()}
+    )
 
 
 def test_a_given_figure_replaces_the_grades_and_survives_json() -> None:
     scenario = parse_scenario(
-        good() | {"navigation": {"grade": "orbit", "position_noise_m": 0, "attitude_drift_deg": 1.0}}, "x"
+        good()
+        | {"navigation": {"grade": "orbit", "position_noise_m": 0, "attitude_drift_deg": 1.0}},
+        "x",
     )
     errors = scenario_from_json(scenario.model_dump_json(), "x").navigation.errors()
     assert (errors.position_noise_m, errors.attitude_drift_rad) == (0.0, math.radians(1.0))
@@ -67,16 +76,27 @@ def test_a_principal_point_alone_does_not_make_the_mounting_uncertain() -> None:
             {"grade": "lap"},
             "navigation.grade: must be one of exact, lab, orbit, poor (got 'lap'); did you mean lab?",
         ),
-        ({"position_noise_m": -1.0}, "navigation.position_noise_m: must be a number from 0 to 10 (got -1.0)"),
-        ({"camera_turn_deg": 91.0}, "navigation.camera_turn_deg: must be a number from 0 to 90 (got 91.0)"),
+        (
+            {"position_noise_m": -1.0},
+            "navigation.position_noise_m: must be a number from 0 to 10 (got -1.0)",
+        ),
+        (
+            {"camera_turn_deg": 91.0},
+            "navigation.camera_turn_deg: must be a number from 0 to 90 (got 91.0)",
+        ),
         (
             {"position_drift_time_s": 0.0},
             "navigation.position_drift_time_s: must be a number from 0.1 to 1000000",
         ),
-        ({"omega_noise_deg_s": float("nan")}, "navigation.omega_noise_deg_s: must be a finite number"),
+        (
+            {"omega_noise_deg_s": float("nan")},
+            "navigation.omega_noise_deg_s: must be a finite number",
+        ),
     ],
 )
-def test_an_impossible_figure_is_one_line_with_path_and_bound(figures: dict[str, Any], line: str) -> None:
+def test_an_impossible_figure_is_one_line_with_path_and_bound(
+    figures: dict[str, Any], line: str
+) -> None:
     with pytest.raises(ScenarioError) as error:
         errors_of(**figures)
     assert str(error.value).startswith(f"x: {line}")

@@ -11,7 +11,9 @@ from chaserdock_protocol.pose_image import decode_pose, encode_pose
 POSITION, ATTITUDE = np.array([0.1, -0.2, 1.5]), np.array([0.5, -0.5, 0.5, 0.5])
 
 
-def decoded(attitude: Array, seed: tuple[int, int] = (7, 2**32 - 1)) -> tuple[Array, Array, tuple[int, int]]:
+def decoded(
+    attitude: Array, seed: tuple[int, int] = (7, 2**32 - 1)
+) -> tuple[Array, Array, tuple[int, int]]:
     pixels = encode_pose(POSITION, attitude, seed)
     return decode_pose(np.frombuffer(pixels, dtype=np.uint8).reshape(1, -1))
 
@@ -23,7 +25,9 @@ def test_decoding_inverts_encoding() -> None:
     assert seed == (7, 2**32 - 1)
 
 
-@pytest.mark.parametrize("attitude", [ATTITUDE * 1.003, np.zeros(4), np.array([np.nan, 0.0, 0.0, 1.0])])
+@pytest.mark.parametrize(
+    "attitude", [ATTITUDE * 1.003, np.zeros(4), np.array([np.nan, 0.0, 0.0, 1.0])]
+)
 def test_an_attitude_that_is_no_rotation_is_refused(attitude: Array) -> None:
     with pytest.raises(ValueError, match="damaged image"):
         decoded(attitude)

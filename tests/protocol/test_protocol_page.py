@@ -12,7 +12,9 @@ from harness import ROOT
 
 def test_the_committed_page_is_up_to_date() -> None:
     command = [sys.executable, str(ROOT / "docs" / "make_protocol.py"), "--print"]
-    made = subprocess.run(command, capture_output=True, text=True, check=True, encoding="utf-8").stdout
+    made = subprocess.run(
+        command, capture_output=True, text=True, check=True, encoding="utf-8"
+    ).stdout
     committed = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
     assert committed == made, "run: python docs/make_protocol.py"
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorders over real Zenoh: a log played and recorded again is the same; a killed one loses its last second at most."""
+"""Recorders over real Zenoh: a log played and recorded again is the same; a killed one loses its
+last second at most.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,18 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 KILLS = int(os.environ.get("CHASERDOCK_KILLS", "2"))
 
 
-def start_recorder(folder: Path, port: int, namespace: str, *options: str) -> subprocess.Popen[bytes]:
+def start_recorder(
+    folder: Path, port: int, namespace: str, *options: str
+) -> subprocess.Popen[bytes]:
     """The recorder process, which joins the player on that port."""
     where = ["-e", f"tcp/127.0.0.1:{port}", "--namespace", namespace]
     return chaserdock("record", "--out", str(folder), *where, *options, stdout=subprocess.DEVNULL)
 
 
 def by_key(log: Path) -> dict[str, list[tuple[str, bytes]]]:
-    """Encodings and payloads of a log, key by key, in their order; without what its own recorder wrote."""
+    """Encodings and payloads of a log, key by key, in their order; without what its own recorder
+    wrote.
+    """
     out: dict[str, list[tuple[str, bytes]]] = defaultdict(list)
     for _, raw in stored_samples(log):
         out[raw.key].append((raw.encoding, raw.payload))
@@ -79,7 +85,9 @@ def test_play_without_a_recorder_is_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(KILLS))
 def test_killed_recorder_loses_the_last_second_at_most(tmp_path: Path, seed: int) -> None:
-    """SIGKILL at a random moment of a flight at a quarter of its speed; what was sent a second before is recovered."""
+    """SIGKILL at a random moment of a flight at a quarter of its speed; what was sent a second
+    before is recovered.
+    """
     port, sent = free_port(), []
     recorder = start_recorder(tmp_path / "killed", port, "killed")
     killed_s: list[float] = []

@@ -29,7 +29,9 @@ SETTLE_S = 0.5
 
 
 def readers_of(key: str) -> set[str]:
-    """Processes that the table lets read a concrete key; of what is one chaser's, that chaser alone."""
+    """Processes that the table lets read a concrete key; of what is one chaser's, that chaser
+    alone.
+    """
     found = topics.topic_of_key(key)
     assert found is not None
     topic, place = found
@@ -52,14 +54,18 @@ class Mission:
 def mission(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mission]:
     keys = make_keys(tmp_path_factory.mktemp("keys"))
     with router_with_rights(keys) as endpoint:
-        sessions = {w.process: zenoh.open(zenoh_config(client(keys, w.process, endpoint))) for w in EVERYONE}
+        sessions = {
+            w.process: zenoh.open(zenoh_config(client(keys, w.process, endpoint))) for w in EVERYONE
+        }
         yield Mission(keys, endpoint, sessions)
         for session in sessions.values():
             session.close()
 
 
 def test_every_wrong_identity_on_every_key_is_dropped(mission: Mission) -> None:
-    """The table: keys by identities. The recorder may read all, so whatever gets through reaches it."""
+    """The table: keys by identities. The recorder may read all, so whatever gets through reaches
+    it.
+    """
     arrived: set[tuple[str, str]] = set()
     subscriber = mission.sessions["recorder"].declare_subscriber(
         "**", lambda s: arrived.add((str(s.key_expr), s.payload.to_string()))
@@ -91,8 +97,15 @@ def test_every_key_reaches_its_readers_only(mission: Mission) -> None:
         heard = arrived[name]
         callback = lambda s, heard=heard: heard.add(str(s.key_expr))  # noqa: E731
         # The key itself, what lies around it, and everything.
-        expressions = {key for key, _ in keys_with_owners()} | {"**", "truth/**", "*/body/target", "world/*"}
-        subscribers += [session.declare_subscriber(expression, callback) for expression in expressions]
+        expressions = {key for key, _ in keys_with_owners()} | {
+            "**",
+            "truth/**",
+            "*/body/target",
+            "world/*",
+        }
+        subscribers += [
+            session.declare_subscriber(expression, callback) for expression in expressions
+        ]
     time.sleep(4 * SETTLE_S)
     for key, owner in keys_with_owners():
         mission.sessions[owner].put(key, owner)
@@ -128,17 +141,27 @@ def test_only_its_answerer_answers_a_query_and_only_those_meant_may_ask(
         meant = {query.server} - {who.process} if who.role in query.clients else set()
         deadline = time.monotonic() + PATIENCE_S
         while True:
-            replies = mission.sessions[who.process].get(query.key, timeout=0.5, target=zenoh.QueryTarget.ALL)
-            answers = {r.ok.payload.to_string() for r in replies if r.ok is not None} - {who.process}
-            answers = {"controller" if name == "standby" else name for name in answers}  # either may
+            replies = mission.sessions[who.process].get(
+                query.key, timeout=0.5, target=zenoh.QueryTarget.ALL
+            )
+            answers = {r.ok.payload.to_string() for r in replies if r.ok is not None} - {
+                who.process
+            }
+            answers = {
+                "controller" if name == "standby" else name for name in answers
+            }  # either may
             if not answers < meant or time.monotonic() > deadline:
-                break  # a slow machine's answers may still be on their way; what is too much stays too much
+                # a slow machine's answers may still be on their way; what is too much stays too
+                # much
+                break
         assert answers == meant, who
     for queryable in offered:
         queryable.undeclare()
 
 
-def test_flight_identities_cannot_query_the_full_scenario_by_any_expression(mission: Mission) -> None:
+def test_flight_identities_cannot_query_the_full_scenario_by_any_expression(
+    mission: Mission,
+) -> None:
     def reply(query: zenoh.Query) -> None:
         query.reply(topics.SCENARIO_KEY, "full scenario")
         query.drop()
@@ -165,7 +188,8 @@ def test_presence_under_another_name_is_denied(mission: Mission) -> None:
         session.liveliness().declare_token(topics.LIVE_KEY.format(process=other))
         for name, session in mission.sessions.items()
         for other in (*PUBLISHERS, "chaser/9")
-        if name not in rights.OBSERVERS and other != name  # a session sees its own tokens without any router
+        if name not in rights.OBSERVERS
+        and other != name  # a session sees its own tokens without any router
     ]
     own = mission.sessions["chaser/1"].liveliness().declare_token("live/chaser/1")
     time.sleep(SETTLE_S)
@@ -217,4 +241,6 @@ def test_a_chaser_commands_nothing_and_reads_no_truth() -> None:
     for who in EVERYONE:
         truth = [key for key in rights.reads(who) if key == "**" or key.startswith("truth")]
         assert bool(truth) == (who.role in ("recorder", "analysis", "viewer")), who
-        assert any(key.endswith("/wrench") for key in rights.writes(who)) == (who.role == "controller")
+        assert any(key.endswith("/wrench") for key in rights.writes(who)) == (
+            who.role == "controller"
+        )

@@ -12,7 +12,12 @@ import numpy as np
 import pytest
 from chaserdock_models import rotations
 from chaserdock_models.targets import target_model
-from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario, scenario_from_json
+from chaserdock_protocol.scenario import (
+    ScenarioError,
+    load_scenario,
+    parse_scenario,
+    scenario_from_json,
+)
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
 from chaserdock_protocol.scenario.fields import unit
 from chaserdock_protocol.shipped_scenarios import SHIPPED, find_scenario
@@ -44,7 +49,7 @@ def errors_of(values: dict[str, Any]) -> list[str]:
     return str(caught.value).splitlines()
 
 
-# -- what is shipped --------------------------------------------------------------------------------------
+# -- what is shipped -------------------------------------------------------------------------------
 
 
 def test_scenarios_of_the_documentation_are_shipped() -> None:
@@ -58,7 +63,11 @@ def test_shipped_scenarios_load(path: Path) -> None:
     assert scenario.name == path.stem
     assert find_scenario(path.stem) == path
     assert scenario.ticks == round(scenario.duration_s * scenario.time.rate_hz)
-    assert scenario.settling_s < (scenario.steady_until_s or scenario.duration_s) <= scenario.duration_s
+    assert (
+        scenario.settling_s
+        < (scenario.steady_until_s or scenario.duration_s)
+        <= scenario.duration_s
+    )
     assert all(entry.at_s < scenario.duration_s for entry in scenario.timeline)
     # What the world sends is what it read, to the last bit.
     assert scenario_from_json(scenario.model_dump_json(), "json") == scenario
@@ -79,7 +88,7 @@ def test_shipped_scenarios_have_the_papers_rates_and_look_at_the_target(path: Pa
         assert float(ahead @ np.array(chaser.position_m)) < -0.9 * math.hypot(*chaser.position_m)
 
 
-# -- what a scenario means --------------------------------------------------------------------------------
+# -- what a scenario means -------------------------------------------------------------------------
 
 
 def test_start_pose_is_the_reference_moved_in_trf_and_turned_in_crf() -> None:
@@ -95,7 +104,8 @@ def test_start_pose_is_the_reference_moved_in_trf_and_turned_in_crf() -> None:
     }
     position, attitude = parse_scenario(values, "x").start_pose(0)
     np.testing.assert_allclose(position, [10.0 - 0.25, 20.0 - 1.5, 30.0], rtol=0, atol=1e-15)
-    # The camera looks along the target's x, which is world y; rolled by a quarter, the body's y is world z.
+    # The camera looks along the target's x, which is world y; rolled by a quarter, the body's y is
+    # world z.
     np.testing.assert_allclose(
         rotations.rotate(attitude, [1.0, 0.0, 0.0]), [0.0, 1.0, 0.0], rtol=0, atol=1e-15
     )
@@ -118,7 +128,10 @@ def test_inertia_defaults_to_the_cuboids() -> None:
     assert given_one.inertia == (1.0, 2.0, 2.5)
 
 
-@given(st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3), st.floats(-9e-4, 9e-4))
+@given(
+    st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3),
+    st.floats(-9e-4, 9e-4),
+)
 def test_normalizing_a_quaternion_is_idempotent_to_the_bit(
     q: tuple[float, float, float, float], error: float
 ) -> None:
@@ -154,7 +167,7 @@ def test_scenarios_cannot_be_changed() -> None:
     assert isinstance(scenario.chasers, tuple)
 
 
-# -- faults -----------------------------------------------------------------------------------------------
+# -- faults ----------------------------------------------------------------------------------------
 
 FAULTS: list[tuple[str, Any, str, str]] = [
     # path, value (None: key removed), expected path, expected text
@@ -173,7 +186,12 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("chasers.0.q_wxyz", [0.0, 0.0, 0.0, 0.0], "chasers.0.q_wxyz", "unit length"),
     ("chasers.0.q_wxyz", [1.0, 0.0, 0.0], "chasers.0.q_wxyz", "must be an array of 4 numbers"),
     ("target.q_wxyz", [2.0, 0.0, 0.0, 0.0], "target.q_wxyz", "unit length"),
-    ("chasers.1.position_m", [-1.0, 0.0, 0.0], "chasers.1", "nearer than limits.min_distance_chasers_m"),
+    (
+        "chasers.1.position_m",
+        [-1.0, 0.0, 0.0],
+        "chasers.1",
+        "nearer than limits.min_distance_chasers_m",
+    ),
     ("chasers.1.start_offset_m", [-1.9, 0.0, 0.0], "chasers.1", "inside one another"),
     ("chasers.1.position_m", [0.0, 0.0, 0.0], "chasers.1", "origin"),
     ("name", "a/b", "name", "must begin with a letter or digit"),
@@ -230,8 +248,18 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("seed", 1.5, "seed", "whole number"),
     ("duration_s", "long", "duration_s", "number"),
     # Types are strict.
-    ("duration_s", "30", "duration_s", "must be a number greater than 0 and at most 7776000 (got '30')"),
-    ("duration_s", True, "duration_s", "must be a number greater than 0 and at most 7776000 (got true)"),
+    (
+        "duration_s",
+        "30",
+        "duration_s",
+        "must be a number greater than 0 and at most 7776000 (got '30')",
+    ),
+    (
+        "duration_s",
+        True,
+        "duration_s",
+        "must be a number greater than 0 and at most 7776000 (got true)",
+    ),
     ("seed", "3", "seed", "must be a whole number"),
     ("seed", 3.0, "seed", "must be a whole number at least 0 and less than 4294967296 (got 3.0)"),
     ("controller.feed_forward", 1, "controller.feed_forward", "must be true or false (got 1)"),
@@ -256,7 +284,9 @@ def test_an_error_is_one_line_with_its_path(path: str, value: Any, where: str, w
 
 def test_whole_numbers_stand_for_any_number() -> None:
     assert parse_scenario(changed("duration_s", 20), "x.toml").duration_s == 20.0
-    assert parse_scenario(changed("chasers.1.position_m", [2, 0, 0]), "x.toml").chasers[1].position_m == (
+    assert parse_scenario(changed("chasers.1.position_m", [2, 0, 0]), "x.toml").chasers[
+        1
+    ].position_m == (
         2.0,
         0.0,
         0.0,
@@ -285,7 +315,9 @@ def test_limits_themselves_are_allowed() -> None:
 
 @given(st.integers(1, 240), st.integers(1, 240), st.integers(60, 4000))
 @settings(derandomize=True, deadline=None, max_examples=100)
-def test_rates_are_accepted_exactly_when_they_divide(rate_hz: int, image_hz: int, physics_hz: int) -> None:
+def test_rates_are_accepted_exactly_when_they_divide(
+    rate_hz: int, image_hz: int, physics_hz: int
+) -> None:
     values = good() | {"time": {"rate_hz": rate_hz, "image_hz": image_hz, "physics_hz": physics_hz}}
     divides = physics_hz % rate_hz == 0 and rate_hz % image_hz == 0
     try:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario files, variants and overrides: every error is one line that names the file or the override, and the path."""
+"""Scenario files, variants and overrides: every error is one line that names the file or the
+override, and the path.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-# -- files ------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------
 
 
 def load_error(path: Path, *overrides: str) -> str:
@@ -63,7 +65,7 @@ def test_json_that_is_not_a_scenario_is_an_error() -> None:
             scenario_from_json(text, "the world's scenario")
 
 
-# -- overrides --------------------------------------------------------------------------------------------
+# -- overrides -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -80,9 +82,15 @@ def test_json_that_is_not_a_scenario_is_an_error() -> None:
         ("target.omega_rad_s=[0, 0.1, -0.2]", lambda s: s.target.omega_rad_s == (0.0, 0.1, -0.2)),
         ("camera.effects.gain=2", lambda s: s.camera.effects.gain == 2.0),
         ("controller.feed_forward=false", lambda s: s.controller.feed_forward is False),
-        ("chasers.1.start_offset_m=[0.1,0,0]", lambda s: s.chasers[1].start_offset_m == (0.1, 0.0, 0.0)),
+        (
+            "chasers.1.start_offset_m=[0.1,0,0]",
+            lambda s: s.chasers[1].start_offset_m == (0.1, 0.0, 0.0),
+        ),
         ("chasers.0.position_m.2=0.5", lambda s: s.chasers[0].position_m == (-1.0, 0.0, 0.5)),
-        ("timeline.0={at_s=1, command='abort', chasers=[0]}", lambda s: s.timeline[0].command == "abort"),
+        (
+            "timeline.0={at_s=1, command='abort', chasers=[0]}",
+            lambda s: s.timeline[0].command == "abort",
+        ),
         ("timeline=[]", lambda s: s.timeline == ()),
         ("success={docked=[0]}", lambda s: s.success.docked == (0,)),
     ],
@@ -107,8 +115,14 @@ def test_overrides_apply_in_order_and_leave_the_rest(file: Path) -> None:
         ("", "--set : must be KEY=VALUE, such as camera.width_px=640"),
         ("=3", "--set =3: must be KEY=VALUE, such as camera.width_px=640"),
         (" =3", "--set  =3: must be KEY=VALUE, such as camera.width_px=640"),
-        ("chasers.2.q_wxyz=[1,0,0,0]", "--set chasers.2.q_wxyz=[1,0,0,0]: 2 must be a number from 0 to 1"),
-        ("chasers.-1.q_wxyz=[1,0,0,0]", "--set chasers.-1.q_wxyz=[1,0,0,0]: -1 must be a number from 0 to 1"),
+        (
+            "chasers.2.q_wxyz=[1,0,0,0]",
+            "--set chasers.2.q_wxyz=[1,0,0,0]: 2 must be a number from 0 to 1",
+        ),
+        (
+            "chasers.-1.q_wxyz=[1,0,0,0]",
+            "--set chasers.-1.q_wxyz=[1,0,0,0]: -1 must be a number from 0 to 1",
+        ),
         ("chasers.first.q_wxyz=[1,0,0,0]", "first must be a number from 0 to 1"),
         ("chasers.².q_wxyz=[1,0,0,0]", "² must be a number from 0 to 1"),
         ("chasers.0.position_m.3=1", "3 must be a number from 0 to 2"),
@@ -162,7 +176,7 @@ def test_an_uninstalled_plugin_is_an_error_of_the_file_but_not_of_a_log(
     assert scenario_from_json(text, "a log")
 
 
-# -- sources of errors --------------------------------------------------------------------------------------
+# -- sources of errors -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -172,7 +186,10 @@ def test_an_uninstalled_plugin_is_an_error_of_the_file_but_not_of_a_log(
             ("camera.widht_px=640",),
             "--set camera.widht_px=640: unknown key camera.widht_px; did you mean camera.width_px?",
         ),
-        (("width_px=640",), "--set width_px=640: unknown key width_px; did you mean camera.width_px?"),
+        (
+            ("width_px=640",),
+            "--set width_px=640: unknown key width_px; did you mean camera.width_px?",
+        ),
         (
             ("target.motion=statc",),
             "--set target.motion=statc: target.motion: must be one of constant_rates, static, torque_free "
@@ -219,7 +236,7 @@ def test_deep_nesting_is_one_line(file: Path) -> None:
     assert "nested too deeply" in load_error(file, f"{deep}=1")
 
 
-# -- format -------------------------------------------------------------------------------------------------
+# -- format ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -230,12 +247,21 @@ def test_deep_nesting_is_one_line(file: Path) -> None:
             "format = 1\ntime.picture_hz = 5",
             "set format = 3 and change: time.picture_hz: is now called time.image_hz",
         ),
-        ("format = 4", "format: must be 3, the format that this version of chaserdock reads (got 4)"),
-        ('format = "3"', "format: must be 3, the format that this version of chaserdock reads (got '3')"),
+        (
+            "format = 4",
+            "format: must be 3, the format that this version of chaserdock reads (got 4)",
+        ),
+        (
+            'format = "3"',
+            "format: must be 3, the format that this version of chaserdock reads (got '3')",
+        ),
         ("time.picture_hz = 5", "time.picture_hz: is now called time.image_hz"),
         ("chaser.jet_test_s = 5", "chaser.jet_test_s: is now called chaser.thruster_test_s"),
         ("jet_failure = []", "jet_failure: is now called thruster_failure"),
-        ("odometry.position_noise_m = 0.1", "odometry: is now called navigation; state the grade, too"),
+        (
+            "odometry.position_noise_m = 0.1",
+            "odometry: is now called navigation; state the grade, too",
+        ),
         (
             "camera.calibration_error.mounting_deg = 0.1",
             "camera.calibration_error.mounting_deg: is now called navigation.camera_turn_deg",
@@ -246,7 +272,9 @@ def test_deep_nesting_is_one_line(file: Path) -> None:
         ),
     ],
 )
-def test_an_older_format_is_one_line_that_names_the_new_key(file: Path, line: str, error: str) -> None:
+def test_an_older_format_is_one_line_that_names_the_new_key(
+    file: Path, line: str, error: str
+) -> None:
     file.write_text(f"{line}\n{GOOD}")
     assert error in load_error(file)
 
@@ -265,7 +293,7 @@ def test_a_renamed_shipped_scenario_is_an_error_with_its_new_name() -> None:
         find_scenario("nowhere/single.toml")
 
 
-# -- extends ------------------------------------------------------------------------------------------------
+# -- extends ---------------------------------------------------------------------------------------
 
 
 def variant(tmp_path: Path, text: str, name: str = "variant.toml") -> Path:
@@ -302,13 +330,21 @@ def test_a_variant_may_extend_a_shipped_scenario_and_another_variant(tmp_path: P
     [
         ('"variant.toml"', "extends: cycle: "),
         ('"nowhere.toml"', "nowhere.toml: no such file"),
-        ('"singel"', "extends: singel: no such scenario file or shipped scenario; did you mean single?"),
+        (
+            '"singel"',
+            "extends: singel: no such scenario file or shipped scenario; did you mean single?",
+        ),
         ('"jet-failure"', "is now called thruster-failure"),
-        ("3", "extends: must be the name of a shipped scenario or the path of a .toml file (got 3)"),
+        (
+            "3",
+            "extends: must be the name of a shipped scenario or the path of a .toml file (got 3)",
+        ),
         ('"../../etc/passwd"', "no such scenario file or shipped scenario"),
     ],
 )
-def test_an_invalid_parent_is_one_line_with_the_path(tmp_path: Path, extends: str, error: str) -> None:
+def test_an_invalid_parent_is_one_line_with_the_path(
+    tmp_path: Path, extends: str, error: str
+) -> None:
     path = variant(tmp_path, f"extends = {extends}\n")
     line = load_error(path)
     assert line.startswith(f"{path}: extends: ")
@@ -335,7 +371,7 @@ def test_extends_is_an_error_outside_files() -> None:
         parse_scenario(good() | {"extends": "single"}, "x")
 
 
-# -- attitudes ----------------------------------------------------------------------------------------------
+# -- attitudes -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -362,7 +398,9 @@ def test_look_at_points_x_at_the_target_without_roll(position: tuple[float, floa
     q = facing_origin(position)
     assert unit(q) == q
     ahead = rotations.rotate(q, [1.0, 0.0, 0.0])
-    np.testing.assert_allclose(ahead, -np.array(position) / math.hypot(*position), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        ahead, -np.array(position) / math.hypot(*position), rtol=0, atol=1e-12
+    )
     assert abs(rotations.rotate(q, [0.0, 1.0, 0.0])[2]) < 1e-12
     assert rotations.rotate(q, [0.0, 0.0, 1.0])[2] > -1e-12
 
@@ -410,7 +448,12 @@ def test_an_invalid_attitude_is_one_line(keys: dict[str, Any], error: str) -> No
 
 def test_an_override_replaces_another_form_of_the_attitude() -> None:
     path = find_scenario("single")
-    assert load_scenario(path, ("chasers.0.q_wxyz=[0,0,0,1]",)).chasers[0].q_wxyz == (0.0, 0.0, 0.0, 1.0)
+    assert load_scenario(path, ("chasers.0.q_wxyz=[0,0,0,1]",)).chasers[0].q_wxyz == (
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )
     yaw = load_scenario(path, ("chasers.0.attitude_deg.yaw=180",)).chasers[0].q_wxyz
     np.testing.assert_allclose(yaw, [0, 0, 0, 1], atol=1e-15)
     one = load_scenario(path, ("chasers.0.q_wxyz.3=1e-4",)).chasers[0].q_wxyz
@@ -431,12 +474,12 @@ def test_a_known_target_replaces_the_geometry_of_the_base(file: Path, tmp_path: 
 @pytest.mark.parametrize("key", ["width_px=640", "height_px=480", "hfov_deg=50.0"])
 def test_camera_values_replaced_by_intrinsics_are_an_error(tmp_path: Path, key: str) -> None:
     lens = "{width_px=800,height_px=600,fx_px=700,fy_px=700,cx_px=400,cy_px=300}"
-    error = (
-        f"camera.{key.partition('=')[0]}: not used with camera.intrinsics; change camera.intrinsics instead"
-    )
+    error = f"camera.{key.partition('=')[0]}: not used with camera.intrinsics; change camera.intrinsics instead"
     variant = tmp_path / "variant.toml"
     variant.write_text(f'extends = "single"\n[camera]\nintrinsics = {lens}\n')
     assert load_scenario(variant).camera_model().width_px == 800
     assert load_error(variant, f"camera.{key}") == f"--set camera.{key}: {error}"
-    variant.write_text(f'extends = "single"\n[camera]\n{key.replace("=", " = ")}\nintrinsics = {lens}\n')
+    variant.write_text(
+        f'extends = "single"\n[camera]\n{key.replace("=", " = ")}\nintrinsics = {lens}\n'
+    )
     assert load_error(variant) == f"{variant}: {error}"

@@ -9,7 +9,13 @@ import sys
 
 import pytest
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.scenario.json_schema import description_of, key_paths, node_at, resolved, schema_of
+from chaserdock_protocol.scenario.json_schema import (
+    description_of,
+    key_paths,
+    node_at,
+    resolved,
+    schema_of,
+)
 from harness import ROOT
 
 SCHEMA = schema_of(Scenario)
@@ -17,7 +23,9 @@ SCHEMA = schema_of(Scenario)
 
 def printed(option: str) -> str:
     command = [sys.executable, str(ROOT / "docs" / "make_scenario.py"), option]
-    return subprocess.run(command, capture_output=True, text=True, check=True, encoding="utf-8").stdout
+    return subprocess.run(
+        command, capture_output=True, text=True, check=True, encoding="utf-8"
+    ).stdout
 
 
 @pytest.mark.parametrize("path", list(key_paths(SCHEMA)))
@@ -64,4 +72,6 @@ def test_the_json_schema_has_no_dangling_reference_and_describes_every_key() -> 
 
 def test_shipped_scenarios_name_the_schema_for_editors() -> None:
     for path in (ROOT / "scenarios").glob("*.toml"):
-        assert path.read_text(encoding="utf-8").startswith("#:schema ./scenario.schema.json\n"), path.name
+        assert path.read_text(encoding="utf-8").startswith("#:schema ./scenario.schema.json\n"), (
+            path.name
+        )

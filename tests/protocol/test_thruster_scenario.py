@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_models.wrench_set import WrenchSet, wrench_matrix, wrench_set
-from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario, scenario_from_json
+from chaserdock_protocol.scenario import (
+    ScenarioError,
+    load_scenario,
+    parse_scenario,
+    scenario_from_json,
+)
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from thruster_cases import box, mission
@@ -28,7 +33,9 @@ def pairs() -> list[dict[str, Any]]:
     return out
 
 
-@pytest.mark.parametrize("name", ["single-thrusters", "thruster-failure", "four-chaser-docking-thrusters"])
+@pytest.mark.parametrize(
+    "name", ["single-thrusters", "thruster-failure", "four-chaser-docking-thrusters"]
+)
 def test_shipped_scenarios_fly_with_thrusters(name: str) -> None:
     s = load_scenario(find_scenario(name))
     assert s.name == name
@@ -46,11 +53,15 @@ def test_any_one_thruster_can_be_lost(body: str, kept: float) -> None:
     wrenches, full, limits = thruster_set(body)
     assert wrenches.box_scale(full, limits) > 1.0
     for thruster in range(len(full)):
-        assert wrenches.box_scale(np.where(np.arange(len(full)) == thruster, 0.0, full), limits) > kept
+        assert (
+            wrenches.box_scale(np.where(np.arange(len(full)) == thruster, 0.0, full), limits) > kept
+        )
 
 
 def test_opposed_pairs_do_not_survive_one() -> None:
-    s = mission(chaser={"body": None, "thrusters": pairs(), "force_max_N": 0.5, "torque_max_N_m": 0.05})
+    s = mission(
+        chaser={"body": None, "thrusters": pairs(), "force_max_N": 0.5, "torque_max_N_m": 0.05}
+    )
     wrenches, full = wrench_set(wrench_matrix(s.chaser.thrusters)), thrusts_max(s.chaser.thrusters)
     full[0] = 0.0
     assert wrenches.box_scale(full, box(s)) == pytest.approx(0.0, abs=1e-9)

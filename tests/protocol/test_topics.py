@@ -123,8 +123,16 @@ def test_flight_roles_may_not_read_the_truth() -> None:
         assert topic.writer == "world"
         assert [r for r in ROLES if topics.may_read(r, topic)] == ["recorder", "analysis", "viewer"]
     # Nor by another name: the types of the truth travel on its own branch alone.
-    assert {t.kind for t in truths} == {m.BodyTruth, m.WorldTruth, m.PortLoad, m.PlumeLoad, m.DrawnTruth}
-    assert not any(t.kind in (m.BodyTruth, m.WorldTruth, m.DrawnTruth) for t in TOPICS if t not in truths)
+    assert {t.kind for t in truths} == {
+        m.BodyTruth,
+        m.WorldTruth,
+        m.PortLoad,
+        m.PlumeLoad,
+        m.DrawnTruth,
+    }
+    assert not any(
+        t.kind in (m.BodyTruth, m.WorldTruth, m.DrawnTruth) for t in TOPICS if t not in truths
+    )
     assert {"chaser", "controller"} == FLYING
 
 
@@ -152,7 +160,10 @@ def test_every_topic_has_a_version_and_a_json_schema() -> None:
     for topic in TOPICS:
         assert m.VERSION[topic.kind] >= 1
         name = topic.kind.__name__
-        assert m.encoding_of(topic.kind) == f"application/msgpack;chaserdock.{name}.v{m.VERSION[topic.kind]}"
+        assert (
+            m.encoding_of(topic.kind)
+            == f"application/msgpack;chaserdock.{name}.v{m.VERSION[topic.kind]}"
+        )
     for kind in m.VERSION:
         schema = json.loads(m.schema_of(kind))
         properties = schema["$defs"][kind.__name__]["properties"]

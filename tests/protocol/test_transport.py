@@ -36,7 +36,9 @@ def test_namespace_is_one_word(name: str) -> None:
 
 def test_configuration_file_overrides_endpoints_and_timeouts(tmp_path: Path) -> None:
     file = tmp_path / "zenoh.json5"
-    file.write_text('{ mode: "client", connect: { endpoints: ["tcp/127.0.0.1:7"], timeout_ms: 1234 } }')
+    file.write_text(
+        '{ mode: "client", connect: { endpoints: ["tcp/127.0.0.1:7"], timeout_ms: 1234 } }'
+    )
     config = zenoh_config(Link("run-1", connect=("tcp/ignored:1",), config=file))
     assert json.loads(config.get_json("mode")) == "client"
     assert json.loads(config.get_json("connect/endpoints")) == ["tcp/127.0.0.1:7"]
@@ -83,7 +85,11 @@ def test_signals_interrupt_a_client_without_a_router() -> None:
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.2)
         with pytest.raises(InterruptedByTest):
-            Node("operator", "operator", Link("run-1", (f"tcp/127.0.0.1:{free_port()}",), (), "client"))
+            Node(
+                "operator",
+                "operator",
+                Link("run-1", (f"tcp/127.0.0.1:{free_port()}",), (), "client"),
+            )
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
@@ -91,9 +97,13 @@ def test_signals_interrupt_a_client_without_a_router() -> None:
 
 def test_command_without_a_router_ends_with_status_2() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    status, said = finished("chaser", "0", "-m", "client", "-e", endpoint, "--timeout", "0.5", timeout_s=120)
+    status, said = finished(
+        "chaser", "0", "-m", "client", "-e", endpoint, "--timeout", "0.5", timeout_s=120
+    )
     assert status == 2, said
-    assert said.splitlines() == [f"chaser/0: no router at {endpoint} accepts the connection; is it running?"]
+    assert said.splitlines() == [
+        f"chaser/0: no router at {endpoint} accepts the connection; is it running?"
+    ]
 
 
 def congestion_of(node: Node, topic: topics.Topic, place: int | str | None = None) -> str:

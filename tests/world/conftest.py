@@ -13,9 +13,11 @@ from docking_cases import world
 
 @pytest.fixture
 def worlds(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """Return a function that opens worlds of ``docking_cases``; all are closed at the end of the test.
+    """Return a function that opens worlds of ``docking_cases``; all are closed at the end of the
+    test.
 
-    They are PyBullet's, or those of the engine that an indirect parameter names (``engine_cases.both``).
+    They are PyBullet's, or those of the engine that an indirect parameter names
+    (``engine_cases.both``).
     """
     opened: list[Physics] = []
     engine = getattr(request, "param", "pybullet")

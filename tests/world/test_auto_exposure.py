@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Auto-exposure: the brightest hundredth of an image reaches the stated grey level, within bounds; off by default."""
+"""Auto-exposure: the brightest hundredth of an image reaches the stated grey level, within bounds;
+off by default.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def test_bright_part_reaches_the_level() -> None:
     ("level", "share", "gain"),
     [(90, 0.3, 2.0), (90, 0.011, 2.0), (90, 0.009, 8.0), (2, 0.3, 8.0), (0, 1.0, 8.0)],
 )
-def test_gain_follows_the_brightest_hundredth_within_bounds(level: int, share: float, gain: float) -> None:
+def test_gain_follows_the_brightest_hundredth_within_bounds(
+    level: int, share: float, gain: float
+) -> None:
     assert exposure_gain(scene(level, share), 180.0) == pytest.approx(gain)
 
 

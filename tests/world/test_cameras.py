@@ -28,9 +28,13 @@ def scenario_with(*changes):
 
 def states_of(scenario, target_omega=(0.0, 0.0, 0.0)):
     target = prescribed_state(scenario, 0.0)
-    states = {TARGET: BodyState(target.position_m, np.zeros(3), target.q_wxyz, np.array(target_omega))}
+    states = {
+        TARGET: BodyState(target.position_m, np.zeros(3), target.q_wxyz, np.array(target_omega))
+    }
     c = scenario.chasers[0]
-    states["chaser/0"] = BodyState(np.array(c.position_m), np.zeros(3), np.array(c.q_wxyz), np.zeros(3))
+    states["chaser/0"] = BodyState(
+        np.array(c.position_m), np.zeros(3), np.array(c.q_wxyz), np.zeros(3)
+    )
     return states
 
 
@@ -41,7 +45,9 @@ def taken(*changes, omega=(0.0, 0.0, 0.0), time_ns=0):
 
 @pytest.mark.parametrize("renderer", ["exact", "pybullet"])
 def test_concurrent_rendering_equals_sequential_rendering(renderer):
-    scenario = load_scenario(SINGLE.with_name("four-chaser-docking.toml"), (f"camera.renderer='{renderer}'",))
+    scenario = load_scenario(
+        SINGLE.with_name("four-chaser-docking.toml"), (f"camera.renderer='{renderer}'",)
+    )
     physics, cameras = Physics(scenario), Cameras(scenario)
     states = {name: physics.state(name) for name in physics.bodies}
     for chasers in ((0, 1, 2, 3), (1, 2, 3), (2,), ()):
@@ -76,7 +82,9 @@ def test_glare_falls_with_squared_angle_and_vanishes_in_eclipse_and_occultation(
     u, v = np.rint(camera.project(to_sun)).astype(int)
     assert lit[v, u] == 255
     for column in (60, 320, 480):
-        ray = np.array([(column - camera.cx_px) / camera.fx_px, (150 - camera.cy_px) / camera.fy_px, 1.0])
+        ray = np.array(
+            [(column - camera.cx_px) / camera.fx_px, (150 - camera.cy_px) / camera.fy_px, 1.0]
+        )
         angle_deg = np.degrees(np.arccos(ray @ to_sun / np.linalg.norm(ray)))
         stray = 500.0 / angle_deg**2
         assert abs((lit - plain)[150, column] - min(stray, 255)) <= 1.0 + 0.05 * stray
@@ -98,7 +106,8 @@ def test_lamp_lights_the_target_in_eclipse():
 
 def test_earth_is_drawn_at_its_direction():
     image = taken(
-        "target.position_m=[0.0, 30.0, 0.0]", "camera.earth={direction=[0.0, 0.0, -1.0], radius_deg=84.0}"
+        "target.position_m=[0.0, 30.0, 0.0]",
+        "camera.earth={direction=[0.0, 0.0, -1.0], radius_deg=84.0}",
     )
     camera = scenario_with().camera_model()
     # Its limb is 6 degrees below the horizon, level in the image.
@@ -146,7 +155,10 @@ def test_odometry_has_the_stated_noise_and_bias():
     off = np.array([k.position_m - state.position_m for k in known])
     assert np.abs(off.std(axis=0) / 0.002 - 1.0).max() < 0.2
     assert np.linalg.norm(off.mean(axis=0)) > 0.002
-    turns = [rotations.log(rotations.multiply(rotations.conjugate(state.q_wxyz), k.q_wxyz)) for k in known]
+    turns = [
+        rotations.log(rotations.multiply(rotations.conjugate(state.q_wxyz), k.q_wxyz))
+        for k in known
+    ]
     assert np.abs(np.degrees(np.std(turns, axis=0)) / 0.1 - 1.0).max() < 0.2
     assert np.array_equal(known[0].velocity_m_s, state.velocity_m_s)
     assert OdometrySensor(scenario_with()).measure(0, 3, state) is state

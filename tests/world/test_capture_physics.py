@@ -50,7 +50,9 @@ def latch_of(physics: Physics) -> ProbeLatch:
 def test_armed_latch_closes_holds_and_conserves_momentum(
     worlds: Any, omega: tuple[float, float, float]
 ) -> None:
-    """Through the touch, the capture and 20 s after: momentum to 1e-4, nothing slips by more than 5 um."""
+    """Through the touch, the capture and 20 s after: momentum to 1e-4, nothing slips by more than 5
+    um.
+    """
     physics = worlds(omega_rad_s=omega)
     before = momentum(physics)
     physics.command_latch(0, "arm", 0)
@@ -101,7 +103,9 @@ def test_latched_bodies_move_as_one_until_release(worlds: Any) -> None:
         ({"turn_rad": math.radians(4.0)}, "angle"),
     ],
 )
-def test_probe_outside_tolerances_bounces(worlds: Any, changes: dict[str, float], reason: str) -> None:
+def test_probe_outside_tolerances_bounces(
+    worlds: Any, changes: dict[str, float], reason: str
+) -> None:
     physics = worlds(omega_rad_s=(0.0, 0.0, 0.0), **changes)
     physics.command_latch(0, "arm", 0)
     physics.advance(HZ, {})

@@ -10,7 +10,11 @@ import trimesh
 from chaserdock_models.meshes import Material, MeshPart, TriangleMesh
 from chaserdock_models.satellites import box, lathe, satellite
 from chaserdock_world.physics.bullet_engine import BulletEngine
-from chaserdock_world.physics.collision_hulls import MOST_PIECES, collision_hulls, connected_surfaces
+from chaserdock_world.physics.collision_hulls import (
+    MOST_PIECES,
+    collision_hulls,
+    connected_surfaces,
+)
 from chaserdock_world.physics.simulation import TARGET, Physics
 from scipy.spatial import ConvexHull
 from world_cases import scenario
@@ -26,7 +30,9 @@ def test_convex_parts_stay_whole() -> None:
     turned = box("b", GREY, (0.4, 0.2, 0.1), (0.1, 0.0, 0.0), (0.3, 0.2, -0.4))
     (hull,) = pieces(turned)
     assert ConvexHull(hull).volume == pytest.approx(0.4 * 0.2 * 0.1, rel=1e-6)
-    cylinder = lathe("c", GREY, ((0, 0), (0.1, 0), (0.1, 0.3), (0, 0.3)), (0, 0, 0), (0.2, 0.3, 1), 1e-3)
+    cylinder = lathe(
+        "c", GREY, ((0, 0), (0.1, 0), (0.1, 0.3), (0, 0.3)), (0, 0, 0), (0.2, 0.3, 1), 1e-3
+    )
     solid = trimesh.creation.icosphere(5, 0.2)
     ball = MeshPart("ball", GREY, np.asarray(solid.vertices), np.asarray(solid.faces))
     assert [len(pieces(part)) for part in (cylinder, ball)] == [1, 1]
@@ -36,14 +42,19 @@ def test_convex_parts_stay_whole() -> None:
 def test_surfaces_of_one_part_are_separated() -> None:
     a, b = box("a", GREY, (0.1, 0.1, 0.1), (0, 0, 0)), box("b", GREY, (0.1, 0.1, 0.1), (0.5, 0, 0))
     both = MeshPart(
-        "p", GREY, np.vstack([a.vertices_m, b.vertices_m]), np.vstack([a.triangles, b.triangles + 8])
+        "p",
+        GREY,
+        np.vstack([a.vertices_m, b.vertices_m]),
+        np.vstack([a.triangles, b.triangles + 8]),
     )
     assert [len(s.vertices_m) for s in connected_surfaces(both)] == [8, 8]
     assert sum(ConvexHull(h).volume for h in pieces(both)) == pytest.approx(2e-3)
 
 
 def test_ring_becomes_arcs() -> None:
-    ring = lathe("r", GREY, ((0.118, 0), (0.13, 0), (0.13, 0.03), (0.118, 0.03)), (0, 0, 0), (0, 0, 1), 2e-4)
+    ring = lathe(
+        "r", GREY, ((0.118, 0), (0.13, 0), (0.13, 0.03), (0.118, 0.03)), (0, 0, 0), (0, 0, 1), 2e-4
+    )
     arcs = pieces(ring)
     assert 8 <= len(arcs) <= MOST_PIECES
     true = np.pi * (0.13**2 - 0.118**2) * 0.03

@@ -25,7 +25,10 @@ def test_patches_cover_each_rectangle_once_and_are_disjoint(covered: list[Rectan
     for patch, members in found:
         assert all(pixels(covered[i]) <= pixels(patch) for i in members)
         held = set().union(*(pixels(covered[i]) for i in members))
-        assert {min(p) for p in zip(*held, strict=True)} == {patch[0], patch[1]}  # no larger than needed
+        assert {min(p) for p in zip(*held, strict=True)} == {
+            patch[0],
+            patch[1],
+        }  # no larger than needed
     for (a, _), (b, _) in combinations(found, 2):
         assert not pixels(a) & pixels(b)
 
@@ -33,4 +36,6 @@ def test_patches_cover_each_rectangle_once_and_are_disjoint(covered: list[Rectan
 def test_distant_rectangles_stay_separate_until_a_third_joins_them() -> None:
     left, right = (0, 0, 10, 10), (50, 0, 60, 10)
     assert merge_overlapping([left, right]) == [(left, frozenset([0])), (right, frozenset([1]))]
-    assert merge_overlapping([left, right, (5, 5, 55, 8)]) == [((0, 0, 60, 10), frozenset([0, 1, 2]))]
+    assert merge_overlapping([left, right, (5, 5, 55, 8)]) == [
+        ((0, 0, 60, 10), frozenset([0, 1, 2]))
+    ]

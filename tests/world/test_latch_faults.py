@@ -44,7 +44,7 @@ def total(physics: Physics) -> tuple[Array, Array]:
     return parts[0][0] + parts[1][0], parts[0][1] + parts[1][1]
 
 
-# -- strength ---------------------------------------------------------------------------------------------------
+# -- strength --------------------------------------------------------------------------------------
 
 
 @both
@@ -83,7 +83,7 @@ def test_closing_does_not_count_for_the_strength(worlds: Any) -> None:
     assert latched(physics)
 
 
-# -- play -------------------------------------------------------------------------------------------------------
+# -- play ------------------------------------------------------------------------------------------
 
 
 def test_play_lets_the_chaser_move_that_far_and_no_farther(worlds: Any) -> None:
@@ -110,7 +110,11 @@ def test_play_of_the_angle(worlds: Any) -> None:
 @pytest.mark.parametrize("wrench", [np.zeros(6), np.array([0.3, 0.5, -0.2, 0.05, 0.1, 0.02])])
 def test_load_of_a_latch_with_play_is_what_the_chaser_lacks(worlds: Any, wrench: Array) -> None:
     physics = worlds(
-        truth={"preset": "mismatch", "latch": {"play_m": 0.0005}, "target": {"centre_of_mass_m": 0.05}}
+        truth={
+            "preset": "mismatch",
+            "latch": {"play_m": 0.0005},
+            "target": {"centre_of_mass_m": 0.05},
+        }
     )
     latch(physics)
     physics.advance(300, {"chaser/0": wrench})
@@ -134,7 +138,7 @@ def test_a_stack_with_play_conserves_momentum(worlds: Any) -> None:
         assert np.linalg.norm(b - a) <= 1e-4 * np.linalg.norm(a)
 
 
-# -- faults -----------------------------------------------------------------------------------------------------
+# -- faults ----------------------------------------------------------------------------------------
 
 
 def test_a_slipping_latch_transmits_its_grip_and_no_more(worlds: Any) -> None:

@@ -78,7 +78,9 @@ def test_running_process_blocks_a_second_instance_until_it_departs() -> None:
     members = joined(membership(), "chaser/0")
     twin = JoinRequest(process="chaser/0", instance="another")
     assert members.admit(twin).reason == "chaser/0 is already running in this mission"
-    assert members.admit(JoinRequest(process="chaser/0", instance="chaser/0-1")).accepted  # asked again
+    assert members.admit(
+        JoinRequest(process="chaser/0", instance="chaser/0-1")
+    ).accepted  # asked again
     members.set_alive("chaser/0", False)
     assert members.take_departed() == ["chaser/0"]
     assert members.take_departed() == []
@@ -101,7 +103,9 @@ def test_connection_requires_mutual_discovery() -> None:
     announce(members, "chaser/0", "world", "controller")
     announce(members, "controller", "world", "chaser/0")
     assert members.connected(everyone) == {"chaser/0", "controller"}
-    assert members.connected(first("controller")) == {"controller"}  # the world has not heard the chaser
+    assert members.connected(first("controller")) == {
+        "controller"
+    }  # the world has not heard the chaser
     announce(members, "controller", "world")  # no longer
     assert members.connected(everyone) == set()
     announce(members, "controller", "chaser/0")  # has not heard the world
@@ -141,7 +145,9 @@ def test_discovery_of_an_earlier_instance_does_not_count() -> None:
     again = {**first("controller"), "chaser/0": "chaser/0-2"}
     assert members.connected(again) == set()  # the controller still talks of the first one
     heard = {"world": "world-1", "chaser/0": "chaser/0-2"}
-    assert members.update_presence(Presence(process="controller", instance="controller-1", heard=heard))
+    assert members.update_presence(
+        Presence(process="controller", instance="controller-1", heard=heard)
+    )
     assert members.connected(again) == {"chaser/0", "controller"}
 
 
@@ -173,7 +179,9 @@ def test_joining_chaser_disconnects_no_other() -> None:
     for _ in range(3):  # the controller has not heard the second start yet
         assert members.connected(heard) == {"chaser/0", "controller"}
     with_it = {**first("chaser/0"), "world": "world-1", "chaser/1": "chaser/1-2"}
-    assert members.update_presence(Presence(process="controller", instance="controller-1", heard=with_it))
+    assert members.update_presence(
+        Presence(process="controller", instance="controller-1", heard=with_it)
+    )
     assert members.connected(heard) == {"chaser/0", "chaser/1", "controller"}
 
 
@@ -193,7 +201,9 @@ def test_joining_controller_disconnects_no_other_and_waits_for_all() -> None:
 
 def test_flying_processes_must_stay_mutually_discovered() -> None:
     members, heard = flying(1)
-    assert members.connected(first("controller")) == {"controller"}  # the world lost sight of the chaser
+    assert members.connected(first("controller")) == {
+        "controller"
+    }  # the world lost sight of the chaser
     members, heard = flying(1)
     announce(members, "controller", "world")
     assert members.connected(heard) == set()
@@ -217,14 +227,16 @@ def test_second_of_two_simultaneous_joins_is_refused() -> None:
     members.now_s = lambda: now_s[0]
     assert members.admit(JoinRequest(process="chaser/0", instance="a")).accepted
     assert (
-        "another chaser/0 is joining" in members.admit(JoinRequest(process="chaser/0", instance="b")).reason
+        "another chaser/0 is joining"
+        in members.admit(JoinRequest(process="chaser/0", instance="b")).reason
     )
     now_s[0] += 6.0  # the first never came
     assert members.admit(JoinRequest(process="chaser/0", instance="b")).accepted
 
 
 def test_heartbeat_ends_with_its_node() -> None:
-    # A thread that is in Zenoh while the interpreter ends aborts the process: it has to end with the node, farewell or not.
+    # A thread that is in Zenoh while the interpreter ends aborts the process: it has to end with
+    # the node, farewell or not.
     node = Node("chaser/0", "chaser", Link("heartbeat", listen=("tcp/127.0.0.1:0",)))
     heartbeat = Heartbeat(node, "first")
     time.sleep(0.1)
@@ -270,7 +282,9 @@ def test_presence_of_an_earlier_mission_is_ignored(heartbeat: Heartbeat) -> None
     heartbeat.take(presence("chaser/0-1"))
     heartbeat.take(presence("chaser/0-0", world="earlier"))
     assert heartbeat.heard() == first("chaser/0")
-    heartbeat.take(presence("chaser/0-2", world=""))  # of a process that does not know its world's session
+    heartbeat.take(
+        presence("chaser/0-2", world="")
+    )  # of a process that does not know its world's session
     assert heartbeat.heard() == {"chaser/0": "chaser/0-2"}
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mesh renderer against Embree: grey levels, silhouettes and shadow edges of a shipped satellite with highlights."""
+"""The mesh renderer against Embree: grey levels, silhouettes and shadow edges of a shipped
+satellite with highlights.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mesh renderer against an independent ray tracer: brute force over all triangles, shadow rays, no code in common but the mesh."""
+"""The mesh renderer against an independent ray tracer: brute force over all triangles, shadow rays,
+no code in common but the mesh.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ CHUNK = 2000
 
 
 def first_hits(origins: Array, directions: Array, corners: Array) -> tuple[IntArray, Array, Array]:
-    """Return the nearest triangle hit by each ray (n,), -1 for none, its distance (n,), and barycentric coordinates (n, 2).
+    """Return the nearest triangle hit by each ray (n,), -1 for none, its distance (n,), and
+    barycentric coordinates (n, 2).
 
     T. Moeller, B. Trumbore, 1997.
     """
@@ -51,12 +54,20 @@ def first_hits(origins: Array, directions: Array, corners: Array) -> tuple[IntAr
 
 
 def ray_traced(mesh: TriangleMesh, position: Array, q_w_irf: Array) -> tuple[Array, Array]:
-    """Return grey levels (h, w) and the number of different triangles (h, w) in each pixel, with SAMPLES squared rays a pixel."""
+    """Return grey levels (h, w) and the number of different triangles (h, w) in each pixel, with
+    SAMPLES squared rays a pixel.
+    """
     soup = triangle_soup(mesh)
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
-    y, x, j, i = np.meshgrid(np.arange(CAMERA.height_px), np.arange(CAMERA.width_px), at, at, indexing="ij")
+    y, x, j, i = np.meshgrid(
+        np.arange(CAMERA.height_px), np.arange(CAMERA.width_px), at, at, indexing="ij"
+    )
     rays = np.stack(
-        [(x + i - CAMERA.cx_px) / CAMERA.fx_px, (y + j - CAMERA.cy_px) / CAMERA.fy_px, np.ones_like(x)],
+        [
+            (x + i - CAMERA.cx_px) / CAMERA.fx_px,
+            (y + j - CAMERA.cy_px) / CAMERA.fy_px,
+            np.ones_like(x),
+        ],
         axis=-1,
     ).reshape(-1, 3)
     rays = rotations.rotate(q_w_irf, rays / np.linalg.norm(rays, axis=1, keepdims=True))
@@ -65,7 +76,9 @@ def ray_traced(mesh: TriangleMesh, position: Array, q_w_irf: Array) -> tuple[Arr
     near = np.flatnonzero(np.linalg.norm(np.cross(rays, centre - position), axis=1) < radius)
     number = np.full(len(rays), -1)
     levels = np.full(len(rays), float(SPACE_LEVEL))
-    hit, distance, where = first_hits(np.broadcast_to(position, (len(near), 3)), rays[near], soup.corners_m)
+    hit, distance, where = first_hits(
+        np.broadcast_to(position, (len(near), 3)), rays[near], soup.corners_m
+    )
     number[near] = hit
     seen = hit >= 0
     points = position + distance[seen, None] * rays[near[seen]]
@@ -75,7 +88,9 @@ def ray_traced(mesh: TriangleMesh, position: Array, q_w_irf: Array) -> tuple[Arr
     return levels.reshape(shape).mean(axis=2), 1 + (np.diff(number, axis=2) != 0).sum(axis=2)
 
 
-def _shaded(mesh: TriangleMesh, soup: TriangleSoup, hit: IntArray, where: Array, points: Array) -> Array:
+def _shaded(
+    mesh: TriangleMesh, soup: TriangleSoup, hit: IntArray, where: Array, points: Array
+) -> Array:
     u, v = where[:, :1], where[:, 1:]
     corners, normals = soup.corners_m[hit], soup.normals[hit]
     normal = (1 - u - v) * normals[:, 0] + u * normals[:, 1] + v * normals[:, 2]
@@ -84,7 +99,9 @@ def _shaded(mesh: TriangleMesh, soup: TriangleSoup, hit: IntArray, where: Array,
     cosine = normal @ LIGHT.direction_w
     lit = (cosine > 0.0) & (flat @ LIGHT.direction_w > 0.0)
     lifted = points[lit] + 1e-6 * flat[lit] / np.linalg.norm(flat[lit], axis=1, keepdims=True)
-    blocked, _, _ = first_hits(lifted, np.broadcast_to(LIGHT.direction_w, lifted.shape), soup.corners_m)
+    blocked, _, _ = first_hits(
+        lifted, np.broadcast_to(LIGHT.direction_w, lifted.shape), soup.corners_m
+    )
     lit[lit] = blocked < 0
     diffuse = np.array([p.material.diffuse for p in mesh.parts])[soup.part[hit]]
     return WHITE_LEVEL * diffuse * (LIGHT.ambient + LIGHT.sun * np.where(lit, cosine, 0.0))

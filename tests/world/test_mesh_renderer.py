@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mesh renderer: grey levels, silhouettes and shadow edges against closed forms, and independence of what cannot matter."""
+"""The mesh renderer: grey levels, silhouettes and shadow edges against closed forms, and
+independence of what cannot matter.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ def draw(
 
 def plate(size_m: float = 0.4, material: Material = GREY) -> TriangleMesh:
     """A square plate whose front is at x = 0."""
-    return TriangleMesh("plate", (box("plate", material, (0.02, size_m, size_m), (0.01, 0.0, 0.0)),), {})
+    return TriangleMesh(
+        "plate", (box("plate", material, (0.02, size_m, size_m), (0.01, 0.0, 0.0)),), {}
+    )
 
 
 def test_lambert_ambient_and_lamp() -> None:
@@ -60,10 +64,13 @@ def test_specular_reflection_is_brightest_at_the_mirror_angle() -> None:
 def test_silhouette_is_exact_to_a_tenth_of_a_pixel(turn_deg: float) -> None:
     """The covered area, and the first moment, of a turned square at sub-pixel places.
 
-    Samples of an edge along the pixels lie an eighth of a pixel apart, which bounds the error of the moment.
+    Samples of an edge along the pixels lie an eighth of a pixel apart, which bounds the error of
+    the moment.
     """
     for shift in (0.0, 0.0007, 0.0013, 0.0021):
-        mesh = TriangleMesh("plate", (box("p", GREY, (0.02, 0.4, 0.3), (0.01, shift, 0.7 * shift)),), {})
+        mesh = TriangleMesh(
+            "plate", (box("p", GREY, (0.02, 0.4, 0.3), (0.01, shift, 0.7 * shift)),), {}
+        )
         q = rotations.exp([np.radians(turn_deg), 0.0, 0.0])
         image = draw(mesh, q=q).astype(float)
         share = (image - SPACE_LEVEL) / (np.median(image[110:130, 150:170]) - SPACE_LEVEL)
@@ -83,7 +90,9 @@ def test_no_background_shows_between_triangles() -> None:
                  (0.0, 0.0, 0.0), (0.3, 0.2, 1.0), 1e-4)  # fmt: skip
     light = Light((-1.0, 0.0, 0.0), 0.0, 1.0)
     for turn in np.linspace(0.0, 1.0, 5):
-        image = draw(TriangleMesh("ball", (ball,), {}), light, rotations.exp([turn, 0.3, 0.0]), at_x=0.3)
+        image = draw(
+            TriangleMesh("ball", (ball,), {}), light, rotations.exp([turn, 0.3, 0.0]), at_x=0.3
+        )
         rows, columns = np.mgrid[0:240, 0:320]
         inside = np.hypot(rows - 119.5, columns - 159.5) < 60.0
         assert np.ptp(image[inside]) == 0
@@ -98,7 +107,8 @@ def test_shadow_edge_is_exact_to_a_third_of_a_pixel() -> None:
         poses = ([bar], (-0.3, 0.0, 0.0), IDENTITY)
         row = draw(plate(0.8), light, obstacles=[poses])[120].astype(float)
         lit, dark = 0.6 * WHITE_LEVEL * (0.2 + 0.8 / np.hypot(1.0, slope)), 0.6 * WHITE_LEVEL * 0.2
-        # Of the solid bar, two edges bound the shadow: front right and back left, seen from the sun.
+        # Of the solid bar, two edges bound the shadow: front right and back left, seen from the
+        # sun.
         low, high = (-0.025 - slope * 0.31, 0.025 - slope * 0.29)
         left, right = 159.5 - 300.0 * high, 159.5 - 300.0 * low
         window = row[round(left) - 8 : round(right) + 9]
@@ -120,9 +130,9 @@ def test_textures_average_to_the_material() -> None:
     assert foil.std() > 2.0
     assert abs(float(foil.mean()) - 0.5 * WHITE_LEVEL) < 4.0
     cells = [
-        draw(plate(material=Material("cells", 0.2, texture="cells")), light, at_x=x)[100:140, 140:180].astype(
-            float
-        )
+        draw(plate(material=Material("cells", 0.2, texture="cells")), light, at_x=x)[
+            100:140, 140:180
+        ].astype(float)
         for x in (0.0, 1.0)
     ]
     share = 1.0 - (1.0 - 0.0016 / 0.04) ** 2
@@ -136,9 +146,13 @@ def test_image_does_not_depend_on_bodies_that_are_nowhere_or_behind() -> None:
     block = [Box((0.2, 0.2, 0.2))]
     for position in ((np.nan, 0.0, 0.0), (-5.0, 0.1, 0.0)):
         image = draw(
-            satellite("cubesat_12u"), Light((0.0, -1.0, 0.0)), obstacles=[(block, position, IDENTITY)]
+            satellite("cubesat_12u"),
+            Light((0.0, -1.0, 0.0)),
+            obstacles=[(block, position, IDENTITY)],
         )
-        np.testing.assert_array_equal(image, draw(satellite("cubesat_12u"), Light((0.0, -1.0, 0.0))))
+        np.testing.assert_array_equal(
+            image, draw(satellite("cubesat_12u"), Light((0.0, -1.0, 0.0)))
+        )
     assert reference.max() > 50
 
 

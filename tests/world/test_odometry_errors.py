@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The world's odometry sensor: noise, drift and biases have the stated statistics and depend on the tick only."""
+"""The world's odometry sensor: noise, drift and biases have the stated statistics and depend on the
+tick only.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def offsets(seen: list[BodyState]) -> Array:
 
 
 def turns(seen: list[BodyState]) -> Array:
-    return rotations.log([rotations.multiply(rotations.conjugate(STATE.q_wxyz), s.q_wxyz) for s in seen])
+    return rotations.log(
+        [rotations.multiply(rotations.conjugate(STATE.q_wxyz), s.q_wxyz) for s in seen]
+    )
 
 
 def test_exact_odometry_is_the_state_itself() -> None:
@@ -65,7 +69,9 @@ def test_measurements_do_not_depend_on_the_order_of_calls(order: list[int], seed
     mission = scenario(
         seed=seed,
         navigation={"grade": "poor"},
-        chasers=[{"position_m": [x, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for x in (-5.0, -3.0)],
+        chasers=[
+            {"position_m": [x, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for x in (-5.0, -3.0)
+        ],
     )
     asked = [(k % 2, k // 2) for k in order]
     one, other = OdometrySensor(mission), OdometrySensor(mission)
@@ -117,5 +123,7 @@ def test_message_states_the_covariance_of_the_white_noise_alone() -> None:
 def test_stated_covariance_is_that_of_the_measurements() -> None:
     s = OdometrySensor(scenario(navigation={"grade": "lab"}))
     seen = [s.measure(0, tick, STATE) for tick in range(2000)]
-    stated = np.sqrt(np.diag(np.reshape(odometry_of(s, 0, STATE, 0, 0).position_covariance_m2, (3, 3))))
+    stated = np.sqrt(
+        np.diag(np.reshape(odometry_of(s, 0, STATE, 0, 0).position_covariance_m2, (3, 3)))
+    )
     np.testing.assert_allclose(offsets(seen).std(axis=0), stated, rtol=0.06)

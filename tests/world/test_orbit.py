@@ -21,7 +21,11 @@ POSITION, VELOCITY = [100.0, -20.0, 5.0], [0.01, -0.22, 0.02]
 
 
 def in_orbit(orbit: dict[str, Any] = ORBIT, **changes: Any) -> Scenario:
-    chaser = {"position_m": POSITION, "q_wxyz": [1.0, 0.0, 0.0, 0.0], "start_velocity_m_s": VELOCITY}
+    chaser = {
+        "position_m": POSITION,
+        "q_wxyz": [1.0, 0.0, 0.0, 0.0],
+        "start_velocity_m_s": VELOCITY,
+    }
     still = {"velocity_m_s": [0.0, 0.0, 0.0]}
     values: dict[str, Any] = {
         "orbit": orbit,
@@ -41,7 +45,8 @@ def test_free_chaser_follows_the_relative_motion_of_two_orbits(orbit: dict[str, 
         physics.advance(HZ, {})
     state = physics.state("chaser/0")
     position, velocity = propagate_relative(state_of(case.orbit.elements), POSITION, VELOCITY, 10.0)
-    # Bullet's positions use the velocity at the end of each step: half a step's change of velocity, 2 micrometres.
+    # Bullet's positions use the velocity at the end of each step: half a step's change of velocity,
+    # 2 micrometres.
     assert state.position_m == pytest.approx(position, abs=4e-6)
     assert state.velocity_m_s == pytest.approx(velocity, abs=1e-8)
     target = physics.state("target")
@@ -49,7 +54,9 @@ def test_free_chaser_follows_the_relative_motion_of_two_orbits(orbit: dict[str, 
 
 
 def test_centre_of_mass_off_the_origin_follows_the_relative_motion() -> None:
-    """Gravity acts at the centre of mass: a body whose centre is off CRF's origin does not turn by the tidal force."""
+    """Gravity acts at the centre of mass: a body whose centre is off CRF's origin does not turn by
+    the tidal force.
+    """
     values = [{"chaser": 0, "centre_of_mass_m": [0.1, 0.0, 0.0]}]
     case = in_orbit(truth={"values": values})
     assert case.orbit is not None
@@ -63,8 +70,14 @@ def test_centre_of_mass_off_the_origin_follows_the_relative_motion() -> None:
 
 
 def test_rotation_against_space_is_free() -> None:
-    """A body with equal moments keeps its rate against space, while its rate in the turning WRF changes."""
-    target = {"motion": "torque_free", "velocity_m_s": [0.0, 0.0, 0.0], "omega_rad_s": [0.2, 0.1, -0.3]}
+    """A body with equal moments keeps its rate against space, while its rate in the turning WRF
+    changes.
+    """
+    target = {
+        "motion": "torque_free",
+        "velocity_m_s": [0.0, 0.0, 0.0],
+        "omega_rad_s": [0.2, 0.1, -0.3],
+    }
     case = in_orbit(target={**target, "inertia_kg_m2": [1.0, 1.0, 1.0]})
     assert case.orbit is not None
     physics, orbit = Physics(case), TargetOrbit(case.orbit)
@@ -74,7 +87,9 @@ def test_rotation_against_space_is_free() -> None:
     rate = np.add(case.target.omega_rad_s, orbit.frame_at(0.0).rate_rad_s)
     in_space = rotations.multiply(rotations.conjugate(axes[0]), rotations.exp(10.0 * rate))
     expected = rotations.multiply(axes[1], in_space)
-    off = rotations.log(rotations.multiply(rotations.conjugate(expected), physics.state("target").q_wxyz))
+    off = rotations.log(
+        rotations.multiply(rotations.conjugate(expected), physics.state("target").q_wxyz)
+    )
     assert np.linalg.norm(off) < 2e-5  # without the torque of the turning frame: 0.02
 
 
@@ -92,7 +107,9 @@ def test_differential_drag_pulls_the_lighter_body_back() -> None:
             physics.advance(HZ, {})
         moved.append(physics.state("chaser/0").velocity_m_s)
     # Across the motion only the Coriolis acceleration acts on what drag changed.
-    assert moved[0] - moved[1] == pytest.approx(5.0 * acceleration, abs=0.15 * 5.0 * abs(acceleration[1]))
+    assert moved[0] - moved[1] == pytest.approx(
+        5.0 * acceleration, abs=0.15 * 5.0 * abs(acceleration[1])
+    )
 
 
 def test_motion_does_not_depend_on_how_steps_are_grouped() -> None:

@@ -42,7 +42,7 @@ def state13(s: BodyState) -> Array:
     return np.concatenate([s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s])
 
 
-# -- free motion ------------------------------------------------------------------------------------------
+# -- free motion -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,12 @@ def test_torque_free_body_conserves_angular_momentum(
     worlds: Any, inertia: tuple[float, ...], omega: tuple[float, ...]
 ) -> None:
     """120 s at the default physics rate: within 1e-3, in size and direction; energy likewise."""
-    target = {"motion": "torque_free", "mass_kg": 10.0, "inertia_kg_m2": inertia, "omega_rad_s": omega}
+    target = {
+        "motion": "torque_free",
+        "mass_kg": 10.0,
+        "inertia_kg_m2": inertia,
+        "omega_rad_s": omega,
+    }
     physics = worlds(target=target)
     moments = np.array(inertia)
 
@@ -75,7 +80,9 @@ def test_torque_free_body_conserves_angular_momentum(
         now, energy_now = momentum_and_energy()
         assert np.linalg.norm(now - momentum) <= 1e-3 * np.linalg.norm(momentum)
         assert abs(energy_now - energy) <= 2e-3 * energy
-        turned = max(turned, float(np.linalg.norm(physics.state(TARGET).omega_rad_s - np.array(omega))))
+        turned = max(
+            turned, float(np.linalg.norm(physics.state(TARGET).omega_rad_s - np.array(omega)))
+        )
     assert turned > 0.02  # the rate itself is far from constant: there was something to keep
     s = physics.state(TARGET)
     np.testing.assert_allclose(s.velocity_m_s, [0.015, 0.0075, 0.03], rtol=1e-12)
@@ -84,7 +91,11 @@ def test_torque_free_body_conserves_angular_momentum(
 
 @pytest.mark.parametrize("steps", [0, 1, 7, 8, 9, HZ, 12_345])
 def test_prescribed_target_is_exact_at_every_step(worlds: Any, steps: int) -> None:
-    q, v, omega = np.array([HALF, 0.0, HALF, 0.0]), np.array([0.01, -0.02, 0.03]), np.array([0.1, -0.3, 0.2])
+    q, v, omega = (
+        np.array([HALF, 0.0, HALF, 0.0]),
+        np.array([0.01, -0.02, 0.03]),
+        np.array([0.1, -0.3, 0.2]),
+    )
     target = {
         "position_m": [1.0, 2.0, 3.0],
         "q_wxyz": q.tolist(),
@@ -97,7 +108,9 @@ def test_prescribed_target_is_exact_at_every_step(worlds: Any, steps: int) -> No
     physics.advance(steps, {})
     s, t = physics.state(TARGET), steps / HZ
     np.testing.assert_allclose(s.position_m, np.array([1.0, 2.0, 3.0]) + v * t, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(s.q_wxyz, rotations.multiply(q, rotations.exp(omega * t)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        s.q_wxyz, rotations.multiply(q, rotations.exp(omega * t)), rtol=0, atol=1e-14
+    )
     np.testing.assert_array_equal(s.velocity_m_s, v)
     np.testing.assert_array_equal(s.omega_rad_s, omega)
     np.testing.assert_array_equal(state13(prescribed_state(physics._scenario, t)), state13(s))
@@ -123,7 +136,9 @@ def test_bodies_start_at_the_scenario_state(worlds: Any) -> None:
         },
         {"position_m": [1.0, 0.0, 0.0], "q_wxyz": [0.0, 0.0, 0.0, 1.0]},
     ]
-    physics = worlds(chasers=chasers, target={"position_m": [3.0, 2.0, 1.0], "q_wxyz": [0.0, 0.0, 0.0, 1.0]})
+    physics = worlds(
+        chasers=chasers, target={"position_m": [3.0, 2.0, 1.0], "q_wxyz": [0.0, 0.0, 0.0, 1.0]}
+    )
     assert physics.bodies == ("target", "chaser/0", "chaser/1")
     s = physics.state("chaser/0")
     np.testing.assert_allclose(s.position_m, [4.0, 1.8, 1.0], rtol=0, atol=1e-12)
@@ -133,7 +148,9 @@ def test_bodies_start_at_the_scenario_state(worlds: Any) -> None:
 
 
 def test_bullets_steps_in_c_have_the_bits_of_those_in_python(worlds: Any) -> None:
-    """A chaser that turns flies against another until they touch; a third is thrust alone. The target moves as prescribed."""
+    """A chaser that turns flies against another until they touch; a third is thrust alone. The
+    target moves as prescribed.
+    """
     chasers = [
         {
             "position_m": [-5.0, 0.0, 0.0],
@@ -153,7 +170,9 @@ def test_bullets_steps_in_c_have_the_bits_of_those_in_python(worlds: Any) -> Non
     for in_c in (True, False):
         physics = worlds(chasers=chasers, limits=NONE, target=moving)
         engine = physics._engine
-        assert engine._stepper is not None, "this build of PyBullet offers no plugin with its C interface"
+        assert engine._stepper is not None, (
+            "this build of PyBullet offers no plugin with its C interface"
+        )
         if not in_c:
             engine._stepper = None
         touched = [physics.advance(HZ, {"chaser/0": wrench, "chaser/2": -wrench}) for _ in range(6)]
@@ -163,7 +182,7 @@ def test_bullets_steps_in_c_have_the_bits_of_those_in_python(worlds: Any) -> Non
     assert flown[0][0][0][0][2] > 0.11  # the target: 6 s at 0.02 m/s
 
 
-# -- forces -----------------------------------------------------------------------------------------------
+# -- forces ----------------------------------------------------------------------------------------
 
 
 @both
@@ -207,9 +226,13 @@ def test_wrench_does_not_persist(worlds: Any) -> None:
     physics.advance(10, {"chaser/0": np.ones(6)})
     s = physics.state("chaser/0")
     physics.advance(10, {})
-    np.testing.assert_allclose(physics.state("chaser/0").velocity_m_s, s.velocity_m_s, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        physics.state("chaser/0").velocity_m_s, s.velocity_m_s, rtol=0, atol=1e-15
+    )
     physics.advance(10, {"chaser/0": np.zeros(6)})
-    np.testing.assert_allclose(physics.state("chaser/0").velocity_m_s, s.velocity_m_s, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        physics.state("chaser/0").velocity_m_s, s.velocity_m_s, rtol=0, atol=1e-15
+    )
 
 
 @both
@@ -224,7 +247,7 @@ def test_grouping_of_steps_does_not_change_the_result(worlds: Any, split: int) -
         np.testing.assert_array_equal(state13(a.state(name)), state13(b.state(name)))
 
 
-# -- against the controller's model -----------------------------------------------------------------------
+# -- against the controller's model ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -234,7 +257,9 @@ def test_grouping_of_steps_does_not_change_the_result(worlds: Any, split: int) -
 def test_controller_model_matches_the_simulation(
     worlds: Any, seed: int, inertia: tuple[float, float, float] | None
 ) -> None:
-    """10 s of random inputs within the limits, inertias far from a sphere: 1 mm and 0.05 degrees (bar of the issue)."""
+    """10 s of random inputs within the limits, inertias far from a sphere: 1 mm and 0.05 degrees
+    (bar of the issue).
+    """
     rng = np.random.default_rng(seed)
     body = {"mass_kg": 12.0, "inertia_kg_m2": inertia} if inertia else {}
     start = {"start_rotation_rad": [0.4, -0.7, 0.2], "start_velocity_m_s": [0.05, -0.02, 0.03]}
@@ -244,7 +269,11 @@ def test_controller_model_matches_the_simulation(
     model = dynamics(
         NmpcParameters(
             mass_kg=b.mass_kg,
-            inertia_kg_m2=((b.inertia[0], 0.0, 0.0), (0.0, b.inertia[1], 0.0), (0.0, 0.0, b.inertia[2])),
+            inertia_kg_m2=(
+                (b.inertia[0], 0.0, 0.0),
+                (0.0, b.inertia[1], 0.0),
+                (0.0, 0.0, b.inertia[2]),
+            ),
             force_max_N=b.force_max_N,
             torque_max_N_m=b.torque_max_N_m,
             **nmpc_settings(physics._scenario.controller, physics._scenario.limits),
@@ -266,7 +295,7 @@ def test_controller_model_matches_the_simulation(
     assert np.linalg.norm(x[:3] - [-5.0, 0.0, 0.0]) > 0.1
 
 
-# -- contacts ---------------------------------------------------------------------------------------------
+# -- contacts --------------------------------------------------------------------------------------
 
 
 @both
@@ -296,7 +325,9 @@ def test_gentle_and_short_contacts_are_reported(
 ) -> None:
     start = {"start_velocity_m_s": [speed_m_s, 0.0, 0.0], "q_wxyz": rotations.exp(turn).tolist()}
     physics = worlds(
-        chasers=[{"position_m": [-0.26, 0.01, 0.0]} | start], target={"motion": "static"}, limits=NONE
+        chasers=[{"position_m": [-0.26, 0.01, 0.0]} | start],
+        target={"motion": "static"},
+        limits=NONE,
     )
     assert physics.contacts() == ()
     touched = physics.advance(int(0.12 / speed_m_s * HZ), {})
@@ -331,4 +362,6 @@ def test_moving_prescribed_target_contacts_a_chaser_in_its_way(worlds: Any) -> N
     )
     assert ("chaser/0", "target") in physics.advance(2 * HZ, {})
     s = physics.state(TARGET)
-    np.testing.assert_allclose(s.position_m, [-0.6, 0.0, 0.0], rtol=0, atol=1e-12)  # and is not stopped by it
+    np.testing.assert_allclose(
+        s.position_m, [-0.6, 0.0, 0.0], rtol=0, atol=1e-12
+    )  # and is not stopped by it

@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 
 Pixels = NDArray[np.uint8]
 
-SIZES = [(480, 640), (64, 64), (65, 67), (70, 96), (64, 161), (217, 333), (3, 5), (1, 1), (2, 40), (40, 2)]
+SIZES = [
+    (480, 640),
+    (64, 64),
+    (65, 67),
+    (70, 96),
+    (64, 161),
+    (217, 333),
+    (3, 5),
+    (1, 1),
+    (2, 40),
+    (40, 2),
+]
 
 
 @pytest.fixture(params=[number for number, _ in X86_64], autouse=True)
@@ -26,7 +37,9 @@ def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
         pytest.skip(f"this processor has no copy {request.param}")
     own = LIBRARY.function
     for module in (effects, background):
-        monkeypatch.setattr(module, "function", lambda name, result=None: own(name, result, request.param))
+        monkeypatch.setattr(
+            module, "function", lambda name, result=None: own(name, result, request.param)
+        )
 
 
 def images(size: tuple[int, int]) -> list[Pixels]:
@@ -61,7 +74,9 @@ def test_noise_kernel_equals_numpy(size: tuple[int, int], read: float, shot: flo
 def test_upsampling_equals_nearest_neighbour_interpolation(number: int) -> None:
     rng = np.random.default_rng(number)
     for rows, columns in SIZES:
-        view = rng.integers(0, 256, (rows + 5, columns + 7), dtype=np.uint8)[2 : 2 + rows, 3 : 3 + columns]
+        view = rng.integers(0, 256, (rows + 5, columns + 7), dtype=np.uint8)[
+            2 : 2 + rows, 3 : 3 + columns
+        ]
         size = (number * columns, number * rows)
         expected = cv2.resize(view, size, interpolation=cv2.INTER_NEAREST)
         np.testing.assert_array_equal(upsample(view, number), expected)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads at the ports of latched chasers, against the equations of motion of the chaser, and what a stack conserves."""
+"""Loads at the ports of latched chasers, against the equations of motion of the chaser, and what a
+stack conserves.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ from engine_cases import both
 
 HZ = 960
 FIRING = np.array([0.3, 0.5, -0.2, 0.05, 0.1, 0.02])
-MISMATCH = {"truth": {"preset": "mismatch", "target": {"centre_of_mass_m": 0.05, "inertia_turn_deg": 20.0}}}
+MISMATCH = {
+    "truth": {"preset": "mismatch", "target": {"centre_of_mass_m": 0.05, "inertia_turn_deg": 20.0}}
+}
 
 
 @both
@@ -53,7 +57,9 @@ def test_port_load_is_what_the_chaser_lacks_to_move_as_it_does(
 
 @both
 def test_a_tumbling_chaser_pulls_outward(worlds: Any) -> None:
-    """About an axis across the port's: centrifugal force m w^2 r along the port's outward axis, r to the common centre."""
+    """About an axis across the port's: centrifugal force m w^2 r along the port's outward axis, r
+    to the common centre.
+    """
     physics = worlds(omega_rad_s=(0.0, 0.0, 0.1))
     latch(physics)
     physics.advance(HZ, {})
@@ -81,8 +87,12 @@ def test_tumble_load_of_the_scenario_checks_is_that_of_the_physics(worlds: Any) 
     q_port = port_attitude(np.array([1.0, 0.0, 0.0, 0.0]))
     assert np.linalg.norm(force) > 0.1
     assert np.linalg.norm(torque) > 1e-3
-    assert loads.force_N == pytest.approx(rotations.rotate_inverse(q_port, force), rel=0.02, abs=2e-3)
-    assert loads.torque_N_m == pytest.approx(rotations.rotate_inverse(q_port, torque), rel=0.02, abs=5e-5)
+    assert loads.force_N == pytest.approx(
+        rotations.rotate_inverse(q_port, force), rel=0.02, abs=2e-3
+    )
+    assert loads.torque_N_m == pytest.approx(
+        rotations.rotate_inverse(q_port, torque), rel=0.02, abs=5e-5
+    )
 
 
 def test_a_pull_shows_as_tension_in_the_port(worlds: Any) -> None:
@@ -140,7 +150,9 @@ def test_loads_need_a_latch(worlds: Any) -> None:
 
 
 def test_recorder_takes_axes_at_each_step() -> None:
-    """Torque in the chaser's axes, force in world axes, each turned by the attitudes of its own step."""
+    """Torque in the chaser's axes, force in world axes, each turned by the attitudes of its own
+    step.
+    """
     q_off = np.array([1.0, 0.0, 0.0, 0.0])
     recorder = PortLoadRecorder(port_attitude(q_off), 1.0 / HZ)
     level, quarter_about_z = (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5)
@@ -149,7 +161,9 @@ def test_recorder_takes_axes_at_each_step() -> None:
     loads = recorder.take()
     assert loads.force_N == pytest.approx([-3.0, 0.0, 4.0])
     assert loads.torque_N_m == pytest.approx([0.0, 2.0, 0.0])
-    assert (loads.peak_axial_N, loads.peak_shear_N, loads.peak_force_N) == pytest.approx((3.0, 4.0, 5.0))
+    assert (loads.peak_axial_N, loads.peak_shear_N, loads.peak_force_N) == pytest.approx(
+        (3.0, 4.0, 5.0)
+    )
     assert (loads.peak_torque_N_m, loads.peak_bending_N_m) == pytest.approx((2.0, 2.0))
 
 
@@ -160,7 +174,9 @@ def test_two_latches_close_in_one_step() -> None:
         for i, side in enumerate((-1.0, 1.0)):
             q = np.array([1.0, 0.0, 0.0, 0.0]) if i == 0 else np.array([0.0, 0.0, 0.0, 1.0])
             place = np.array([side * (0.2 + REACH_M + 0.001), 0.0, -0.05])
-            physics.place(f"chaser/{i}", BodyState(place, np.array([-side * 0.01, 0.0, 0.0]), q, np.zeros(3)))
+            physics.place(
+                f"chaser/{i}", BodyState(place, np.array([-side * 0.01, 0.0, 0.0]), q, np.zeros(3))
+            )
             physics.command_latch(i, "arm", 0)
         physics.advance(HZ // 2, {})
         assert [x.latched for x in physics.latches.values()] == [True, True]
@@ -174,7 +190,9 @@ def test_two_latches_close_in_one_step() -> None:
 
 
 def momentum_drifts(worlds: Any, seconds: int) -> list[float]:
-    """Return the changes of linear and angular momentum of a free tumbling stack, as shares, after ``seconds``."""
+    """Return the changes of linear and angular momentum of a free tumbling stack, as shares, after
+    ``seconds``.
+    """
     physics = worlds(omega_rad_s=(0.045, 0.135, 0.09), lateral_m=0.003, turn_rad=0.02, **MISMATCH)
     latch(physics)
     physics.advance(10, {})
@@ -187,7 +205,10 @@ def momentum_drifts(worlds: Any, seconds: int) -> list[float]:
     disturbance = {"chaser/0": -physics.plants["chaser/0"].disturbance}
     before = total()
     physics.advance(seconds * HZ, disturbance)
-    return [float(np.linalg.norm(b - a) / np.linalg.norm(a)) for a, b in zip(before, total(), strict=True)]
+    return [
+        float(np.linalg.norm(b - a) / np.linalg.norm(a))
+        for a, b in zip(before, total(), strict=True)
+    ]
 
 
 @both

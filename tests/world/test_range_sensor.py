@@ -135,7 +135,9 @@ def test_bearing_is_measured_in_the_image_with_the_stated_errors() -> None:
         cameras, perception = make_cameras(lit), make_perception(flight_scenario(lit))
         for k, metres in enumerate((9.0, 14.0, 25.0, 60.0, 100.0) * 3):
             flown = states((-metres, *(rng.uniform(-0.2, 0.2, 2) * metres).tolist()))
-            turned = BodyState(np.zeros(3), np.zeros(3), rotations.normalize(rng.normal(size=4)), np.zeros(3))
+            turned = BodyState(
+                np.zeros(3), np.zeros(3), rotations.normalize(rng.normal(size=4)), np.zeros(3)
+            )
             flown["target"] = turned
             true_m, true_q = true_pose(flown)
             sighting = look(perception, cameras.image(0, k, k, 0, flown), (true_m, true_q))
@@ -198,7 +200,8 @@ def test_first_sighting_of_a_spot_as_small_as_a_star_is_near_the_optical_axis() 
     assert np.linalg.norm(pose.position_m - true_pose(states((-200.0, 0.0, 0.0)))[0]) < 0.3
 
 
-# A face of 0.32 x 0.32 m of the servicer at this range is 10 pixels wide; +Y of TRF is to the right.
+# A face of 0.32 x 0.32 m of the servicer at this range is 10 pixels wide; +Y of TRF is to the
+# right.
 FACING = rotations.from_matrix(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]))
 FACE_AT_M = scenario().camera_model().fx_px * 0.032
 
@@ -215,7 +218,9 @@ def test_origin_of_the_target_beside_its_silhouette_is_measured() -> None:
 
 def test_bright_spots_alike_are_told_apart_by_the_prediction_only() -> None:
     camera, rng = scenario().camera_model(), np.random.default_rng(3)
-    pixels = np.clip(rng.normal(4.0, 1.5, (camera.height_px, camera.width_px)), 0, 255).astype(np.uint8)
+    pixels = np.clip(rng.normal(4.0, 1.5, (camera.height_px, camera.width_px)), 0, 255).astype(
+        np.uint8
+    )
     pixels[200:210, 300:310] = pixels[300:310, 600:610] = 120
     finder = BearingFinder(camera, scenario().target_model())
     target = RangedTarget(FACE_AT_M, 0.02, FACING, 1e-7 * np.eye(3))

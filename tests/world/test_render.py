@@ -47,8 +47,9 @@ def test_marker_corners_are_at_their_projection(draw, camera, name):
     position = np.array([0.05, -0.03, 0.45 if name == "paper" else 0.8])
     q = turned(0.2, -0.3, 0.4)
     image = draw(camera, model).render(EYE, AHEAD, position, q, (), FULL_SUN)
-    # Each side's edge, found where the grey level is half way from black to white, against its true place:
-    # lines across the side in 3-D, projected. (A large marker, so that its border is many pixels wide.)
+    # Each side's edge, found where the grey level is half way from black to white, against its true
+    # place: lines across the side in 3-D, projected. (A large marker, so that its border is many
+    # pixels wide.)
     marker = model.markers[0]
     corners = marker.corners_trf_m()
     across_m = np.linspace(-0.003, 0.003, 61)
@@ -60,7 +61,9 @@ def test_marker_corners_are_at_their_projection(draw, camera, name):
         for share in np.linspace(0.2, 0.8, 13):
             line = start + share * (end - start) + across_m[:, None] * out
             px = camera.project(rotations.rotate(q, line) + position).astype(np.float32)
-            levels = np.ravel(cv2.remap(image, px[:, :1], px[:, 1:], cv2.INTER_LINEAR)).astype(float)
+            levels = np.ravel(cv2.remap(image, px[:, :1], px[:, 1:], cv2.INTER_LINEAR)).astype(
+                float
+            )
             half = 0.5 * (levels[0] + levels[-1])
             assert levels[-1] - levels[0] > 50
             i = int(np.flatnonzero(levels >= half)[0])
@@ -161,10 +164,16 @@ def test_paint_order_agrees_with_ray_casting(seed):
     generator = np.random.default_rng(seed)
     boxes, shades = [], iter(np.linspace(0.3, 1.0, 5))
     while len(boxes) < 5:
-        size, at = generator.uniform(0.05, 0.5, 3), generator.uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 2.5])
+        size, at = (
+            generator.uniform(0.05, 0.5, 3),
+            generator.uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 2.5]),
+        )
         box = Box(tuple(size), tuple(at), tuple(rotations.normalize(generator.normal(size=4))), 0.5)
         radius = np.linalg.norm(size) / 2.0
-        if all(np.linalg.norm(at - b.position_m) > radius + np.linalg.norm(b.size_m) / 2.0 for b in boxes):
+        if all(
+            np.linalg.norm(at - b.position_m) > radius + np.linalg.norm(b.size_m) / 2.0
+            for b in boxes
+        ):
             boxes.append(box)
             continue
         if generator.random() < 0.02:  # no room left for this shape: start again
@@ -295,7 +304,9 @@ def test_sunlit_faces_are_brighter_than_shaded_ones():
     model = blank(Box((0.2, 0.2, 0.2), shade=0.5))
     renderer = Renderer(CAMERA, model)
     lit = renderer.render(EYE, AHEAD, [0.0, 0.0, 1.0], rotations.IDENTITY, (), FULL_SUN)
-    dark = renderer.render(EYE, AHEAD, [0.0, 0.0, 1.0], rotations.IDENTITY, (), Light((0.0, 0.0, 1.0)))
+    dark = renderer.render(
+        EYE, AHEAD, [0.0, 0.0, 1.0], rotations.IDENTITY, (), Light((0.0, 0.0, 1.0))
+    )
     assert lit[240, 320] == round(235 * 0.5)
     assert dark[240, 320] == round(235 * 0.5 * 0.35)
     with pytest.raises(ValueError, match="direction to the sun"):
@@ -329,7 +340,9 @@ def test_texture_levels_preserve_the_mean():
 
 def test_renderer_refuses_a_non_invertible_lens():
     with pytest.raises(ValueError, match="distortion"):
-        Renderer(Camera.from_hfov(640, 480, 1.6, distortion=(-0.9, 0.0, 0.0, 0.0)), target_model("paper"))
+        Renderer(
+            Camera.from_hfov(640, 480, 1.6, distortion=(-0.9, 0.0, 0.0, 0.0)), target_model("paper")
+        )
 
 
 def test_chaser_boxes_reach_to_the_probe_tip():

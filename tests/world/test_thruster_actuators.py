@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thrusters in the world: the body gets what they give at their places, however they fail and whatever comes late."""
+"""Thrusters in the world: the body gets what they give at their places, however they fail and
+whatever comes late.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def command(
         source="command",
         force_N=(0.0, 0.0, 0.0),
         torque_N_m=(0.0, 0.0, 0.0),
-        pulses=tuple(ThrusterPulse(thruster=j, open_ns=a * MS, close_ns=b * MS) for j, a, b in pulses),
+        pulses=tuple(
+            ThrusterPulse(thruster=j, open_ns=a * MS, close_ns=b * MS) for j, a, b in pulses
+        ),
         isolated=isolated,
     )
 
@@ -72,10 +76,16 @@ def test_body_receives_thruster_forces_at_their_positions(
     physics.close()
     # Impulse and momentum agree while the body has hardly turned.
     np.testing.assert_allclose(took.impulse, wrench, atol=2e-6)
-    np.testing.assert_allclose(linear, wrench[:3], atol=0.02 * float(np.linalg.norm(wrench[:3])) + 2e-3)
-    np.testing.assert_allclose(angular, wrench[3:], atol=0.02 * float(np.linalg.norm(wrench[3:])) + 2e-4)
+    np.testing.assert_allclose(
+        linear, wrench[:3], atol=0.02 * float(np.linalg.norm(wrench[:3])) + 2e-3
+    )
+    np.testing.assert_allclose(
+        angular, wrench[3:], atol=0.02 * float(np.linalg.norm(wrench[3:])) + 2e-4
+    )
     assert took.propellant_kg == pytest.approx(sum(took.thruster_impulse_N_s) / (70.0 * 9.80665))
-    assert np.all(np.array(took.thruster_open_s) * 1.5 >= np.array(took.thruster_impulse_N_s) - 1e-9)
+    assert np.all(
+        np.array(took.thruster_open_s) * 1.5 >= np.array(took.thruster_impulse_N_s) - 1e-9
+    )
 
 
 @pytest.mark.parametrize("thruster", range(12))
@@ -99,7 +109,9 @@ def test_grouping_of_steps_does_not_change_thruster_output() -> None:
         for end in slices:
             fly_to(end, physics, {"chaser/0": thrusters}, STEP_S)
         state = physics.state("chaser/0")
-        states.append(np.concatenate([state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s]))
+        states.append(
+            np.concatenate([state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s])
+        )
         physics.close()
     np.testing.assert_array_equal(states[0], states[1])
 
@@ -111,7 +123,9 @@ def test_stuck_thruster_fires_until_isolated() -> None:
     assert thrusters.take_output(96).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.049, rel=1e-3)
     thrusters.command(command(isolated=(2,), effective_ns=150 * MS), 144, 96)
     fly_to(960, physics, {"chaser/0": thrusters}, STEP_S)
-    assert thrusters.take_output(960).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.051, rel=1e-3)
+    assert thrusters.take_output(960).thruster_impulse_N_s[2] == pytest.approx(
+        1.5 * 0.051, rel=1e-3
+    )
     fly_to(1920, physics, {"chaser/0": thrusters}, STEP_S)
     assert thrusters.take_output(1920).thruster_impulse_N_s[2] == 0.0
     physics.close()

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster faults by operator command: applied between ticks, refused with a reason, recorded as events."""
+"""Thruster faults by operator command: applied between ticks, refused with a reason, recorded as
+events.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,11 @@ def test_thruster_fails_from_the_tick_on_until_repaired() -> None:
         (ALLOWED, {"kind": "weak"}, "factor is required for weak"),
         (ALLOWED, {"factor": 0.5}, "factor is required for weak"),
         (ALLOWED, {"kind": "weak", "factor": 1.5}, "factor must be from 0 to 1, not 1.5"),
-        ({"chaser": {"actuation": "ideal", "thruster_faults_by_command": True}}, {}, "have no thrusters"),
+        (
+            {"chaser": {"actuation": "ideal", "thruster_faults_by_command": True}},
+            {},
+            "have no thrusters",
+        ),
     ],
 )
 def test_invalid_fault_command_is_refused_without_effect(
@@ -92,14 +98,21 @@ def test_the_ends_of_the_range_of_a_factor_are_valid(factor: float) -> None:
 def test_chaser_detects_a_commanded_thruster_fault_in_a_mission(tmp_path: Path) -> None:
     by_hand, log = ByHand.at_free_port("thrusterfault"), tmp_path / "mission.mcap"
     reach = ("--namespace", by_hand.namespace, "--connect", by_hand.endpoint)
-    flown = (*SHORT, "thruster_failure=[]", "duration_s=25.0", "chaser.thruster_faults_by_command=true")
+    flown = (
+        *SHORT,
+        "thruster_failure=[]",
+        "duration_s=25.0",
+        "chaser.thruster_faults_by_command=true",
+    )
     try:
         by_hand.start("world", "world", "thruster-failure", *sets(*flown))
         by_hand.start("recorder", "record", "--out", str(tmp_path))
         by_hand.start("controller", "controller")
         by_hand.start("chaser/0", "chaser", "0")
         wait_for_log(log, 200_000)
-        status, said = finished("thruster-fault", "0", "5", "stuck_on", "--operator", "test", *reach)
+        status, said = finished(
+            "thruster-fault", "0", "5", "stuck_on", "--operator", "test", *reach
+        )
         assert (status, "accepted" in said) == (0, True), said
         status, said = finished("thruster-fault", "0", "44", "stuck_on", *reach)
         assert (status, "there is no thruster 44" in said) == (1, True), said

@@ -35,11 +35,21 @@ class Network:
 
 
 def test_first_tick_after_a_return_is_repeated_until_it_is_answered() -> None:
-    """The chasers state their leases again, which the network may have lost. Later ticks are not repeated."""
+    """The chasers state their leases again, which the network may have lost. Later ticks are not
+    repeated.
+    """
     network, connected = Network(), set[str]()
     membership: Any = Mock(realtime=False, connected=lambda heard: connected, take_departed=list)
     membership.progress = dict
-    arguments: list[Any] = [network, membership, Mock(), TIMING, {"chaser/0": Mock()}, lambda: 0, Mock()]
+    arguments: list[Any] = [
+        network,
+        membership,
+        Mock(),
+        TIMING,
+        {"chaser/0": Mock()},
+        lambda: 0,
+        Mock(),
+    ]
     barrier = TickBarrier(*arguments, recorder_expected=False)
     barrier.open_tick(0, images=False)
     assert barrier.chasers == ()
@@ -60,11 +70,21 @@ def test_first_tick_after_a_return_is_repeated_until_it_is_answered() -> None:
 
 
 def test_commands_of_a_replaced_chaser_are_rejected() -> None:
-    """A chaser that was frozen and replaced may send a command before it reads that another one flies in its place."""
+    """A chaser that was frozen and replaced may send a command before it reads that another one
+    flies in its place.
+    """
     network, chaser = Network(), Mock()
     membership: Any = Mock(realtime=True, connected=lambda heard: {"chaser/0"}, take_departed=list)
     membership.instance_of = lambda name: "second"
-    arguments: list[Any] = [network, membership, Mock(), TIMING, {"chaser/0": chaser}, lambda: 0, Mock()]
+    arguments: list[Any] = [
+        network,
+        membership,
+        Mock(),
+        TIMING,
+        {"chaser/0": chaser},
+        lambda: 0,
+        Mock(),
+    ]
     barrier = TickBarrier(*arguments, recorder_expected=False)
     barrier.open_tick(0, images=False)
     assert network.ticks[-1].chaser_instances == {"chaser/0": "second"}

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``[truth]``: true bodies, actuators and sensors that differ from the nominal values of the flight software."""
+"""``[truth]``: true bodies, actuators and sensors that differ from the nominal values of the flight
+software.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,10 @@ offsets = st.tuples(*[st.floats(-0.03, 0.03, allow_subnormal=False)] * 3)
 rates = st.tuples(*[st.floats(-0.5, 0.5, allow_subnormal=False)] * 3)
 TENSOR = [[0.30, 0.02, -0.01], [0.02, 0.35, 0.015], [-0.01, 0.015, 0.40]]
 AT = BodyState(
-    np.array([1.0, -2.0, 3.0]), np.array([0.05, 0.02, -0.01]), rotations.exp([0.3, -0.2, 0.5]), np.zeros(3)
+    np.array([1.0, -2.0, 3.0]),
+    np.array([0.05, 0.02, -0.01]),
+    rotations.exp([0.3, -0.2, 0.5]),
+    np.zeros(3),
 )
 
 
@@ -41,25 +46,33 @@ def with_values(**values: Any) -> Any:
 
 
 def momenta(physics: Physics, name: str = "chaser/0") -> tuple[Array, Array, float]:
-    """Return linear and angular momentum (WRF, about the centre of mass) and kinetic energy of a body."""
+    """Return linear and angular momentum (WRF, about the centre of mass) and kinetic energy of a
+    body.
+    """
     s, plant = physics.state(name), physics.plants[name]
-    velocity = s.velocity_m_s + rotations.rotate(s.q_wxyz, np.cross(s.omega_rad_s, plant.centre_of_mass_m))
+    velocity = s.velocity_m_s + rotations.rotate(
+        s.q_wxyz, np.cross(s.omega_rad_s, plant.centre_of_mass_m)
+    )
     spin = plant.inertia_kg_m2 @ s.omega_rad_s
     energy = 0.5 * plant.mass_kg * velocity @ velocity + 0.5 * s.omega_rad_s @ spin
     return plant.mass_kg * velocity, rotations.rotate(s.q_wxyz, spin), float(energy)
 
 
-# -- mesh of the target -------------------------------------------------------------------------------------
+# -- mesh of the target ----------------------------------------------------------------------------
 
 
 def mesh_errors(seed: int, **knowledge: float) -> tuple[float, Array]:
     """Return scale and rotation vectors (2, 3) of the true mesh, recovered from its vertices."""
     s = scenario(
-        seed=seed, target={"model": "geo_servicer", "knowledge": knowledge}, perception={"name": "model"}
+        seed=seed,
+        target={"model": "geo_servicer", "knowledge": knowledge},
+        perception={"name": "model"},
     )
     mesh, nominal = true_mesh(s), satellite("geo_servicer")
     assert mesh is not None
-    pairs = {p.name: (p.vertices_m, q.vertices_m) for p, q in zip(nominal.parts, mesh.parts, strict=True)}
+    pairs = {
+        p.name: (p.vertices_m, q.vertices_m) for p, q in zip(nominal.parts, mesh.parts, strict=True)
+    }
     scale = float(np.linalg.norm(pairs["bus"][1]) / np.linalg.norm(pairs["bus"][0])) - 1.0
     turns = []
     for joint, at in nominal.joints.items():
@@ -93,7 +106,7 @@ def test_true_mesh_is_integrated_about_its_principal_axes() -> None:
     assert np.abs(s.target.inertia_tensor - np.diag(s.target.moments)).max() > 1e-4
 
 
-# -- bodies -------------------------------------------------------------------------------------------------
+# -- bodies ----------------------------------------------------------------------------------------
 
 
 def test_without_truth_plants_are_the_nominal_bodies() -> None:
@@ -124,7 +137,8 @@ def test_a_thin_rod_still_gets_moments_of_a_rigid_body() -> None:
 
 def test_drawn_mass_has_the_stated_sigma_and_limit() -> None:
     masses = [
-        chaser_plant(scenario(seed=seed, truth={"chaser": {"mass_share": 0.1}}), 0).mass_kg / 30.0 - 1.0
+        chaser_plant(scenario(seed=seed, truth={"chaser": {"mass_share": 0.1}}), 0).mass_kg / 30.0
+        - 1.0
         for seed in range(400)
     ]
     assert np.std(masses) == pytest.approx(0.1, rel=0.12)
@@ -141,7 +155,10 @@ def test_chasers_and_target_are_drawn_apart() -> None:
 
 def test_explicit_values_replace_drawn_ones() -> None:
     s = with_values(
-        mass_kg=12.0, inertia_kg_m2=TENSOR, centre_of_mass_m=[0.01, 0.0, -0.02], force_N=[0.0, 0.1, 0.0]
+        mass_kg=12.0,
+        inertia_kg_m2=TENSOR,
+        centre_of_mass_m=[0.01, 0.0, -0.02],
+        force_N=[0.0, 0.1, 0.0],
     )
     plant = chaser_plant(s, 0)
     assert plant.mass_kg == 12.0
@@ -151,7 +168,7 @@ def test_explicit_values_replace_drawn_ones() -> None:
     assert chaser_plant(scenario(), 0).mass_kg == 30.0
 
 
-# -- motion -------------------------------------------------------------------------------------------------
+# -- motion ----------------------------------------------------------------------------------------
 
 
 @few
@@ -185,7 +202,11 @@ def test_the_origin_circles_the_centre_of_mass() -> None:
     """A body that spins about its centre of mass: the origin, 2 cm beside it, moves on a circle."""
     physics = Physics(with_values(centre_of_mass_m=[0.02, 0.0, 0.0]))
     upright = np.array([1.0, 0.0, 0.0, 0.0])
-    at, moving, spin = np.array([9.0, 0.0, 0.0]), np.array([0.0, -0.01, 0.0]), np.array([0.0, 0.0, 0.5])
+    at, moving, spin = (
+        np.array([9.0, 0.0, 0.0]),
+        np.array([0.0, -0.01, 0.0]),
+        np.array([0.0, 0.0, 0.5]),
+    )
     physics.place("chaser/0", BodyState(at, moving, upright, spin))
     physics.advance(HZ, {})
     s = physics.state("chaser/0")
@@ -197,7 +218,9 @@ def test_the_origin_circles_the_centre_of_mass() -> None:
 
 def test_a_force_beside_the_centre_of_mass_turns_the_body_as_calculated() -> None:
     offset, force = np.array([0.0, 0.01, -0.02]), np.array([2.0, -1.0, 0.5])
-    physics = Physics(with_values(mass_kg=20.0, inertia_kg_m2=TENSOR, centre_of_mass_m=offset.tolist()))
+    physics = Physics(
+        with_values(mass_kg=20.0, inertia_kg_m2=TENSOR, centre_of_mass_m=offset.tolist())
+    )
     physics.place("chaser/0", BodyState(AT.position_m, np.zeros(3), AT.q_wxyz, np.zeros(3)))
     steps = 24
     physics.advance(steps, {"chaser/0": np.array([*force, 0.0, 0.0, 0.0])})
@@ -218,7 +241,9 @@ def test_constant_disturbance_acts_without_commands() -> None:
     physics.advance(HZ // 4, {})
     s, plant = physics.state("chaser/0"), physics.plants["chaser/0"]
     physics.close()
-    np.testing.assert_allclose(s.omega_rad_s, [0.25 * 0.01 / plant.moments_kg_m2[0], 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(
+        s.omega_rad_s, [0.25 * 0.01 / plant.moments_kg_m2[0], 0.0, 0.0], atol=1e-6
+    )
     gained = rotations.rotate_inverse(before.q_wxyz, s.velocity_m_s - before.velocity_m_s)
     np.testing.assert_allclose(gained, [0.0, 0.25 * 0.3 / 30.0, 0.0], atol=1e-4)
 
@@ -242,7 +267,11 @@ def test_the_surface_stays_where_it_is_with_another_centre_of_mass() -> None:
     places = [{"position_m": [x, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for x in (-5.0, -3.0)]
     s = scenario(
         chasers=places,
-        truth={"values": [{"chaser": 0, "centre_of_mass_m": [0.02, 0.01, 0.0], "inertia_kg_m2": TENSOR}]},
+        truth={
+            "values": [
+                {"chaser": 0, "centre_of_mass_m": [0.02, 0.01, 0.0], "inertia_kg_m2": TENSOR}
+            ]
+        },
     )
     for gap_m, touch in ((-0.0005, True), (0.0005, False)):
         physics = Physics(s)
@@ -264,7 +293,9 @@ def test_a_latched_pair_keeps_its_relative_pose() -> None:
     target = physics.state(TARGET)
     at = target.position_m + rotations.rotate(target.q_wxyz, [-0.56, 0.0, -0.05])
     omega = target.omega_rad_s
-    velocity = target.velocity_m_s + rotations.rotate(target.q_wxyz, np.cross(omega, [-0.56, 0.0, -0.05]))
+    velocity = target.velocity_m_s + rotations.rotate(
+        target.q_wxyz, np.cross(omega, [-0.56, 0.0, -0.05])
+    )
     physics.place("chaser/0", BodyState(at, velocity, target.q_wxyz, omega))
     physics._add_joint("chaser/0")
     physics.advance(2 * HZ, {"chaser/0": np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])})
@@ -275,7 +306,7 @@ def test_a_latched_pair_keeps_its_relative_pose() -> None:
     assert rotations.angle_between(a.q_wxyz, b.q_wxyz) < np.radians(0.2)
 
 
-# -- actuators ----------------------------------------------------------------------------------------------
+# -- actuators -------------------------------------------------------------------------------------
 
 
 def wrench_of(actuators: IdealActuators, force: Any, step: int = 10) -> Array:
@@ -296,14 +327,20 @@ def test_ideal_actuators_give_the_command_with_their_errors() -> None:
     s = with_values(thrust_share=[0.1, -0.1, 0.0, 0.0, 0.0, 0.0])
     actuators = make_actuators(s, 0)
     assert isinstance(actuators, IdealActuators)
-    np.testing.assert_allclose(wrench_of(actuators, (1.0, 1.0, 1.0))[:3], [1.1, 0.9, 1.0], rtol=1e-12)
-    np.testing.assert_allclose(actuators.take_output(11).impulse[:3], np.array([1.1, 0.9, 1.0]) * STEP_S)
+    np.testing.assert_allclose(
+        wrench_of(actuators, (1.0, 1.0, 1.0))[:3], [1.1, 0.9, 1.0], rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        actuators.take_output(11).impulse[:3], np.array([1.1, 0.9, 1.0]) * STEP_S
+    )
 
 
 def test_thrust_turn_keeps_the_force_and_changes_its_direction() -> None:
     angles = []
     for seed in range(100):
-        actuators = make_actuators(scenario(seed=seed, truth={"chaser": {"thrust_turn_deg": 1.0}}), 0)
+        actuators = make_actuators(
+            scenario(seed=seed, truth={"chaser": {"thrust_turn_deg": 1.0}}), 0
+        )
         assert isinstance(actuators, IdealActuators)
         force = wrench_of(actuators, (0.0, 0.0, 1.0))[:3]
         assert np.linalg.norm(force) == pytest.approx(1.0)
@@ -320,7 +357,9 @@ def test_delay_moves_the_effect_of_a_command() -> None:
 
 
 @pytest.mark.parametrize(("offset_s", "acts_at"), [(0.05, 10), (-0.05, 58 + 10 - 10)])
-def test_a_clock_that_is_ahead_does_not_act_before_the_command_arrives(offset_s: float, acts_at: int) -> None:
+def test_a_clock_that_is_ahead_does_not_act_before_the_command_arrives(
+    offset_s: float, acts_at: int
+) -> None:
     actuators = make_actuators(with_values(clock_offset_s=offset_s), 0)
     command = ActuatorCommand(
         tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command", force_N=(1.0, 0.0, 0.0),
@@ -332,7 +371,9 @@ def test_a_clock_that_is_ahead_does_not_act_before_the_command_arrives(offset_s:
 
 
 def test_jitter_keeps_the_order_of_commands() -> None:
-    actuators = make_actuators(scenario(truth={"chaser": {"delay_s": 0.02, "delay_jitter_s": 0.02}}), 0)
+    actuators = make_actuators(
+        scenario(truth={"chaser": {"delay_s": 0.02, "delay_jitter_s": 0.02}}), 0
+    )
     assert isinstance(actuators, IdealActuators)
     steps = []
     for k in range(60):
@@ -365,7 +406,9 @@ def impulse_of(s: Any, width_ns: int = 50_000_000) -> Array:
 def test_thrusters_have_their_own_thrust_and_direction() -> None:
     n = len(mission().chaser.thrusters)
     stated = impulse_of(mission())
-    stronger = impulse_of(mission(truth={"values": [{"chaser": 0, "thrust_share": [0.1] + [0.0] * (n - 1)}]}))
+    stronger = impulse_of(
+        mission(truth={"values": [{"chaser": 0, "thrust_share": [0.1] + [0.0] * (n - 1)}]})
+    )
     np.testing.assert_allclose(stronger, 1.1 * stated, rtol=1e-9, atol=1e-12)
     turned = impulse_of(mission(truth={"chaser": {"thrust_turn_deg": 2.0}}))[:3]
     assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(stated[:3]), rel=1e-9)
@@ -375,7 +418,9 @@ def test_thrusters_have_their_own_thrust_and_direction() -> None:
 def test_pulses_scatter_in_width_but_not_below_the_minimum() -> None:
     nominal = np.linalg.norm(impulse_of(mission())[:3])
     widths = [
-        np.linalg.norm(impulse_of(mission(seed=k, truth={"chaser": {"pulse_scatter_share": 0.1}}))[:3])
+        np.linalg.norm(
+            impulse_of(mission(seed=k, truth={"chaser": {"pulse_scatter_share": 0.1}}))[:3]
+        )
         / nominal
         for k in range(100)
     ]
@@ -383,14 +428,16 @@ def test_pulses_scatter_in_width_but_not_below_the_minimum() -> None:
     shortest = np.linalg.norm(impulse_of(mission(), 10_000_000)[:3])
     scattered = [
         np.linalg.norm(
-            impulse_of(mission(seed=k, truth={"chaser": {"pulse_scatter_share": 0.1}}), 10_000_000)[:3]
+            impulse_of(mission(seed=k, truth={"chaser": {"pulse_scatter_share": 0.1}}), 10_000_000)[
+                :3
+            ]
         )
         for k in range(20)
     ]
     assert min(scattered) == pytest.approx(shortest)
 
 
-# -- sensors and target -------------------------------------------------------------------------------------
+# -- sensors and target ----------------------------------------------------------------------------
 
 
 def test_unknown_camera_errors_add_to_the_known_ones() -> None:
@@ -439,7 +486,7 @@ def test_drawn_truth_states_what_the_world_simulates() -> None:
     physics.close()
 
 
-# -- errors of a scenario -----------------------------------------------------------------------------------
+# -- errors of a scenario --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -453,8 +500,14 @@ def test_drawn_truth_states_what_the_world_simulates() -> None:
             {"chaser": {"mass_share": 0.5}},
             "truth.chaser.mass_share: must be a number from 0 to 0.3 (got 0.5)",
         ),
-        ({"target": {"mass_share": 0.1}}, 'truth.target.mass_share: needs target.motion = "torque_free"'),
-        ({"values": [{"chaser": 1, "mass_kg": 1.0}]}, "truth.values.0.chaser: there is no chaser 1"),
+        (
+            {"target": {"mass_share": 0.1}},
+            'truth.target.mass_share: needs target.motion = "torque_free"',
+        ),
+        (
+            {"values": [{"chaser": 1, "mass_kg": 1.0}]},
+            "truth.values.0.chaser: there is no chaser 1",
+        ),
         ({"values": [{"mass_kg": 1.0}]}, "truth.values.0: give either chaser = N or target = true"),
         ({"values": [{"chaser": 0}, {"chaser": 0}]}, "truth.values.1: chaser 0 has values already"),
         (

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The target's orbit over a mission: its Hill frame, which is WRF, and sun and Earth seen in it. A function of time only."""
+"""The target's orbit over a mission: its Hill frame, which is WRF, and sun and Earth seen in it. A
+function of time only.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,14 @@ from functools import lru_cache
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.orbit import EARTH_RADIUS_M, HillFrame, OrbitState, hill_frame, propagate, state_of
+from chaserdock_models.orbit import (
+    EARTH_RADIUS_M,
+    HillFrame,
+    OrbitState,
+    hill_frame,
+    propagate,
+    state_of,
+)
 from chaserdock_models.orbit_environment import drag, sun_position, sunlit_share
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.orbit import Orbit
@@ -73,7 +82,9 @@ def to_sun(scenario: Scenario, time_s: float = 0.0) -> tuple[float, float, float
 
 
 def earth_disc(scenario: Scenario) -> tuple[tuple[float, float, float], float] | None:
-    """Return the direction (3,) to the Earth's centre, WRF, and its angular radius (rad); None without an Earth in images."""
+    """Return the direction (3,) to the Earth's centre, WRF, and its angular radius (rad); None
+    without an Earth in images.
+    """
     if scenario.orbit is not None:
         return (-1.0, 0.0, 0.0), TargetOrbit(scenario.orbit).earth_radius_rad(0.0)
     earth = scenario.camera.earth

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""True bodies and actuators: the nominal ones of the flight software with the errors of ``[truth]``.
+"""True bodies and actuators: the nominal ones of the flight software with the errors of
+``[truth]``.
 
-Everything is drawn from the scenario's seed and the chaser's number. Without ``[truth]`` a plant is the nominal body.
+Everything is drawn from the scenario's seed and the chaser's number. Without ``[truth]`` a plant is
+the nominal body.
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ _LARGEST_SIGMA = 3.0
 
 @dataclass(frozen=True, eq=False)
 class PrincipalFrame:
-    """Principal axes at the centre of mass, in which an engine integrates: ``q_wxyz`` (4,) principal to body axes, and the
-    centre of mass ``offset_m`` (3,) in body axes."""
+    """Principal axes at the centre of mass, in which an engine integrates: ``q_wxyz`` (4,)
+    principal to body axes, and the centre of mass ``offset_m`` (3,) in body axes."""
 
     q_wxyz: Array
     offset_m: Array
@@ -54,19 +56,26 @@ class PrincipalFrame:
         )
 
     def wrench(self, wrench: Array) -> Array:
-        """Return force and torque (6,) about the centre of mass, principal axes, of a wrench at the body's origin."""
+        """Return force and torque (6,) about the centre of mass, principal axes, of a wrench at the
+        body's origin.
+        """
         torque = wrench[3:] - rotations.cross(self.offset_m, wrench[:3])
-        return np.concatenate([rotations.rotate_inverse(self.q_wxyz, part) for part in (wrench[:3], torque)])
+        return np.concatenate(
+            [rotations.rotate_inverse(self.q_wxyz, part) for part in (wrench[:3], torque)]
+        )
 
     def place(self, position_m: Array, q_wxyz: Array) -> tuple[Array, Array]:
         """Return the pose in this frame of a part with this pose in the body's frame."""
         inverse = rotations.conjugate(self.q_wxyz)
-        return rotations.rotate(inverse, position_m - self.offset_m), rotations.multiply(inverse, q_wxyz)
+        return rotations.rotate(inverse, position_m - self.offset_m), rotations.multiply(
+            inverse, q_wxyz
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """True mass properties of a body and its constant disturbance (6,), N and N m, at its origin in body axes.
+    """True mass properties of a body and its constant disturbance (6,), N and N m, at its origin in
+    body axes.
 
     ``frame``: None if the principal axes at the centre of mass are the body's frame.
     """
@@ -92,8 +101,8 @@ class Plant:
 class ActuationErrors:
     """Errors of one chaser's actuators.
 
-    ``thrust_share`` (n,) and ``thrust_turn_rad`` (n, 3): of each thruster. With ideal actuation, the shares (6,) of force
-    and torque per axis, and the turns (2, 3) of force and torque.
+    ``thrust_share`` (n,) and ``thrust_turn_rad`` (n, 3): of each thruster. With ideal actuation,
+    the shares (6,) of force and torque per axis, and the turns (2, 3) of force and torque.
     """
 
     seed: int
@@ -112,7 +121,9 @@ class ActuationErrors:
         return not (any(figures) or self.thrust_share.any() or self.thrust_turn_rad.any())
 
     def delay(self, step: int) -> float:
-        """Return the time, s, after which a command for this physics step acts; negative if the clock is ahead."""
+        """Return the time, s, after which a command for this physics step acts; negative if the
+        clock is ahead.
+        """
         jitter = 0.0
         if self.delay_jitter_s:
             draw = generator(self.seed, Stream.DELAY, self.chaser, step).standard_normal()
@@ -120,7 +131,9 @@ class ActuationErrors:
         return max(0.0, self.delay_s + jitter) - self.clock_offset_s
 
     def scatter(self, key: int, time: int, count: int) -> Array:
-        """Return factors (count,) that scatter around 1. ``key``: of the thruster; ``time``: of the pulse or command."""
+        """Return factors (count,) that scatter around 1. ``key``: of the thruster; ``time``: of the
+        pulse or command.
+        """
         draw = generator(self.seed, Stream.SCATTER, self.chaser, key, time).standard_normal(count)
         return 1.0 + self.scatter_share * np.clip(draw, -_LARGEST_SIGMA, _LARGEST_SIGMA)
 
@@ -131,10 +144,11 @@ def _normal(seed: int, stream: Stream, key: int, count: int) -> Array:
 
 
 def draw_moments(nominal: Moments, share: float, rng: np.random.Generator) -> Moments:
-    """Return principal moments with relative errors of standard deviation ``share`` that a rigid body can have.
+    """Return principal moments with relative errors of standard deviation ``share`` that a rigid
+    body can have.
 
-    What violates the triangle inequality is drawn again, each time with a slightly smaller deviation, which ends for every
-    nominal body.
+    What violates the triangle inequality is drawn again, each time with a slightly smaller
+    deviation, which ends for every nominal body.
     """
     while share:
         draw = np.clip(rng.standard_normal(3), -_LARGEST_SIGMA, _LARGEST_SIGMA)
@@ -146,7 +160,9 @@ def draw_moments(nominal: Moments, share: float, rng: np.random.Generator) -> Mo
 
 
 def _principal(inertia: Array) -> tuple[Moments, Array]:
-    """Return the principal moments of an inertia tensor (3, 3), and the rotation (4,) from principal to body axes."""
+    """Return the principal moments of an inertia tensor (3, 3), and the rotation (4,) from
+    principal to body axes.
+    """
     values, axes = np.linalg.eigh(inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     a, b, c = values.tolist()
@@ -163,7 +179,9 @@ def _plant(
     axes_wxyz: Array | None = None,
     centre_m: Array | None = None,
 ) -> Plant:
-    """Return a body with errors. ``axes_wxyz`` (4,): stated principal axes to body axes; ``centre_m`` (3,): stated centre of mass."""
+    """Return a body with errors. ``axes_wxyz`` (4,): stated principal axes to body axes;
+    ``centre_m`` (3,): stated centre of mass.
+    """
     draw = _normal(seed, Stream.PLANT, key, 13)
     mass = mass_kg * (1.0 + sigma.mass_share * float(draw[0]))
     offset, turn = sigma.centre_of_mass_m * draw[1:4], sigma.inertia_turn_rad * draw[4:7]
@@ -196,7 +214,9 @@ def chaser_plant(scenario: Scenario, chaser: int) -> Plant:
 
 
 def target_plant(scenario: Scenario) -> Plant:
-    """Return the true body of the target. A prescribed motion needs none: then it is the stated one."""
+    """Return the true body of the target. A prescribed motion needs none: then it is the stated
+    one.
+    """
     target = scenario.target
     if target.motion != "torque_free":
         return Plant(target.mass_kg, target.moments)
@@ -238,13 +258,16 @@ def true_target(scenario: Scenario) -> TargetModel:
     model, sigma = scenario.target_model(), scenario.truth.mismatch("target").marker_m
     if not sigma:
         return model
-    draw = sigma * _normal(scenario.seed, Stream.MARKERS, TARGET_KEY, 2 * len(model.markers)).reshape(-1, 2)
+    draw = sigma * _normal(
+        scenario.seed, Stream.MARKERS, TARGET_KEY, 2 * len(model.markers)
+    ).reshape(-1, 2)
     markers = tuple(_moved(m, off) for m, off in zip(model.markers, draw, strict=True))
     return replace(model, markers=markers)
 
 
 def true_mesh(scenario: Scenario) -> TriangleMesh | None:
-    """Return the target's mesh as it is: finer than the known one, its size and the angles of its joints in error.
+    """Return the target's mesh as it is: finer than the known one, its size and the angles of its
+    joints in error.
 
     None for a target without a mesh.
     """
@@ -253,7 +276,9 @@ def true_mesh(scenario: Scenario) -> TriangleMesh | None:
 
 
 def true_geometry_errors(scenario: Scenario) -> tuple[float, dict[str, Array]]:
-    """Return the errors of the known mesh that a seed draws: of the scale, a share, and the turn (3,) of each joint, rad."""
+    """Return the errors of the known mesh that a seed draws: of the scale, a share, and the turn
+    (3,) of each joint, rad.
+    """
     mesh, knowledge = scenario.target.nominal_mesh(), scenario.target.knowledge
     joints = () if mesh is None else tuple(mesh.joints)
     draw = _normal(scenario.seed, Stream.MESH, TARGET_KEY, 1 + 3 * len(joints))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The world process: owns simulated time, simulates the bodies, renders the images and publishes the ground truth.
+"""The world process: owns simulated time, simulates the bodies, renders the images and publishes
+the ground truth.
 
-Lock-step: a tick ends when all expected replies have arrived; nothing depends on the order of arrival or on the wall clock.
-Real time: the wall clock ends a tick.
+Lock-step: a tick ends when all expected replies have arrived; nothing depends on the order of
+arrival or on the wall clock. Real time: the wall clock ends a tick.
 """
 
 from __future__ import annotations
@@ -21,7 +22,12 @@ from chaserdock_protocol.messages import (
     ThrusterFaultCommand,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
-from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario_json, load_scenario
+from chaserdock_protocol.scenario import (
+    Scenario,
+    ScenarioError,
+    flight_scenario_json,
+    load_scenario,
+)
 from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node, TransportError
@@ -50,8 +56,11 @@ _REALTIME_SLICES_HZ = 240
 
 
 def main(options: ProcessOptions) -> int:
-    """Run the world of ``options.scenario``; return 0 if the mission was completed, 1 if not, 2 for invalid input."""
-    # The other processes need the cores, and OpenCV's idle threads spin between the many short calls of an image.
+    """Run the world of ``options.scenario``; return 0 if the mission was completed, 1 if not, 2 for
+    invalid input.
+    """
+    # The other processes need the cores, and OpenCV's idle threads spin between the many short
+    # calls of an image.
     cv2.setNumThreads(1)
     node: Node | None = None
     try:
@@ -68,10 +77,14 @@ def main(options: ProcessOptions) -> int:
 
 
 def load_world_scenario(options: ProcessOptions) -> Scenario:
-    """Return the scenario of the options, with overrides and seed; raises ScenarioError and MissingPackageError."""
+    """Return the scenario of the options, with overrides and seed; raises ScenarioError and
+    MissingPackageError.
+    """
     if options.scenario is None:
         raise ScenarioError("the world needs a scenario file")
-    overrides = options.overrides if options.seed is None else (*options.overrides, f"seed={options.seed}")
+    overrides = (
+        options.overrides if options.seed is None else (*options.overrides, f"seed={options.seed}")
+    )
     scenario = load_scenario(options.scenario, overrides)
     require_packages(scenario)
     return scenario
@@ -85,14 +98,18 @@ def refuse_second_world(node: Node) -> None:
 
 
 class World:
-    """One mission: simulation, sensors, actuators and the barrier of its ticks. Processes can join once it is made."""
+    """One mission: simulation, sensors, actuators and the barrier of its ticks. Processes can join
+    once it is made.
+    """
 
     def __init__(self, scenario: Scenario, options: ProcessOptions, node: Node) -> None:
         self._scenario, self._options, self._node = scenario, options, node
         self._timing, self._realtime = scenario.timing, options.mode == "realtime"
         self._cameras, self._physics = make_cameras(scenario), Physics(scenario)
         self._odometry = OdometrySensor(scenario)
-        self._actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in range(len(scenario.chasers))}
+        self._actuators = {
+            f"chaser/{i}": make_actuators(scenario, i) for i in range(len(scenario.chasers))
+        }
         self._faults = ThrusterFaultHandler(scenario, self._actuators)
         self._contacts: set[tuple[str, str]] = set()
         self._started_s = 0.0
@@ -169,11 +186,14 @@ class World:
             elif stalled := self._await_replies_and_step(tick, stop):
                 return self._end_mission(tick, stalled, complete=False)
             if stop() or self._barrier.lost_all_chasers(self._options.rejoin_s, stop):
-                return self._end_mission(tick, "stopped" if stop() else "no chaser is left", complete=False)
+                return self._end_mission(
+                    tick, "stopped" if stop() else "no chaser is left", complete=False
+                )
             tick += 1
 
     def _wait_for_processes(self, stop: StopSignal) -> str:
-        """Wait until all expected processes are connected; return why they are not, empty if they are.
+        """Wait until all expected processes are connected; return why they are not, empty if they
+        are.
 
         ``ProcessOptions.patience_s`` limits the time in which no process connects.
         """
@@ -190,17 +210,23 @@ class World:
         def missing_names() -> str:
             return ", ".join(missing)
 
-        print_status("world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing_names()}")
+        print_status(
+            "world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing_names()}"
+        )
         if not barrier.wait_until(over, stop, missing_names):
             return "stopped before the first tick"
         barrier.start_flight()
         return f"not connected within {patience_s:g} s: {missing_names()}" if missing else ""
 
     def _publish_state(self, tick: int) -> States:
-        """Publish odometry, docking sensors and ground truth at the beginning of a tick; return the bodies' states."""
+        """Publish odometry, docking sensors and ground truth at the beginning of a tick; return the
+        bodies' states.
+        """
         node, physics, timing = self._node, self._physics, self._timing
         states = {name: physics.state(name) for name in physics.bodies}
-        publish_docking(node, physics.latches, tick, timing)  # first, as the ground truth takes the touches
+        publish_docking(
+            node, physics.latches, tick, timing
+        )  # first, as the ground truth takes the touches
         publish_truth(node, states, tick, timing, self._actuators, self._contacts, physics.latches)
         publish_port_loads(node, physics, tick, timing)
         publish_plume_loads(node, physics, tick, timing)
@@ -217,7 +243,8 @@ class World:
     def _expose_images(self, tick: int, states: States) -> None:
         """Render and publish the images of a tick.
 
-        In lock-step each is published as soon as it is rendered, in real time all together, as synchronized cameras do.
+        In lock-step each is published as soon as it is rendered, in real time all together, as
+        synchronized cameras do.
         """
         timing, chasers = self._timing, self._barrier.chasers
         if not timing.has_images(tick):
@@ -228,14 +255,16 @@ class World:
             self._node.publish(topics.IMAGE, image, image.chaser)
 
     def _await_replies_and_step(self, tick: int, stop: StopSignal) -> str:
-        """Lock-step: step the physics to the end of the tick, waiting for all replies before they take effect.
+        """Lock-step: step the physics to the end of the tick, waiting for all replies before they
+        take effect.
 
         Returns why the tick cannot end, empty if it does.
         """
         timing, barrier = self._timing, self._barrier
         end = timing.step_of_tick(tick + 1)
         self._contacts = set()
-        # No reply takes effect before the latency has passed: simulate that far while the others compute.
+        # No reply takes effect before the latency has passed: simulate that far while the others
+        # compute.
         self._step_to(min(end, timing.step_of_tick(tick) + timing.latency_steps))
         stalled = barrier.await_replies(stop, self._options.stall_s)
         if not stalled and not stop():
@@ -243,7 +272,9 @@ class World:
         return stalled
 
     def _step_realtime(self, tick: int) -> None:
-        """Real time: step the physics with the wall clock, in slices, so that a command acts as soon as it arrives."""
+        """Real time: step the physics with the wall clock, in slices, so that a command acts as
+        soon as it arrives.
+        """
         timing = self._timing
         self._contacts = set()
         slices = max(1, timing.steps_per_tick // max(1, timing.physics_hz // _REALTIME_SLICES_HZ))
@@ -253,7 +284,9 @@ class World:
             self._step_to(step)
 
     def _step_to(self, step: int) -> None:
-        self._contacts |= fly_to(step, self._physics, self._actuators, 1.0 / self._timing.physics_hz)
+        self._contacts |= fly_to(
+            step, self._physics, self._actuators, 1.0 / self._timing.physics_hz
+        )
 
     def _end_mission(self, tick: int, reason: str, complete: bool) -> int:
         """Publish the end of the mission; return the exit status."""

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random numbers that depend on the scenario's seed and a key only, not on the order in which they are drawn."""
+"""Random numbers that depend on the scenario's seed and a key only, not on the order in which they
+are drawn.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
 
 
 class GaussMarkov:
-    """Stationary Gauss-Markov processes of unit variance, one per time constant, sampled every ``period_s``.
+    """Stationary Gauss-Markov processes of unit variance, one per time constant, sampled every
+    ``period_s``.
 
     x(k+1) = exp(-dt/T) x(k) + sqrt(1 - exp(-2 dt/T)) n is the exact discretization.
     """
@@ -56,7 +59,9 @@ class GaussMarkov:
         return generator(self._seed, self._stream, self._key, tick).standard_normal(len(self._kept))
 
     def at(self, tick: int) -> Array:
-        """Return the values (n,) at a tick; cheap for the next one, otherwise computed from the first."""
+        """Return the values (n,) at a tick; cheap for the next one, otherwise computed from the
+        first.
+        """
         if tick < self._tick:
             self._tick, self._value = 0, self._drawn(0)
         while self._tick < tick:

@@ -25,11 +25,11 @@ def require_pybullet(
     what: str = "the world",
     instead: str = "elsewhere, pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\" (--set world.engine=mujoco)",
 ) -> None:
-    """Raise MissingPackageError if PyBullet, which ``what`` needs, is not installed; ``instead``: what else helps."""
+    """Raise MissingPackageError if PyBullet, which ``what`` needs, is not installed; ``instead``:
+    what else helps.
+    """
     if find_spec("pybullet") is None:
-        here = (
-            f"Python {sys.version_info.major}.{sys.version_info.minor} on {sys.platform} {platform.machine()}"
-        )
+        here = f"Python {sys.version_info.major}.{sys.version_info.minor} on {sys.platform} {platform.machine()}"
         raise MissingPackageError(
             f"{what} needs PyBullet, which is not installed; it has wheels for Python 3.11 on Linux x86_64 only (this is "
             f"{here}); {instead}",

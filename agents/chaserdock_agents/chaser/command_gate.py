@@ -21,8 +21,8 @@ def refusal(
 ) -> str | None:
     """Return why a wrench command must not be executed, or None.
 
-    ``last_tick``: the newest tick whose command was executed; ``now_ns``: the newest simulated time known; ``due_ns``: when
-    commands of its tick take effect.
+    ``last_tick``: the newest tick whose command was executed; ``now_ns``: the newest simulated time
+    known; ``due_ns``: when commands of its tick take effect.
     """
     if command.chaser != chaser:
         return f"addressed to chaser {command.chaser}"
@@ -60,7 +60,9 @@ def _thrusts_refusal(thrusts_N: tuple[float, ...], body: Body) -> str | None:
 def brake_command(
     odometry: Odometry, body: Body, effective_ns: int, latched: bool = False
 ) -> ActuatorCommand:
-    """Return the command that brings a chaser to rest in WRF (see ``braking``); a latched chaser gets a zero wrench."""
+    """Return the command that brings a chaser to rest in WRF (see ``braking``); a latched chaser
+    gets a zero wrench.
+    """
     wrench = np.zeros(6) if latched else brake_wrench(odometry, body)
     return autonomous_command(odometry, effective_ns, "brake", wrench)
 
@@ -68,7 +70,9 @@ def brake_command(
 def autonomous_command(
     odometry: Odometry, effective_ns: int, source: Literal["plan", "brake", "hold"], wrench: Array
 ) -> ActuatorCommand:
-    """Return an actuator command of the chaser itself; ``wrench`` (6,): force and torque, body axes."""
+    """Return an actuator command of the chaser itself; ``wrench`` (6,): force and torque, body
+    axes.
+    """
     return ActuatorCommand(
         tick=odometry.tick,
         sim_time_ns=odometry.sim_time_ns,

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fallback of a chaser that receives no commands. Pure functions; SI units; WRF unless stated otherwise.
+"""Fallback of a chaser that receives no commands. Pure functions; SI units; WRF unless stated
+otherwise.
 
-Three modes in this order, recorded as events: fly the last plan to the end of its horizon (``plan``), come to rest
-relative to the target (``brake``), hold a position relative to it outside of the approach corridor (``hold``). The inputs
-are the plan and the target estimate of the last executed command; the target is extrapolated with constant velocity. Where
-the target was unknown, rest and position are those in WRF.
+Three modes in this order, recorded as events: fly the last plan to the end of its horizon
+(``plan``), come to rest relative to the target (``brake``), hold a position relative to it outside
+of the approach corridor (``hold``). The inputs are the plan and the target estimate of the last
+executed command; the target is extrapolated with constant velocity. Where the target was unknown,
+rest and position are those in WRF.
 """
 
 from __future__ import annotations
@@ -30,9 +32,13 @@ FallbackMode = Literal["plan", "brake", "hold"]
 REST_M_S, REST_RAD_S = 0.004, math.radians(0.3)
 """A chaser below these rates, relative to the target's velocity and in WRF, is at rest."""
 BRAKE_LIMIT_S = 5 * BRAKE_TIME_S
-"""Longest time of ``brake``: a constant disturbance, which the braking law only balances, may keep a chaser from rest."""
+"""Longest time of ``brake``: a constant disturbance, which the braking law only balances, may keep
+a chaser from rest.
+"""
 REST_PULSES = 2.0
-"""A chaser with thrusters is at rest below the rates that so many shortest pulses of its strongest thruster change."""
+"""A chaser with thrusters is at rest below the rates that so many shortest pulses of its strongest
+thruster change.
+"""
 CLEARANCE_MARGIN_M = 0.05
 """Distance of the hold position beyond the entry of the corridor."""
 _KNOWN = ("tracking", "predicting")
@@ -47,7 +53,9 @@ class LastCommand:
 
 
 class FallbackLimits(NamedTuple):
-    """Least distance of the hold position from the target (m); speed (m/s) and rate (rad/s) below which a chaser is at rest."""
+    """Least distance of the hold position from the target (m); speed (m/s) and rate (rad/s) below
+    which a chaser is at rest.
+    """
 
     clearance_m: float
     rest_m_s: float
@@ -58,8 +66,8 @@ class FallbackLimits(NamedTuple):
 class FallbackState:
     """Mode of a chaser without commands. For ``brake``: when it began, ``since_ns``.
 
-    For ``hold``: ``outward_w`` (3,), unit vector from the target to the chaser, and ``distance_m`` between them; without a
-    known target the position itself (3,) and None.
+    For ``hold``: ``outward_w`` (3,), unit vector from the target to the chaser, and ``distance_m``
+    between them; without a known target the position itself (3,) and None.
     """
 
     mode: FallbackMode
@@ -79,7 +87,9 @@ class FallbackState:
 
 
 def interpolate_plan(plan: Plan | None, time_ns: int) -> Setpoint | None:
-    """Return the setpoint of a plan at a time, the first one before its start; None after its end or without a plan."""
+    """Return the setpoint of a plan at a time, the first one before its start; None after its end
+    or without a plan.
+    """
     if plan is None or not plan.inputs:
         return None
     stages = len(plan.inputs) // 6
@@ -101,7 +111,9 @@ def interpolate_plan(plan: Plan | None, time_ns: int) -> Setpoint | None:
 
 
 def extrapolate_target(target: TargetEstimate | None, time_ns: int) -> Array | None:
-    """Return the extrapolated position (3,) of the target's origin; None if the target was not known."""
+    """Return the extrapolated position (3,) of the target's origin; None if the target was not
+    known.
+    """
     if target is None or target.status not in _KNOWN:
         return None
     elapsed_s = (time_ns - target.sim_time_ns) / 1e9
@@ -109,9 +121,11 @@ def extrapolate_target(target: TargetEstimate | None, time_ns: int) -> Array | N
 
 
 def clearance_m(scenario: FlightScenario, chaser: int) -> float:
-    """Return the distance from the target (m, centre to centre) at which a chaser is outside of its corridor.
+    """Return the distance from the target (m, centre to centre) at which a chaser is outside of its
+    corridor.
 
-    The corridor begins at the entry to the chaser's port or, for docking at a distance, at its nominal position.
+    The corridor begins at the entry to the chaser's port or, for docking at a distance, at its
+    nominal position.
     """
     port = scenario.docking.port_of(chaser)
     entry_m = math.hypot(*scenario.chasers[chaser].position_m) - CLEARANCE_MARGIN_M
@@ -122,7 +136,9 @@ def clearance_m(scenario: FlightScenario, chaser: int) -> float:
 
 
 def fallback_limits(scenario: FlightScenario, chaser: int) -> FallbackLimits:
-    """Return the limits of a chaser's fallback. Thrusters hold rates only within a few of their shortest pulses."""
+    """Return the limits of a chaser's fallback. Thrusters hold rates only within a few of their
+    shortest pulses.
+    """
     body, rest_m_s, rest_rad_s = scenario.chaser, REST_M_S, REST_RAD_S
     if body.actuation == "thrusters":
         shortest_N_s = thrusts_max(body.thrusters) * [t.min_on_s for t in body.thrusters]
@@ -153,10 +169,12 @@ def next_state(
     last: LastCommand,
     limits: FallbackLimits,
 ) -> FallbackState:
-    """Return the fallback state that follows ``state`` (None: the fallback starts). Modes only advance.
+    """Return the fallback state that follows ``state`` (None: the fallback starts). Modes only
+    advance.
 
-    ``effective_ns``: when the actuator command of this tick takes effect. Braking ends at rest, or after ``BRAKE_LIMIT_S``. A
-    chaser that is farther away than ``limits.clearance_m`` keeps its distance.
+    ``effective_ns``: when the actuator command of this tick takes effect. Braking ends at rest, or
+    after ``BRAKE_LIMIT_S``. A chaser that is farther away than ``limits.clearance_m`` keeps its
+    distance.
     """
     mode = None if state is None else state.mode
     if mode in (None, "plan") and interpolate_plan(last.plan, effective_ns) is not None:
@@ -168,11 +186,16 @@ def next_state(
         odometry, target_velocity(last.target), limits
     ):
         return FallbackState("brake", since_ns=since_ns)
-    position, target = np.asarray(odometry.position_m), extrapolate_target(last.target, odometry.sim_time_ns)
+    position, target = (
+        np.asarray(odometry.position_m),
+        extrapolate_target(last.target, odometry.sim_time_ns),
+    )
     if target is None or not np.any(position - target):
         return FallbackState("hold", position)
     distance_m = float(np.linalg.norm(position - target))
-    return FallbackState("hold", (position - target) / distance_m, max(distance_m, limits.clearance_m))
+    return FallbackState(
+        "hold", (position - target) / distance_m, max(distance_m, limits.clearance_m)
+    )
 
 
 def hold_setpoint(state: FallbackState, odometry: Odometry, last: LastCommand) -> Setpoint:
@@ -199,6 +222,10 @@ def fallback_wrench(
         return brake_wrench(odometry, body, target_velocity(last.target))
     # Errors at the time of the odometry, feed-forward at the time the command takes effect.
     setpoint = Setpoint(
-        current.position_m, current.velocity_m_s, current.q_wxyz, current.omega_rad_s, effective.wrench
+        current.position_m,
+        current.velocity_m_s,
+        current.q_wxyz,
+        current.omega_rad_s,
+        effective.wrench,
     )
     return track_setpoint(odometry, body, setpoint)

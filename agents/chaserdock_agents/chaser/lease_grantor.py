@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leases that a chaser grants: to which controller, in which term, until which tick. No I/O; ticks are the only clock.
+"""Leases that a chaser grants: to which controller, in which term, until which tick. No I/O; ticks
+are the only clock.
 
-As in PaxosLease (M. Trencseni et al., 2012) the acceptors decide: a chaser has promised each tick to at most one controller,
-and a controller commands a tick that a majority has promised to it (``chaserdock_protocol.lease_holder``). Every executed
-command renews the lease. When it has run out, or its holder is lost, the next controller gets it in a higher term.
+As in PaxosLease (M. Trencseni et al., 2012) the acceptors decide: a chaser has promised each tick
+to at most one controller, and a controller commands a tick that a majority has promised to it
+(``chaserdock_protocol.lease_holder``). Every executed command renews the lease. When it has run
+out, or its holder is lost, the next controller gets it in a higher term.
 """
 
 from __future__ import annotations
@@ -18,13 +20,14 @@ from chaserdock_protocol.topics import CONTROLLERS
 FIRST_COMMAND_S = 1.0
 """Lease of a new holder, which may need longer for its first command."""
 BACKOFF_RESET_S = 20.0
-"""A lease that runs out again within this time doubles, up to ``leases.LEASE_MAX_S``: repeated expiry means that the
-machine is overloaded, and a change of commander does not help."""
+"""A lease that runs out again within this time doubles, up to ``leases.LEASE_MAX_S``: repeated
+expiry means that the machine is overloaded, and a change of commander does not help."""
 
 
 @dataclass
 class LeaseGrantor:
-    """The lease of chaser ``chaser``: granted to ``holder`` (process) and its ``instance`` until tick ``until_tick``.
+    """The lease of chaser ``chaser``: granted to ``holder`` (process) and its ``instance`` until
+    tick ``until_tick``.
 
     ``since``: tick and revision from which on that holder has it.
     """
@@ -45,9 +48,11 @@ class LeaseGrantor:
         self._length = lease_ticks(self.rate_hz)
 
     def update(self, tick: Tick) -> Lease | None:
-        """Take the next tick: keep the lease or grant the next one; return what to state, None if this chaser takes no part.
+        """Take the next tick: keep the lease or grant the next one; return what to state, None if
+        this chaser takes no part.
 
-        An older tick than the last would give the lease to a controller that it lists; see ``ChaserProcess``, which ignores it.
+        An older tick than the last would give the lease to a controller that it lists; see
+        ``ChaserProcess``, which ignores it.
         """
         if self.chaser not in tick.chasers:
             return None
@@ -59,14 +64,18 @@ class LeaseGrantor:
 
     def _grant_next(self, tick: Tick, listed: bool) -> None:
         """Grant the lease to another controller or, where there is no other, to the same again."""
-        others = [n for n in CONTROLLERS if n in tick.controllers and not (listed and n == self.holder)]
+        others = [
+            n for n in CONTROLLERS if n in tick.controllers and not (listed and n == self.holder)
+        ]
         if others:
             if listed and not self._given_back:
                 self._back_off(tick.tick)
             self.holder, self.instance = others[0], tick.controllers[others[0]]
             self.term = next_term(self.term, self.holder)
             self.since = (tick.tick, tick.revision)
-            self.until_tick = tick.tick + max(self._length, math.ceil(FIRST_COMMAND_S * self.rate_hz)) - 1
+            self.until_tick = (
+                tick.tick + max(self._length, math.ceil(FIRST_COMMAND_S * self.rate_hz)) - 1
+            )
         elif listed:
             self.until_tick = tick.tick + self._length - 1
         else:
@@ -106,12 +115,12 @@ class LeaseGrantor:
         return (command.commander, command.instance) == (self.holder, self.instance)
 
     def refusal(self, command: WrenchCommand) -> str | None:
-        """Return why a command must not be executed: its sender does not hold the lease. None if it does."""
+        """Return why a command must not be executed: its sender does not hold the lease. None if it
+        does.
+        """
         if not self.is_of_holder(command):
             holder = self.holder or "no controller"
-            return (
-                f"stale term: {command.commander} {command.instance} sent it, {holder} holds term {self.term}"
-            )
+            return f"stale term: {command.commander} {command.instance} sent it, {holder} holds term {self.term}"
         if command.term < self.term or commander_of(command.term) != self.holder:
             return f"stale term: sent in term {command.term}, the lease is of term {self.term}"
         return None
@@ -127,9 +136,11 @@ class LeaseGrantor:
         self.until_tick = max(self.until_tick, command.tick + self._length - 1)
 
     def give_back(self, command: WrenchCommand) -> None:
-        """Take the lease back after the tick in which its holder, without a majority, yields it. See ``refusal`` first.
+        """Take the lease back after the tick in which its holder, without a majority, yields it.
+        See ``refusal`` first.
 
-        The holder counts no lease stated up to that tick, but may count one that was stated after it.
+        The holder counts no lease stated up to that tick, but may count one that was stated after
+        it.
         """
         if command.tick >= self._newest_tick:
             self.until_tick = min(self.until_tick, command.tick)

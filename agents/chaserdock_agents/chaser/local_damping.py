@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damping of the stack by one latched chaser whose controller is silent, from its own odometry alone. No I/O.
+"""Damping of the stack by one latched chaser whose controller is silent, from its own odometry
+alone. No I/O.
 
-A thruster with unit force d at r fires against the velocity of its own place, u = -d . (v + omega x r). The power that it gives
-to the stack is -f u, never positive while u > 0: whatever the mass, the other chasers and their thrusters, the kinetic energy
-falls. Thrusts are proportional to u, so that several chasers together do not overshoot; below a deadband nothing fires.
+A thruster with unit force d at r fires against the velocity of its own place, u = -d . (v + omega x
+r). The power that it gives to the stack is -f u, never positive while u > 0: whatever the mass, the
+other chasers and their thrusters, the kinetic energy falls. Thrusts are proportional to u, so that
+several chasers together do not overshoot; below a deadband nothing fires.
 """
 
 from __future__ import annotations
@@ -20,17 +22,25 @@ from chaserdock_protocol.scenario.mounting import plume_free_thrusters
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 
 _GAIN_N_S_PER_M = 60.0
-"""Thrust per velocity of a thruster's place. Of 20, 60 and 120 the one that stopped two, three and four chasers soonest."""
+"""Thrust per velocity of a thruster's place. Of 20, 60 and 120 the one that stopped two, three and
+four chasers soonest.
+"""
 _FIRES_M_S, _CLOSES_M_S = 0.0005, 0.0001
 """A thruster begins to fire above the first velocity of its place, and ends below the second."""
 _NOISE_SHARE = 5.0
-"""The deadband is at least so many standard deviations of the filtered velocity, so that noise fires nothing."""
+"""The deadband is at least so many standard deviations of the filtered velocity, so that noise
+fires nothing.
+"""
 _SLOW_M_S, _SLOW_S, _FAST_S = 0.005, 0.8, 0.3
-"""Time constants of the filter: long below a velocity, where noise matters, short above, where the delay does."""
+"""Time constants of the filter: long below a velocity, where noise matters, short above, where the
+delay does.
+"""
 
 
 class LocalDamping:
-    """Damping law of one chaser with a port; one ``thrusts`` a tick. ``reset`` after a tick with another command."""
+    """Damping law of one chaser with a port; one ``thrusts`` a tick. ``reset`` after a tick with
+    another command.
+    """
 
     def __init__(self, scenario: FlightScenario, chaser: int) -> None:
         body, errors = scenario.chaser, scenario.navigation.errors()
@@ -64,9 +74,12 @@ class LocalDamping:
             elapsed_s = (odometry.sim_time_ns - self._time_ns) * 1e-9
             share = _share(elapsed_s, _FAST_S if moving else _SLOW_S)
             rates = self._rates + share * (rates - self._rates)
-        # A force d at r does work on d . (v + omega x r): the transpose of the wrench of unit thrusts.
+        # A force d at r does work on d . (v + omega x r): the transpose of the wrench of unit
+        # thrusts.
         speeds = -self._wrenches.T @ rates
-        self._firing = self._free & (speeds > np.where(self._firing, self._closes_m_s, self.fires_m_s))
+        self._firing = self._free & (
+            speeds > np.where(self._firing, self._closes_m_s, self.fires_m_s)
+        )
         thrusts = np.where(self._firing, np.minimum(_GAIN_N_S_PER_M * speeds, self._full_N), 0.0)
         self._rates, self._time_ns, self._thrusts_N = rates, odometry.sim_time_ns, thrusts
         return thrusts

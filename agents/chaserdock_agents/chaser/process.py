@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chaser process: images to sightings, wrench commands to actuator commands. It has no access to ground truth."""
+"""The chaser process: images to sightings, wrench commands to actuator commands. It has no access
+to ground truth.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,9 @@ from .sighting import apply_geometry, look, prediction_from
 
 
 def main(options: ProcessOptions) -> int:
-    """Run chaser ``options.chaser``; return 0 if the mission ended, 1 if stopped before, 2 if it could not join."""
+    """Run chaser ``options.chaser``; return 0 if the mission ended, 1 if stopped before, 2 if it
+    could not join.
+    """
     cv2.setNumThreads(1)
     number = int(options.chaser or 0)
 
@@ -60,8 +64,12 @@ def main(options: ProcessOptions) -> int:
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
         faults = process_faults_from_json(mission.faults)
         lockstep = mission.mode == "lockstep"
-        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep, node.host)
-        chaser = ChaserProcess(node, scenario, number, reports=FailureReports(faults.reported_failures))
+        node.message_filter = create_fault_layer(
+            faults, node.name, scenario.timing, lockstep, node.host
+        )
+        chaser = ChaserProcess(
+            node, scenario, number, reports=FailureReports(faults.reported_failures)
+        )
         chaser.open(instance, realtime=not lockstep, stall_s=options.stall_s)
         node.host.finish_startup()
         while not (chaser.ended or chaser.replaced or stop() or chaser.heartbeat.world_is_gone()):
@@ -77,9 +85,10 @@ def main(options: ProcessOptions) -> int:
 class ChaserProcess:
     """The state of one chaser process: latest messages, last executed command and fallback.
 
-    ``executed_tick`` and ``executed_ns``: tick of the last actuator command for which the world need not wait any more, and
-    time of the last executed command of the controller. ``reports``: the thruster failures that the test bed reports.
-    ``replaced``: this process was lost, and the mission goes on with another one of its name.
+    ``executed_tick`` and ``executed_ns``: tick of the last actuator command for which the world
+    need not wait any more, and time of the last executed command of the controller. ``reports``:
+    the thruster failures that the test bed reports. ``replaced``: this process was lost, and the
+    mission goes on with another one of its name.
     """
 
     node: Node
@@ -152,7 +161,7 @@ class ChaserProcess:
         tick = self.tick
         self.heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)
 
-    # -- receiving -------------------------------------------------------------------------------------------
+    # -- receiving ---------------------------------------------------------------------------------
 
     def listen(self) -> None:
         """Wait for one message and handle it."""
@@ -184,7 +193,9 @@ class ChaserProcess:
                 self._replace_lost(received.topic, lost)
 
     def _missing_keys(self) -> tuple[str, ...]:
-        """Return the keys of the messages that this chaser needs to reply to the open tick, or to get the next one."""
+        """Return the keys of the messages that this chaser needs to reply to the open tick, or to
+        get the next one.
+        """
         tick = self.tick
         if tick is None or tick.tick <= self.executed_tick or self.number not in tick.chasers:
             return (topics.TICK.key_of(),)
@@ -197,7 +208,10 @@ class ChaserProcess:
         return tuple(topic.key_of(self.number) for topic in missing or [topics.WRENCH])
 
     def _begin_tick(self, tick: Tick) -> None:
-        if self.tick is not None and (tick.tick, tick.revision) < (self.tick.tick, self.tick.revision):
+        if self.tick is not None and (tick.tick, tick.revision) < (
+            self.tick.tick,
+            self.tick.revision,
+        ):
             return
         self.replaced |= self.heartbeat.is_replaced(tick.chaser_instances.get(self.name))
         if self.replaced:
@@ -283,10 +297,14 @@ class ChaserProcess:
         self._processed_images.append(image.tick)
         started_s = self.node.host.now_s()
         sighting = look(
-            self.perception, image, prediction_from(self.sighting, self._expected, image.sim_time_ns)
+            self.perception,
+            image,
+            prediction_from(self.sighting, self._expected, image.sim_time_ns),
         )
         elapsed_s = self.node.host.now_s() - started_s
-        if sighting.status == "bad_image" and (self.sighting is None or self.sighting.status != "bad_image"):
+        if sighting.status == "bad_image" and (
+            self.sighting is None or self.sighting.status != "bad_image"
+        ):
             self._publish_warning("bad image", sighting.detail, image.tick, image.sim_time_ns)
         self.sighting = sighting
         sighting = msgspec.structs.replace(sighting, wall_estimate_s=elapsed_s)
@@ -295,8 +313,9 @@ class ChaserProcess:
     def _report_thrusters(self) -> None:
         """Publish the thrusters' capability and the events of fault detection.
 
-        Runs once per open tick, when its odometry and, with a docking sensor, the sensor's status have arrived in any
-        order. The last odometry belongs to no open tick and may arrive before or after the mission's end.
+        Runs once per open tick, when its odometry and, with a docking sensor, the sensor's status
+        have arrived in any order. The last odometry belongs to no open tick and may arrive before
+        or after the mission's end.
         """
         tick, odometry, docking = self.tick, self.odometry, self.docking
         if self._thrusters is None or tick is None or odometry is None:
@@ -312,7 +331,7 @@ class ChaserProcess:
         for level, what, detail in self._thrusters.drain_events():
             self._publish_event(level, what, detail, odometry.tick, odometry.sim_time_ns)
 
-    # -- commands --------------------------------------------------------------------------------------------
+    # -- commands ----------------------------------------------------------------------------------
 
     def _handle_command(self, command: WrenchCommand) -> None:
         """Execute a command of the controller, or refuse it."""
@@ -320,7 +339,11 @@ class ChaserProcess:
         newest = -1 if self.tick is None else self.tick.tick
         # It would count as newer than all commands to come, and extend the lease.
         early = command.tick > newest + longest_lease_ticks(self.scenario.time.rate_hz)
-        stale = f"for tick {command.tick}, the newest is {newest}" if early else self.leases.refusal(command)
+        stale = (
+            f"for tick {command.tick}, the newest is {newest}"
+            if early
+            else self.leases.refusal(command)
+        )
         tick = newest if early else command.tick
         if stale:
             self.node.counts.rejected["wrench:early tick" if early else "wrench:stale term"] += 1
@@ -339,7 +362,9 @@ class ChaserProcess:
             self._renew_lease(command)
             return  # repeated by a controller that became commander within the tick
         due_ns = self.scenario.timing.effective_ns(command.tick)
-        reason = refusal(command, self.number, self.scenario.chaser, self.executed_tick, now_ns, due_ns)
+        reason = refusal(
+            command, self.number, self.scenario.chaser, self.executed_tick, now_ns, due_ns
+        )
         if reason is None:
             self._renew_lease(command)
             # Ticks are the clock that all share: that of the controller may be wrong.
@@ -369,7 +394,9 @@ class ChaserProcess:
             self.node.publish(topics.LEASE, self.leases.stated(self.tick), self.number)
 
     def _now_ns(self) -> int:
-        """Return the simulated time: in real time it continues while this process does not run or receives nothing."""
+        """Return the simulated time: in real time it continues while this process does not run or
+        receives nothing.
+        """
         if self.odometry is None:
             return 0
         silent_s = self.node.host.now_s() - self._odometry_arrived_s if self.realtime else 0.0
@@ -399,7 +426,9 @@ class ChaserProcess:
         self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
 
     def inform_perception(self, command: WrenchCommand) -> None:
-        """Pass on what a command states about the target: its geometry, and where it is expected in the next image."""
+        """Pass on what a command states about the target: its geometry, and where it is expected in
+        the next image.
+        """
         self._expected = command.expected
         if (refused := apply_geometry(self.perception, command.geometry)) is not None:
             self._publish_warning("geometry refused", refused, command.tick, command.sim_time_ns)
@@ -418,15 +447,19 @@ class ChaserProcess:
         if self._damping is not None:
             self._damping.reset()
 
-    # -- fallback --------------------------------------------------------------------------------------------
+    # -- fallback ----------------------------------------------------------------------------------
 
     def _mark_uncommanded(self, tick: int) -> None:
-        """Record that no command arrives for a tick; the chaser replies itself once it knows its state."""
+        """Record that no command arrives for a tick; the chaser replies itself once it knows its
+        state.
+        """
         self._uncommanded_tick = max(tick, self._uncommanded_tick)
         self._reply_without_command()
 
     def _reply_without_command(self) -> None:
-        """Reply to the open tick with a fallback command if there is no controller or no command for the tick."""
+        """Reply to the open tick with a fallback command if there is no controller or no command
+        for the tick.
+        """
         tick, odometry = self.tick, self.odometry
         if tick is None or odometry is None or odometry.tick != tick.tick:
             return
@@ -436,7 +469,9 @@ class ChaserProcess:
         if self.number in tick.chasers and tick.tick > self.executed_tick:
             if commanded and not self._reported_missing:
                 self._reported_missing = True
-                self._publish_warning("no command", "lost or refused", tick.tick, odometry.sim_time_ns)
+                self._publish_warning(
+                    "no command", "lost or refused", tick.tick, odometry.sim_time_ns
+                )
             self._reply(*self._fallback_command(odometry))
 
     def _check_command_timeout(self, odometry: Odometry) -> None:
@@ -456,7 +491,9 @@ class ChaserProcess:
         self._actuate(*self._fallback_command(odometry))
 
     def _fallback_command(self, odometry: Odometry) -> tuple[ActuatorCommand, Array | None]:
-        """Return the chaser's own command (see ``fallback``), and thrusts (n,) in place of an allocation."""
+        """Return the chaser's own command (see ``fallback``), and thrusts (n,) in place of an
+        allocation.
+        """
         effective_ns = self.scenario.timing.effective_ns(odometry.tick)
         body = self.scenario.chaser
         latched = self.docking is not None and self.docking.latched
@@ -479,14 +516,16 @@ class ChaserProcess:
     def _damp(
         self, damping: LocalDamping, odometry: Odometry, effective_ns: int
     ) -> tuple[ActuatorCommand, Array]:
-        """Return the command of a latched chaser that the controller left while it stopped the stack (``local_damping``)."""
+        """Return the command of a latched chaser that the controller left while it stopped the
+        stack (``local_damping``).
+        """
         if not self._is_damping:
             detail = "stopping the stack by the chaser's own odometry"
             self._publish_warning("fallback: brake", detail, odometry.tick, odometry.sim_time_ns)
         self._is_damping = True
         return damping_command(damping, odometry, effective_ns, self.scenario.chaser)
 
-    # -- publishing ------------------------------------------------------------------------------------------
+    # -- publishing --------------------------------------------------------------------------------
 
     def _reply(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> None:
         """Publish the actuator command that is the reply to its tick."""

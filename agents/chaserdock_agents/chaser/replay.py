@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of the chasers' perception on recorded images: the code of their processes on a replay node."""
+"""Replay of the chasers' perception on recorded images: the code of their processes on a replay
+node.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 from .process import ChaserProcess
 
 
-def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
+def play_perception(
+    scenario: FlightScenario, recorded: Iterable[ReceivedMessage]
+) -> Iterator[Published]:
     """Return the sightings of all chasers."""
     cv2.setNumThreads(1)
     chasers: dict[int, tuple[ReplayNode, ChaserProcess]] = {}
@@ -38,7 +42,9 @@ def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage
         node, chaser = chasers[number]
         node.put(received)
         chaser.listen()
-        yield from (published for published in node.take_published() if published[0] is topics.SIGHTING)
+        yield from (
+            published for published in node.take_published() if published[0] is topics.SIGHTING
+        )
 
 
 PERCEPTION = Stage("chaser", (topics.IMAGE, topics.WRENCH), (topics.SIGHTING,), play_perception)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert an image message to a sighting message; a pure function of image, prediction and parameters."""
+"""Convert an image message to a sighting message; a pure function of image, prediction and
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,8 @@ def decode_image(image: Image) -> NDArray[np.uint8]:
                 f"{data.size} bytes; a mono8 image of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
             )
         return data.reshape(shape)
-    # Checked first, as OpenCV allocates memory for any size that the header states, and accepts other formats.
+    # Checked first, as OpenCV allocates memory for any size that the header states, and accepts
+    # other formats.
     size = _jpeg_size(image.data)
     if size is None:
         raise BadImage(f"{data.size} bytes that are not a JPEG")
@@ -71,7 +74,11 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
         marker = data[offset + 1]
         if marker == 0xFF:  # a fill byte
             offset += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # these three are not frame headers
+        elif 0xC0 <= marker <= 0xCF and marker not in (
+            0xC4,
+            0xC8,
+            0xCC,
+        ):  # these three are not frame headers
             head = data[offset + 5 : offset + 9]
             return int.from_bytes(head[:2], "big"), int.from_bytes(head[2:], "big")
         else:
@@ -80,9 +87,13 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def look(perception: PerceptionMethod, image: Image, predicted: Prediction | None) -> Sighting:
-    """Return the sighting of the target in an image, by markers or, where that is more accurate, by bearing and range; the caller sets
-    ``wall_estimate_s``."""
-    header: dict[str, Any] = {"tick": image.tick, "sim_time_ns": image.sim_time_ns, "chaser": image.chaser}
+    """Return the sighting of the target in an image, by markers or, where that is more accurate, by
+    bearing and range; the caller sets ``wall_estimate_s``."""
+    header: dict[str, Any] = {
+        "tick": image.tick,
+        "sim_time_ns": image.sim_time_ns,
+        "chaser": image.chaser,
+    }
     try:
         pixels = decode_image(image)
         seen = perception.estimate(pixels, predicted)
@@ -118,9 +129,16 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
     )
 
 
-def _without_markers(header: dict[str, Any], pose: PoseSolution, rejected: tuple[int, ...]) -> Sighting:
+def _without_markers(
+    header: dict[str, Any], pose: PoseSolution, rejected: tuple[int, ...]
+) -> Sighting:
     return Sighting(
-        **header, status="seen", solutions=(pose,), marker_ids=(), corners_px=(), rejected_ids=rejected
+        **header,
+        status="seen",
+        solutions=(pose,),
+        marker_ids=(),
+        corners_px=(),
+        rejected_ids=rejected,
     )
 
 
@@ -139,10 +157,15 @@ def _solution(pose: TargetPose) -> PoseSolution:
 
 
 def _by_bearing(
-    finder: BearingFinder, pixels: NDArray[np.uint8], measured: RangeMeasurement, predicted: Prediction | None
+    finder: BearingFinder,
+    pixels: NDArray[np.uint8],
+    measured: RangeMeasurement,
+    predicted: Prediction | None,
 ) -> PoseSolution:
     covariance = np.array(measured.attitude_covariance_rad2).reshape(3, 3)
-    target = RangedTarget(measured.range_m, measured.range_sigma_m, np.array(measured.q_wxyz), covariance)
+    target = RangedTarget(
+        measured.range_m, measured.range_sigma_m, np.array(measured.q_wxyz), covariance
+    )
     return _solution(finder.find(pixels, target, None if predicted is None else predicted[0]))
 
 
@@ -158,7 +181,9 @@ def geometry_message(found: GeometryInformation) -> GeometryMeasurement:
 
 
 def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | None) -> str | None:
-    """Correct what a perception knows of the target's geometry, if it uses it; return why that was refused."""
+    """Correct what a perception knows of the target's geometry, if it uses it; return why that was
+    refused.
+    """
     correct = getattr(perception, "correct_geometry", None)
     if estimate is None or correct is None:
         return None
@@ -180,8 +205,8 @@ def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | No
 def prediction_from(
     sighting: Sighting | None, expected: ExpectedPose | None = None, time_ns: int = 0
 ) -> Prediction | None:
-    """Return the pose prediction for an image of ``time_ns``: the last measured pose, else the one that the controller expects;
-    None without any."""
+    """Return the pose prediction for an image of ``time_ns``: the last measured pose, else the one
+    that the controller expects; None without any."""
     if sighting is not None and sighting.solutions:
         best = sighting.solutions[0]
         return np.array(best.position_m), np.array(best.q_wxyz)

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Viewer layer of a log: Foxglove messages in addition to the verbatim ones, for Rerun, Foxglove and Lichtblick.
+"""Viewer layer of a log: Foxglove messages in addition to the verbatim ones, for Rerun, Foxglove
+and Lichtblick.
 
 Channels (all under ``/viewer/``); times are simulated:
 
-- ``tf``: true frames ``target`` and ``chaser/N`` in ``world`` (WRF), ``chaser/N/camera`` (IRF) on each chaser, and
-  ``target/estimate``, the fused estimate while available
+- ``tf``: true frames ``target`` and ``chaser/N`` in ``world`` (WRF), ``chaser/N/camera`` (IRF) on
+  each chaser, and ``target/estimate``, the fused estimate while available
 - ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: image, camera, used corners
-- ``chaser/N/measurement`` (in the camera's frame), ``chaser/N/reference``, ``target/estimate`` (in WRF): poses
+- ``chaser/N/measurement`` (in the camera's frame), ``chaser/N/reference``, ``target/estimate`` (in
+  WRF): poses
 - ``scene``: the bodies as boxes in their true frames; ``events``: events of all processes
-- ``target/points``, ``chaser/N/points``: the same bodies as points on their edges or mesh, and ``chaser/N/corners``: the used
-  corners as points in the camera's frame, at the measured distance, where they cover those of the image. Rerun maps neither
-  ``SceneUpdate`` nor ``ImageAnnotations``, but point clouds.
+- ``target/points``, ``chaser/N/points``: the same bodies as points on their edges or mesh, and
+  ``chaser/N/corners``: the used corners as points in the camera's frame, at the measured distance,
+  where they cover those of the image. Rerun maps neither ``SceneUpdate`` nor ``ImageAnnotations``,
+  but point clouds.
 """
 
 from __future__ import annotations
@@ -43,7 +46,14 @@ Write = Callable[[str, tuple[str, str, bytes], bytes, int], None]
 """``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
 
 SHOWN = frozenset(
-    {topics.IMAGE, topics.TRUTH_BODY, topics.SIGHTING, topics.TARGET, topics.REFERENCE, topics.EVENT}
+    {
+        topics.IMAGE,
+        topics.TRUTH_BODY,
+        topics.SIGHTING,
+        topics.TARGET,
+        topics.REFERENCE,
+        topics.EVENT,
+    }
 )
 """Topics from which the layer is made."""
 
@@ -106,7 +116,11 @@ class ViewerLayer:
         stamp = _time(time_ns)
         shapes = [("target", self._scenario.target_model().size_m, _TARGET_COLOUR)]
         for i in range(len(self._scenario.chasers)):
-            self._put("tf", _frame(stamp, f"chaser/{i}", f"chaser/{i}/camera", *self._camera_pose), time_ns)
+            self._put(
+                "tf",
+                _frame(stamp, f"chaser/{i}", f"chaser/{i}/camera", *self._camera_pose),
+                time_ns,
+            )
             shapes.append((f"chaser/{i}", self._scenario.chaser.size_m, _CHASER_COLOUR))
         entities = [
             fox.SceneEntity(
@@ -120,9 +134,15 @@ class ViewerLayer:
         ]
         self._put("scene", fox.SceneUpdate(entities=entities), time_ns)
         body = self._scenario.chaser
-        chaser = _mesh_points(satellite(body.mesh, _SPACING_M)) if body.mesh else _outline([Box(body.size_m)])
+        chaser = (
+            _mesh_points(satellite(body.mesh, _SPACING_M))
+            if body.mesh
+            else _outline([Box(body.size_m)])
+        )
         mesh = self._scenario.target.nominal_mesh(_SPACING_M)
-        target = _outline(self._scenario.target_model().boxes) if mesh is None else _mesh_points(mesh)
+        target = (
+            _outline(self._scenario.target_model().boxes) if mesh is None else _mesh_points(mesh)
+        )
         self._put("target/points", _cloud(stamp, "target", target), time_ns)
         for i in range(len(self._scenario.chasers)):
             self._put(f"chaser/{i}/points", _cloud(stamp, f"chaser/{i}", chaser), time_ns)
@@ -132,7 +152,9 @@ class ViewerLayer:
             case Image():
                 yield f"chaser/{message.chaser}/image", _image(message, stamp)
                 frame = f"chaser/{message.chaser}/camera"
-                calibration = fox.CameraCalibration(timestamp=stamp, frame_id=frame, **self._calibration)
+                calibration = fox.CameraCalibration(
+                    timestamp=stamp, frame_id=frame, **self._calibration
+                )
                 yield f"chaser/{message.chaser}/calibration", calibration
             case BodyTruth():
                 yield "tf", _frame(stamp, "world", message.body, message.position_m, message.q_wxyz)
@@ -154,10 +176,15 @@ class ViewerLayer:
             case Event():
                 text = f"{message.what}: {message.detail}" if message.detail else message.what
                 level = _LEVELS[message.level]
-                yield "events", fox.Log(timestamp=stamp, level=level, message=text, name=message.process)
+                yield (
+                    "events",
+                    fox.Log(timestamp=stamp, level=level, message=text, name=message.process),
+                )
 
     def _corners(self, corners_px: Sequence[float], depth_m: float) -> Array:
-        """Return corners as points (N, 3) at one depth in the camera's frame (IRF); a viewer draws no lens distortion."""
+        """Return corners as points (N, 3) at one depth in the camera's frame (IRF); a viewer draws
+        no lens distortion.
+        """
         pixels = np.reshape(corners_px, (-1, 2))
         return depth_m * np.column_stack([pixels, np.ones(len(pixels))]) @ self._inverse_matrix.T
 
@@ -208,10 +235,14 @@ def _quaternion(q_wxyz: Quaternion) -> fox.Quaternion:
     return fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
-_NO_POSE = fox.Pose(position=_vector((0.0, 0.0, 0.0)), orientation=_quaternion((1.0, 0.0, 0.0, 0.0)))
+_NO_POSE = fox.Pose(
+    position=_vector((0.0, 0.0, 0.0)), orientation=_quaternion((1.0, 0.0, 0.0, 0.0))
+)
 
 
-def _frame(stamp: fox.Timestamp, parent: str, child: str, p: Vector3, q: Quaternion) -> fox.FrameTransform:
+def _frame(
+    stamp: fox.Timestamp, parent: str, child: str, p: Vector3, q: Quaternion
+) -> fox.FrameTransform:
     return fox.FrameTransform(
         timestamp=stamp,
         parent_frame_id=parent,
@@ -242,7 +273,9 @@ def _image(image: Image, stamp: fox.Timestamp) -> fox.CompressedImage | fox.RawI
 
 
 def _detections(sighting: Sighting, stamp: fox.Timestamp) -> fox.ImageAnnotations:
-    """Return the outlines of the used markers; a viewer's pixel origin is a corner of the first pixel, not its centre."""
+    """Return the outlines of the used markers; a viewer's pixel origin is a corner of the first
+    pixel, not its centre.
+    """
     u, v = sighting.corners_px[0::2], sighting.corners_px[1::2]
     corners = [fox.Point2(x=a + 0.5, y=b + 0.5) for a, b in zip(u, v, strict=False)]
     outlines = [

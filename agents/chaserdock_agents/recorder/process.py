@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder process: writes every message of a run verbatim to MCAP.
 
-In lock-step it acknowledges each tick that it has received completely, which bounds how far the flight runs ahead. At the
-end it waits until it has received as many messages as the other processes report to have published.
+In lock-step it acknowledges each tick that it has received completely, which bounds how far the
+flight runs ahead. At the end it waits until it has received as many messages as the other processes
+report to have published.
 """
 
 from __future__ import annotations
@@ -32,7 +33,12 @@ from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.transport import Node, RawSample
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
-from chaserdock_protocol.transport.session import Heartbeat, create_health, request_scenario, run_member
+from chaserdock_protocol.transport.session import (
+    Heartbeat,
+    create_health,
+    request_scenario,
+    run_member,
+)
 
 from .foxglove_layer import SHOWN
 from .rotation import Recording
@@ -47,7 +53,9 @@ _MAPPED_FROM_BYTES = 1 << 18
 
 
 def main(options: ProcessOptions) -> int:
-    """Record to ``options.out``; return 0 if complete, 1 if stopped early or messages are missing, 2 on an error."""
+    """Record to ``options.out``; return 0 if complete, 1 if stopped early or messages are missing,
+    2 on an error.
+    """
     if options.link.network is None:  # a simulated process shares its heap with others
         _limit_heap()
     return run_member("recorder", "recorder", options, lambda *member: record(options, *member))
@@ -56,8 +64,8 @@ def main(options: ProcessOptions) -> int:
 def _limit_heap() -> None:
     """Make glibc return large blocks (images, chunks, indices) to the system when they are freed.
 
-    By default glibc keeps blocks up to the largest one freed so far, in one heap per thread, and a recorder grows for hours
-    (``benchmarks/endurance.py``). No effect with other C libraries.
+    By default glibc keeps blocks up to the largest one freed so far, in one heap per thread, and a
+    recorder grows for hours (``benchmarks/endurance.py``). No effect with other C libraries.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -65,8 +73,12 @@ def _limit_heap() -> None:
         mallopt(_M_ARENA_MAX, 2)
 
 
-def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
-    """Record until the mission has ended and all published messages are in the file; return the exit status."""
+def record(
+    options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: StopSignal
+) -> int:
+    """Record until the mission has ended and all published messages are in the file; return the
+    exit status.
+    """
     full = request_scenario(node, mission, stop)
     if full is None:
         return 1
@@ -99,7 +111,8 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
         recording.close()
     if recorder.ended_s is None:
         print_status(
-            "recorder", f"stopped before the mission's end; {recording.path} holds all messages up to then"
+            "recorder",
+            f"stopped before the mission's end; {recording.path} holds all messages up to then",
         )
         return 1
     missing = recorder.missing()
@@ -141,9 +154,13 @@ class Recorder:
             self.node.counts.rejected["queue full"] += 1
 
     def write_waiting(self, timeout_s: float) -> None:
-        """Write the messages that wait, at most ``_BATCH``; if there are none, the next one that arrives in time."""
+        """Write the messages that wait, at most ``_BATCH``; if there are none, the next one that
+        arrives in time.
+        """
         while self.node.receive(0) is not None:
-            pass  # the raw subscription receives presence as well; the typed one only serves the join barrier
+            # the raw subscription receives presence as well; the typed one only serves the join
+            # barrier
+            pass
         try:
             self._write(self._queue.get(timeout_s))
         except queue.Empty:
@@ -194,7 +211,9 @@ class Recorder:
 
     def _missing_keys(self) -> tuple[str, ...]:
         """Return the keys of the messages that the next acknowledgement waits for."""
-        return tuple(sorted(key for key in self._awaited() if self._latest.get(key, -1) <= self._acked))
+        return tuple(
+            sorted(key for key in self._awaited() if self._latest.get(key, -1) <= self._acked)
+        )
 
     def _awaited(self) -> set[str]:
         awaited = self._expected | {topics.TICK.key_of()}
@@ -210,7 +229,9 @@ class Recorder:
                 self.node.publish(topics.HEALTH, create_health(self.node, held, 0), "recorder")
 
     def missing(self) -> dict[str, int]:
-        """Return the number of missing messages by key, according to the counts that publishers report."""
+        """Return the number of missing messages by key, according to the counts that publishers
+        report.
+        """
         # Several controllers publish on the same keys, one at a time.
         total: Counter[str] = Counter()
         for published in self._published.values():
@@ -227,7 +248,9 @@ class Recorder:
         return self._queue.empty()
 
     def finished(self) -> bool:
-        """Return whether the mission has ended and all published messages have arrived or timed out."""
+        """Return whether the mission has ended and all published messages have arrived or timed
+        out.
+        """
         if self.ended_s is None:
             return False
         publishers = {

@@ -19,9 +19,11 @@ from .foxglove_layer import ViewerLayer
 
 
 class Recording:
-    """Writes a mission's log to ``folder``, which is created; every file is self-contained and holds the full scenario.
+    """Writes a mission's log to ``folder``, which is created; every file is self-contained and
+    holds the full scenario.
 
-    Without ``scenario`` there is no viewer layer. Raises LogError if a file cannot be created or written.
+    Without ``scenario`` there is no viewer layer. Raises LogError if a file cannot be created or
+    written.
     """
 
     def __init__(
@@ -35,7 +37,12 @@ class Recording:
         compressed: bool = True,
     ) -> None:
         self._compressed = compressed
-        self._folder, self._mission, self._rotation, self._scenario = folder, mission, rotation, scenario
+        self._folder, self._mission, self._rotation, self._scenario = (
+            folder,
+            mission,
+            rotation,
+            scenario,
+        )
         self._full_scenario_json = full_scenario_json
         self._rotates = rotation.wanted
         self._now_s, self._part = now_s, 0
@@ -65,7 +72,9 @@ class Recording:
             name, run["part"] = part_name(self._part), str(self._part)
         self._writer = LogWriter(self._folder / name, self._now_s, self._compressed)
         self._writer.describe(self._full_scenario_json, run)
-        self._viewer = ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
+        self._viewer = (
+            ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
+        )
         self._from_ns = None
 
     def write(self, raw: RawSample, message: Any) -> None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of a mission as messages of ROS 2: pure functions, without network or files.
 
-ROS states poses and their covariances in the parent frame, twists in the child frame, and quaternions scalar last
-(REP 103, REP 105, nav_msgs/Odometry). Frames: ``world`` (WRF), ``target`` (TRF), ``chaser_N`` (CRF) and
-``chaser_N_camera`` (IRF, which is an optical frame of ROS). Time stamps are simulated time; those of images are the middle
-of the exposure.
+ROS states poses and their covariances in the parent frame, twists in the child frame, and
+quaternions scalar last (REP 103, REP 105, nav_msgs/Odometry). Frames: ``world`` (WRF), ``target``
+(TRF), ``chaser_N`` (CRF) and ``chaser_N_camera`` (IRF, which is an optical frame of ROS). Time
+stamps are simulated time; those of images are the middle of the exposure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ from chaserdock_protocol.scenario import FlightScenario
 from rosbags.typesys.stores import ros2_jazzy as ros
 
 WORLD, TARGET_FRAME = "world", "target"
-_TARGET_RGB, _CHASER_RGB, _PLAN_RGB = (0.875, 0.625, 0.25), (0.375, 0.5, 0.875), (0.375, 0.875, 0.375)
+_TARGET_RGB, _CHASER_RGB, _PLAN_RGB = (
+    (0.875, 0.625, 0.25),
+    (0.375, 0.5, 0.875),
+    (0.375, 0.875, 0.375),
+)
 _CUBE, _LINE_STRIP, _ADD, _DELETE = 1, 4, 0, 2
 _ZERO, _IDENTITY = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
 
@@ -46,7 +50,7 @@ class RosMessage:
         return self.message.__msgtype__
 
 
-# -- parts ------------------------------------------------------------------------------------------------
+# -- parts -----------------------------------------------------------------------------------------
 
 
 def chaser_frame(chaser: int) -> str:
@@ -78,7 +82,9 @@ def _quaternion(q_wxyz: Sequence[float]) -> ros.geometry_msgs__msg__Quaternion:
 
 
 def _pose(position_m: Sequence[float], q_wxyz: Sequence[float]) -> ros.geometry_msgs__msg__Pose:
-    return ros.geometry_msgs__msg__Pose(ros.geometry_msgs__msg__Point(*position_m), _quaternion(q_wxyz))
+    return ros.geometry_msgs__msg__Pose(
+        ros.geometry_msgs__msg__Point(*position_m), _quaternion(q_wxyz)
+    )
 
 
 def _pose_stamped(
@@ -95,10 +101,12 @@ def _transform(
 
 
 def pose_covariance(position: Array, attitude: Array, cross: Array, to_world: Array) -> Array:
-    """Return the covariance (36,) of a pose, row-major over (x, y, z, rotations about the parent's axes).
+    """Return the covariance (36,) of a pose, row-major over (x, y, z, rotations about the parent's
+    axes).
 
-    ``position`` (3, 3) in parent axes; ``attitude`` (3, 3) of dtheta with q_true = q (x) exp(dtheta), hence in the axes of
-    the body; ``cross`` (3, 3) of position (rows) with dtheta; ``to_world`` (3, 3) rotates from body to parent.
+    ``position`` (3, 3) in parent axes; ``attitude`` (3, 3) of dtheta with q_true = q (x)
+    exp(dtheta), hence in the axes of the body; ``cross`` (3, 3) of position (rows) with dtheta;
+    ``to_world`` (3, 3) rotates from body to parent.
     """
     whole = np.empty((6, 6))
     whole[:3, :3] = position
@@ -109,9 +117,11 @@ def pose_covariance(position: Array, attitude: Array, cross: Array, to_world: Ar
 
 
 def twist_covariance(velocity: Array, rate: Array, cross: Array, to_world: Array) -> Array:
-    """Return the covariance (36,) of a twist, row-major over (velocity, angular rate), both in the axes of the body.
+    """Return the covariance (36,) of a twist, row-major over (velocity, angular rate), both in the
+    axes of the body.
 
-    ``velocity`` (3, 3) in parent axes, ``rate`` (3, 3) in body axes, ``cross`` (3, 3) of velocity (rows) with rate.
+    ``velocity`` (3, 3) in parent axes, ``rate`` (3, 3) in body axes, ``cross`` (3, 3) of velocity
+    (rows) with rate.
     """
     whole = np.empty((6, 6))
     whole[:3, :3] = to_world.T @ velocity @ to_world
@@ -138,7 +148,7 @@ def _odometry(
     )
 
 
-# -- messages ---------------------------------------------------------------------------------------------
+# -- messages --------------------------------------------------------------------------------------
 
 
 def clock(tick: m.Tick) -> ros.rosgraph_msgs__msg__Clock:
@@ -168,7 +178,9 @@ def image(message: m.Image) -> ros.sensor_msgs__msg__Image:
 
 
 def camera_info(message: m.Image, camera: Camera) -> ros.sensor_msgs__msg__CameraInfo:
-    """Return the calibration that belongs to an image (distortion model ``plumb_bob``: k1, k2, p1, p2, k3)."""
+    """Return the calibration that belongs to an image (distortion model ``plumb_bob``: k1, k2, p1,
+    p2, k3).
+    """
     k = camera.matrix()
     return ros.sensor_msgs__msg__CameraInfo(
         _header(message.sim_time_ns, camera_frame(message.chaser)),
@@ -200,7 +212,9 @@ def odometry(message: m.Odometry) -> ros.nav_msgs__msg__Odometry:
     )
     pose_cov = pose_covariance(position, attitude, none, to_world)
     twist_cov = twist_covariance(velocity, rate, none, to_world)
-    return _odometry(message.sim_time_ns, chaser_frame(message.chaser), message, pose_cov, twist_cov)
+    return _odometry(
+        message.sim_time_ns, chaser_frame(message.chaser), message, pose_cov, twist_cov
+    )
 
 
 def body_odometry(message: m.BodyTruth) -> ros.nav_msgs__msg__Odometry:
@@ -259,7 +273,9 @@ def reference(message: m.Reference) -> ros.geometry_msgs__msg__PoseStamped:
 
 
 def chaser_transforms(message: m.Odometry, camera: Camera) -> ros.tf2_msgs__msg__TFMessage:
-    """Return the frames of a chaser and of its camera, which is repeated for readers that join late."""
+    """Return the frames of a chaser and of its camera, which is repeated for readers that join
+    late.
+    """
     chaser, time_ns = message.chaser, message.sim_time_ns
     body = _transform(time_ns, WORLD, chaser_frame(chaser), message.position_m, message.q_wxyz)
     mounting = (camera.position_crf_m, camera.q_crf_irf_wxyz)
@@ -270,7 +286,9 @@ def chaser_transforms(message: m.Odometry, camera: Camera) -> ros.tf2_msgs__msg_
 def target_transform(message: m.TargetEstimate) -> ros.tf2_msgs__msg__TFMessage:
     """Return the estimated frame of the target."""
     pose = (message.position_m, message.q_wxyz)
-    return ros.tf2_msgs__msg__TFMessage([_transform(message.sim_time_ns, WORLD, TARGET_FRAME, *pose)])
+    return ros.tf2_msgs__msg__TFMessage(
+        [_transform(message.sim_time_ns, WORLD, TARGET_FRAME, *pose)]
+    )
 
 
 def _marker(
@@ -301,7 +319,9 @@ def _marker(
         list(points),
         [],
         "",
-        ros.sensor_msgs__msg__CompressedImage(ros.std_msgs__msg__Header(none, ""), "", np.zeros(0, np.uint8)),
+        ros.sensor_msgs__msg__CompressedImage(
+            ros.std_msgs__msg__Header(none, ""), "", np.zeros(0, np.uint8)
+        ),
         [],
         "",
         "",
@@ -313,7 +333,9 @@ def _marker(
 def body_markers(
     message: m.TargetEstimate, target_size_m: Vector3, chaser_size_m: Vector3, chasers: int
 ) -> ros.visualization_msgs__msg__MarkerArray:
-    """Return target and chasers as boxes in their frames; the target is transparent unless it is tracked, or deleted."""
+    """Return target and chasers as boxes in their frames; the target is transparent unless it is
+    tracked, or deleted.
+    """
     known = message.status in ("tracking", "predicting")
     alpha = 0.875 if message.status == "tracking" else 0.25
     markers: list[Any] = [
@@ -335,7 +357,9 @@ def body_markers(
     return ros.visualization_msgs__msg__MarkerArray(markers)
 
 
-def plan_markers(message: m.Plan, plan: ros.nav_msgs__msg__Path) -> ros.visualization_msgs__msg__MarkerArray:
+def plan_markers(
+    message: m.Plan, plan: ros.nav_msgs__msg__Path
+) -> ros.visualization_msgs__msg__MarkerArray:
     """Return a plan, of which ``plan`` is the path, as a line in WRF."""
     line: Any = _marker(
         message.sim_time_ns,
@@ -350,7 +374,7 @@ def plan_markers(message: m.Plan, plan: ros.nav_msgs__msg__Path) -> ros.visualiz
     return ros.visualization_msgs__msg__MarkerArray([line])
 
 
-# -- all of them ------------------------------------------------------------------------------------------
+# -- all of them -----------------------------------------------------------------------------------
 
 
 def topic_types(chasers: int) -> dict[str, str]:
@@ -369,7 +393,11 @@ def topic_types(chasers: int) -> dict[str, str]:
         "/markers": "visualization_msgs/msg/MarkerArray",
         "/target/odometry": "nav_msgs/msg/Odometry",
         "/target/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-        **{f"/{chaser_frame(i)}/{name}": kind for i in range(chasers) for name, kind in of_chaser.items()},
+        **{
+            f"/{chaser_frame(i)}/{name}": kind
+            for i in range(chasers)
+            for name, kind in of_chaser.items()
+        },
     }
 
 
@@ -377,7 +405,11 @@ class Converter:
     """Converts messages of one mission. Nothing of one message influences another."""
 
     def __init__(self, scenario: FlightScenario) -> None:
-        self._bodies = (scenario.target_model().size_m, scenario.chaser.size_m, len(scenario.chasers))
+        self._bodies = (
+            scenario.target_model().size_m,
+            scenario.chaser.size_m,
+            len(scenario.chasers),
+        )
         self._camera = scenario.camera_model()
         self._parts: dict[type, Callable[[Any], Iterable[tuple[str, Any]]]] = {
             m.Tick: lambda x: [("/clock", clock(x))],

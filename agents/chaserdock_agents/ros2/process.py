@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge process: shows a mission to ROS 2, and serves its operator commands. Needs no ROS.
 
-It observes: the mission does not wait for it, and receives nothing from it but the commands of its services.
+It observes: the mission does not wait for it, and receives nothing from it but the commands of its
+services.
 """
 
 from __future__ import annotations
@@ -72,14 +73,19 @@ class Bridge:
     """Topics and services of one mission."""
 
     def __init__(self, node: Node, ros: RosNode, mission: JoinReply) -> None:
-        scenario: FlightScenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
+        scenario: FlightScenario = flight_scenario_from_json(
+            mission.scenario_json, "the world's scenario"
+        )
         self._node, chasers = node, len(scenario.chasers)
         ignore_foreign_publishers(
-            node, mission.source, lambda detail, _: print_status(NAME, f"foreign publisher: {detail}")
+            node,
+            mission.source,
+            lambda detail, _: print_status(NAME, f"foreign publisher: {detail}"),
         )
         self._converter = Converter(scenario)
         self._invalid: Counter[str] = Counter()
-        # In lock-step every message arrives, in real time slow readers miss some, as everywhere in a mission.
+        # In lock-step every message arrives, in real time slow readers miss some, as everywhere in
+        # a mission.
         lockstep = mission.mode == "lockstep"
         self._publishers = {
             topic: ros.publisher(topic, kind, blocking=lockstep)

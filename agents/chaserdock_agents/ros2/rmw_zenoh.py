@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node of ROS 2 on Zenoh, as ``rmw_zenoh_cpp`` (Jazzy, Kilted) expects it: keys, liveliness tokens, attachments, CDR.
+"""A node of ROS 2 on Zenoh, as ``rmw_zenoh_cpp`` (Jazzy, Kilted) expects it: keys, liveliness
+tokens, attachments, CDR.
 
 After the design document and the sources of ros2/rmw_zenoh. Data of a topic travel on
-``DOMAIN/TOPIC/TYPE/HASH``; that a node, publisher, subscription or service exists is stated by a liveliness token
-under ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/…``; every message carries its number, time and publisher as an attachment.
+``DOMAIN/TOPIC/TYPE/HASH``; that a node, publisher, subscription or service exists is stated by a
+liveliness token under ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/…``; every message carries its
+number, time and publisher as an attachment.
 """
 
 from __future__ import annotations
@@ -26,15 +28,17 @@ EndpointKind = Literal["NN", "MP", "MS", "SS"]
 """Node, publisher, subscription, service."""
 
 DEFAULT_QOS = "::,10:,:,:,,"
-"""Reliable, volatile, keep the last 10: reliability : durability : history,depth : deadline : lifespan : liveliness.
-An empty field is the default of rmw_zenoh."""
+"""Reliable, volatile, keep the last 10: reliability : durability : history,depth : deadline :
+lifespan : liveliness. An empty field is the default of rmw_zenoh."""
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
 _WORKERS = 4
 
 
 def dds_name(type_name: str) -> str:
-    """Return the name of a type in keys: ``std_msgs::msg::dds_::String_`` for ``std_msgs/msg/String``."""
+    """Return the name of a type in keys: ``std_msgs::msg::dds_::String_`` for
+    ``std_msgs/msg/String``.
+    """
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
@@ -56,14 +60,18 @@ def node_token(domain: int, session: str, node: str) -> str:
 def endpoint_token(
     domain: int, session: str, node: str, number: int, kind: EndpointKind, name: str, type_name: str
 ) -> str:
-    """Return the liveliness token of the node's endpoint ``number``: publisher, subscription or service ``name``."""
+    """Return the liveliness token of the node's endpoint ``number``: publisher, subscription or
+    service ``name``.
+    """
     head = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/%/%/{node}"
     return f"{head}/{_mangled(name)}/{dds_name(type_name)}/{type_hash(type_name)}/{DEFAULT_QOS}"
 
 
 @dataclass(frozen=True)
 class Attachment:
-    """Number (from 1) of a message of its publisher or of a request of its client, wall clock, identity of the sender."""
+    """Number (from 1) of a message of its publisher or of a request of its client, wall clock,
+    identity of the sender.
+    """
 
     number: int
     time_ns: int
@@ -77,7 +85,9 @@ class Attachment:
     def unpack(cls, data: bytes) -> Attachment:
         """Raise ValueError for bytes that are no attachment."""
         if len(data) != _ATTACHMENT.size or data[16] != _GID_BYTES:
-            raise ValueError(f"no attachment of rmw_zenoh: {len(data)} bytes, expected {_ATTACHMENT.size}")
+            raise ValueError(
+                f"no attachment of rmw_zenoh: {len(data)} bytes, expected {_ATTACHMENT.size}"
+            )
         number, time_ns, _, gid = _ATTACHMENT.unpack(data)
         return cls(number, time_ns, gid)
 
@@ -117,11 +127,15 @@ class RosNode:
 
     def publisher(self, topic: str, type_name: str, *, blocking: bool) -> RosPublisher:
         """Declare a publisher. ``blocking``: it waits for slow readers, else they miss messages."""
-        put = self._session.declare_publisher(topic_key(self._domain, topic, type_name), blocking=blocking)
+        put = self._session.declare_publisher(
+            topic_key(self._domain, topic, type_name), blocking=blocking
+        )
         return RosPublisher(type_name, self._declare("MP", topic, type_name), put)
 
     def subscribe(self, topic: str, type_name: str, arrived: Callable[[Any], None]) -> None:
-        """Call ``arrived(message)`` on Zenoh's thread for every message of a topic; those that are no CDR are ignored."""
+        """Call ``arrived(message)`` on Zenoh's thread for every message of a topic; those that are
+        no CDR are ignored.
+        """
 
         def decode(payload: bytes, _: bytes) -> None:
             message = _decoded(payload, type_name)
@@ -132,7 +146,9 @@ class RosNode:
         self._declare("MS", topic, type_name)
 
     def serve(self, name: str, type_name: str, handle: Callable[[Any], Any]) -> None:
-        """Serve requests with ``handle(request) -> response``, on threads of this node. Malformed requests get an error."""
+        """Serve requests with ``handle(request) -> response``, on threads of this node. Malformed
+        requests get an error.
+        """
 
         def arrived(query: AttachedQuery) -> None:
             request = _decoded(query.payload, f"{type_name}_Request")
@@ -157,7 +173,13 @@ class RosNode:
         """Declare an endpoint's token, after the endpoint, and return its identity."""
         self._endpoints += 1
         token = endpoint_token(
-            self._domain, self._session.session_id, self._name, self._endpoints, kind, name, type_name
+            self._domain,
+            self._session.session_id,
+            self._name,
+            self._endpoints,
+            kind,
+            name,
+            type_name,
         )
         self._session.declare_token(token)
         return _gid_of(token)

@@ -38,7 +38,9 @@ def command_of(verb: OperatorCommandName, chaser: int, request: Any) -> Operator
 
 
 def handler(kind: str, verb: OperatorCommandName, chaser: int, ask: Ask) -> Callable[[Any], Any]:
-    """Return a function from a service's request to its response: whether the controller accepted, and why not."""
+    """Return a function from a service's request to its response: whether the controller accepted,
+    and why not.
+    """
 
     def handle(request: Any) -> Any:
         try:

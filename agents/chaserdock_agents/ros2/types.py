@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message and service types of ROS 2 Jazzy, which Kilted shares: serialization (CDR) and type hashes.
+"""Message and service types of ROS 2 Jazzy, which Kilted shares: serialization (CDR) and type
+hashes.
 
-The hash (REP 2016, RIHS01) of a type is part of its keys on the network. Messages come with rosbags; services are defined
-here, those with arguments by the files of the ROS package ``chaserdock_interfaces`` beside this module.
+The hash (REP 2016, RIHS01) of a type is part of its keys on the network. Messages come with
+rosbags; services are defined here, those with arguments by the files of the ROS package
+``chaserdock_interfaces`` beside this module.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ def _name(type_name: str) -> Any:
 
 
 def _register_service(name: str, definition: str) -> None:
-    """Add the types that a service consists of: request, response, event, and the service itself, which has a hash only."""
+    """Add the types that a service consists of: request, response, event, and the service itself,
+    which has a hash only.
+    """
     request, _, response = definition.partition("---\n")
     types: dict[str, Any] = {}
     for part, text in (("Request", request), ("Response", response)):
@@ -47,7 +51,11 @@ def _register_service(name: str, definition: str) -> None:
             ("response", (Nodetype.SEQUENCE, (_name(f"{name}_Response"), 1))),
         ],
     )
-    parts = (("request_message", "Request"), ("response_message", "Response"), ("event_message", "Event"))
+    parts = (
+        ("request_message", "Request"),
+        ("response_message", "Response"),
+        ("event_message", "Event"),
+    )
     types[name] = ([], [(field, _name(f"{name}_{part}")) for field, part in parts])
     TYPES.register(types)
 
@@ -57,13 +65,20 @@ _INFO = TYPES.fielddefs["service_msgs/msg/ServiceEventInfo"]
 TYPES.fielddefs["service_msgs/msg/ServiceEventInfo"] = (
     _INFO[0],
     [
-        (field, (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16)) if field == "client_gid" else kind)
+        (
+            field,
+            (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))
+            if field == "client_gid"
+            else kind,
+        )
         for field, kind in _INFO[1]
     ],
 )
 _register_service(TRIGGER, _REPLY)
 for _service in (GOTO, SELECT_THRUSTER):
-    _register_service(_service, (INTERFACES / f"srv/{_service.rpartition('/')[2]}.srv").read_text("utf-8"))
+    _register_service(
+        _service, (INTERFACES / f"srv/{_service.rpartition('/')[2]}.srv").read_text("utf-8")
+    )
 
 
 @cache

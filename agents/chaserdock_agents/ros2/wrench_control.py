@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node of ROS 2 as the controller of a mission in real time: wrenches of a topic per chaser become its commands.
+"""A node of ROS 2 as the controller of a mission in real time: wrenches of a topic per chaser
+become its commands.
 
-This process takes the controller's place and name. It estimates and plans nothing: a chaser for which no wrench arrives has no
-commands, and does what it does without a controller (docs/faults.md). As every controller it commands a tick while a majority
-of the chasers has granted it their leases.
+This process takes the controller's place and name. It estimates and plans nothing: a chaser for
+which no wrench arrives has no commands, and does what it does without a controller
+(docs/faults.md). As every controller it commands a tick while a majority of the chasers has granted
+it their leases.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ def command_topic(chaser: int) -> str:
 
 
 def why_invalid(wrench: Any, chaser: int) -> str | None:
-    """Return why a ``WrenchStamped`` is no command of a chaser, or None. Its frame must be the chaser's, or empty."""
+    """Return why a ``WrenchStamped`` is no command of a chaser, or None. Its frame must be the
+    chaser's, or empty.
+    """
     frame = wrench.header.frame_id
     if frame not in ("", chaser_frame(chaser)):
         return f"frame {frame!r}, must be {chaser_frame(chaser)!r}"
@@ -79,11 +83,15 @@ def wrench_command(
 
 
 def main(options: ProcessOptions) -> int:
-    """Command one mission; return 0 at its end, 1 if stopped before or the world is gone, 2 on an error."""
+    """Command one mission; return 0 at its end, 1 if stopped before or the world is gone, 2 on an
+    error.
+    """
 
     def work(node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
         if mission.mode != "realtime":
-            raise ControlError("--control: the mission is in lock-step; start the world with --mode realtime")
+            raise ControlError(
+                "--control: the mission is in lock-step; start the world with --mode realtime"
+            )
         ros = open_ros(options.ros, ROS_NODE)
         try:
             return WrenchControl(node, ros, mission, instance, options.stall_s).run(stop)
@@ -96,7 +104,9 @@ def main(options: ProcessOptions) -> int:
 class WrenchControl:
     """Commands each chaser at most once a tick, by the first wrench that arrives in it."""
 
-    def __init__(self, node: Node, ros: RosNode, mission: JoinReply, instance: str, stall_s: float) -> None:
+    def __init__(
+        self, node: Node, ros: RosNode, mission: JoinReply, instance: str, stall_s: float
+    ) -> None:
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
         self._node, self._timing, self._instance = node, scenario.timing, instance
         self._lock = threading.Lock()
@@ -169,12 +179,16 @@ class WrenchControl:
             return
         self._set_leads(True)
         self._commanded[chaser] = tick.tick
-        command = wrench_command(wrench, chaser, tick, self._timing, self._leases.term, self._instance)
+        command = wrench_command(
+            wrench, chaser, tick, self._timing, self._leases.term, self._instance
+        )
         self._expires_ns = command.expires_ns
         self._node.publish(topics.WRENCH, command, chaser)
 
     def _complete_tick(self) -> None:
-        """Renew the leases of chasers without a wrench while one is valid; without a majority, give the leases back."""
+        """Renew the leases of chasers without a wrench while one is valid; without a majority, give
+        the leases back.
+        """
         self._deadline_s, tick, leases = math.inf, self._tick, self._leases
         if tick is None:
             return
@@ -189,7 +203,9 @@ class WrenchControl:
 
     def _publish_without_wrench(self, chaser: int, tick: Tick, mode: str, term: int) -> None:
         head = {"mode": mode, "term": term, "commander": NAME, "instance": self._instance}
-        self._node.publish(topics.WRENCH, msgspec.structs.replace(no_command(chaser, tick), **head), chaser)
+        self._node.publish(
+            topics.WRENCH, msgspec.structs.replace(no_command(chaser, tick), **head), chaser
+        )
 
     def _set_leads(self, leads: bool) -> None:
         """Note, and print, whether this process commands."""

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Audit log of access-control denials, read from Zenoh's log, as Zenoh drops messages without notice.
+"""Audit log of access-control denials, read from Zenoh's log, as Zenoh drops messages without
+notice.
 
-At level ``trace`` Zenoh writes a line for every decision. Some are not attempts: when a client declares a key, all
-permissions for it are cached (between "caching permissions" and the ninth decision, on one thread). Other lines with "is
-unauthorized to ... (ingress)" are messages that a client sent and that were dropped.
+At level ``trace`` Zenoh writes a line for every decision. Some are not attempts: when a client
+declares a key, all permissions for it are cached (between "caching permissions" and the ninth
+decision, on one thread). Other lines with "is unauthorized to ... (ingress)" are messages that a
+client sent and that were dropped.
 """
 
 from __future__ import annotations
@@ -20,18 +22,25 @@ from dataclasses import dataclass, field
 TARGET = "zenoh::net::routing::interceptor::access_control"
 TLS_TARGET = "zenoh_link_tls::unicast"
 MAX_DISTINCT = 4096
-"""Number of distinct denials that are counted separately; bounds the memory for clients that use ever new keys."""
+"""Number of distinct denials that are counted separately; bounds the memory for clients that use
+ever new keys.
+"""
 _MAX_KEY_LENGTH = 200
 _PIPE_BYTES = 1 << 20
 _POLL_S = 0.02
-"""Interval at which the pipe is read: waking the reader for every line costs more than the lines."""
+"""Interval at which the pipe is read: waking the reader for every line costs more than the lines.
+"""
 
 _DECISION = re.compile(
     rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: (?P<cached>Using cached result: )?(?P<client>[0-9a-f]+)"
     r"(?: on (?P<subject>\S+))? is (?P<un>un)?authorized to (?P<what>[\w /]+) \((?P<flow>ingress|egress)\) on (?P<key>.*)"
 )
-_CACHING = re.compile(rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: ACL \(\w+\): caching permissions")
-_NO_SUBJECT = re.compile(rf".*{TARGET}: (?P<client>[0-9a-f]+) did not match any configured ACL subject")
+_CACHING = re.compile(
+    rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: ACL \(\w+\): caching permissions"
+)
+_NO_SUBJECT = re.compile(
+    rf".*{TARGET}: (?P<client>[0-9a-f]+) did not match any configured ACL subject"
+)
 _REFUSED = re.compile(
     rf".*{TLS_TARGET}: (?P<why>peer sent no certificates|invalid peer certificate: \w+|received fatal alert: \w+)"
 )
@@ -55,7 +64,9 @@ _ACTIONS = {
 
 @dataclass(frozen=True)
 class Denial:
-    """A denied action of a client (certificate name) on a key without the namespace, or a denied connection."""
+    """A denied action of a client (certificate name) on a key without the namespace, or a denied
+    connection.
+    """
 
     client: str
     what: str
@@ -88,13 +99,16 @@ class DenialParser:
                 f"a client without a role ({client_without_role['client']})", "do anything on", "**"
             )
         if (refused := _REFUSED.match(line)) is not None:
-            return Denial("a client without a certificate of this mission", "connect:", refused["why"])
+            return Denial(
+                "a client without a certificate of this mission", "connect:", refused["why"]
+            )
         if (decision := _DECISION.match(line)) is None:
             return None
         thread, client, what = decision["thread"], decision["client"], decision["what"]
         if (named := _NAME.search(decision["subject"] or "")) is not None:
             if len(self._names) >= MAX_DISTINCT:
-                self._names.clear()  # every connection is a new client; its id is used until it is named again
+                # every connection is a new client; its id is used until it is named again
+                self._names.clear()
             self._names[client] = named["name"]
         if thread in self._caching and not decision["cached"]:
             if what == _LAST_CACHED:
@@ -102,7 +116,9 @@ class DenialParser:
             return None
         if not decision["un"] or decision["flow"] == "egress" or what not in _ACTIONS:
             return None
-        return Denial(self._names.get(client, client), _ACTIONS[what], self._printable(decision["key"]))
+        return Denial(
+            self._names.get(client, client), _ACTIONS[what], self._printable(decision["key"])
+        )
 
     def _printable(self, key: str) -> str:
         """Return a key as printable text of limited length, as clients choose it."""
@@ -119,10 +135,16 @@ class DenialCounter:
     overflow: int = 0
 
     def add(self, denial: Denial) -> str | None:
-        """Count a denial; return a text to be published at the first, tenth, hundredth, ... occurrence, else None."""
+        """Count a denial; return a text to be published at the first, tenth, hundredth, ...
+        occurrence, else None.
+        """
         if denial not in self.counts and len(self.counts) >= MAX_DISTINCT:
             self.overflow += 1
-            return f"{self.overflow} times on further keys" if _is_power_of_ten(self.overflow) else None
+            return (
+                f"{self.overflow} times on further keys"
+                if _is_power_of_ten(self.overflow)
+                else None
+            )
         self.counts[denial] += 1
         times = self.counts[denial]
         if not _is_power_of_ten(times):
@@ -139,9 +161,11 @@ def _is_power_of_ten(n: int) -> bool:
 
 
 class ZenohLog:
-    """Captures this process' standard output, to which Zenoh writes its log, and forwards all other lines.
+    """Captures this process' standard output, to which Zenoh writes its log, and forwards all other
+    lines.
 
-    Must be created before the process' first session. The user's ``RUST_LOG`` still applies to everything else.
+    Must be created before the process' first session. The user's ``RUST_LOG`` still applies to
+    everything else.
     """
 
     def __init__(self, namespace: str) -> None:
@@ -177,9 +201,14 @@ class ZenohLog:
         rest = b""
         while piece := os.read(self._lines, _PIPE_BYTES):
             whole, end, rest = (rest + piece).rpartition(b"\n")
-            # Nearly all lines are authorizations, thousands per second, and are skipped without parsing.
+            # Nearly all lines are authorizations, thousands per second, and are skipped without
+            # parsing.
             only_authorized = whole.count(_AUTHORIZED) == whole.count(b"\n") + len(end)
-            if not only_authorized or self._parser.is_caching or any(word in whole for word in _RELEVANT):
+            if (
+                not only_authorized
+                or self._parser.is_caching
+                or any(word in whole for word in _RELEVANT)
+            ):
                 for line in whole.split(b"\n") if end else ():
                     self._handle_line(line)
             time.sleep(_POLL_S)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The router process, to which clients on several hosts or in several containers connect.
 
-It forwards messages, enforces access control (``access_control``) and reports denials on standard error and as events.
+It forwards messages, enforces access control (``access_control``) and reports denials on standard
+error and as events.
 """
 
 from __future__ import annotations
@@ -22,12 +23,14 @@ NAME = "router"
 MAX_CHASERS = 256
 POLL_S = 0.2
 GRACE_S = 5.0
-"""Delay between the departure of the process that it waits for and its own end: the process may return after a cut link, and
-with Compose its exit status must be available before the router's."""
+"""Delay between the departure of the process that it waits for and its own end: the process may
+return after a cut link, and with Compose its exit status must be available before the router's."""
 
 
 def main(options: ProcessOptions) -> int:
-    """Route until stopped, or until ``options.until`` has joined and departed; return 0, or 2 if it cannot listen."""
+    """Route until stopped, or until ``options.until`` has joined and departed; return 0, or 2 if it
+    cannot listen.
+    """
     link = replace(options.link, mode="router")
     log: ZenohLog | None = None
     if link.tls is not None:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's estimation combiner, as a baseline for comparison.
 
-The paper (Fourlas et al. 2023) averages the latest estimates of all chasers that see the target, with "a moving average
-filter for noise reduction, outlier detection and removal methods". The authors' code differentiates poses for the rates
-and averages 11 of them. Window, outlier limits and age limit are unspecified there and parameters here. Weaknesses of
-the original that are kept: no weighting, no latency compensation (the latest pose is returned for any time), rates from
+The paper (Fourlas et al. 2023) averages the latest estimates of all chasers that see the target,
+with "a moving average filter for noise reduction, outlier detection and removal methods". The
+authors' code differentiates poses for the rates and averages 11 of them. Window, outlier limits and
+age limit are unspecified there and parameters here. Weaknesses of the original that are kept: no
+weighting, no latency compensation (the latest pose is returned for any time), rates from
 differences. Averaging of Euler angles is replaced by a mean of attitudes.
 """
 
@@ -73,7 +74,8 @@ def average_quaternion(quaternions: Sequence[Array]) -> Array:
     """Return the mean attitude (4,) of unit quaternions (4,) of any sign; scalar part not negative.
 
     The eigenvector of sum q q' with the largest eigenvalue. Source: Markley et al., "Averaging
-    Quaternions", Journal of Guidance, Control, and Dynamics 30(4), 2007. Raises ValueError for none.
+    Quaternions", Journal of Guidance, Control, and Dynamics 30(4), 2007. Raises ValueError for
+    none.
     """
     if not quaternions:
         raise ValueError("no quaternions to average")
@@ -85,9 +87,9 @@ def average_quaternion(quaternions: Sequence[Array]) -> Array:
 class PaperEstimator:
     """The paper's combiner with the interface of ``Mekf``.
 
-    ``late_dropped`` counts measurements not newer than the chaser's latest or than the newest combination, ``gated``
-    the poses removed as outliers, ``reinitialisations`` the dropped histories. For an ambiguous view the first
-    hypothesis is used.
+    ``late_dropped`` counts measurements not newer than the chaser's latest or than the newest
+    combination, ``gated`` the poses removed as outliers, ``reinitialisations`` the dropped
+    histories. For an ambiguous view the first hypothesis is used.
     """
 
     def __init__(self, parameters: PaperParameters | None = None) -> None:
@@ -121,7 +123,9 @@ class PaperEstimator:
             elif not is_usable(m):
                 self.invalid += 1
                 self._events.append(
-                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: dropped an unusable measurement")
+                    EstimatorEvent(
+                        now_ns, "info", f"chaser {m.chaser}: dropped an unusable measurement"
+                    )
                 )
             else:
                 usable.append(m)
@@ -148,12 +152,19 @@ class PaperEstimator:
         p = self.parameters
         combined_ns, position, q = self._mean
         age_s = (time_ns - combined_ns) * 1e-9
-        status = "lost" if age_s > p.lost_s else "predicting" if age_s > p.tracking_s else "tracking"
+        status = (
+            "lost" if age_s > p.lost_s else "predicting" if age_s > p.tracking_s else "tracking"
+        )
         velocity, omega = np.zeros(3), np.zeros(3)
         if self._rates:
             velocity = np.mean([v for v, _ in self._rates], axis=0)
             omega = np.mean([w for _, w in self._rates], axis=0)
-        sigma = (p.sigma_position_m, p.sigma_velocity_m_s, p.sigma_attitude_rad, p.sigma_omega_rad_s)
+        sigma = (
+            p.sigma_position_m,
+            p.sigma_velocity_m_s,
+            p.sigma_attitude_rad,
+            p.sigma_omega_rad_s,
+        )
         covariance = np.diag(np.repeat(np.square(sigma), 3))
         return TargetState(
             time_ns,
@@ -190,11 +201,17 @@ class PaperEstimator:
         if len(views) > 2:
             middle = np.median([position for position, _ in views.values()], axis=0)
             removed = {
-                c for c, (x, _) in views.items() if float(np.linalg.norm(x - middle)) > p.outlier_position_m
+                c
+                for c, (x, _) in views.items()
+                if float(np.linalg.norm(x - middle)) > p.outlier_position_m
             }
             # Median attitude: the one with the smallest sum of angles to the others.
-            centre = min(views, key=lambda c: (sum(_angle(views[c][1], q) for _, q in views.values()), c))
-            removed |= {c for c in views if _angle(views[centre][1], views[c][1]) > p.outlier_attitude_rad}
+            centre = min(
+                views, key=lambda c: (sum(_angle(views[c][1], q) for _, q in views.values()), c)
+            )
+            removed |= {
+                c for c in views if _angle(views[centre][1], views[c][1]) > p.outlier_attitude_rad
+            }
         self._rejected = tuple(sorted(removed & fresh))
         self._seen = len((views.keys() - removed) & fresh)
         self.gated += len(removed & fresh)
@@ -202,7 +219,9 @@ class PaperEstimator:
         kept = [views[c] for c in views if c not in removed]
         if kept:
             self._append(
-                time_ns, np.mean([x for x, _ in kept], axis=0), average_quaternion([q for _, q in kept])
+                time_ns,
+                np.mean([x for x, _ in kept], axis=0),
+                average_quaternion([q for _, q in kept]),
             )
 
     def _append(self, time_ns: int, position: Array, q: Array) -> None:

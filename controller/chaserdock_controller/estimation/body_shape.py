@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the free rotation of a rigid body depends on: its inertia up to a factor, and its centre of mass. Eight numbers.
+"""What the free rotation of a rigid body depends on: its inertia up to a factor, and its centre of
+mass. Eight numbers.
 
-The inertia over its trace differs from an estimate by a symmetric matrix without trace, of which five numbers are the
-coordinates. In these the acceleration is nearly linear and an uncertain inertia nearly Gaussian, which they are not in logarithms
-of the second moments. A body can have an inertia I if and only if its second moments 1/2 trace(I) 1 - I are positive (Wensing, Kim
-and Slotine, "Linear matrix inequalities for physically consistent inertial parameter identification", 2018). This set is convex:
-an estimate outside it is replaced by the nearest one in it, which is nearer to every inertia that a body can have.
+The inertia over its trace differs from an estimate by a symmetric matrix without trace, of which
+five numbers are the coordinates. In these the acceleration is nearly linear and an uncertain
+inertia nearly Gaussian, which they are not in logarithms of the second moments. A body can have an
+inertia I if and only if its second moments 1/2 trace(I) 1 - I are positive (Wensing, Kim and
+Slotine, "Linear matrix inequalities for physically consistent inertial parameter identification",
+2018). This set is convex: an estimate outside it is replaced by the nearest one in it, which is
+nearer to every inertia that a body can have.
 """
 
 from __future__ import annotations
@@ -17,7 +20,9 @@ import numpy as np
 from chaserdock_models.arrays import Array
 
 SHAPE = 8
-"""Components of the error of a shape: inertia over trace in ``RATIO_BASIS``, then the centre of mass, m (TRF)."""
+"""Components of the error of a shape: inertia over trace in ``RATIO_BASIS``, then the centre of
+mass, m (TRF).
+"""
 RATIOS, CENTRE_OF_MASS = slice(0, 5), slice(5, 8)
 INERTIA_ROWS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Order of the elements of an inertia in covariances."""
@@ -40,7 +45,9 @@ RATIO_BASIS = _basis()
 
 @dataclass(frozen=True, eq=False)
 class BodyShape:
-    """``inertia`` (3, 3): about the centre of mass, TRF axes, with trace 1. ``centre_m`` (3,): centre of mass, TRF."""
+    """``inertia`` (3, 3): about the centre of mass, TRF axes, with trace 1. ``centre_m`` (3,):
+    centre of mass, TRF.
+    """
 
     inertia: Array
     centre_m: Array
@@ -57,15 +64,17 @@ class BodyShape:
 
 
 def shape_of(inertia: Array, centre_m: Array) -> BodyShape:
-    """Return the shape of a body with this inertia (3, 3), in any unit, about its centre of mass (3,), TRF."""
+    """Return the shape of a body with this inertia (3, 3), in any unit, about its centre of mass
+    (3,), TRF.
+    """
     return BodyShape(inertia / np.trace(inertia), np.array(centre_m, dtype=float))
 
 
 def shape_covariance(inertia: Array, covariance: Array) -> Array:
     """Return the covariance (8, 8) of the error of ``shape_of`` of a body.
 
-    ``covariance`` (9, 9): of its centre of mass (m) and its inertia (elements in the order of ``INERTIA_ROWS``; unit of
-    ``inertia``).
+    ``covariance`` (9, 9): of its centre of mass (m) and its inertia (elements in the order of
+    ``INERTIA_ROWS``; unit of ``inertia``).
     """
     trace = float(np.trace(inertia))
     jacobian = np.zeros((SHAPE, 9))
@@ -79,8 +88,8 @@ def shape_covariance(inertia: Array, covariance: Array) -> Array:
 
 
 def mass_covariance(covariance: Array, trace: float) -> Array:
-    """Return the covariance (9, 9) of centre of mass and inertia, as in ``shape_covariance``, of a shape with ``covariance``
-    (8, 8), if the trace of the inertia is ``trace``."""
+    """Return the covariance (9, 9) of centre of mass and inertia, as in ``shape_covariance``, of a
+    shape with ``covariance`` (8, 8), if the trace of the inertia is ``trace``."""
     jacobian = np.zeros((9, SHAPE))
     jacobian[:3, CENTRE_OF_MASS] = np.eye(3)
     jacobian[3:, RATIOS] = trace * np.stack([RATIO_BASIS[:, i, j] for i, j in INERTIA_ROWS])
@@ -88,9 +97,11 @@ def mass_covariance(covariance: Array, trace: float) -> Array:
 
 
 def _physical(inertia: Array) -> Array:
-    """Return the nearest inertia (3, 3) with trace 1 whose second moments are not less than ``_LEAST_MOMENT``.
+    """Return the nearest inertia (3, 3) with trace 1 whose second moments are not less than
+    ``_LEAST_MOMENT``.
 
-    The moments are projected onto their simplex (Duchi et al., "Efficient projections onto the l1-ball", 2008).
+    The moments are projected onto their simplex (Duchi et al., "Efficient projections onto the
+    l1-ball", 2008).
     """
     values, axes = np.linalg.eigh(inertia)
     moments = 0.5 - values - _LEAST_MOMENT  # descending, sum 1/2 - 3 _LEAST_MOMENT

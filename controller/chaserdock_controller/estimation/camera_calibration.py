@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurement model of a camera with extrinsic and focal-length calibration errors. Pure functions.
 
-Each camera has seven errors, constant in its own axes (IRF): the rotation vector delta of its true axes, the shift b of
-its optical centre, and the relative error s of its focal length. With the nominal centre e (WRF) and axes E (IRF to
-WRF), a target at p, q is measured at e + E m and E exp(-delta) E^-1 q, where m = S^-1 exp(-delta) (E' (p - e) - b) and
-S = diag(1, 1, 1 + s): a longer focal length reduces the measured distance. To first order, an error of the principal
-point equals a rotation.
+Each camera has seven errors, constant in its own axes (IRF): the rotation vector delta of its true
+axes, the shift b of its optical centre, and the relative error s of its focal length. With the
+nominal centre e (WRF) and axes E (IRF to WRF), a target at p, q is measured at e + E m and E
+exp(-delta) E^-1 q, where m = S^-1 exp(-delta) (E' (p - e) - b) and S = diag(1, 1, 1 + s): a longer
+focal length reduces the measured distance. To first order, an error of the principal point equals a
+rotation.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ NO_ERROR.flags.writeable = False
 
 
 class PredictedMeasurement(NamedTuple):
-    """Predicted position (3,) and attitude (4,) in WRF; Jacobian (3, 3) of the position by the target's position, and
-    (6, 7) of both (attitude in TRF axes) by the camera's errors."""
+    """Predicted position (3,) and attitude (4,) in WRF; Jacobian (3, 3) of the position by the
+    target's position, and (6, 7) of both (attitude in TRF axes) by the camera's errors."""
 
     position_m: Array
     q_wxyz: Array
@@ -38,7 +39,9 @@ class PredictedMeasurement(NamedTuple):
 def predict_measurement(
     camera: CameraPose, position_m: Array, q_wxyz: Array, errors: Array
 ) -> PredictedMeasurement:
-    """Predict what a camera with ``errors`` (7,) measures of a target at ``position_m`` (3,), ``q_wxyz`` (4,), WRF."""
+    """Predict what a camera with ``errors`` (7,) measures of a target at ``position_m`` (3,),
+    ``q_wxyz`` (4,), WRF.
+    """
     axes = so3.to_matrix(camera.q_wxyz)
     delta, focal_ratio = errors[:3], 1.0 + float(errors[6])
     r_delta = so3.to_matrix(so3.exp(-delta))
@@ -71,7 +74,9 @@ def _diagonal(turn_rad: float, shift_m: float, share: float) -> Array:
     return matrix
 
 
-def pose_prior_covariance(camera: CameraPose, position_m: Array, q_wxyz: Array, p: MekfParameters) -> Array:
+def pose_prior_covariance(
+    camera: CameraPose, position_m: Array, q_wxyz: Array, p: MekfParameters
+) -> Array:
     """Return the covariance (6, 6) of a measured pose due to the camera's prior errors."""
     g = predict_measurement(camera, position_m, q_wxyz, NO_ERROR).by_errors
     return g @ prior(p) @ g.T

@@ -29,7 +29,8 @@ _CHASER_MASS_SHARE, _CHASER_CENTRE_M = 0.1, 0.01
 _COMMANDED_UNKNOWN = 0.1
 """Share of a commanded impulse's effect that is unknown."""
 _MEASURED_UNKNOWN = 1.0
-"""Share of a measured impulse that may act in any other direction: an undetected thruster failure."""
+"""Share of a measured impulse that may act in any other direction: an undetected thruster failure.
+"""
 
 
 def target_body(scenario: FlightScenario) -> TargetBody:
@@ -39,7 +40,9 @@ def target_body(scenario: FlightScenario) -> TargetBody:
 
 
 def stated_properties(scenario: FlightScenario) -> MassProperties:
-    """Return the scenario's target without any chaser, with the covariance of what is not known of it."""
+    """Return the scenario's target without any chaser, with the covariance of what is not known of
+    it.
+    """
     t = scenario.target
     return prior_of(
         target_body(scenario), t.mass_sigma_share, t.inertia_sigma_share, t.centre_of_mass_sigma_m
@@ -53,7 +56,9 @@ def rows_of(covariance: Array) -> Matrix9:
 
 def centre_in_target(target: TargetState, odometry: Odometry) -> Array:
     """Return a chaser's estimated centre (3,) in TRF."""
-    return rotations.rotate_inverse(target.q_wxyz, np.array(odometry.position_m) - target.position_m)
+    return rotations.rotate_inverse(
+        target.q_wxyz, np.array(odometry.position_m) - target.position_m
+    )
 
 
 def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Array]:
@@ -63,8 +68,8 @@ def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Arra
 
 
 class CompositeBody:
-    """Chasers whose latch holds the target (``latched``), and the body that they form with it (``body``), by what is known of the
-    target alone at the last change of a latch."""
+    """Chasers whose latch holds the target (``latched``), and the body that they form with it
+    (``body``), by what is known of the target alone at the last change of a latch."""
 
     def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
         self._scenario = scenario
@@ -81,8 +86,12 @@ class CompositeBody:
         impulses: Mapping[int, AppliedImpulse],
         now_ns: int,
     ) -> None:
-        """Inform the estimator of contacts, latch changes and impulses of latched chasers, before a tick's sightings."""
-        latched = self.latched - docking.keys() | {i for i, status in docking.items() if status.latched}
+        """Inform the estimator of contacts, latch changes and impulses of latched chasers, before a
+        tick's sightings.
+        """
+        latched = self.latched - docking.keys() | {
+            i for i, status in docking.items() if status.latched
+        }
         changed = latched != self.latched
         if changed:
             self._target_alone = self.target
@@ -117,9 +126,13 @@ class CompositeBody:
 
     @property
     def target(self) -> MassProperties:
-        """Return the mass properties of the target alone: while nothing is latched, with the shape that its motion shows."""
+        """Return the mass properties of the target alone: while nothing is latched, with the shape
+        that its motion shows.
+        """
         estimated = self._estimated_shape() if not self.latched else None
-        return self._target_alone if estimated is None else with_shape(self._target_alone, *estimated)
+        return (
+            self._target_alone if estimated is None else with_shape(self._target_alone, *estimated)
+        )
 
     @property
     def moving(self) -> TargetBody:
@@ -129,7 +142,9 @@ class CompositeBody:
             return self.body
         shape, _ = estimated
         return TargetBody(
-            self.body.mass_kg, float(np.trace(self.body.inertia_kg_m2)) * shape.inertia, shape.centre_m
+            self.body.mass_kg,
+            float(np.trace(self.body.inertia_kg_m2)) * shape.inertia,
+            shape.centre_m,
         )
 
     def _estimated_shape(self) -> tuple[BodyShape, Array] | None:
@@ -141,14 +156,17 @@ class CompositeBody:
         self._changed = True
 
     def update_body(self, target: TargetState, odometry: Mapping[int, Odometry]) -> None:
-        """Recompute the body after a latch change or a better knowledge of the target, after a tick's sightings.
+        """Recompute the body after a latch change or a better knowledge of the target, after a
+        tick's sightings.
 
         The chasers' masses are the scenario's; the poses of the latched chasers are estimated.
         """
         if not self._changed or not self.latched <= odometry.keys():
             return
         chaser = self._scenario.chaser
-        mounted = {i: MountedChaser(*pose_in_target(target, odometry[i])) for i in sorted(self.latched)}
+        mounted = {
+            i: MountedChaser(*pose_in_target(target, odometry[i])) for i in sorted(self.latched)
+        }
         stack = attach(self._target_alone, mounted, chaser)
         self.body = stack.body
         rows = self.body.inertia_kg_m2.tolist()

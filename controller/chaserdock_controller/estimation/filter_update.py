@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Update of the filter by one exposure: initialization, update, choice between hypotheses, re-initialization.
+"""Update of the filter by one exposure: initialization, update, choice between hypotheses,
+re-initialization.
 
-``process`` is a pure function from state and measurements to state. A late measurement is handled by a rollback to the
-state before it and a replay of the later exposures.
+``process`` is a pure function from state and measurements to state. A late measurement is handled
+by a rollback to the state before it and a replay of the later exposures.
 """
 
 from __future__ import annotations
@@ -31,10 +32,11 @@ from .types import Array, EstimatorEvent, Measurement, PoseHypothesis
 
 
 class FilterState(HypothesisSet[StateHypothesis], frozen=True, eq=False):
-    """Complete state of the filter after the exposure at ``time_ns``; no hypotheses before the first measurement.
+    """Complete state of the filter after the exposure at ``time_ns``; no hypotheses before the
+    first measurement.
 
-    recent: the latest measurement of each chaser. considered: covariance (6, 6) of the pose error of the last accepted
-    measurements that does not average out.
+    recent: the latest measurement of each chaser. considered: covariance (6, 6) of the pose error
+    of the last accepted measurements that does not average out.
     """
 
     recent: tuple[Measurement, ...] = ()
@@ -46,7 +48,8 @@ def process_exposure(
 ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
     """Return the state after the exposure at ``time_ns`` and the events.
 
-    ``group``: its measurements, sorted by chaser. ``state``: after the previous exposure, None at the first.
+    ``group``: its measurements, sorted by chaser. ``state``: after the previous exposure, None at
+    the first.
     """
     before = state if state is not None else FilterState(time_ns)
     events: list[EstimatorEvent] = []
@@ -73,7 +76,10 @@ def process_exposure(
         if all(_mostly_gated(b, now, p) for b in now.hypotheses):
             now = _reinitialize(now, seen, p, events)
     now = replace(
-        now, considered=_considered_covariance([m for m in seen if m.chaser in now.seen], p, now.considered)
+        now,
+        considered=_considered_covariance(
+            [m for m in seen if m.chaser in now.seen], p, now.considered
+        ),
     )
     return choose(now, p, events), tuple(events)
 
@@ -81,8 +87,8 @@ def process_exposure(
 def _considered_covariance(used: list[Measurement], p: MekfParameters, before: Array) -> Array:
     """Return the covariance (6, 6) of the camera errors that stay constant while the view does.
 
-    Each camera's part is a fixed ratio of its measurement's sigma, independent of the other cameras'. Without an
-    accepted measurement ``before`` is returned.
+    Each camera's part is a fixed ratio of its measurement's sigma, independent of the other
+    cameras'. Without an accepted measurement ``before`` is returned.
     """
     if not used or p.considered_ratio == 0.0:
         return before
@@ -103,7 +109,9 @@ def _update_hypotheses(
         if hypothesis.rejections[chaser] == p.sustained_rejections:
             events.append(
                 EstimatorEvent(
-                    now.time_ns, "warning", f"chaser {chaser} gated out: {p.sustained_rejections} in a row"
+                    now.time_ns,
+                    "warning",
+                    f"chaser {chaser} gated out: {p.sustained_rejections} in a row",
                 )
             )
     for chaser in accepted:
@@ -114,14 +122,18 @@ def _update_hypotheses(
 
 
 def _recent_measurements(now: FilterState) -> list[Measurement]:
-    """Return the latest measurement of each camera, propagated to now with the rates of the first hypothesis."""
+    """Return the latest measurement of each camera, propagated to now with the rates of the first
+    hypothesis.
+    """
     velocity, omega = now.hypotheses[0].velocity_m_s, now.hypotheses[0].omega_rad_s
     candidates: list[Measurement] = []
     for m in now.recent:
         dt = (now.time_ns - m.time_ns) * 1e-9
         moved = tuple(
             PoseHypothesis(
-                h.position_m + velocity * dt, so3.multiply(h.q_wxyz, so3.exp(omega * dt)), h.covariance
+                h.position_m + velocity * dt,
+                so3.multiply(h.q_wxyz, so3.exp(omega * dt)),
+                h.covariance,
             )
             for h in m.hypotheses
         )
@@ -129,7 +141,9 @@ def _recent_measurements(now: FilterState) -> list[Measurement]:
     return [m for m in candidates if m.hypotheses]
 
 
-def _support(h: PoseHypothesis, seen: Measurement, candidates: list[Measurement], p: MekfParameters) -> int:
+def _support(
+    h: PoseHypothesis, seen: Measurement, candidates: list[Measurement], p: MekfParameters
+) -> int:
     return sum(
         any(measurements_agree(h, seen.camera, other, m.camera, p) for other in m.hypotheses)
         for m in candidates
@@ -161,7 +175,9 @@ def _initialize(
     hypotheses = tuple(start(now.time_ns, seed, h, rates, p) for h in kept)
     text = f"{action} by chaser {seed.chaser}"
     events.append(
-        EstimatorEvent(now.time_ns, "info", text + (", ambiguous: two hypotheses" if len(kept) > 1 else ""))
+        EstimatorEvent(
+            now.time_ns, "info", text + (", ambiguous: two hypotheses" if len(kept) > 1 else "")
+        )
     )
     now = replace(now, hypotheses=hypotheses, ambiguous_since_ns=now.time_ns)
     now = count_measurements(now, (seed.chaser,), ())
@@ -196,9 +212,11 @@ def _reacquire(
 def _reinitialize(
     now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[EstimatorEvent]
 ) -> FilterState:
-    """Initialize at the pose that most cameras agree on, keeping the rates with a larger covariance.
+    """Initialize at the pose that most cameras agree on, keeping the rates with a larger
+    covariance.
 
-    Does nothing if a camera outside this exposure has more agreement; its next exposure will re-initialize.
+    Does nothing if a camera outside this exposure has more agreement; its next exposure will
+    re-initialize.
     """
     candidates = _recent_measurements(now)
     best = max(_ranking(m, candidates, p)[0] for m in candidates)

@@ -66,4 +66,6 @@ def to_world(
         j[:3, 3:] = -c @ so3.skew(lever)
         j[3:, 3:] = so3.to_matrix(q_ct).T
         total = total + j @ odometry @ j.T
-    return PoseHypothesis(p_c + c @ lever, rot.normalize(rot.multiply(q_c, q_ct)), 0.5 * (total + total.T))
+    return PoseHypothesis(
+        p_c + c @ lever, rot.normalize(rot.multiply(q_c, q_ct)), 0.5 * (total + total.T)
+    )

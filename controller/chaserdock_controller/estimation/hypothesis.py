@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One hypothesis of the target's state: prediction and measurement update of the error-state filter.
+"""One hypothesis of the target's state: prediction and measurement update of the error-state
+filter.
 
-Error state: position, velocity (WRF), dtheta, omega (TRF), then for every camera seen so far its seven calibration
-errors (``camera_calibration``). Hypotheses are immutable values.
-Source of the error-state equations: J. Sola, "Quaternion kinematics for the error-state Kalman filter".
+Error state: position, velocity (WRF), dtheta, omega (TRF), then for every camera seen so far its
+seven calibration errors (``camera_calibration``). Hypotheses are immutable values. Source of the
+error-state equations: J. Sola, "Quaternion kinematics for the error-state Kalman filter".
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ _EYE3 = np.eye(3)
 
 
 class StateHypothesis(TargetHypothesis, frozen=True, eq=False, kw_only=True):
-    """State of the target and of the cameras' errors at ``time_ns``; covariance (12 + 7 n, 12 + 7 n).
+    """State of the target and of the cameras' errors at ``time_ns``; covariance (12 + 7 n, 12 + 7
+    n).
 
-    cameras: chaser of each of n bias slots. bias: (n, 7). rejections: number of consecutive rejected measurements of each
-    chaser.
+    cameras: chaser of each of n bias slots. bias: (n, 7). rejections: number of consecutive
+    rejected measurements of each chaser.
     """
 
     cameras: tuple[int, ...] = ()
@@ -41,7 +43,9 @@ class StateHypothesis(TargetHypothesis, frozen=True, eq=False, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Residual r (6,), Jacobian (6, n), innovation covariance S (6, 6), noise R (6, 6), and nis = r' S^-1 r."""
+    """Residual r (6,), Jacobian (6, n), innovation covariance S (6, 6), noise R (6, 6), and nis =
+    r' S^-1 r.
+    """
 
     residual: Array
     jacobian: Array
@@ -53,14 +57,21 @@ class Innovation:
 
 
 def predict(hypothesis: StateHypothesis, time_ns: int, p: MekfParameters) -> StateHypothesis:
-    """Propagate the hypothesis to ``time_ns`` by the motion model. Raises ValueError for an earlier time."""
+    """Propagate the hypothesis to ``time_ns`` by the motion model. Raises ValueError for an earlier
+    time.
+    """
     if time_ns == hypothesis.time_ns:
         return hypothesis
     if time_ns < hypothesis.time_ns:
         raise ValueError(f"cannot predict backwards, from {hypothesis.time_ns} to {time_ns} ns")
     dt = (time_ns - hypothesis.time_ns) * 1e-9
     (position, velocity, q, w), own = motion.propagate_target(
-        hypothesis.position_m, hypothesis.velocity_m_s, hypothesis.q_wxyz, hypothesis.omega_rad_s, dt, p
+        hypothesis.position_m,
+        hypothesis.velocity_m_s,
+        hypothesis.q_wxyz,
+        hypothesis.omega_rad_s,
+        dt,
+        p,
     )
     n = hypothesis.covariance.shape[0]
     f = np.eye(n)
@@ -88,8 +99,12 @@ def predict(hypothesis: StateHypothesis, time_ns: int, p: MekfParameters) -> Sta
     )
 
 
-def with_cameras(hypothesis: StateHypothesis, chasers: list[int], p: MekfParameters) -> StateHypothesis:
-    """Return the hypothesis with a bias slot for each of ``chasers``; unchanged if biases are switched off."""
+def with_cameras(
+    hypothesis: StateHypothesis, chasers: list[int], p: MekfParameters
+) -> StateHypothesis:
+    """Return the hypothesis with a bias slot for each of ``chasers``; unchanged if biases are
+    switched off.
+    """
     new = tuple(c for c in chasers if c not in hypothesis.cameras) if p.has_bias else ()
     if not new:
         return hypothesis
@@ -103,11 +118,16 @@ def with_cameras(hypothesis: StateHypothesis, chasers: list[int], p: MekfParamet
 
 
 def innovate(
-    hypothesis: StateHypothesis, chaser: int, camera: CameraPose, h: PoseHypothesis, p: MekfParameters
+    hypothesis: StateHypothesis,
+    chaser: int,
+    camera: CameraPose,
+    h: PoseHypothesis,
+    p: MekfParameters,
 ) -> Innovation:
     """Return the innovation of the measured pose ``h`` and its covariance.
 
-    The Jacobian of the residual is exact at zero error. The camera's errors are part of the prediction.
+    The Jacobian of the residual is exact at zero error. The camera's errors are part of the
+    prediction.
     """
     n = hypothesis.covariance.shape[0]
     jacobian = np.zeros((6, n))
@@ -115,7 +135,9 @@ def innovate(
     residual = np.empty(6)
     if p.has_bias:
         k = hypothesis.cameras.index(chaser)
-        expected = predict_measurement(camera, hypothesis.position_m, hypothesis.q_wxyz, hypothesis.bias[k])
+        expected = predict_measurement(
+            camera, hypothesis.position_m, hypothesis.q_wxyz, hypothesis.bias[k]
+        )
         column = 12 + ERRORS * k
         jacobian[:3, :3] = expected.by_position
         jacobian[:, column : column + ERRORS] = expected.by_errors
@@ -131,7 +153,9 @@ def innovate(
     white = np.linalg.solve(factor, residual)
     nis = float(white @ white)
     log_determinant = 2.0 * sum(math.log(x) for x in factor.diagonal().tolist())
-    return Innovation(residual, jacobian, s, noise, nis, -0.5 * (nis + log_determinant), log_determinant)
+    return Innovation(
+        residual, jacobian, s, noise, nis, -0.5 * (nis + log_determinant), log_determinant
+    )
 
 
 def correct(hypothesis: StateHypothesis, i: Innovation) -> StateHypothesis:
@@ -157,8 +181,12 @@ def correct(hypothesis: StateHypothesis, i: Innovation) -> StateHypothesis:
     )
 
 
-def best_innovation(hypothesis: StateHypothesis, m: Measurement, p: MekfParameters) -> tuple[int, Innovation]:
-    """Return index and innovation of the likeliest hypothesis of a measurement that has at least one."""
+def best_innovation(
+    hypothesis: StateHypothesis, m: Measurement, p: MekfParameters
+) -> tuple[int, Innovation]:
+    """Return index and innovation of the likeliest hypothesis of a measurement that has at least
+    one.
+    """
     innovations = [innovate(hypothesis, m.chaser, m.camera, h, p) for h in m.hypotheses]
     best = max(range(len(innovations)), key=lambda k: (innovations[k].log_density, -k))
     return best, innovations[best]
@@ -169,9 +197,10 @@ def update_hypothesis(
 ) -> tuple[StateHypothesis, tuple[int, ...], tuple[int, ...]]:
     """Update a hypothesis with the non-empty measurements of one exposure at its time.
 
-    The cameras are processed in the given order. If the prediction is vague, the cameras that agree with most others
-    come first, and among these the closest to the prediction; a faulty camera then does not pull the state away.
-    Returns the hypothesis, the accepted chasers and the rejected chasers.
+    The cameras are processed in the given order. If the prediction is vague, the cameras that agree
+    with most others come first, and among these the closest to the prediction; a faulty camera then
+    does not pull the state away. Returns the hypothesis, the accepted chasers and the rejected
+    chasers.
     """
     gate = p.gate_chi_square
     hypothesis = with_cameras(hypothesis, [m.chaser for m in group], p)
@@ -204,7 +233,9 @@ def update_hypothesis(
     return hypothesis, tuple(sorted(accepted)), tuple(sorted(rejected))
 
 
-def count_agreements(poses: list[tuple[PoseHypothesis, CameraPose]], p: MekfParameters) -> list[int]:
+def count_agreements(
+    poses: list[tuple[PoseHypothesis, CameraPose]], p: MekfParameters
+) -> list[int]:
     """Count for each pose the others that agree within noise, floor and the cameras' prior errors."""
     counts = [0] * len(poses)
     for i in range(len(poses)):
@@ -216,9 +247,15 @@ def count_agreements(poses: list[tuple[PoseHypothesis, CameraPose]], p: MekfPara
 
 
 def measurements_agree(
-    a: PoseHypothesis, camera_a: CameraPose, b: PoseHypothesis, camera_b: CameraPose, p: MekfParameters
+    a: PoseHypothesis,
+    camera_a: CameraPose,
+    b: PoseHypothesis,
+    camera_b: CameraPose,
+    p: MekfParameters,
 ) -> bool:
-    """Test whether the difference of two simultaneous measured poses is within the chi-square gate of their errors."""
+    """Test whether the difference of two simultaneous measured poses is within the chi-square gate
+    of their errors.
+    """
     s = _pose_covariance(a, camera_a, p) + _pose_covariance(b, camera_b, p)
     return poses_agree(a, b, s, p.gate_chi_square)
 
@@ -252,8 +289,11 @@ def start(
     if not p.has_bias:
         return hypothesis
     hypothesis = with_cameras(hypothesis, [m.chaser], p)
-    # The measured pose is the true pose plus the effect of the camera's errors, hence the negative correlation.
-    spread = predict_measurement(m.camera, hypothesis.position_m, hypothesis.q_wxyz, NO_ERROR).by_errors
+    # The measured pose is the true pose plus the effect of the camera's errors, hence the negative
+    # correlation.
+    spread = predict_measurement(
+        m.camera, hypothesis.position_m, hypothesis.q_wxyz, NO_ERROR
+    ).by_errors
     covariance = hypothesis.covariance.copy()
     covariance[_POSE_GRID] += spread @ prior(p) @ spread.T
     cross = -spread @ prior(p)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mass, centre of mass and inertia of a body with their covariance, and of bodies that are attached or detached. Pure functions."""
+"""Mass, centre of mass and inertia of a body with their covariance, and of bodies that are attached
+or detached. Pure functions.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ for _k, (_i, _j) in enumerate(INERTIA_ROWS):
 
 @dataclass(frozen=True, eq=False)
 class MassProperties:
-    """A body, and the covariance (10, 10) of mass (kg), centre (m) and inertia (xx, yy, zz, xy, xz, yz; kg m²)."""
+    """A body, and the covariance (10, 10) of mass (kg), centre (m) and inertia (xx, yy, zz, xy, xz,
+    yz; kg m²).
+    """
 
     body: TargetBody
     covariance: Array
@@ -44,12 +48,16 @@ def body_of(values: Array) -> TargetBody:
     return TargetBody(float(values[0]), np.tensordot(values[4:], _BASIS, 1), values[1:4].copy())
 
 
-def attach(target: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody) -> MassProperties:
-    """Return the mass properties of a target with chasers fixed to it; the chasers' are taken as exact.
+def attach(
+    target: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody
+) -> MassProperties:
+    """Return the mass properties of a target with chasers fixed to it; the chasers' are taken as
+    exact.
 
-    Centre and inertia of the stack are not linear in the target's mass: with centre and ratios well known and the mass to 30 %, this
-    moves the centre by centimetres. The covariance contains the second-order term about the estimate, 3 c c' with the curvature c
-    by one sigma of the logarithm of the mass, in which the motion of the stack shows the mass.
+    Centre and inertia of the stack are not linear in the target's mass: with centre and ratios well
+    known and the mass to 30 %, this moves the centre by centimetres. The covariance contains the
+    second-order term about the estimate, 3 c c' with the curvature c by one sigma of the logarithm
+    of the mass, in which the motion of the stack shows the mass.
     """
     parts = _parts(chasers, body, 1.0)
     stack = _transformed(target, parts)
@@ -76,8 +84,9 @@ def covariance_by_chasers(
     mass_share: float,
     centre_m: float,
 ) -> Array:
-    """Return the covariance (10, 10) of the mass properties of a stack by what is not known of its chasers: standard deviations of
-    their masses, as a share, and of their centres of mass, per axis."""
+    """Return the covariance (10, 10) of the mass properties of a stack by what is not known of its
+    chasers: standard deviations of their masses, as a share, and of their centres of mass, per
+    axis."""
     total = np.zeros((10, 10))
     for k in range(len(chasers)):
         for change in (*np.diag([centre_m] * 3), None):
@@ -96,7 +105,9 @@ def covariance_by_chasers(
     return total
 
 
-def detach(stack: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody) -> MassProperties:
+def detach(
+    stack: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody
+) -> MassProperties:
     """Return the mass properties of the target of a stack: those of the stack without the chasers."""
     return _transformed(stack, _parts(chasers, body, -1.0))
 
@@ -117,15 +128,20 @@ def _transformed(
     for k, step in enumerate(steps):
         shift = np.zeros(10)
         shift[k] = step
-        ends = [properties_of(attach_bodies(body_of(values + s * shift), parts)) for s in (1.0, -1.0)]
+        ends = [
+            properties_of(attach_bodies(body_of(values + s * shift), parts)) for s in (1.0, -1.0)
+        ]
         jacobian[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     body = attach_bodies(properties.body, parts)
     return MassProperties(body, jacobian @ properties.covariance @ jacobian.T)
 
 
-def prior_of(target: TargetBody, mass_share: float, inertia_share: float, centre_m: float) -> MassProperties:
-    """Return the stated mass properties of a target with these standard deviations: of the mass, as a share of it; of each element
-    of the inertia, as a share of the mean moment; of the centre of mass per axis."""
+def prior_of(
+    target: TargetBody, mass_share: float, inertia_share: float, centre_m: float
+) -> MassProperties:
+    """Return the stated mass properties of a target with these standard deviations: of the mass, as
+    a share of it; of each element of the inertia, as a share of the mean moment; of the centre of
+    mass per axis."""
     moment = float(np.trace(target.inertia_kg_m2)) / 3.0
     sigmas = [mass_share * target.mass_kg, *[centre_m] * 3]
     return MassProperties(target, np.diag(np.square([*sigmas, *[inertia_share * moment] * 6])))
@@ -140,7 +156,8 @@ def inertia_ratios(properties: MassProperties) -> tuple[Array, Array]:
 
 
 def with_shape(known: MassProperties, shape: BodyShape, covariance: Array) -> MassProperties:
-    """Return mass properties with another centre and ratios of the inertia: those of ``shape``, with its ``covariance`` (8, 8).
+    """Return mass properties with another centre and ratios of the inertia: those of ``shape``,
+    with its ``covariance`` (8, 8).
 
     Mass and trace of the inertia stay those of ``known``, as uncertain as a moment is in it.
     """

@@ -49,5 +49,7 @@ class SightingConverter:
                 for solution in s.solutions
             )
             pose = CameraPose(*self._camera.irf_pose_in_world(odometry.position_m, odometry.q_wxyz))
-            measurements.append(Measurement(s.chaser, s.sim_time_ns, hypotheses, len(s.marker_ids), pose))
+            measurements.append(
+                Measurement(s.chaser, s.sim_time_ns, hypotheses, len(s.marker_ids), pose)
+            )
         return measurements

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default estimator: a multiplicative extended Kalman filter that applies measurements at their exposure time.
+"""Default estimator: a multiplicative extended Kalman filter that applies measurements at their
+exposure time.
 
-Mathematics: docs/estimation.md. Late measurements are inserted by rollback and replay over a short buffer, so the state
-does not depend on the order of arrival.
+Mathematics: docs/estimation.md. Late measurements are inserted by rollback and replay over a short
+buffer, so the state does not depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Exposure(ReplayRecord[FilterState]):
 class Mekf(ReplayingFilter[Exposure, FilterState]):
     """Estimate the target state from the measurements of all chasers.
 
-    Counters besides those of ``ReplayingFilter``: ``early_dropped`` (exposed after ``now_ns``) and ``invalid`` (not finite,
-    wrong shape or not a covariance).
+    Counters besides those of ``ReplayingFilter``: ``early_dropped`` (exposed after ``now_ns``) and
+    ``invalid`` (not finite, wrong shape or not a covariance).
     """
 
     def __init__(self, parameters: MekfParameters | None = None) -> None:
@@ -53,7 +54,8 @@ class Mekf(ReplayingFilter[Exposure, FilterState]):
         self._before: list[tuple[int, MekfParameters]] = []
 
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
-        """Add measurements with exposure times up to ``now_ns``, in any order, and return the estimate for ``now_ns``.
+        """Add measurements with exposure times up to ``now_ns``, in any order, and return the
+        estimate for ``now_ns``.
 
         Raises ValueError as ``estimate_at``.
         """
@@ -75,7 +77,9 @@ class Mekf(ReplayingFilter[Exposure, FilterState]):
                 text = f"chaser {m.chaser}: dropped an unusable measurement"
                 pending.append(EstimatorEvent(now_ns, "info", text))
             elif self._insert(m):
-                first_changed = m.time_ns if first_changed is None else min(first_changed, m.time_ns)
+                first_changed = (
+                    m.time_ns if first_changed is None else min(first_changed, m.time_ns)
+                )
         if first_changed is not None:
             self._buffer.replay(self._buffer.find(first_changed)[0], self._process)
             self._buffer.trim(self.target.buffer_s)
@@ -84,7 +88,8 @@ class Mekf(ReplayingFilter[Exposure, FilterState]):
         return self._reported(self.estimate_at(now_ns))
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """Return the estimate for ``time_ns`` from the measurements exposed up to then; changes no state.
+        """Return the estimate for ``time_ns`` from the measurements exposed up to then; changes no
+        state.
 
         Raises ValueError for a time before the oldest state still held in the buffer.
         """
@@ -92,7 +97,9 @@ class Mekf(ReplayingFilter[Exposure, FilterState]):
         if state is None or not state.hypotheses:
             return no_estimate(time_ns)
         if time_ns < state.time_ns:
-            raise ValueError(f"no state for {time_ns} ns in the buffer; the oldest is {state.time_ns} ns")
+            raise ValueError(
+                f"no state for {time_ns} ns in the buffer; the oldest is {state.time_ns} ns"
+            )
         hypotheses = list(state.hypotheses)
         for end_ns, model in self._models_between(state.time_ns, time_ns):
             hypotheses = [predict(h, end_ns, model) for h in hypotheses]
@@ -101,21 +108,27 @@ class Mekf(ReplayingFilter[Exposure, FilterState]):
         best = hypotheses[0]
         return target_state(state, time_ns, best, covariance, is_lost(best.covariance, p), p)
 
-    def change_body(self, inertia: Matrix3, centre_trf_m: Vector3, covariance: Matrix9 = ()) -> None:
-        """As ``ReplayingFilter``, but from the time of the last update on: older measurements that arrive later keep the
-        model before."""
+    def change_body(
+        self, inertia: Matrix3, centre_trf_m: Vector3, covariance: Matrix9 = ()
+    ) -> None:
+        """As ``ReplayingFilter``, but from the time of the last update on: older measurements that
+        arrive later keep the model before."""
         self._before.append((self._updated_ns, self.target))
         super().change_body(inertia, centre_trf_m, covariance)
 
     def cameras(self) -> tuple[CameraError, ...]:
-        """Return the estimated calibration errors of all cameras, sorted by chaser, at the newest exposure."""
+        """Return the estimated calibration errors of all cameras, sorted by chaser, at the newest
+        exposure.
+        """
         state = self._buffer.newest
         if state is None or not state.hypotheses:
             return ()
         best, errors = state.hypotheses[0], []
         for k, (chaser, error) in enumerate(zip(best.cameras, best.bias, strict=True)):
             i = slice(12 + ERRORS * k, 12 + ERRORS * (k + 1))
-            errors.append(CameraError(chaser, error[:3], error[3:6], float(error[6]), best.covariance[i, i]))
+            errors.append(
+                CameraError(chaser, error[:3], error[3:6], float(error[6]), best.covariance[i, i])
+            )
         return tuple(sorted(errors, key=lambda e: e.chaser))
 
     def _insert(self, m: Measurement) -> bool:
@@ -135,7 +148,9 @@ class Mekf(ReplayingFilter[Exposure, FilterState]):
         return next((model for end_ns, model in self._before if time_ns <= end_ns), self.target)
 
     def _models_between(self, from_ns: int, to_ns: int) -> list[tuple[int, MekfParameters]]:
-        """Return the models of the target from one time to another, each with the time at which it ends."""
+        """Return the models of the target from one time to another, each with the time at which it
+        ends.
+        """
         changes = [(end_ns, model) for end_ns, model in self._before if from_ns < end_ns < to_ns]
         return [*changes, (to_ns, self._model_at(to_ns))]
 

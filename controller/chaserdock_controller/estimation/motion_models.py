@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion models of the target: prediction of the mean, and transition matrix of the error state.
 
-Error state (12): position and velocity (WRF), dtheta and omega (TRF), with q_true = q (x) exp(dtheta).
-Process noise is white acceleration and white angular acceleration, given as spectral densities.
+Error state (12): position and velocity (WRF), dtheta and omega (TRF), with q_true = q (x)
+exp(dtheta). Process noise is white acceleration and white angular acceleration, given as spectral
+densities.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ _EYE3, _EYE12, _ZERO3 = np.eye(3), np.eye(12), np.zeros(3)
 
 
 def constant_rates(q_wxyz: Array, omega_rad_s: Array, dt_s: float) -> tuple[Array, Array, Array]:
-    """Return attitude (4,), body rate (3,) and the (6, 6) transition of (dtheta, domega) after ``dt_s`` at a
-    constant body rate (exact). Source: Sola 2017, section 5.4 (right Jacobian for the rate column)."""
+    """Return attitude (4,), body rate (3,) and the (6, 6) transition of (dtheta, domega) after
+    ``dt_s`` at a constant body rate (exact). Source: Sola 2017, section 5.4 (right Jacobian for the
+    rate column)."""
     phi = omega_rad_s * dt_s
     step = so3.exp(phi)
     transition = np.zeros((6, 6))
@@ -64,13 +66,17 @@ def torque_free(
 
 
 def free_shape(
-    motion: tuple[Array, Array, Array, Array], dt_s: float, shape: BodyShape, mean_motion_rad_s: float = 0.0
+    motion: tuple[Array, Array, Array, Array],
+    dt_s: float,
+    shape: BodyShape,
+    mean_motion_rad_s: float = 0.0,
 ) -> tuple[tuple[Array, Array, Array, Array], Array]:
-    """Return position, velocity, attitude and rate of TRF after ``dt_s``, and the transition (12, 20) by their errors and
-    the error of ``shape``.
+    """Return position, velocity, attitude and rate of TRF after ``dt_s``, and the transition (12,
+    20) by their errors and the error of ``shape``.
 
-    The body rotates freely and its centre of mass moves at constant velocity. ``mean_motion_rad_s``: WRF turns at this rate about
-    its Z axis, as the Hill frame of a circular orbit does, and the gravity gradient acts.
+    The body rotates freely and its centre of mass moves at constant velocity.
+    ``mean_motion_rad_s``: WRF turns at this rate about its Z axis, as the Hill frame of a circular
+    orbit does, and the gravity gradient acts.
     """
     position, velocity, q, omega = motion
     q_after, omega_after, turned = _rotation(q, omega, dt_s, shape, mean_motion_rad_s)
@@ -83,7 +89,8 @@ def free_shape(
     spin, spin_after = so3.skew(omega), so3.skew(omega_after)
     centre_velocity = velocity + r @ (spin @ c)
     centre = position + r @ c + centre_velocity * dt_s
-    # Errors of TRF's origin to those of the centre of mass, transition, and back; the matrix of the way back is 2 - that there.
+    # Errors of TRF's origin to those of the centre of mass, transition, and back; the matrix of the
+    # way back is 2 - that there.
     there, back = to_centre(q, omega, c), 2.0 * _EYE12 - to_centre(q_after, omega_after, c)
     by_centre = f[:, 0:3] @ r + f[:, 3:6] @ (r @ spin)
     by_centre[0:3] -= r_after
@@ -91,20 +98,29 @@ def free_shape(
     f[:, 0:12] = f[:, 0:12] @ there
     f[:, 17:20] = by_centre
     position_after = centre - r_after @ c
-    return (position_after, centre_velocity - r_after @ (spin_after @ c), q_after, omega_after), back @ f
+    return (
+        position_after,
+        centre_velocity - r_after @ (spin_after @ c),
+        q_after,
+        omega_after,
+    ), back @ f
 
 
 def _rotation(
     q_wxyz: Array, omega_rad_s: Array, dt_s: float, shape: BodyShape, mean_motion_rad_s: float
 ) -> tuple[Array, Array, Array]:
-    """Return attitude, rate and the transition (6, 11) of (dtheta, domega) by themselves and by the ratios of the inertia.
+    """Return attitude, rate and the transition (6, 11) of (dtheta, domega) by themselves and by the
+    ratios of the inertia.
 
-    With W the rate of WRF in TRF axes, which changes by W' = -omega x W, the body turns in space at Omega = omega + W:
-    I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, and T = 3 n^2 u x I u with u away from the Earth. The change of T with
-    an error (4e-6 1/s^2 at most) is left out of the transition. Attitude and rate by RK4, in the steps of ``torque_free``; the
-    transition of a step to third order, with the derivatives in its middle.
+    With W the rate of WRF in TRF axes, which changes by W' = -omega x W, the body turns in space at
+    Omega = omega + W: I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, and T = 3 n^2 u
+    x I u with u away from the Earth. The change of T with an error (4e-6 1/s^2 at most) is left out
+    of the transition. Attitude and rate by RK4, in the steps of ``torque_free``; the transition of
+    a step to third order, with the derivatives in its middle.
     """
-    steps = max(1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s)))))
+    steps = max(
+        1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s))))
+    )
     inertia, n, h = shape.inertia, mean_motion_rad_s, dt_s / steps
     inverse = np.linalg.inv(inertia)
 
@@ -151,7 +167,8 @@ def _rotation(
 
 
 def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:
-    """Return the matrix (12, 12) from errors of TRF's origin to errors of a point ``centre_trf_m`` (3,) fixed in TRF.
+    """Return the matrix (12, 12) from errors of TRF's origin to errors of a point ``centre_trf_m``
+    (3,) fixed in TRF.
 
     The point is at p + R c and moves at v + R (omega x c); dtheta and omega are unchanged.
     """
@@ -170,10 +187,12 @@ def about_centre(
     centre_trf_m: Array,
     dt_s: float,
 ) -> tuple[Array, Array, Array]:
-    """Return position, velocity (3,) of TRF's origin and transition (12, 12) for an offset centre of mass.
+    """Return position, velocity (3,) of TRF's origin and transition (12, 12) for an offset centre
+    of mass.
 
-    ``before``: position, velocity, attitude, rate; ``after``: attitude and rate ``dt_s`` later; ``transition`` (12, 12)
-    of a body whose centre of mass is TRF's origin. The centre of mass moves at constant velocity.
+    ``before``: position, velocity, attitude, rate; ``after``: attitude and rate ``dt_s`` later;
+    ``transition`` (12, 12) of a body whose centre of mass is TRF's origin. The centre of mass moves
+    at constant velocity.
     """
     position, velocity, q, omega = before
     q_after, omega_after = after
@@ -190,9 +209,16 @@ def about_centre(
 
 
 def propagate_target(
-    position_m: Array, velocity_m_s: Array, q_wxyz: Array, omega_rad_s: Array, dt_s: float, p: MekfParameters
+    position_m: Array,
+    velocity_m_s: Array,
+    q_wxyz: Array,
+    omega_rad_s: Array,
+    dt_s: float,
+    p: MekfParameters,
 ) -> tuple[tuple[Array, Array, Array, Array], Array]:
-    """Return position, velocity, attitude and rate after ``dt_s`` by the motion model of ``p``, and the transition (12, 12)."""
+    """Return position, velocity, attitude and rate after ``dt_s`` by the motion model of ``p``, and
+    the transition (12, 12).
+    """
     if p.motion_model == "torque_free":
         inertia = np.array(p.inertia_ratios, dtype=float)
         q, w, t = torque_free(q_wxyz, omega_rad_s, dt_s, inertia, np.linalg.inv(inertia))
@@ -203,7 +229,10 @@ def propagate_target(
     f[6:12, 6:12] = t
     if not any(p.centre_of_mass_trf_m):
         return (position_m + velocity_m_s * dt_s, velocity_m_s, q, w), f
-    before, centre = (position_m, velocity_m_s, q_wxyz, omega_rad_s), np.array(p.centre_of_mass_trf_m)
+    before, centre = (
+        (position_m, velocity_m_s, q_wxyz, omega_rad_s),
+        np.array(p.centre_of_mass_trf_m),
+    )
     position, velocity, f = about_centre(before, (q, w), f, centre, dt_s)
     return (position, velocity, q, w), f
 
@@ -212,8 +241,8 @@ def process_noise(dt_s: float, acceleration_density: float, angular_density: flo
     """Return the covariance (12, 12) that white noise adds in ``dt_s``.
 
     acceleration_density in (m/s^2)^2/Hz, angular_density in (rad/s^2)^2/Hz (the squares of the
-    parameters). The rotation of the axes within the step is neglected: it changes the attitude block by less than
-    (|omega| dt)^2 / 12 of itself and never makes it too small.
+    parameters). The rotation of the axes within the step is neglected: it changes the attitude
+    block by less than (|omega| dt)^2 / 12 of itself and never makes it too small.
     """
     q = np.zeros((12, 12))
     d3, d2, d1 = dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s

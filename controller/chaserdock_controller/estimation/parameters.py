@@ -14,7 +14,9 @@ BodyPrior = tuple[Matrix3, Vector3, Matrix9]
 """Inertia, centre of mass and their covariance, as in ``MekfParameters``."""
 MODELS = ("constant_rates", "torque_free")
 GATE_CHI_SQUARE = 27.85634123601289
-"""0.9999 quantile of the chi-square distribution with 6 degrees of freedom (tests compare with SciPy)."""
+"""0.9999 quantile of the chi-square distribution with 6 degrees of freedom (tests compare with
+SciPy).
+"""
 
 
 @dataclass(frozen=True)
@@ -81,10 +83,21 @@ class MekfParameters:
 
     def __post_init__(self) -> None:
         if self.motion_model not in MODELS:
-            raise ValueError(f"unknown motion model {self.motion_model!r}; known: {', '.join(MODELS)}")
-        may_be_zero = ("floor_position_m", "floor_attitude_rad", "bias_position_m", "bias_attitude_rad")
+            raise ValueError(
+                f"unknown motion model {self.motion_model!r}; known: {', '.join(MODELS)}"
+            )
+        may_be_zero = (
+            "floor_position_m",
+            "floor_attitude_rad",
+            "bias_position_m",
+            "bias_attitude_rad",
+        )
         may_be_zero += ("bias_focal_share", "considered_ratio")
-        may_be_zero += ("acceleration_noise_m_s2_sqrt_hz", "angular_noise_rad_s2_sqrt_hz", "buffer_s")
+        may_be_zero += (
+            "acceleration_noise_m_s2_sqrt_hz",
+            "angular_noise_rad_s2_sqrt_hz",
+            "buffer_s",
+        )
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, float | int):
@@ -100,7 +113,9 @@ class MekfParameters:
             raise ValueError("inertia_ratios must be a symmetric 3 x 3 tensor")
         principal = np.linalg.eigvalsh(inertia)
         if principal[0] <= 0.0 or principal[2] > (principal[0] + principal[1]) * (1.0 + 1e-9):
-            raise ValueError("inertia_ratios: principal moments of inertia violate the triangle inequality")
+            raise ValueError(
+                "inertia_ratios: principal moments of inertia violate the triangle inequality"
+            )
 
     @property
     def body_prior(self) -> BodyPrior:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base of filters that process their newest records again, so that a late measurement counts at its exposure."""
+"""Base of filters that process their newest records again, so that a late measurement counts at its
+exposure.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from .types import EstimatorEvent, Shock, TargetState
 class ReplayRecord(Generic[StateT]):
     """What a filter needs to process one time again, and the state and the events that result.
 
-    ``parameters``, with the target's model, apply from the record before to this one; ``shocks`` change the rates after it.
+    ``parameters``, with the target's model, apply from the record before to this one; ``shocks``
+    change the rates after it.
     """
 
     time_ns: int
@@ -36,7 +39,8 @@ RecordT = TypeVar("RecordT", bound=ReplayRecord[Any])
 class ReplayBuffer(Generic[RecordT, StateT]):
     """Records in order of time.
 
-    base: the state just before the records. pending: events of no record, not yet drained. drained: events of records that are.
+    base: the state just before the records. pending: events of no record, not yet drained. drained:
+    events of records that are.
     """
 
     records: list[RecordT] = field(default_factory=list)
@@ -65,7 +69,9 @@ class ReplayBuffer(Generic[RecordT, StateT]):
         first: int,
         process: Callable[[StateT | None, RecordT], tuple[StateT, tuple[EstimatorEvent, ...]]],
     ) -> None:
-        """Process the records from index ``first`` on; ``process`` maps the state before and the record to the state after."""
+        """Process the records from index ``first`` on; ``process`` maps the state before and the
+        record to the state after.
+        """
         state = self.records[first - 1].state if first > 0 else self.base
         for record in self.records[first:]:
             state, record.events = process(state, record)
@@ -80,7 +86,9 @@ class ReplayBuffer(Generic[RecordT, StateT]):
                 newest.state = apply_shocks(newest.state, [shock])
 
     def trim(self, duration_s: float) -> None:
-        """Drop the records that are older than the newest by more than ``duration_s``; keep their events."""
+        """Drop the records that are older than the newest by more than ``duration_s``; keep their
+        events.
+        """
         horizon = self.records[-1].time_ns - round(duration_s * 1e9)
         while self.records[0].time_ns < horizon:
             old = self.records.pop(0)
@@ -100,15 +108,20 @@ class ReplayBuffer(Generic[RecordT, StateT]):
         """Return the buffer with its newest record alone."""
         if len(self.records) < 2:
             return self
-        newest, drained = self.records[-1], {e for e in self.drained if e in self.records[-1].events}
+        newest, drained = (
+            self.records[-1],
+            {e for e in self.drained if e in self.records[-1].events},
+        )
         return replace(self, records=[newest], base=self.records[-2].state, drained=drained)
 
 
 class ReplayingFilter(Generic[RecordT, StateT]):
-    """What both Kalman filters share: the model of the target, the buffer of what can be processed again, events, counters.
+    """What both Kalman filters share: the model of the target, the buffer of what can be processed
+    again, events, counters.
 
-    target: model of the target, and parameters of its estimate. Counters: ``accepted`` and ``gated`` measurements,
-    ``reinitialisations``; ``late_dropped`` (older than the buffer), ``duplicates`` (same chaser and time as an earlier one).
+    target: model of the target, and parameters of its estimate. Counters: ``accepted`` and
+    ``gated`` measurements, ``reinitialisations``; ``late_dropped`` (older than the buffer),
+    ``duplicates`` (same chaser and time as an earlier one).
     """
 
     def __init__(self, target: MekfParameters) -> None:
@@ -137,12 +150,15 @@ class ReplayingFilter(Generic[RecordT, StateT]):
         """Apply a sudden change of the target's rates after the newest record."""
         self._buffer.disturb(shock)
 
-    def change_body(self, inertia: Matrix3, centre_trf_m: Vector3, covariance: Matrix9 = ()) -> None:
-        """Model the target from the newest record on as a torque-free rigid body with other mass properties.
+    def change_body(
+        self, inertia: Matrix3, centre_trf_m: Vector3, covariance: Matrix9 = ()
+    ) -> None:
+        """Model the target from the newest record on as a torque-free rigid body with other mass
+        properties.
 
-        ``inertia``: TRF, rows, about the centre of mass, up to a factor. ``centre_trf_m``: centre of mass in TRF.
-        ``covariance``: theirs, as ``MekfParameters.body_covariance``.
-        Raises ValueError for an inertia that no rigid body has.
+        ``inertia``: TRF, rows, about the centre of mass, up to a factor. ``centre_trf_m``: centre
+        of mass in TRF. ``covariance``: theirs, as ``MekfParameters.body_covariance``. Raises
+        ValueError for an inertia that no rigid body has.
         """
         self.target = replace(
             self.target,

@@ -19,7 +19,12 @@ from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.latency_compensation import predict_state
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
-from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
+from chaserdock_controller.interfaces import (
+    IdentifiedStack,
+    LogEntry,
+    Observation,
+    TargetEstimation,
+)
 
 from .composite_body import CompositeBody
 from .identification.stage import StackIdentification
@@ -54,9 +59,10 @@ class EstimationStage:
         self.identification = StackIdentification(scenario) if enabled else None
 
     def run(self, observation: Observation, inspecting: Collection[int] = ()) -> TargetEstimation:
-        """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the geometry by pairs of
-        images and those of the chasers that were ``inspecting`` after the tick before, and the identification of the stack, whose
-        result the estimator takes from the next tick on."""
+        """Update the estimator with a tick's inputs, and with contacts and impulses from before
+        them; then the geometry by pairs of images and those of the chasers that were ``inspecting``
+        after the tick before, and the identification of the stack, whose result the estimator takes
+        from the next tick on."""
         estimation = self._estimate(observation)
         if self.shape is not None:
             estimation = replace(estimation, shape=self.shape.update(observation, inspecting))
@@ -90,7 +96,9 @@ class EstimationStage:
             target=target,
             at_effect=estimator.estimate_at(o.effective_ns) if known else None,
             own=own,
-            own_at_effect={i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own},
+            own_at_effect={
+                i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own
+            },
             disturbances=disturbances,
             motion_covariances=self._motion_covariances(own) if known else {},
             relative=estimator.relative_poses() if isinstance(estimator, JointEstimator) else (),
@@ -104,14 +112,18 @@ class EstimationStage:
         )
 
     def _free_target(self, target: TargetState) -> IdentifiedStack | None:
-        """Return what the motion of the target shows of its mass properties while no chaser is latched to it."""
+        """Return what the motion of the target shows of its mass properties while no chaser is
+        latched to it.
+        """
         if (
             self.composite.latched
             or not isinstance(self.estimator, JointEstimator)
             or self.estimator.shape is None
         ):
             return None
-        motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+        motion = BodyState(
+            target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s
+        )
         found = self.composite.target
         return IdentifiedStack(found, found, {}, motion, {}, {}, tuple)
 
@@ -120,7 +132,9 @@ class EstimationStage:
         self._converter.add_odometry((*o.measured.values(), *o.outdated.values()), o.time_ns)
         return estimator.update(self._converter.measurements(o.sightings), o.time_ns)
 
-    def _joint_inputs(self, o: Observation, chasers: int, latched_before: frozenset[int]) -> JointInputs:
+    def _joint_inputs(
+        self, o: Observation, chasers: int, latched_before: frozenset[int]
+    ) -> JointInputs:
         impulses = np.zeros((chasers, 6))
         for i, applied in o.impulses.items():
             impulses[i] = applied.impulse
@@ -139,8 +153,8 @@ class EstimationStage:
         )
 
     def _disturbances(self, o: Observation, own: Mapping[int, Odometry]) -> dict[int, Array]:
-        """Return the wrench of the orbit on each chaser, with the estimated disturbance; none on a latched one, whose motion
-        is the target's."""
+        """Return the wrench of the orbit on each chaser, with the estimated disturbance; none on a
+        latched one, whose motion is the target's."""
         estimator, found = self.estimator, dict.fromkeys(own, _NO_DISTURBANCE)
         if self._mean_motion_rad_s:
             found |= {i: self._orbital_wrench(own[i]) for i in own.keys() - self.composite.latched}
@@ -148,7 +162,9 @@ class EstimationStage:
             return found
         for i in own.keys() - self.composite.latched:
             impulse = o.impulses[i].impulse if i in o.impulses else np.zeros(6)
-            estimated = disturbance(estimator.state, i, impulse / self._period_s, estimator.parameters)
+            estimated = disturbance(
+                estimator.state, i, impulse / self._period_s, estimator.parameters
+            )
             found[i] = found[i] + estimated if self._mean_motion_rad_s else estimated
         return found
 
@@ -171,13 +187,17 @@ def _without_drift(
     if state is None:
         return odometry
     return {
-        i: msgspec.structs.replace(o, position_m=vector(np.array(o.position_m) - state.of(i, POSITION_DRIFT)))
+        i: msgspec.structs.replace(
+            o, position_m=vector(np.array(o.position_m) - state.of(i, POSITION_DRIFT))
+        )
         for i, o in odometry.items()
     }
 
 
 def _estimated(state: JointState | None, odometry: Mapping[int, Odometry]) -> dict[int, Odometry]:
-    """Return the estimated states of the chasers that have odometry, in place of it, where they are known."""
+    """Return the estimated states of the chasers that have odometry, in place of it, where they are
+    known.
+    """
     assert state is not None
     return {
         i: msgspec.structs.replace(
@@ -196,7 +216,9 @@ def _estimated(state: JointState | None, odometry: Mapping[int, Odometry]) -> di
 def camera_calibrations(
     estimator: Estimator | JointEstimator, camera: Camera
 ) -> tuple[CameraCalibration, ...]:
-    """Return the estimated errors of the cameras used so far, in CRF axes; ``camera``: the nominal calibration."""
+    """Return the estimated errors of the cameras used so far, in CRF axes; ``camera``: the nominal
+    calibration.
+    """
     if not isinstance(estimator, Mekf | JointEstimator):
         return ()
     errors = estimator.cameras()

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The target as a free rigid body: its predicted path, and its mass properties with captured chasers attached.
+"""The target as a free rigid body: its predicted path, and its mass properties with captured
+chasers attached.
 
 TRF's origin need not be the centre of mass: with a captured chaser it is not.
 """
@@ -18,7 +19,9 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True)
 class TargetBody:
-    """mass_kg; inertia_kg_m2 (3, 3) about the centre of mass, TRF axes; centre_trf_m (3,) the centre of mass."""
+    """mass_kg; inertia_kg_m2 (3, 3) about the centre of mass, TRF axes; centre_trf_m (3,) the
+    centre of mass.
+    """
 
     mass_kg: float
     inertia_kg_m2: Array
@@ -27,8 +30,8 @@ class TargetBody:
 
 @dataclass(frozen=True)
 class TargetPath:
-    """The target at K times: positions (K, 3) of TRF's origin in WRF, attitudes (K, 4); in TRF axes the rates,
-    angular accelerations and the origin's acceleration, each (K, 3)."""
+    """The target at K times: positions (K, 3) of TRF's origin in WRF, attitudes (K, 4); in TRF axes
+    the rates, angular accelerations and the origin's acceleration, each (K, 3)."""
 
     positions_m: Array
     q_wxyz: Array
@@ -41,12 +44,14 @@ class TargetPath:
         return TargetPath(*(getattr(self, f.name)[instants] for f in fields(self)))
 
 
-def attach_bodies(target: TargetBody, attached: Sequence[tuple[float, Array, Array, Array]]) -> TargetBody:
-    """Return the target with bodies fixed to it: each mass, principal inertia (3,), centre (3,) and attitude (4,) in
-    TRF.
+def attach_bodies(
+    target: TargetBody, attached: Sequence[tuple[float, Array, Array, Array]]
+) -> TargetBody:
+    """Return the target with bodies fixed to it: each mass, principal inertia (3,), centre (3,) and
+    attitude (4,) in TRF.
 
-    Parallel axes: I = sum of R I_i R' + m_i (d'd 1 - d d'), d from the common centre of mass (Goldstein, "Classical
-    Mechanics", section 5.3).
+    Parallel axes: I = sum of R I_i R' + m_i (d'd 1 - d d'), d from the common centre of mass
+    (Goldstein, "Classical Mechanics", section 5.3).
     """
     parts = [(target.mass_kg, target.inertia_kg_m2, target.centre_trf_m)]
     for mass, inertia, centre, q in attached:
@@ -72,8 +77,9 @@ def predict_path(
 ) -> TargetPath:
     """Return the free body's motion at 0, step_s, ... steps * step_s from now.
 
-    position and velocity (3,) of TRF's origin in WRF, q_wxyz (4,) TRF to WRF, omega (3,) in TRF. The centre of mass
-    moves at constant velocity; ``free_rotation`` integrates the attitude. Raises ValueError for a zero quaternion.
+    position and velocity (3,) of TRF's origin in WRF, q_wxyz (4,) TRF to WRF, omega (3,) in TRF.
+    The centre of mass moves at constant velocity; ``free_rotation`` integrates the attitude. Raises
+    ValueError for a zero quaternion.
     """
     q, omega, c = normalize(q_wxyz), np.array(omega_rad_s, dtype=float), body.centre_trf_m
     n = steps + 1

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hypotheses of the target's state, as both Kalman filters treat them: rates, loss, shocks, choice, mixture. Pure functions.
+"""Hypotheses of the target's state, as both Kalman filters treat them: rates, loss, shocks, choice,
+mixture. Pure functions.
 
-The error vector of every hypothesis begins with the target's 12 components: position, velocity (WRF), rotation, rate (TRF).
+The error vector of every hypothesis begins with the target's 12 components: position, velocity
+(WRF), rotation, rate (TRF).
 """
 
 from __future__ import annotations
@@ -24,9 +26,11 @@ POSE, RATES = np.array([0, 1, 2, 6, 7, 8]), np.array([3, 4, 5, 9, 10, 11])
 
 
 class TargetHypothesis(Struct, frozen=True, eq=False, kw_only=True):
-    """State of the target at ``time_ns``: position, velocity, attitude and rate, as in ``TargetState``.
+    """State of the target at ``time_ns``: position, velocity, attitude and rate, as in
+    ``TargetState``.
 
-    covariance: of the filter's complete error vector. log_likelihood: of all measurements since the start of the target.
+    covariance: of the filter's complete error vector. log_likelihood: of all measurements since the
+    start of the target.
     """
 
     time_ns: int
@@ -44,8 +48,9 @@ HypothesisT = TypeVar("HypothesisT", bound=TargetHypothesis)
 class HypothesisSet(Struct, Generic[HypothesisT], frozen=True, eq=False):
     """State of a filter at ``time_ns``.
 
-    hypotheses: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is unresolved.
-    seen, rejected: chasers accepted and gated out at this time. accepted, gated, reinitialisations: counts since the start.
+    hypotheses: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is
+    unresolved. seen, rejected: chasers accepted and gated out at this time. accepted, gated,
+    reinitialisations: counts since the start.
     """
 
     time_ns: int
@@ -87,7 +92,9 @@ def rates_of(h: TargetHypothesis) -> TargetRates:
 
 
 def widened(covariance: Array, variances: Array, first: int = 0) -> Array:
-    """Return the covariance with ``variances`` (6,) added to the rates of the body whose error begins at ``first``."""
+    """Return the covariance with ``variances`` (6,) added to the rates of the body whose error
+    begins at ``first``.
+    """
     wider, k = covariance.copy(), first + RATES
     wider[k, k] += variances
     return wider
@@ -100,7 +107,9 @@ def with_uncertain_rates(h: HypothesisT, p: MekfParameters) -> HypothesisT:
 
 
 def apply_shocks(state: StateT, shocks: Sequence[Shock]) -> StateT:
-    """Add the known part of ``shocks`` to the rates of every hypothesis, and the unknown part to the covariance."""
+    """Add the known part of ``shocks`` to the rates of every hypothesis, and the unknown part to
+    the covariance.
+    """
     for shock in shocks:
         added = rate_variances(shock.sigma_velocity_m_s, shock.sigma_omega_rad_s)
         hypotheses = tuple(
@@ -131,8 +140,12 @@ def all_lost(state: HypothesisSet[Any], p: MekfParameters) -> bool:
 
 
 def poses_agree(a: PoseHypothesis, b: PoseHypothesis, covariance: Array, gate: float) -> bool:
-    """Test whether the difference of two simultaneous poses is within the gate of its ``covariance`` (6, 6)."""
-    d = np.concatenate([a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))])
+    """Test whether the difference of two simultaneous poses is within the gate of its
+    ``covariance`` (6, 6).
+    """
+    d = np.concatenate(
+        [a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))]
+    )
     return float(d @ np.linalg.solve(covariance, d)) <= gate
 
 
@@ -143,8 +156,11 @@ def weights(hypotheses: Sequence[TargetHypothesis]) -> list[float]:
     return [x / sum(w) for x in w]
 
 
-def mixture_covariance(hypotheses: Sequence[TargetHypothesis], covariances: Sequence[Array]) -> Array:
-    """Return the target's covariance (12, 12) about the first hypothesis, including the spread between hypotheses.
+def mixture_covariance(
+    hypotheses: Sequence[TargetHypothesis], covariances: Sequence[Array]
+) -> Array:
+    """Return the target's covariance (12, 12) about the first hypothesis, including the spread
+    between hypotheses.
 
     ``covariances`` (12, 12): of the target's state, one for each hypothesis.
     """
@@ -182,7 +198,9 @@ def count_measurements(state: StateT, accepted: Sequence[int], rejected: Sequenc
 
 
 def before_restart(state: StateT) -> StateT:
-    """Return the state in which the measurements of its time are not counted yet, and a re-initialization is."""
+    """Return the state in which the measurements of its time are not counted yet, and a
+    re-initialization is.
+    """
     return replace(
         state,
         seen=(),
@@ -194,7 +212,9 @@ def before_restart(state: StateT) -> StateT:
 
 
 def choose(state: StateT, p: MekfParameters, events: list[EstimatorEvent]) -> StateT:
-    """Sort the hypotheses by likelihood and drop those ruled out by log odds or timeout; append an event for that."""
+    """Sort the hypotheses by likelihood and drop those ruled out by log odds or timeout; append an
+    event for that.
+    """
     if len(state.hypotheses) < 2:
         return state
     ranked = sorted(state.hypotheses, key=lambda h: -h.log_likelihood)
@@ -218,7 +238,9 @@ def target_state(
     lost: bool,
     p: MekfParameters,
 ) -> TargetState:
-    """Return the estimate for ``time_ns``: ``best`` and ``covariance`` (12, 12) predicted from the filter's ``state``."""
+    """Return the estimate for ``time_ns``: ``best`` and ``covariance`` (12, 12) predicted from the
+    filter's ``state``.
+    """
     status = "predicting"
     if lost:
         status = "lost"

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the target's known geometry, fused over views from all around by an information filter.
 
-A view has information on the geometry for any pose (the Schur complement of the tracker's least squares). Views from one direction
-err alike, by texture and shading that the known mesh does not have, and count once. The parameters are in their standard deviations;
-prior: 0 with covariance 1. The distance of two cameras, as their images show it and as odometry measures it, tells the scale.
+A view has information on the geometry for any pose (the Schur complement of the tracker's least
+squares). Views from one direction err alike, by texture and shading that the known mesh does not
+have, and count once. The parameters are in their standard deviations; prior: 0 with covariance 1.
+The distance of two cameras, as their images show it and as odometry measures it, tells the scale.
 """
 
 from __future__ import annotations
@@ -49,8 +50,9 @@ def view_cell(direction_trf: Array) -> int:
 
 
 class SeenPlace(Struct, frozen=True, eq=False):
-    """Where an image shows the target from: the place (3,) of the lens in TRF for a geometry without errors, its change (3, k) by the
-    errors, its covariance (3, 3) for known errors, and the cell of the direction of view."""
+    """Where an image shows the target from: the place (3,) of the lens in TRF for a geometry
+    without errors, its change (3, k) by the errors, its covariance (3, 3) for known errors, and the
+    cell of the direction of view."""
 
     place_m: Array
     by_errors: Array
@@ -59,11 +61,12 @@ class SeenPlace(Struct, frozen=True, eq=False):
 
 
 class ShapeFilter(Struct, frozen=True, eq=False):
-    """Information (k, k) and information vector (k,) of the parameters by single views, with that of the prior, and the cells of the
-    views that were used.
+    """Information (k, k) and information vector (k,) of the parameters by single views, with that
+    of the prior, and the cells of the views that were used.
 
-    ``baselines`` (k + 1, k + 1) and ``lengths`` (k + 1,): the same by pairs of views, whose distance odometry measures; the last
-    parameter is the error that all these distances have in common, in its standard deviations. ``pairs``: their cells.
+    ``baselines`` (k + 1, k + 1) and ``lengths`` (k + 1,): the same by pairs of views, whose
+    distance odometry measures; the last parameter is the error that all these distances have in
+    common, in its standard deviations. ``pairs``: their cells.
     """
 
     information: Array
@@ -100,7 +103,9 @@ class ShapeFilter(Struct, frozen=True, eq=False):
         return 0.5 * (covariance + covariance.T)
 
     def _combined(self) -> tuple[Array, Array]:
-        """Return information (k + 1, k + 1) and vector (k + 1,) of all parameters by prior, views and baselines."""
+        """Return information (k + 1, k + 1) and vector (k + 1,) of all parameters by prior, views
+        and baselines.
+        """
         k = len(self.vector)
         values, vectors = np.linalg.eigh(self.information - np.eye(k))
         values = np.maximum(values, 0.0)
@@ -111,7 +116,9 @@ class ShapeFilter(Struct, frozen=True, eq=False):
         return matrix, vector
 
     def with_view(self, direction_trf: Array, matrix: Array, vector: Array) -> ShapeFilter:
-        """Return the filter after a view from a direction (3,); itself for a known direction, or a view that contradicts it."""
+        """Return the filter after a view from a direction (3,); itself for a known direction, or a
+        view that contradicts it.
+        """
         cell = view_cell(direction_trf)
         if cell in self.cells or self._contradicts(matrix, vector):
             return self
@@ -121,10 +128,11 @@ class ShapeFilter(Struct, frozen=True, eq=False):
     def with_baseline(
         self, a: SeenPlace, b: SeenPlace, length_m: float, sigma_m: float, common_m: float
     ) -> ShapeFilter:
-        """Return the filter after two views at one time from places at a distance of ``length_m``; itself for known directions, or
-        a distance that contradicts it.
+        """Return the filter after two views at one time from places at a distance of ``length_m``;
+        itself for known directions, or a distance that contradicts it.
 
-        ``sigma_m``, ``common_m``: standard deviations of the distance by noise, and by what all distances have in common.
+        ``sigma_m``, ``common_m``: standard deviations of the distance by noise, and by what all
+        distances have in common.
         """
         pair = (min(a.cell, b.cell), max(a.cell, b.cell))
         between = a.place_m - b.place_m
@@ -159,7 +167,9 @@ class ShapeFilter(Struct, frozen=True, eq=False):
 
 
 def shape_parameters(scenario: FlightScenario) -> tuple[GeometryParameter, ...]:
-    """Return the errors of the target's known geometry; none without a mesh, or for a perception that does not use it."""
+    """Return the errors of the target's known geometry; none without a mesh, or for a perception
+    that does not use it.
+    """
     mesh, knowledge = scenario.target.known_mesh(), scenario.target.knowledge
     if mesh is None or scenario.perception.name != "model":
         return ()
@@ -167,7 +177,9 @@ def shape_parameters(scenario: FlightScenario) -> tuple[GeometryParameter, ...]:
 
 
 def seen_place(pose: PoseSolution, measured: GeometryMeasurement, count: int) -> SeenPlace | None:
-    """Return where an image shows the target from; None if it does not tell how that depends on ``count`` errors."""
+    """Return where an image shows the target from; None if it does not tell how that depends on
+    ``count`` errors.
+    """
     if len(measured.position_by_errors) != 3 * count or len(measured.position_covariance_m2) != 9:
         return None
     axes = rotations.to_matrix(np.array(pose.q_wxyz)).T
@@ -175,10 +187,13 @@ def seen_place(pose: PoseSolution, measured: GeometryMeasurement, count: int) ->
     arm = np.cross(place, np.eye(3))
     attitude = np.array(pose.covariance).reshape(6, 6)[3:, 3:]
     covariance = (
-        axes @ np.array(measured.position_covariance_m2).reshape(3, 3) @ axes.T + arm @ attitude @ arm.T
+        axes @ np.array(measured.position_covariance_m2).reshape(3, 3) @ axes.T
+        + arm @ attitude @ arm.T
     )
     by_errors = -axes @ np.array(measured.position_by_errors).reshape(3, count)
-    if not (np.isfinite(place).all() and np.isfinite(by_errors).all() and np.isfinite(covariance).all()):
+    if not (
+        np.isfinite(place).all() and np.isfinite(by_errors).all() and np.isfinite(covariance).all()
+    ):
         return None
     if not np.linalg.norm(place) > 0.0:
         return None
@@ -186,9 +201,11 @@ def seen_place(pose: PoseSolution, measured: GeometryMeasurement, count: int) ->
 
 
 class ShapeEstimation:
-    """Fuses images: single ones of chasers that inspect the target, and pairs of any, whose distance odometry measures.
+    """Fuses images: single ones of chasers that inspect the target, and pairs of any, whose
+    distance odometry measures.
 
-    One image hardly tells the scale, as a larger body farther away looks the same; the distance of two cameras does.
+    One image hardly tells the scale, as a larger body farther away looks the same; the distance of
+    two cameras does.
     """
 
     def __init__(self, scenario: FlightScenario, parameters: tuple[GeometryParameter, ...]) -> None:
@@ -198,7 +215,9 @@ class ShapeEstimation:
         place_m = math.hypot(errors.position_drift_m, errors.position_bias_m, errors.camera_shift_m)
         self._place_sigma_m, self._focal_share = place_m, errors.camera_focal_share
 
-    def update(self, observation: Observation, inspecting: Collection[int]) -> EstimatedShape | None:
+    def update(
+        self, observation: Observation, inspecting: Collection[int]
+    ) -> EstimatedShape | None:
         """Return the estimate after a tick; None before the first view."""
         before = self.filter
         for sighting in observation.sightings:
@@ -224,7 +243,11 @@ class ShapeEstimation:
             if measured is None or odometry is None or odometry.sim_time_ns != sighting.sim_time_ns:
                 continue
             ambiguous = len(sighting.solutions) != 1
-            place = None if ambiguous else seen_place(sighting.solutions[0], measured, len(self.parameters))
+            place = (
+                None
+                if ambiguous
+                else seen_place(sighting.solutions[0], measured, len(self.parameters))
+            )
             if place is not None:
                 lens, _ = self._camera.irf_pose_in_world(odometry.position_m, odometry.q_wxyz)
                 noise = np.array(odometry.position_covariance_m2).reshape(3, 3)
@@ -234,12 +257,16 @@ class ShapeEstimation:
             length_m = float(np.linalg.norm(between))
             along = between / max(length_m, 1e-9)
             sigma_m = math.sqrt(max(float(along @ (noise_a + noise_b) @ along), 0.0))
-            focal_m = self._focal_share * math.hypot(*(float(np.linalg.norm(x.place_m)) for x in (a, b)))
+            focal_m = self._focal_share * math.hypot(
+                *(float(np.linalg.norm(x.place_m)) for x in (a, b))
+            )
             common_m = math.hypot(math.sqrt(2.0) * self._place_sigma_m, focal_m)
             self.filter = self.filter.with_baseline(a, b, length_m, sigma_m, common_m)
 
     def _with(self, sighting: Sighting) -> ShapeFilter:
-        """Return the filter with a sighting; without it where it has no information on these parameters."""
+        """Return the filter with a sighting; without it where it has no information on these
+        parameters.
+        """
         measured, k = sighting.geometry, len(self.parameters)
         if (
             measured is None
@@ -250,6 +277,8 @@ class ShapeEstimation:
         pose = sighting.solutions[0]
         direction = -rotations.rotate_inverse(np.array(pose.q_wxyz), np.array(pose.position_m))
         matrix, vector = np.array(measured.information).reshape(k, k), np.array(measured.vector)
-        if not (np.isfinite(matrix).all() and np.isfinite(vector).all() and np.isfinite(direction).all()):
+        if not (
+            np.isfinite(matrix).all() and np.isfinite(vector).all() and np.isfinite(direction).all()
+        ):
             return self.filter
         return self.filter.with_view(direction / np.linalg.norm(direction), matrix, vector)

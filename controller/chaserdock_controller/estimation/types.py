@@ -29,7 +29,9 @@ class PoseHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Nominal pose of a camera at an exposure: optical centre (3,) in WRF and rotation (4,) IRF to WRF."""
+    """Nominal pose of a camera at an exposure: optical centre (3,) in WRF and rotation (4,) IRF to
+    WRF.
+    """
 
     position_m: Array
     q_wxyz: Array
@@ -55,8 +57,9 @@ class Measurement:
 class CameraError:
     """Estimated calibration error of a chaser's camera.
 
-    turn_rad: (3,) rotation vector from nominal to true camera axes, in nominal IRF. shift_m: (3,) of the optical
-    centre, in IRF. focal_share: relative error of the focal length. covariance: (7, 7) in that order.
+    turn_rad: (3,) rotation vector from nominal to true camera axes, in nominal IRF. shift_m: (3,)
+    of the optical centre, in IRF. focal_share: relative error of the focal length. covariance: (7,
+    7) in that order.
     """
 
     chaser: int
@@ -70,8 +73,8 @@ class CameraError:
 class RelativePose:
     """Estimated pose of a chaser relative to the target.
 
-    position_m: (3,) origin of CRF in TRF. q_wxyz: (4,) CRF to TRF. covariance: (6, 6), order (position in TRF axes, m;
-    dtheta in CRF axes, rad).
+    position_m: (3,) origin of CRF in TRF. q_wxyz: (4,) CRF to TRF. covariance: (6, 6), order
+    (position in TRF axes, m; dtheta in CRF axes, rad).
     """
 
     chaser: int
@@ -108,8 +111,8 @@ class TargetState:
 class Shock:
     """A sudden change of the target's rates.
 
-    sigma_*: standard deviation of the unknown part. velocity_m_s (3,) of TRF's origin in WRF and omega_rad_s (3,) in
-    TRF: the known part.
+    sigma_*: standard deviation of the unknown part. velocity_m_s (3,) of TRF's origin in WRF and
+    omega_rad_s (3,) in TRF: the known part.
     """
 
     sigma_velocity_m_s: float
@@ -171,8 +174,8 @@ def no_estimate(time_ns: int) -> TargetState:
 
 
 def is_usable(measurement: Measurement) -> bool:
-    """Check camera pose and hypotheses: shapes, finite numbers, unit quaternions (to 1e-3), and symmetric positive
-    definite covariances."""
+    """Check camera pose and hypotheses: shapes, finite numbers, unit quaternions (to 1e-3), and
+    symmetric positive definite covariances."""
     camera = measurement.camera
     if (
         camera.position_m.shape != (3,)
@@ -201,7 +204,9 @@ def is_usable(measurement: Measurement) -> bool:
 
 
 def content_key(m: Measurement) -> tuple[int, int, int, int, bytes]:
-    """Return a sort key (time, chaser, content) that makes results independent of the order of arrival."""
+    """Return a sort key (time, chaser, content) that makes results independent of the order of
+    arrival.
+    """
     content = m.camera.position_m.tobytes() + m.camera.q_wxyz.tobytes()
     content += b"".join(
         h.position_m.tobytes() + h.q_wxyz.tobytes() + h.covariance.tobytes() for h in m.hypotheses

@@ -26,9 +26,10 @@ class NextMove(StrEnum):
 class ChaserGuidance:
     """Phase since ``since_s`` (simulated time) and motion of the reference in TRF.
 
-    ``inside_since_s``: since when the chaser is within its tolerances. ``attempt``: number of the docking attempt, from 1.
-    ``held``: position (3,) and attitude (4,) in TRF when the pull test began. ``faces``: the reference attitude turns
-    with the offset so that the chaser faces the target. ``stuck``: it is to back out, but its latch does not open.
+    ``inside_since_s``: since when the chaser is within its tolerances. ``attempt``: number of the
+    docking attempt, from 1. ``held``: position (3,) and attitude (4,) in TRF when the pull test
+    began. ``faces``: the reference attitude turns with the offset so that the chaser faces the
+    target. ``stuck``: it is to back out, but its latch does not open.
     """
 
     phase: Phase
@@ -52,7 +53,9 @@ class CommandResult:
 
 @dataclass(frozen=True)
 class PhaseChange:
-    """A chaser entered ``phase``; ``detail`` names the phase before and the reason, or what has happened in the phase."""
+    """A chaser entered ``phase``; ``detail`` names the phase before and the reason, or what has
+    happened in the phase.
+    """
 
     chaser: int
     phase: Phase

@@ -27,11 +27,17 @@ def why_stale(command: OperatorCommand, now_s: float) -> str:
 
 def why_unknown_chaser(chaser: int, chasers: int) -> str:
     """Check a chaser's number."""
-    return "" if chaser < chasers else f"there is no chaser {chaser}; this mission has 0 to {chasers - 1}"
+    return (
+        ""
+        if chaser < chasers
+        else f"there is no chaser {chaser}; this mission has 0 to {chasers - 1}"
+    )
 
 
 def why_not_along(scenario: FlightScenario, chaser: int, offset_m: Array) -> str:
-    """Check that a reference at ``offset_m`` (3,), TRF, is on the approach line through the nominal offset."""
+    """Check that a reference at ``offset_m`` (3,), TRF, is on the approach line through the nominal
+    offset.
+    """
     nominal = np.asarray(scenario.chasers[chaser].position_m)
     along = float(offset_m @ nominal) / math.hypot(*nominal)
     aside = math.sqrt(max(0.0, float(offset_m @ offset_m) - along * along))
@@ -69,12 +75,16 @@ def why_not_offset(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -
     distance = float(np.linalg.norm(offset_m))
     nearest = scenario.limits.min_distance_target_m
     if not nearest < distance <= scenario.limits.max_reference_distance_m:
-        return f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
+        return (
+            f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
+        )
     return why_not_off_shape(scenario, chaser, offset_m)
 
 
 def why_not_off_shape(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
-    """Check the distance of a chaser's shape at an offset (3,), TRF, from the cuboids of the target's shape."""
+    """Check the distance of a chaser's shape at an offset (3,), TRF, from the cuboids of the
+    target's shape.
+    """
     least_m = scenario.limits.min_distance_shape_m
     if not least_m or (distance_m := shape_distance_m(scenario, chaser, offset_m)) >= least_m:
         return ""
@@ -95,7 +105,9 @@ def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) 
 def why_not_goto(
     scenario: FlightScenario, chaser: int, offset_m: ArrayLike | None, ends_m: Mapping[int, Array]
 ) -> str:
-    """Check a chaser's offset (3,), TRF, against the target and the goals ``ends_m`` of the other chasers."""
+    """Check a chaser's offset (3,), TRF, against the target and the goals ``ends_m`` of the other
+    chasers.
+    """
     if offset_m is None:
         return "goto needs an offset"
     if reason := why_not_offset(scenario, chaser, offset_m):
@@ -105,7 +117,10 @@ def why_not_goto(
         apart = float(np.linalg.norm(end_m - np.asarray(offset_m)))
         if apart < scenario.limits.min_distance_chasers_m:
             return f"the offset is {apart:.3g} m from the goal of chaser {j}"
-        if least_m and (apart := shapes_apart_m(scenario, (chaser, offset_m), (j, end_m))) < least_m:
+        if (
+            least_m
+            and (apart := shapes_apart_m(scenario, (chaser, offset_m), (j, end_m))) < least_m
+        ):
             return f"there the chaser is {apart:.3g} m from chaser {j} at its goal; allowed are at least {least_m:.3g} m"
     return ""
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docking by capture: geometry of a port's corridor and the conditions of phase changes. Pure functions."""
+"""Docking by capture: geometry of a port's corridor and the conditions of phase changes. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ _IN_LINE_M = 0.3
 
 @dataclass(frozen=True)
 class Dock:
-    """A chaser's port, the distance ``reach_m`` from its centre to the probe tip, and the docking limits."""
+    """A chaser's port, the distance ``reach_m`` from its centre to the probe tip, and the docking
+    limits.
+    """
 
     port: Port
     reach_m: float
@@ -33,19 +37,27 @@ class Dock:
         return centre_offset(self.port, self.reach_m, gap_m)
 
     def gap_and_lateral(self, offset_m: Array) -> tuple[float, float]:
-        """Return gap and lateral distance (m) of a centre at ``offset_m`` (3,), TRF, for the nominal attitude."""
+        """Return gap and lateral distance (m) of a centre at ``offset_m`` (3,), TRF, for the
+        nominal attitude.
+        """
         off, axis = offset_m - self.offset(0.0), np.asarray(self.port.axis)
         gap = float(off @ axis)
         return gap, float(np.linalg.norm(off - gap * axis))
 
     def inside(self, offset_m: Array) -> bool:
-        """Return whether a centre at ``offset_m`` (3,), TRF, is in the corridor, nearer than its entry."""
+        """Return whether a centre at ``offset_m`` (3,), TRF, is in the corridor, nearer than its
+        entry.
+        """
         gap, lateral = self.gap_and_lateral(offset_m)
         return gap < self.docking.entry_m - 0.02 and lateral < 2.0 * self.docking.corridor.lateral_m
 
     def keep_out_m(self) -> float:
-        """Return the least distance from the target's centre that a plan in this corridor must keep."""
-        return max(0.0, float(np.linalg.norm(self.offset(-self.docking.overdrive_m))) - _KEEP_OUT_MARGIN_M)
+        """Return the least distance from the target's centre that a plan in this corridor must
+        keep.
+        """
+        return max(
+            0.0, float(np.linalg.norm(self.offset(-self.docking.overdrive_m))) - _KEEP_OUT_MARGIN_M
+        )
 
 
 def dock_of(scenario: FlightScenario, chaser: int) -> Dock | None:
@@ -61,7 +73,9 @@ def corridors_apart(a: Dock, b: Dock) -> float:
 
 
 def why_not_approach(dock: Dock, offset_m: Array) -> str:
-    """Return why a chaser cannot fly from a reference at ``offset_m`` (3,), TRF, to its corridor, or an empty string."""
+    """Return why a chaser cannot fly from a reference at ``offset_m`` (3,), TRF, to its corridor,
+    or an empty string.
+    """
     gap, lateral = dock.gap_and_lateral(offset_m)
     if gap < 0.0 or lateral > _IN_LINE_M:
         return (
@@ -75,8 +89,8 @@ def why_not_approach(dock: Dock, offset_m: Array) -> str:
 class DockingObservation:
     """Estimated geometry of a chaser at its port, and the state of its docking sensor.
 
-    ``offset_m`` (3,) and ``q_wxyz`` (4,): estimated pose of its centre and body in TRF. ``sensed``: the sensor has reported in
-    this tick; otherwise ``latched`` is its last report.
+    ``offset_m`` (3,) and ``q_wxyz`` (4,): estimated pose of its centre and body in TRF. ``sensed``:
+    the sensor has reported in this tick; otherwise ``latched`` is its last report.
     """
 
     view: PortView
@@ -89,8 +103,9 @@ class DockingObservation:
 
 @dataclass(frozen=True)
 class PhaseProgress:
-    """Progress within a phase: duration, whether the reference move is complete, the reference's gap, the time within
-    the alignment limits, and the pose in TRF (offset, attitude) at the start of the pull test."""
+    """Progress within a phase: duration, whether the reference move is complete, the reference's
+    gap, the time within the alignment limits, and the pose in TRF (offset, attitude) at the start
+    of the pull test."""
 
     phase: Phase
     in_phase_s: float
@@ -101,7 +116,9 @@ class PhaseProgress:
 
 
 def pull_N(docking: Docking, in_phase_s: float) -> float:
-    """Return the force along -X (CRF) of the latch test at ``in_phase_s``: a pull, then an equally long push."""
+    """Return the force along -X (CRF) of the latch test at ``in_phase_s``: a pull, then an equally
+    long push.
+    """
     into_s = in_phase_s - docking.settle_s
     if into_s < 0.0 or into_s >= 2.0 * docking.pull_s:
         return 0.0
@@ -126,7 +143,9 @@ def _failed(reason: str) -> TriggerReason:
     return Trigger.ATTEMPT_FAILED, reason
 
 
-def _check_align(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> TriggerReason | None:
+def _check_align(
+    docking: Docking, now: PhaseProgress, observed: DockingObservation
+) -> TriggerReason | None:
     if now.move_complete and now.inside_s >= _ALIGNED_S:
         return Trigger.ALIGNED, "aligned"
     if now.in_phase_s > docking.align_timeout_s:
@@ -142,13 +161,19 @@ def _check_approach(
         return _failed(f"left the corridor: {fault}")
     if now.reference_gap_m <= docking.final_m:
         fault = observed.view.fault(docking.final, docking.corridor.closing_m_s)
-        return _failed(f"not fit for the final approach: {fault}") if fault else (Trigger.FINAL_DISTANCE, "")
+        return (
+            _failed(f"not fit for the final approach: {fault}")
+            if fault
+            else (Trigger.FINAL_DISTANCE, "")
+        )
     if now.in_phase_s > docking.approach_timeout_s:
         return _failed(f"approach took more than {docking.approach_timeout_s:g} s")
     return None
 
 
-def _check_final(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> TriggerReason | None:
+def _check_final(
+    docking: Docking, now: PhaseProgress, observed: DockingObservation
+) -> TriggerReason | None:
     if observed.contact:
         return Trigger.TIP_CONTACT, "the tip touches"
     if fault := observed.view.fault(docking.final, docking.corridor.closing_m_s):
@@ -186,7 +211,9 @@ def _check_latched(
     return None
 
 
-_CHECKS: dict[Phase, Callable[[Docking, PhaseProgress, DockingObservation], TriggerReason | None]] = {
+_CHECKS: dict[
+    Phase, Callable[[Docking, PhaseProgress, DockingObservation], TriggerReason | None]
+] = {
     Phase.ALIGN: _check_align,
     Phase.APPROACH: _check_approach,
     Phase.FINAL: _check_final,

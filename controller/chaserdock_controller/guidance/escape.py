@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passive safety enforced: moves whose coasts stay clear of the target, and aborts onto a safe coast.
+"""Passive safety enforced: moves whose coasts stay clear of the target, and aborts onto a safe
+coast.
 
-An abort is a burn of a few seconds in one of several directions, and then the coast. All coasts are those after a loss of all
-thrust (chaserdock_models/passive_safety.py); a collision avoidance manoeuvre of this kind: Fehse, Automated Rendezvous and Docking
-of Spacecraft, section 4.5.
+An abort is a burn of a few seconds in one of several directions, and then the coast. All coasts are
+those after a loss of all thrust (chaserdock_models/passive_safety.py); a collision avoidance
+manoeuvre of this kind: Fehse, Automated Rendezvous and Docking of Spacecraft, section 4.5.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from chaserdock_controller.nmpc.passive_safety import coast_duration_s
 from .trajectories import Escape, Motion
 
 _COARSE_STEP_S = 60.0
-"""Step of the coasts in an orbit, by which moves and aborts are selected. The monitor's is shorter."""
+"""Step of the coasts in an orbit, by which moves and aborts are selected. The monitor's is shorter.
+"""
 _SPEED_SHARES = 0.7 ** np.arange(14)
 _MOVE_SAMPLES, _TURN_SAMPLES = 33, 12
 _LONGEST_TURN_S = 600.0
@@ -34,16 +36,22 @@ _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1)[:, None]
 _IMPULSE_SHARES = (0.5, 1.0, 2.0, 4.0)
 """Changes of velocity of an abort, as shares of the speed of an abort by a move."""
 _FORCE_SHARE = 0.4
-"""Share of the largest force per axis with which an abort burns; the rest is left to attitude and feedback."""
+"""Share of the largest force per axis with which an abort burns; the rest is left to attitude and
+feedback.
+"""
 _BURN_ERROR = 0.03
 """Standard deviation of a burn's change of velocity, as a share of it."""
 _SPARE = 1.5
-"""An abort with this multiple of the required margin is as good as any with more, and the smallest such burn is taken."""
+"""An abort with this multiple of the required margin is as good as any with more, and the smallest
+such burn is taken.
+"""
 
 
 @dataclass(frozen=True)
 class RelativeState:
-    """Estimated state (6,) of a chaser relative to the target, WRF, with covariance (6, 6), at one moment."""
+    """Estimated state (6,) of a chaser relative to the target, WRF, with covariance (6, 6), at one
+    moment.
+    """
 
     state: Array
     covariance: Array
@@ -69,14 +77,16 @@ class EscapePlanner:
         """Return whether a chaser at an offset (3,) is in the final corridor by its distance."""
         return float(np.linalg.norm(offset_m)) <= self._final_m
 
-    # -- moves -----------------------------------------------------------------------------------------------
+    # -- moves -------------------------------------------------------------------------------------
 
     def limited(
         self, i: int, move: Callable[[float], Motion], speed_m_s: float, now_s: float
     ) -> Motion | None:
-        """Return the fastest of the moves at shares of ``speed_m_s`` whose coasts are safe, or None if none is.
+        """Return the fastest of the moves at shares of ``speed_m_s`` whose coasts are safe, or None
+        if none is.
 
-        ``move``: maps a speed to the move, which must be in TRF. Without a state of the chaser the first is returned.
+        ``move``: maps a speed to the move, which must be in TRF. Without a state of the chaser the
+        first is returned.
         """
         known = self.relative.get(i)
         for share in _SPEED_SHARES:
@@ -86,28 +96,38 @@ class EscapePlanner:
         return None
 
     def move_margin(self, known: RelativeState, move: Motion, now_s: float) -> float:
-        """Return the smallest margin of the coasts from a move outside the final corridor; infinity if there is none."""
+        """Return the smallest margin of the coasts from a move outside the final corridor; infinity
+        if there is none.
+        """
         omega = np.asarray(known.target.omega_rad_s)
         rate = float(np.linalg.norm(omega))
         turn_s = min(2.0 * math.pi / rate, _LONGEST_TURN_S) if rate > 0.0 else 0.0
         end_s = move.start_s + move.duration_s
         times_s = np.concatenate(
-            [np.linspace(now_s, end_s, _MOVE_SAMPLES), end_s + np.linspace(0.0, turn_s, _TURN_SAMPLES)]
+            [
+                np.linspace(now_s, end_s, _MOVE_SAMPLES),
+                end_s + np.linspace(0.0, turn_s, _TURN_SAMPLES),
+            ]
         )
         offsets, velocities, _ = move.at(times_s)
         outside = np.linalg.norm(offsets, axis=1) > self._final_m
         if not outside.any():
             return math.inf
         offsets, velocities, times_s = offsets[outside], velocities[outside], times_s[outside]
-        turned = rotations.multiply(known.target.q_wxyz, rotations.exp((times_s - now_s)[:, None] * omega))
+        turned = rotations.multiply(
+            known.target.q_wxyz, rotations.exp((times_s - now_s)[:, None] * omega)
+        )
         moving = velocities + np.cross(omega, offsets)
-        states = np.concatenate([rotations.rotate(turned, offsets), rotations.rotate(turned, moving)], axis=1)
+        states = np.concatenate(
+            [rotations.rotate(turned, offsets), rotations.rotate(turned, moving)], axis=1
+        )
         return self._margin(states, known.covariance)
 
-    # -- aborts ----------------------------------------------------------------------------------------------
+    # -- aborts ------------------------------------------------------------------------------------
 
     def escape(self, i: int, now_s: float) -> tuple[Escape, float] | None:
-        """Return the abort of a chaser from its newest state, and the margin of its coast; None without a state.
+        """Return the abort of a chaser from its newest state, and the margin of its coast; None
+        without a state.
 
         The smallest burn whose coast has spare margin, otherwise the one with the largest margin.
         """
@@ -123,8 +143,12 @@ class EscapePlanner:
                 break
         return best
 
-    def _best_of(self, known: RelativeState, impulse_m_s: float, now_s: float) -> tuple[Escape, float]:
-        """Return the abort with a change of velocity that has the largest margin, over all directions."""
+    def _best_of(
+        self, known: RelativeState, impulse_m_s: float, now_s: float
+    ) -> tuple[Escape, float]:
+        """Return the abort with a change of velocity that has the largest margin, over all
+        directions.
+        """
         burn_s = impulse_m_s / self._acceleration_m_s2
         escapes = [
             Escape(

@@ -27,7 +27,9 @@ _GREATEST_MARGIN_M = 0.1
 def target_path(
     body: TargetBody, torque_free: bool, start: TargetState, step_s: float, steps: int
 ) -> TargetPath:
-    """Return the target's predicted motion at 0, step_s, ... steps * step_s, and then in the middles between."""
+    """Return the target's predicted motion at 0, step_s, ... steps * step_s, and then in the
+    middles between.
+    """
     state = (start.position_m, start.velocity_m_s, start.q_wxyz, start.omega_rad_s)
     if torque_free:
         path = predict_path(body, *state, step_s / 2, 2 * steps)
@@ -50,7 +52,9 @@ class ReferenceBuilder:
         self._boxes = box_table(scenario.target_model().boxes) if keeps else None
 
     def pose(self, i: int, target: TargetState, now_s: float) -> tuple[Array, Array, Array]:
-        """Return a chaser's reference now: position (3,) and attitude (4,) in WRF, offset (3,) in TRF."""
+        """Return a chaser's reference now: position (3,) and attitude (4,) in WRF, offset (3,) in
+        TRF.
+        """
         move = self._machine.chasers[i].move
         offset = move.at(np.array([now_s]))[0][0]
         if isinstance(move, Escape):
@@ -73,7 +77,8 @@ class ReferenceBuilder:
     ) -> HorizonReference:
         """Return the references of ``chasers`` from the time of ``start`` on.
 
-        ``relative``: poses relative to the target, whose covariance widens the distance to keep from it.
+        ``relative``: poses relative to the target, whose covariance widens the distance to keep
+        from it.
         """
         s, step_s = self._scenario, self._step_s
         torque_free = s.target.motion == "torque_free"
@@ -96,11 +101,16 @@ class ReferenceBuilder:
                 middles.acceleration_m_s2,
             )
         known = {r.chaser: r for r in relative}
-        margins = self._margins_m([known[i].covariance if i in known else start.covariance for i in chasers])
+        margins = self._margins_m(
+            [known[i].covariance if i in known else start.covariance for i in chasers]
+        )
         distances = np.array([self._machine.min_distance_target_m(i) for i in chasers])
-        # An uncertain pose pushes no chaser out of the corridor of its port, where no other place is safe.
+        # An uncertain pose pushes no chaser out of the corridor of its port, where no other place
+        # is safe.
         room = [
-            length(known[i].position_m) - d if i in known and self._machine.in_corridor(i) else np.inf
+            length(known[i].position_m) - d
+            if i in known and self._machine.in_corridor(i)
+            else np.inf
             for i, d in zip(chasers, distances.tolist(), strict=True)
         ]
         distances = distances + np.minimum(margins, np.maximum(room, 0.0))
@@ -126,8 +136,8 @@ class ReferenceBuilder:
     def _offsets(
         self, chasers: tuple[int, ...], times_s: Array, target: TargetPath
     ) -> tuple[tuple[Array, Array, Array], Array]:
-        """Return offsets, their velocities and accelerations in TRF, each (N, K, 3), and attitudes, body to TRF,
-        (N, K, 4), at times (K,), at which the target moves as ``target``."""
+        """Return offsets, their velocities and accelerations in TRF, each (N, K, 3), and attitudes,
+        body to TRF, (N, K, 4), at times (K,), at which the target moves as ``target``."""
         moves = [self._motion(i, times_s, target) for i in chasers]
         q_off = np.empty((len(chasers), len(times_s), 4))
         for row, i in enumerate(chasers):
@@ -142,7 +152,9 @@ class ReferenceBuilder:
         return reference.seen_from(target, *motion) if isinstance(move, Escape) else motion
 
     def _attitudes(self, i: int, offsets: Array, times_s: Array) -> Array:
-        """Return reference attitudes, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or (4,) if constant."""
+        """Return reference attitudes, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or
+        (4,) if constant.
+        """
         c, q = self._scenario.chasers[i], np.array(self._scenario.chasers[i].q_wxyz)
         if self._scenario.approach.face_target or self._machine.chasers[i].faces:
             q = facing_attitudes(c.position_m, c.q_wxyz, offsets)
@@ -150,6 +162,10 @@ class ReferenceBuilder:
         return q if turns is None else rotations.multiply(q, turns)
 
     def _margins_m(self, covariances: Sequence[Array]) -> Array:
-        """Return the additions (N,) to the distance from the target for uncertain positions, the first blocks of ``covariances``."""
+        """Return the additions (N,) to the distance from the target for uncertain positions, the
+        first blocks of ``covariances``.
+        """
         sigmas_m = np.sqrt(np.linalg.eigvalsh(np.array([c[:3, :3] for c in covariances]))[:, -1])
-        return np.minimum(self._scenario.limits.estimate_margin_sigmas * sigmas_m, _GREATEST_MARGIN_M)
+        return np.minimum(
+            self._scenario.limits.estimate_margin_sigmas * sigmas_m, _GREATEST_MARGIN_M
+        )

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State machine of every chaser: phase, and motion of the reference position in TRF. No I/O; time is an argument.
+"""State machine of every chaser: phase, and motion of the reference position in TRF. No I/O; time
+is an argument.
 
 Phases and transitions: ``phases``. Every phase change looks up its target in the transition table.
 """
@@ -70,7 +71,9 @@ class PhaseMachine:
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
         self._changes: list[PhaseChange] = []
-        self.chasers = [ChaserGuidance(Phase.ACQUIRE, 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]
+        self.chasers = [
+            ChaserGuidance(Phase.ACQUIRE, 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers
+        ]
         self._pending_goals: dict[int, Array] = {}
         self._pending_inspections: set[int] = set()
         self._docks = [dock_of(scenario, i) for i in range(len(scenario.chasers))]
@@ -88,7 +91,7 @@ class PhaseMachine:
             speed = scenario.approach.max_speed_m_s * _ABORT_SPEED_FACTOR
             self.escapes = EscapePlanner(scenario, speed)
 
-    # -- the target's estimate -------------------------------------------------------------------------------
+    # -- the target's estimate ---------------------------------------------------------------------
 
     def target_acquired(self, now_s: float) -> None:
         """Let every chaser in ``acquire`` hold: the target's pose is known."""
@@ -102,7 +105,9 @@ class PhaseMachine:
                 self._transition(i, Trigger.TARGET_UNKNOWN, now_s, c.move)
 
     def target_settled(self, i: int, now_s: float, offset_m: Array) -> None:
-        """Send a searching chaser at ``offset_m`` (3,), TRF, to its nominal offset, facing the target on the way."""
+        """Send a searching chaser at ``offset_m`` (3,), TRF, to its nominal offset, facing the
+        target on the way.
+        """
         speed = self._scenario.approach.max_speed_m_s * _GOTO_SPEED_FACTOR
         if not self._permits(i, Trigger.TARGET_SETTLED):
             return
@@ -115,9 +120,11 @@ class PhaseMachine:
         for i in range(len(self.chasers)):
             self._stop_or_back_out(i, Trigger.TARGET_LOST, now_s, "the target is lost")
 
-    def update_visibility(self, now_s: float, visible: bool, doubtful: Collection[int] = frozenset()) -> None:
-        """Interrupt approaches to a target that no chaser has seen for a while, and those of chasers whose odometry is
-        ``doubtful``; resume them afterwards."""
+    def update_visibility(
+        self, now_s: float, visible: bool, doubtful: Collection[int] = frozenset()
+    ) -> None:
+        """Interrupt approaches to a target that no chaser has seen for a while, and those of
+        chasers whose odometry is ``doubtful``; resume them afterwards."""
         self._seen_s = now_s if visible or self._seen_s is None else self._seen_s
         unseen_s = now_s - self._seen_s
         for i in range(len(self.chasers)):
@@ -127,15 +134,26 @@ class PhaseMachine:
                     reason = "its sightings have contradicted its odometry since that was received"
                 if self._stop_or_back_out(i, Trigger.SIGHT_LOST, now_s, reason) is Phase.HOLD:
                     self._interrupted.add(i)
-            elif i in self._interrupted and unseen_s == 0.0 and self._permits(i, Trigger.SIGHT_REGAINED):
+            elif (
+                i in self._interrupted
+                and unseen_s == 0.0
+                and self._permits(i, Trigger.SIGHT_REGAINED)
+            ):
                 move = move_to(
-                    self._in_trf(i, now_s), self.dock_offset(i), now_s, self._scenario.approach.max_speed_m_s
+                    self._in_trf(i, now_s),
+                    self.dock_offset(i),
+                    now_s,
+                    self._scenario.approach.max_speed_m_s,
                 )
-                self._transition(i, Trigger.SIGHT_REGAINED, now_s, move, "its sightings can be used again")
+                self._transition(
+                    i, Trigger.SIGHT_REGAINED, now_s, move, "its sightings can be used again"
+                )
             if self.chasers[i].phase is not Phase.HOLD:
                 self._interrupted.discard(i)
 
-    def _stop_or_back_out(self, i: int, trigger: Trigger, now_s: float, reason: str) -> Phase | None:
+    def _stop_or_back_out(
+        self, i: int, trigger: Trigger, now_s: float, reason: str
+    ) -> Phase | None:
         phase = next_phase(self.chasers[i].phase, trigger, self._docks[i] is not None)
         if phase is Phase.RETREAT:
             self._back_out(i, trigger, now_s, reason)
@@ -145,10 +163,12 @@ class PhaseMachine:
             self._transition(i, trigger, now_s, stop(self._in_trf(i, now_s), now_s), why)
         return phase
 
-    # -- planning ------------------------------------------------------------------------------------------------
+    # -- planning ----------------------------------------------------------------------------------
 
     def update_planning(self, now_s: float, failures: Mapping[int, PlanningFailure]) -> None:
-        """Let every chaser retreat for which planning fails, once per failure, and again when it becomes one without plans."""
+        """Let every chaser retreat for which planning fails, once per failure, and again when it
+        becomes one without plans.
+        """
         for i, failure in failures.items():
             before = self._planning_failures.get(i)
             worse = before is None or (failure.without_plan and not before.without_plan)
@@ -156,35 +176,47 @@ class PhaseMachine:
                 self._back_out(i, Trigger.PLANNING_FAILED, now_s, failure.text())
         self._planning_failures = dict(failures)
 
-    # -- passive safety ------------------------------------------------------------------------------------------
+    # -- passive safety ----------------------------------------------------------------------------
 
     def update_safety(self, now_s: float, unsafe: Mapping[int, str]) -> None:
-        """Let every chaser abort whose passive safety is enforced, but whose plans are ``unsafe``, with the reasons."""
+        """Let every chaser abort whose passive safety is enforced, but whose plans are ``unsafe``,
+        with the reasons.
+        """
         for i, reason in unsafe.items():
             if self.enforces_safety(i) and self._permits(i, Trigger.SAFETY_LOST):
                 self._back_out(i, Trigger.SAFETY_LOST, now_s, reason)
 
     def enforces_safety(self, i: int) -> bool:
-        """Return whether the passive safety of a chaser is enforced now: outside the final corridor."""
+        """Return whether the passive safety of a chaser is enforced now: outside the final
+        corridor.
+        """
         position = self._positions.get(i)
         if self.escapes is None or position is None or i not in self.escapes.relative:
             return False
-        final = self.escapes.is_final(position) or self.in_corridor(i) or self.corridor(i) is not None
+        final = (
+            self.escapes.is_final(position) or self.in_corridor(i) or self.corridor(i) is not None
+        )
         return not (final or self._is_held(i))
 
     def _in_trf(self, i: int, now_s: float) -> Motion:
-        """Return a chaser's motion in TRF: in place of an abort's, which is in WRF, rest at the estimated position."""
+        """Return a chaser's motion in TRF: in place of an abort's, which is in WRF, rest at the
+        estimated position.
+        """
         move = self.chasers[i].move
         return stay(self._positions[i], now_s) if isinstance(move, Escape) else move
 
     def _move(self, i: int, goal_m: Array, now_s: float, speed_m_s: float) -> Motion:
-        """Return the move to a goal (3,), TRF, at most at a speed; if passive safety is enforced, as slow as it needs."""
+        """Return the move to a goal (3,), TRF, at most at a speed; if passive safety is enforced,
+        as slow as it needs.
+        """
         return self._safe_move(i, goal_m, now_s, speed_m_s) or move_to(
             self._in_trf(i, now_s), goal_m, now_s, speed_m_s
         )
 
     def _closing_speed(self, start: Motion, goal_m: Array, now_s: float, speed_m_s: float) -> float:
-        """Return the largest speed of a move that keeps the speed limit by range all along its way, at least ``speed_m_s``."""
+        """Return the largest speed of a move that keeps the speed limit by range all along its way,
+        at least ``speed_m_s``.
+        """
         slope = self._scenario.approach.closing_per_s
         if not slope:
             return speed_m_s
@@ -206,10 +238,14 @@ class PhaseMachine:
         speed_m_s = self._closing_speed(start, goal_m, now_s, speed_m_s)
         if self.escapes is None:
             return move_to(start, goal_m, now_s, speed_m_s)
-        return self.escapes.limited(i, lambda speed: move_to(start, goal_m, now_s, speed), speed_m_s, now_s)
+        return self.escapes.limited(
+            i, lambda speed: move_to(start, goal_m, now_s, speed), speed_m_s, now_s
+        )
 
     def _escape(self, i: int, now_s: float) -> Escape | None:
-        """Return the abort onto a safe coast if passive safety is enforced; log one whose coast is not safe."""
+        """Return the abort onto a safe coast if passive safety is enforced; log one whose coast is
+        not safe.
+        """
         found = self.escapes.escape(i, now_s) if self.escapes is not None else None
         if self.escapes is None or found is None:
             return None
@@ -230,7 +266,7 @@ class PhaseMachine:
             f"{self._scenario.limits.min_distance_target_m:g} m of the target (limits.passive_safety)"
         )
 
-    # -- commands --------------------------------------------------------------------------------------------
+    # -- commands ----------------------------------------------------------------------------------
 
     def due_commands(self, now_s: float) -> list[OperatorCommand]:
         """Return the commands of the scenario's timeline that are due and were not returned before."""
@@ -238,12 +274,18 @@ class PhaseMachine:
         while self._timeline and self._timeline[0].at_s <= now_s + 1e-9:
             entry = self._timeline.pop(0)
             for chaser in entry.chasers:
-                fields = {"command": entry.command, "offset_m": entry.offset_m, "thruster": entry.thruster}
+                fields = {
+                    "command": entry.command,
+                    "offset_m": entry.offset_m,
+                    "thruster": entry.thruster,
+                }
                 out.append(OperatorCommand(chaser=chaser, **fields))
         return out
 
     def set_pending_goals(self, commands: Sequence[OperatorCommand]) -> None:
-        """Note the goals of one tick's commands together, so that two chasers can swap their places."""
+        """Note the goals of one tick's commands together, so that two chasers can swap their
+        places.
+        """
         self._pending_inspections = {c.chaser for c in commands if c.command == "inspect"}
         self._pending_goals = {
             c.chaser: np.asarray(c.offset_m)
@@ -257,10 +299,13 @@ class PhaseMachine:
     def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
         """Apply or refuse a command.
 
-        Of different commands to a chaser in one tick only the first is accepted, except that an abort always is.
+        Of different commands to a chaser in one tick only the first is accepted, except that an
+        abort always is.
         """
         i, what = command.chaser, command.command
-        reason = validation.why_unknown_chaser(i, len(self.chasers)) or validation.why_stale(command, now_s)
+        reason = validation.why_unknown_chaser(i, len(self.chasers)) or validation.why_stale(
+            command, now_s
+        )
         if reason:
             return CommandResult(False, reason)
         if self.chasers[i].phase in (Phase.ACQUIRE, Phase.SEARCHING):
@@ -276,7 +321,9 @@ class PhaseMachine:
 
     def _apply_command(self, command: OperatorCommand, now_s: float) -> CommandResult:
         i, what = command.chaser, command.command
-        self._interrupted.discard(i)  # a new command cancels the automatic resumption of the one before
+        self._interrupted.discard(
+            i
+        )  # a new command cancels the automatic resumption of the one before
         c, dock = self.chasers[i], self._docks[i]
         if what != "goto" and (what == c.phase or (what == "approach" and c.phase in APPROACHING)):
             return CommandResult(True, f"already in phase {c.phase}")
@@ -299,13 +346,18 @@ class PhaseMachine:
                 self.chasers[i] = replace(self.chasers[i], faces=True)
             case Trigger.COMMAND_APPROACH if dock is None:
                 self._transition(
-                    i, trigger, now_s, move_to(self._in_trf(i, now_s), self.dock_offset(i), now_s, speed)
+                    i,
+                    trigger,
+                    now_s,
+                    move_to(self._in_trf(i, now_s), self.dock_offset(i), now_s, speed),
                 )
             case Trigger.COMMAND_APPROACH:
                 occupied = self._why_corridor_occupied(i)
                 if occupied:
                     blocked = Trigger.COMMAND_APPROACH_BLOCKED
-                    self._transition(i, blocked, now_s, stop(self._in_trf(i, now_s), now_s), occupied)
+                    self._transition(
+                        i, blocked, now_s, stop(self._in_trf(i, now_s), now_s), occupied
+                    )
                 else:
                     self._align(i, trigger, now_s, 1)
             case _:
@@ -346,11 +398,13 @@ class PhaseMachine:
                 if j != i
             }
             reason = validation.why_not_goto(self._scenario, i, command.offset_m, goals)
-            reason = reason or validation.why_not_in_cone(self._scenario, i, np.asarray(command.offset_m))
+            reason = reason or validation.why_not_in_cone(
+                self._scenario, i, np.asarray(command.offset_m)
+            )
             return reason or self._why_not_safe(i, np.asarray(command.offset_m), now_s)
         return ""
 
-    # -- inspection ------------------------------------------------------------------------------------------------
+    # -- inspection --------------------------------------------------------------------------------
 
     def _circuit(self, i: int, now_s: float) -> Circuit:
         section = self._scenario.inspection
@@ -361,7 +415,9 @@ class PhaseMachine:
         """Return why a chaser may not fly around the target, or an empty string."""
         c = self.chasers[i]
         path = self._circuit(i, now_s)
-        if reason := validation.why_not_inspect(self._scenario, i, path.from_m, c.move.over_at(now_s)):
+        if reason := validation.why_not_inspect(
+            self._scenario, i, path.from_m, c.move.over_at(now_s)
+        ):
             return reason
         others = {j: o for j, o in enumerate(self.chasers) if j != i}
         if any(o.phase is Phase.INSPECT and o.since_s != now_s for o in others.values()):
@@ -375,7 +431,7 @@ class PhaseMachine:
                 return f"the way around the target comes within {apart:.3g} m of chaser {j}"
         return self._why_not_safe(i, path.goal_m, now_s)
 
-    # -- the stack of the target and latched chasers ---------------------------------------------------------------
+    # -- the stack of the target and latched chasers -----------------------------------------------
 
     def may_detumble(self, i: int) -> bool:
         """Return whether a chaser stops the stack already, or may be commanded to."""
@@ -406,7 +462,9 @@ class PhaseMachine:
         self._detumble_refusal = reason
 
     def update_stack(self, now_s: float, stopped: bool, moving: bool) -> None:
-        """Advance the phases of detumbling chasers by the motion of the stack, which is neither stopped nor moving in between."""
+        """Advance the phases of detumbling chasers by the motion of the stack, which is neither
+        stopped nor moving in between.
+        """
         timeout_s = self._scenario.detumble.timeout_s
         for i in sorted(self.detumbling()):
             c = self.chasers[i]
@@ -426,21 +484,30 @@ class PhaseMachine:
         for i in self.detumbling():
             self._transition(i, Trigger.DETUMBLE_FAILED, now_s, self.chasers[i].move, reason)
 
-    # -- progress --------------------------------------------------------------------------------------------
+    # -- progress ----------------------------------------------------------------------------------
 
-    def update_tracking(self, i: int, now_s: float, position_error_m: float, angle_error_rad: float) -> None:
+    def update_tracking(
+        self, i: int, now_s: float, position_error_m: float, angle_error_rad: float
+    ) -> None:
         """Advance a chaser's phase by its estimated errors from the reference pose."""
         c, approach = self.chasers[i], self._scenario.approach
         if c.phase is Phase.CALIBRATE and now_s - c.since_s >= CALIBRATION_S:
-            self._transition(i, Trigger.CALIBRATION_COMPLETE, now_s, c.move, "the manoeuvre is complete")
+            self._transition(
+                i, Trigger.CALIBRATION_COMPLETE, now_s, c.move, "the manoeuvre is complete"
+            )
         elif c.phase is Phase.INSPECT and c.move.over_at(now_s):
             self._transition(i, Trigger.INSPECTION_COMPLETE, now_s, stay(c.move.goal_m, now_s))
             self.chasers[i] = replace(self.chasers[i], faces=False)
         elif c.phase in (Phase.RETREAT, Phase.ABORT, Phase.GOTO) and c.move.over_at(now_s):
             self._continue_move(i, now_s)
-        elif self._docks[i] is None and c.phase in (Phase.APPROACH, Phase.DOCKED) and c.move.over_at(now_s):
-            inside = position_error_m <= approach.docked_position_m and angle_error_rad <= math.radians(
-                approach.docked_angle_deg
+        elif (
+            self._docks[i] is None
+            and c.phase in (Phase.APPROACH, Phase.DOCKED)
+            and c.move.over_at(now_s)
+        ):
+            inside = (
+                position_error_m <= approach.docked_position_m
+                and angle_error_rad <= math.radians(approach.docked_angle_deg)
             )
             since = self._inside_since(i, inside, now_s)
             self.chasers[i] = ChaserGuidance(c.phase, c.since_s, c.move, since, faces=c.faces)
@@ -457,7 +524,9 @@ class PhaseMachine:
             case NextMove.ATTEMPT | NextMove.NOMINAL:
                 nominal, speed = self._scenario.chasers[i].position_m, self._back_out_speed(c.phase)
                 self.chasers[i] = replace(
-                    c, move=move_to(self._in_trf(i, now_s), nominal, now_s, speed), then=NextMove.NONE
+                    c,
+                    move=move_to(self._in_trf(i, now_s), nominal, now_s, speed),
+                    then=NextMove.NONE,
                 )
             case NextMove.ESCAPE if (escape := self._escape(i, now_s)) is not None:
                 self.chasers[i] = replace(c, move=escape, then=NextMove.NONE)
@@ -518,7 +587,9 @@ class PhaseMachine:
         match trigger:
             case Trigger.ATTEMPT_FAILED:
                 again = c.attempt < docking.attempts and c.phase not in ATTACHED
-                self._back_out(i, trigger, now_s, reason, NextMove.ATTEMPT if again else NextMove.NOMINAL)
+                self._back_out(
+                    i, trigger, now_s, reason, NextMove.ATTEMPT if again else NextMove.NOMINAL
+                )
                 return
             case Trigger.ALIGNED:
                 fast = (docking.entry_m - docking.final_m, docking.approach_speed_m_s)
@@ -537,10 +608,12 @@ class PhaseMachine:
             return None
         return now_s if since_s is None else since_s
 
-    # -- what the plan and the commands depend on ------------------------------------------------------------
+    # -- what the plan and the commands depend on --------------------------------------------------
 
     def body_rotations(self, i: int, times_s: ArrayLike) -> Array | None:
-        """Return rotations (K, 4) of the body from its reference attitude at times (K,), or None without any."""
+        """Return rotations (K, 4) of the body from its reference attitude at times (K,), or None
+        without any.
+        """
         c = self.chasers[i]
         if c.phase is not Phase.CALIBRATE:
             return None
@@ -552,7 +625,9 @@ class PhaseMachine:
         return observed is None or not (observed.contact or observed.latched)
 
     def in_corridor(self, i: int) -> bool:
-        """Return whether a chaser is in its corridor or at its port, by its phase or its estimated position."""
+        """Return whether a chaser is in its corridor or at its port, by its phase or its estimated
+        position.
+        """
         c, dock = self.chasers[i], self._docks[i]
         if dock is None or i not in self._observed:
             return False
@@ -560,7 +635,9 @@ class PhaseMachine:
         return at_port or dock.inside(self._observed[i].offset_m)
 
     def _is_held(self, i: int) -> bool:
-        """Return whether the latch of a chaser holds the target, by its phase, or because it does not open."""
+        """Return whether the latch of a chaser holds the target, by its phase, or because it does
+        not open.
+        """
         return self.chasers[i].phase in ATTACHED or self.chasers[i].stuck
 
     def set_position(self, i: int, offset_m: Array) -> None:
@@ -570,8 +647,8 @@ class PhaseMachine:
     def corridor(self, i: int) -> Cone | None:
         """Return the cone in which a chaser on its way in or out is planned; None outside of it.
 
-        A chaser that docks at a distance has its cone from the command on, and on its way out until it is at the
-        distance that every chaser keeps.
+        A chaser that docks at a distance has its cone from the command on, and on its way out until
+        it is at the distance that every chaser keeps.
         """
         position, dock = self._positions.get(i), self._docks[i]
         if position is None or self._is_held(i):
@@ -584,7 +661,9 @@ class PhaseMachine:
         return self._cones[i] if applies and self._cones[i].room_m(position) > -_OUTSIDE_M else None
 
     def min_distance_target_m(self, i: int) -> float:
-        """Return the distance from the target that a chaser's plan keeps; 0 when its latch holds the target."""
+        """Return the distance from the target that a chaser's plan keeps; 0 when its latch holds
+        the target.
+        """
         limit, dock = self._scenario.limits.min_distance_target_m, self._docks[i]
         if dock is None:
             docked_m = max(0.0, self._scenario.approach.dock_distance_m - _HELD_MARGIN_M)
@@ -594,20 +673,28 @@ class PhaseMachine:
         return 0.0 if self._is_held(i) else min(limit, dock.keep_out_m())
 
     def min_distance_shape_m(self, i: int) -> float:
-        """Return the distance from the target's shape that a chaser's plan keeps; 0 in its corridor and at its port."""
+        """Return the distance from the target's shape that a chaser's plan keeps; 0 in its corridor
+        and at its port.
+        """
         free = self.corridor(i) is None and not self.in_corridor(i) and not self._is_held(i)
         return self._scenario.limits.min_distance_shape_m if free else 0.0
 
     def latch(self, i: int) -> Latch:
-        """Return the latch command: armed from the final approach on, open before and when backing out."""
+        """Return the latch command: armed from the final approach on, open before and when backing
+        out.
+        """
         if self._docks[i] is None:
             return "keep"
-        return "arm" if self.chasers[i].phase in (Phase.FINAL, Phase.CONTACT, *ATTACHED) else "release"
+        return (
+            "arm" if self.chasers[i].phase in (Phase.FINAL, Phase.CONTACT, *ATTACHED) else "release"
+        )
 
     def pull_N(self, i: int, now_s: float) -> float:
         """Return the force along -X, CRF, of the latch test."""
         c = self.chasers[i]
-        return pull_N(self._scenario.docking, now_s - c.since_s) if c.phase is Phase.LATCHED else 0.0
+        return (
+            pull_N(self._scenario.docking, now_s - c.since_s) if c.phase is Phase.LATCHED else 0.0
+        )
 
     def dock_offset(self, i: int) -> Array:
         """Return a docked chaser's centre (3,), TRF, for docking at a distance."""
@@ -619,7 +706,7 @@ class PhaseMachine:
         changes, self._changes = self._changes, []
         return changes
 
-    # -- transitions -----------------------------------------------------------------------------------------
+    # -- transitions -------------------------------------------------------------------------------
 
     def _permits(self, i: int, trigger: Trigger) -> bool:
         return next_phase(self.chasers[i].phase, trigger, self._docks[i] is not None) is not None
@@ -635,13 +722,17 @@ class PhaseMachine:
         then: NextMove = NextMove.NONE,
         attempt: int | None = None,
     ) -> None:
-        """Enter the phase that the transition table gives for ``trigger``; do nothing where it gives none."""
+        """Enter the phase that the transition table gives for ``trigger``; do nothing where it
+        gives none.
+        """
         before = self.chasers[i]
         phase = next_phase(before.phase, trigger, self._docks[i] is not None)
         if phase is None:
             return
         number = before.attempt if attempt is None else attempt
-        self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number, faces=before.faces)
+        self.chasers[i] = ChaserGuidance(
+            phase, now_s, move, inside_since_s, then, number, faces=before.faces
+        )
         if phase is not before.phase:
             detail = f"from {before.phase}" + (f": {reason}" if reason else "")
             failed = (
@@ -659,7 +750,12 @@ class PhaseMachine:
         return self._scenario.approach.max_speed_m_s * factor
 
     def _back_out(
-        self, i: int, trigger: Trigger, now_s: float, reason: str = "", then: NextMove = NextMove.NOMINAL
+        self,
+        i: int,
+        trigger: Trigger,
+        now_s: float,
+        reason: str = "",
+        then: NextMove = NextMove.NOMINAL,
     ) -> None:
         """Move to the nominal offset; from inside a corridor first along its axis to the entry."""
         dock = self._docks[i]
@@ -667,7 +763,9 @@ class PhaseMachine:
         speed = self._back_out_speed(Phase.ABORT if aborts else Phase.RETREAT)
         if dock is None or not self.in_corridor(i):
             escape = self._escape(i, now_s) if aborts else None
-            move = escape or self._move(i, np.asarray(self._scenario.chasers[i].position_m), now_s, speed)
+            move = escape or self._move(
+                i, np.asarray(self._scenario.chasers[i].position_m), now_s, speed
+            )
             self._transition(i, trigger, now_s, move, reason)
             return
         if aborts and self.escapes is not None:

@@ -76,7 +76,9 @@ class Trigger(StrEnum):
 
 @dataclass(frozen=True)
 class Transition:
-    """``by_capture``: valid for chasers that dock by capture (True), at a distance (False), or both (None)."""
+    """``by_capture``: valid for chasers that dock by capture (True), at a distance (False), or both
+    (None).
+    """
 
     sources: tuple[Phase, ...]
     trigger: Trigger
@@ -108,7 +110,9 @@ TRANSITIONS = (
     Transition((_P.ALIGN, _P.APPROACH, _P.FINAL), _T.SIGHT_LOST, _P.RETREAT, by_capture=True),
     Transition((_P.CALIBRATE, _P.INSPECT, *_MOVING), _T.COMMAND_HOLD, _P.HOLD),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_HOLD, _P.HOLD, by_capture=False),
-    Transition((_P.WAIT, _P.ALIGN, _P.APPROACH, _P.FINAL), _T.COMMAND_HOLD, _P.HOLD, by_capture=True),
+    Transition(
+        (_P.WAIT, _P.ALIGN, _P.APPROACH, _P.FINAL), _T.COMMAND_HOLD, _P.HOLD, by_capture=True
+    ),
     Transition((_P.HOLD,), _T.COMMAND_CALIBRATE, _P.CALIBRATE),
     Transition((_P.CALIBRATE,), _T.CALIBRATION_COMPLETE, _P.HOLD),
     Transition((_P.HOLD,), _T.COMMAND_INSPECT, _P.INSPECT),
@@ -116,10 +120,14 @@ TRANSITIONS = (
     Transition(_FREE, _T.COMMAND_GOTO, _P.GOTO),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_GOTO, _P.GOTO, by_capture=False),
     Transition((_P.WAIT, _P.ALIGN), _T.COMMAND_GOTO, _P.GOTO, by_capture=True),
-    Transition((_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.ABORT, _P.GOTO), _T.COMMAND_RETREAT, _P.RETREAT),
+    Transition(
+        (_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.ABORT, _P.GOTO), _T.COMMAND_RETREAT, _P.RETREAT
+    ),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_RETREAT, _P.RETREAT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR, *ATTACHED), _T.COMMAND_RETREAT, _P.RETREAT, by_capture=True),
-    Transition((_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.RETREAT, _P.GOTO), _T.COMMAND_ABORT, _P.ABORT),
+    Transition(
+        (_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.RETREAT, _P.GOTO), _T.COMMAND_ABORT, _P.ABORT
+    ),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_ABORT, _P.ABORT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR, *ATTACHED), _T.COMMAND_ABORT, _P.ABORT, by_capture=True),
     Transition(_MOVING, _T.MOVE_COMPLETE, _P.HOLD),
@@ -172,7 +180,9 @@ _COMMANDS = {
 
 
 def next_phase(phase: Phase, trigger: Trigger, by_capture: bool) -> Phase | None:
-    """Return the phase that ``trigger`` leads to from ``phase``, or None where there is no such transition."""
+    """Return the phase that ``trigger`` leads to from ``phase``, or None where there is no such
+    transition.
+    """
     return _TARGETS.get((phase, trigger, by_capture))
 
 

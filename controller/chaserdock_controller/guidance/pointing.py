@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pointing: the search pattern for the target, and the manoeuvre that makes camera errors observable. Pure functions of
-time; SI units, radians.
+"""Pointing: the search pattern for the target, and the manoeuvre that makes camera errors
+observable. Pure functions of time; SI units, radians.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[float, float]:
-    """Return yaw and pitch of the line of sight (about Z and Y of the body at the start) at ``time_s`` of a search.
+    """Return yaw and pitch of the line of sight (about Z and Y of the body at the start) at
+    ``time_s`` of a search.
 
-    The pattern is ellipses about the first line of sight. After the k-th, everything within height/2 + k 0.9 height of it
-    has been in the image. The last ellipse is repeated.
+    The pattern is ellipses about the first line of sight. After the k-th, everything within
+    height/2 + k 0.9 height of it has been in the image. The last ellipse is repeated.
     """
     before, left_s, k = (0.0, 0.0), max(time_s, 0.0), 1
     while True:
@@ -54,7 +55,10 @@ def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[f
         # Circumference of an ellipse (S. Ramanujan, 1914).
         h = ((yaw - pitch) / (yaw + pitch)) ** 2
         round_s = (
-            math.pi * (yaw + pitch) * (1.0 + 3.0 * h / (10.0 + math.sqrt(4.0 - 3.0 * h))) / SEARCH_RATE_RAD_S
+            math.pi
+            * (yaw + pitch)
+            * (1.0 + 3.0 * h / (10.0 + math.sqrt(4.0 - 3.0 * h)))
+            / SEARCH_RATE_RAD_S
         )
         if left_s < out_s:
             # Out along the pitch axis, where the image is lowest.
@@ -68,13 +72,17 @@ def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[f
 
 
 def search_attitude(q_start_wxyz: ArrayLike, camera: Camera, time_s: float) -> Array:
-    """Return the attitude (4,), CRF to WRF, at ``time_s`` of a search that began at ``q_start_wxyz``."""
+    """Return the attitude (4,), CRF to WRF, at ``time_s`` of a search that began at
+    ``q_start_wxyz``.
+    """
     yaw, pitch = search_angles(time_s, *field_of_view(camera))
     return rotations.multiply(q_start_wxyz, rotations.exp([0.0, pitch, yaw]))
 
 
 def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
-    """Return the attitude (4,) nearest to ``q_wxyz``, CRF to WRF, with +X along ``direction_w`` (3,), which is not zero."""
+    """Return the attitude (4,) nearest to ``q_wxyz``, CRF to WRF, with +X along ``direction_w``
+    (3,), which is not zero.
+    """
     a = rotations.rotate(q_wxyz, [1.0, 0.0, 0.0])
     b = np.asarray(direction_w, dtype=float) / np.linalg.norm(np.asarray(direction_w, dtype=float))
     axis, cosine = rotations.cross(a, b), float(a @ b)
@@ -86,8 +94,8 @@ def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
 
 
 def turning_wrench(odometry: Odometry, body: Body, q_wxyz: Array, q_soon_wxyz: Array) -> Array:
-    """Return force and torque (6,), body axes, that brake and turn to ``q_wxyz`` (4,), which moves to ``q_soon_wxyz`` in
-    0.02 s."""
+    """Return force and torque (6,), body axes, that brake and turn to ``q_wxyz`` (4,), which moves
+    to ``q_soon_wxyz`` in 0.02 s."""
     wrench = brake_wrench(odometry, body)
     error = rotations.log(rotations.multiply(rotations.conjugate(odometry.q_wxyz), q_wxyz))
     ahead = rotations.log(rotations.multiply(rotations.conjugate(q_wxyz), q_soon_wxyz)) / _STEP_S
@@ -108,11 +116,12 @@ def search_wrench(
 
 
 def calibration_turns(times_s: ArrayLike) -> Array:
-    """Return rotations (K, 4) of the body from its reference attitude at times (K,) of the calibration manoeuvre; identity
-    before and after it.
+    """Return rotations (K, 4) of the body from its reference attitude at times (K,) of the
+    calibration manoeuvre; identity before and after it.
 
-    Rotation about the line of sight makes the mounting's yaw and pitch observable, small rotations about the other axes its
-    roll: three sines of one, two and three periods, with smooth ends (fifth-degree polynomials).
+    Rotation about the line of sight makes the mounting's yaw and pitch observable, small rotations
+    about the other axes its roll: three sines of one, two and three periods, with smooth ends
+    (fifth-degree polynomials).
     """
     t = np.clip(np.asarray(times_s, dtype=float), 0.0, CALIBRATION_S)
     x = np.clip(np.minimum(t, CALIBRATION_S - t) / _RAMP_S, 0.0, 1.0)

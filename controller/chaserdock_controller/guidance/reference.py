@@ -1,14 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predicted motion of the target, reference poses and feed-forward wrenches.
 
-The target moves at constant velocity (WRF) and constant body rate. Pure functions; SI units, radians.
+The target moves at constant velocity (WRF) and constant body rate. Pure functions; SI units,
+radians.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.rotations import conjugate, cross, exp, multiply, normalize, rotate, rotate_inverse
+from chaserdock_models.rotations import (
+    conjugate,
+    cross,
+    exp,
+    multiply,
+    normalize,
+    rotate,
+    rotate_inverse,
+)
 from numpy.typing import ArrayLike
 
 from chaserdock_controller.estimation.target_body import TargetPath
@@ -21,10 +30,11 @@ def predict_target(
     omega_rad_s: ArrayLike,
     times_s: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Return target positions (K, 3) in WRF and attitudes (K, 4) body to world at ``times_s`` (K,) from now.
+    """Return target positions (K, 3) in WRF and attitudes (K, 4) body to world at ``times_s`` (K,)
+    from now.
 
-    position and velocity (3,) in WRF, q_wxyz (4,), omega (3,) in TRF. Exact for constant velocity and body rate:
-    q(t) = q (x) exp(omega t). Raises ValueError for a zero quaternion.
+    position and velocity (3,) in WRF, q_wxyz (4,), omega (3,) in TRF. Exact for constant velocity
+    and body rate: q(t) = q (x) exp(omega t). Raises ValueError for a zero quaternion.
     """
     times = np.asarray(times_s, dtype=float)[:, None]
     positions = np.asarray(position_m, dtype=float) + times * np.asarray(velocity_m_s, dtype=float)
@@ -43,8 +53,9 @@ def reference_trajectory(
 ) -> Array:
     """Return reference poses (K, 7): p (WRF, m), q_wxyz (chaser body to world) at ``times_s`` (K,).
 
-    Target arguments as in `predict_target`; offset_position_m (K, 3) or (3,) in TRF, q_off_wxyz (4,) or (K, 4) chaser
-    body to TRF. p_ref = p_tar + q_tar p_off q_tar*, q_ref = q_tar q_off (paper, section 4.1).
+    Target arguments as in `predict_target`; offset_position_m (K, 3) or (3,) in TRF, q_off_wxyz
+    (4,) or (K, 4) chaser body to TRF. p_ref = p_tar + q_tar p_off q_tar*, q_ref = q_tar q_off
+    (paper, section 4.1).
     """
     positions, attitudes = predict_target(position_m, velocity_m_s, q_wxyz, omega_rad_s, times_s)
     return references_on(positions, attitudes, offset_position_m, normalize(q_off_wxyz))
@@ -53,13 +64,17 @@ def reference_trajectory(
 def references_on(
     positions_m: Array, attitudes_wxyz: Array, offset_position_m: ArrayLike, q_off_wxyz: ArrayLike
 ) -> Array:
-    """Return reference poses (..., K, 7) for a target at ``positions_m`` (K, 3), WRF, and ``attitudes_wxyz`` (K, 4).
+    """Return reference poses (..., K, 7) for a target at ``positions_m`` (K, 3), WRF, and
+    ``attitudes_wxyz`` (K, 4).
 
-    As `reference_trajectory`, for any motion of the target and, with leading axes, for several chasers; ``q_off_wxyz``
-    is of unit length.
+    As `reference_trajectory`, for any motion of the target and, with leading axes, for several
+    chasers; ``q_off_wxyz`` is of unit length.
     """
     return np.concatenate(
-        [positions_m + rotate(attitudes_wxyz, offset_position_m), multiply(attitudes_wxyz, q_off_wxyz)],
+        [
+            positions_m + rotate(attitudes_wxyz, offset_position_m),
+            multiply(attitudes_wxyz, q_off_wxyz),
+        ],
         axis=-1,
     )
 
@@ -73,7 +88,8 @@ def reference_state(
     offset_velocity_m_s: ArrayLike,
     q_off_wxyz: ArrayLike,
 ) -> Array:
-    """Return the state (13,) of a chaser exactly on its reference: p, v (WRF), q_wxyz, omega (chaser body).
+    """Return the state (13,) of a chaser exactly on its reference: p, v (WRF), q_wxyz, omega
+    (chaser body).
 
     Target arguments as in `predict_target`; offset position and velocity (3,) in TRF.
     """
@@ -93,7 +109,8 @@ def reference_state(
 def seen_from(
     target: TargetPath, position_m: Array, velocity_m_s: Array, acceleration_m_s2: Array
 ) -> tuple[Array, Array, Array]:
-    """Return positions, velocities and accelerations (K, 3) in TRF of a motion (K, 3) relative to TRF's origin in WRF.
+    """Return positions, velocities and accelerations (K, 3) in TRF of a motion (K, 3) relative to
+    TRF's origin in WRF.
 
     The inverse of the acceleration in a rotating frame, see ``feed_forward``.
     """
@@ -115,16 +132,17 @@ def feed_forward(
     alpha_rad_s2: ArrayLike = (0.0, 0.0, 0.0),
     origin_acceleration_m_s2: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Array:
-    """Return the force and torque (..., K, 6), N and N m in chaser body axes, needed to follow the reference.
+    """Return the force and torque (..., K, 6), N and N m in chaser body axes, needed to follow the
+    reference.
 
-    omega, alpha (its derivative) and the acceleration of TRF's origin: each (3,) or (K, 3), in TRF axes. Offset
-    position, velocity and acceleration (..., K, 3) in TRF, one row per instant (for an input held over a stage, give the
-    stage's middle), leading axes for several chasers; q_off_wxyz, unit, (4,) or (..., K, 4) chaser body to TRF, whose
-    own rotation is neglected.
-    Acceleration in a rotating frame, a = a_0 + p'' + alpha x p + 2 omega x p' + omega x (omega x p) (Goldstein,
-    "Classical Mechanics", eq. 4.91), turned into body axes; torque I alpha_b + omega_b x I omega_b. The
-    target's position, velocity and attitude do not enter: in body axes the wrench is the same anywhere.
-    Raises ValueError for a mass that is not positive.
+    omega, alpha (its derivative) and the acceleration of TRF's origin: each (3,) or (K, 3), in TRF
+    axes. Offset position, velocity and acceleration (..., K, 3) in TRF, one row per instant (for an
+    input held over a stage, give the stage's middle), leading axes for several chasers; q_off_wxyz,
+    unit, (4,) or (..., K, 4) chaser body to TRF, whose own rotation is neglected. Acceleration in a
+    rotating frame, a = a_0 + p'' + alpha x p + 2 omega x p' + omega x (omega x p) (Goldstein,
+    "Classical Mechanics", eq. 4.91), turned into body axes; torque I alpha_b + omega_b x I omega_b.
+    The target's position, velocity and attitude do not enter: in body axes the wrench is the same
+    anywhere. Raises ValueError for a mass that is not positive.
     """
     if not mass_kg > 0.0:
         raise ValueError(f"mass_kg must be positive, not {mass_kg!r}")
@@ -136,7 +154,9 @@ def feed_forward(
     )
     alpha, inertia = np.asarray(alpha_rad_s2, dtype=float), np.asarray(inertia_kg_m2, dtype=float)
     acceleration = a + 2.0 * cross(omega, v) + cross(omega, cross(omega, p))
-    acceleration = acceleration + cross(alpha, p) + np.asarray(origin_acceleration_m_s2, dtype=float)
+    acceleration = (
+        acceleration + cross(alpha, p) + np.asarray(origin_acceleration_m_s2, dtype=float)
+    )
     q_off = np.asarray(q_off_wxyz, dtype=float)
     omega_body = rotate_inverse(q_off, omega)
     torque = cross(omega_body, omega_body @ inertia.T) + rotate_inverse(q_off, alpha) @ inertia.T

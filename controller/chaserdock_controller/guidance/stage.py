@@ -61,7 +61,9 @@ class GuidanceStage:
         estimation: TargetEstimation,
         history: PlanningHistory,
     ) -> GuidanceResult:
-        """Return what every chaser is to do in this tick; ``history``: how planning went in the ticks before."""
+        """Return what every chaser is to do in this tick; ``history``: how planning went in the
+        ticks before.
+        """
         self._follow_estimate(observation, estimation)
         self._follow_relative_states(estimation)
         self.machine.update_planning(observation.time_s, history.failures(observation.time_ns))
@@ -96,7 +98,8 @@ class GuidanceStage:
                 isolated=self._isolated(i, estimation),
                 trusted=self.thrusters.trusted(i),
                 reference=references.get(i),
-                direct=thrusts.get(i) or self._direct_command(i, observation, estimation, i in attached),
+                direct=thrusts.get(i)
+                or self._direct_command(i, observation, estimation, i in attached),
             )
         return GuidanceResult(
             directives,
@@ -132,20 +135,29 @@ class GuidanceStage:
             escapes.relative[i] = RelativeState(state, covariance, target)
 
     def _update_abort_margins(self, observation: Observation) -> dict[int, float]:
-        """Return the margin of the best abort of each chaser whose passive safety is enforced, renewed once a second."""
+        """Return the margin of the best abort of each chaser whose passive safety is enforced,
+        renewed once a second.
+        """
         escapes, machine = self.machine.escapes, self.machine
         if escapes is None:
             return {}
         enforced = [i for i in sorted(observation.odometry) if machine.enforces_safety(i)]
         renew = observation.tick % self._scenario.time.rate_hz == 0
         for i in enforced:
-            if (renew or i not in self._abort_margins) and (found := escapes.escape(i, observation.time_s)):
+            if (renew or i not in self._abort_margins) and (
+                found := escapes.escape(i, observation.time_s)
+            ):
                 self._abort_margins[i] = found[1]
-        self._abort_margins = {i: self._abort_margins[i] for i in enforced if i in self._abort_margins}
+        self._abort_margins = {
+            i: self._abort_margins[i] for i in enforced if i in self._abort_margins
+        }
         return dict(self._abort_margins)
 
     def _apply_commands(
-        self, commands: Sequence[OperatorCommand], observation: Observation, stack: StackState | None
+        self,
+        commands: Sequence[OperatorCommand],
+        observation: Observation,
+        stack: StackState | None,
     ) -> list[CommandReply]:
         now_s = observation.time_s
         self.machine.set_pending_goals(commands)
@@ -168,10 +180,17 @@ class GuidanceStage:
         return replies
 
     def _why_not_detumble(
-        self, commands: Sequence[OperatorCommand], observation: Observation, stack: StackState | None
+        self,
+        commands: Sequence[OperatorCommand],
+        observation: Observation,
+        stack: StackState | None,
     ) -> str:
-        """Return why the chasers that one tick's commands name cannot stop the stack together with those that do already."""
-        named = {c.chaser for c in commands if c.command == "detumble" and c.chaser < len(self.chasers)}
+        """Return why the chasers that one tick's commands name cannot stop the stack together with
+        those that do already.
+        """
+        named = {
+            c.chaser for c in commands if c.command == "detumble" and c.chaser < len(self.chasers)
+        }
         able = {i for i in named if self.machine.may_detumble(i)}
         if not able:
             return ""
@@ -180,7 +199,9 @@ class GuidanceStage:
     def _detumble_commands(
         self, observation: Observation, stack: StackState | None
     ) -> Mapping[int, DirectCommand]:
-        """Return the commands of chasers that move the stack, by chaser. Pulses that identify it wait while it is stopped."""
+        """Return the commands of chasers that move the stack, by chaser. Pulses that identify it
+        wait while it is stopped.
+        """
         detumbling = self.machine.detumbling() & observation.odometry.keys()
         active = detumbling or self.machine.identifying() & observation.odometry.keys()
         if stack is None or not active:
@@ -196,12 +217,17 @@ class GuidanceStage:
         return self.detumble.commands(stack, active, observation.isolated, task, observation)
 
     def _leaving(self) -> list[int]:
-        """Return the chasers that back out of their corridor: the stack must not turn under them by thrust."""
+        """Return the chasers that back out of their corridor: the stack must not turn under them by
+        thrust.
+        """
         out = (Phase.RETREAT, Phase.ABORT)
         return [
             i
             for i, c in enumerate(self.chasers)
-            if c.phase in out and not c.stuck and self.machine.is_free(i) and self.machine.in_corridor(i)
+            if c.phase in out
+            and not c.stuck
+            and self.machine.is_free(i)
+            and self.machine.in_corridor(i)
         ]
 
     def _report_waiting(self) -> list[LogEntry]:
@@ -216,7 +242,9 @@ class GuidanceStage:
         return [("info", f"the stack coasts while chaser {leaving[0]} backs out")]
 
     def _update_stack(self, observation: Observation, stack: StackState | None) -> None:
-        """Advance the phases of detumbling chasers; close their thrusters if those that are left cannot stop the stack."""
+        """Advance the phases of detumbling chasers; close their thrusters if those that are left
+        cannot stop the stack.
+        """
         self.machine.update_identification(observation.time_s)
         active = self.machine.detumbling()
         if not active or stack is None:
@@ -230,8 +258,12 @@ class GuidanceStage:
             observation.time_s, self.detumble.is_stopped(stack), self.detumble.moves_again(stack)
         )
 
-    def _update_chaser(self, i: int, observation: Observation, estimation: TargetEstimation) -> ReferencePose:
-        """Advance a chaser's phase by its errors and its docking sensor; return its reference at the start of the tick."""
+    def _update_chaser(
+        self, i: int, observation: Observation, estimation: TargetEstimation
+    ) -> ReferencePose:
+        """Advance a chaser's phase by its errors and its docking sensor; return its reference at
+        the start of the tick.
+        """
         target, odometry, now_s = estimation.target, estimation.own[i], observation.time_s
         pose = self.references.pose(i, target, now_s)
         error_m = length(pose[0] - odometry.position_m)
@@ -257,7 +289,9 @@ class GuidanceStage:
         """Return the thrusters that an operator or the motion of the stack has isolated."""
         failed = () if estimation.stack is None else estimation.stack.failed.get(i, ())
         trusted = self.thrusters.trusted(i)
-        return tuple(sorted({*self.thrusters.isolated(i), *(k for k in failed if k not in trusted)}))
+        return tuple(
+            sorted({*self.thrusters.isolated(i), *(k for k in failed if k not in trusted)})
+        )
 
     def _observe_docking(
         self, i: int, odometry: Odometry, observation: Observation, estimation: TargetEstimation
@@ -273,15 +307,23 @@ class GuidanceStage:
             np.array(odometry.q_wxyz),
             np.array(odometry.omega_rad_s),
         )
-        moving = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
-        view = view_of(port, s.chaser.probe_reach_m, np.asarray(s.chasers[i].q_wxyz), chaser, moving)
+        moving = BodyState(
+            target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s
+        )
+        view = view_of(
+            port, s.chaser.probe_reach_m, np.asarray(s.chasers[i].q_wxyz), chaser, moving
+        )
         status = observation.docking.get(i)
         contact = status is not None and status.contact
         pose = pose_in_target(target, odometry)
-        return DockingObservation(view, contact, i in estimation.latched, *pose, sensed=status is not None)
+        return DockingObservation(
+            view, contact, i in estimation.latched, *pose, sensed=status is not None
+        )
 
     def _attached(self, observation: Observation, estimation: TargetEstimation) -> frozenset[int]:
-        """Return the latched chasers that are to stay, or cannot leave; their actuators are off but for the latch test."""
+        """Return the latched chasers that are to stay, or cannot leave; their actuators are off but
+        for the latch test.
+        """
         backing_out = (Phase.RETREAT, Phase.ABORT)
         latched = estimation.latched & observation.odometry.keys()
         return frozenset(
@@ -308,7 +350,9 @@ class GuidanceStage:
 
     def _events(self, estimation: TargetEstimation) -> list[LogEntry]:
         changes = self.machine.drain_changes()
-        events: list[LogEntry] = [(c.level, f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in changes]
+        events: list[LogEntry] = [
+            (c.level, f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in changes
+        ]
         for change in changes:
             camera = next((c for c in estimation.cameras if c.chaser == change.chaser), None)
             if change.calibration_complete and camera is not None:
@@ -317,5 +361,7 @@ class GuidanceStage:
 
 
 def _describe(c: CameraCalibration) -> str:
-    turn, sigma = (", ".join(f"{np.degrees(v):.3f}" for v in x) for x in (c.turn_rad, c.turn_sigma_rad))
+    turn, sigma = (
+        ", ".join(f"{np.degrees(v):.3f}" for v in x) for x in (c.turn_rad, c.turn_sigma_rad)
+    )
     return f"camera calibrated: turned by ({turn}) deg in CRF, sigma ({sigma}) deg"

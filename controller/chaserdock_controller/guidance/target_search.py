@@ -20,15 +20,16 @@ from .pointing import facing, search_wrench, turning_wrench
 # Largest sigmas of the target's rates with which a chaser leaves the search.
 _SETTLED_M_S, _SETTLED_RAD_S = 0.01, 0.02
 _PAUSE_S, _BETWEEN_PAUSES_S = 8.0, 2.0
-"""Longest time for which a chaser stops turning while it searches one of its images, and least time of turning between two of these:
-an acquisition by shape takes up to 120 images, and half a field of view passes in 2 s."""
+"""Longest time for which a chaser stops turning while it searches one of its images, and least time
+of turning between two of these: an acquisition by shape takes up to 120 images, and half a field of
+view passes in 2 s."""
 
 
 class SearchProgress(Struct, frozen=True):
     """Search of one chaser: its begin and the attitude there, and its pauses.
 
-    ``paused_s``: of all pauses; ``pause_s``: of the present one; ``resumed_s``: when the last one ended; ``updated_s``: time of this
-    state.
+    ``paused_s``: of all pauses; ``pause_s``: of the present one; ``resumed_s``: when the last one
+    ended; ``updated_s``: time of this state.
     """
 
     since_s: float
@@ -39,7 +40,8 @@ class SearchProgress(Struct, frozen=True):
     resumed_s: float = -math.inf
 
     def at(self, now_s: float, acquiring: bool | None) -> SearchProgress:
-        """Return the progress at ``now_s`` of a chaser that is ``acquiring`` the target in an earlier image, or is not.
+        """Return the progress at ``now_s`` of a chaser that is ``acquiring`` the target in an
+        earlier image, or is not.
 
         None: not known, as no sighting has come; a pause goes on.
         """
@@ -49,7 +51,10 @@ class SearchProgress(Struct, frozen=True):
         begins = self.pause_s > 0.0 or now_s - self.resumed_s >= _BETWEEN_PAUSES_S
         if acquiring and begins and self.pause_s < _PAUSE_S:
             return replace(
-                self, updated_s=now_s, paused_s=self.paused_s + step_s, pause_s=self.pause_s + step_s
+                self,
+                updated_s=now_s,
+                paused_s=self.paused_s + step_s,
+                pause_s=self.pause_s + step_s,
             )
         resumed_s = now_s if self.pause_s > 0.0 else self.resumed_s
         return replace(self, updated_s=now_s, pause_s=0.0, resumed_s=resumed_s)
@@ -60,7 +65,9 @@ def is_settled(target: TargetState) -> bool:
     v = target.covariance.diagonal().tolist()
     if v[3] + v[4] + v[5] < _SETTLED_M_S**2 and v[9] + v[10] + v[11] < _SETTLED_RAD_S**2:
         return True  # no eigenvalue is larger than the trace
-    largest = [float(np.linalg.eigvalsh(target.covariance[i : i + 3, i : i + 3])[-1]) for i in (3, 9)]
+    largest = [
+        float(np.linalg.eigvalsh(target.covariance[i : i + 3, i : i + 3])[-1]) for i in (3, 9)
+    ]
     return largest[0] < _SETTLED_M_S**2 and largest[1] < _SETTLED_RAD_S**2
 
 
@@ -76,8 +83,8 @@ class TargetSearch:
     ) -> Array:
         """Return force and torque (6,), body axes, of a chaser that has searched since ``since_s``.
 
-        The chaser turns along the search pattern, with pauses in which it is ``acquiring`` the target in an earlier image, or to the
-        target once its pose is known.
+        The chaser turns along the search pattern, with pauses in which it is ``acquiring`` the
+        target in an earlier image, or to the target once its pose is known.
         """
         if target.status in ("tracking", "predicting"):
             q = facing(odometry.q_wxyz, target.position_m - odometry.position_m)

@@ -30,13 +30,19 @@ class ThrusterCommandHandler:
         return tuple(sorted(self._isolated.get(chaser, ())))
 
     def trusted(self, chaser: int) -> tuple[int, ...]:
-        """Return the thrusters that an operator has restored, which fault detection must not isolate."""
+        """Return the thrusters that an operator has restored, which fault detection must not
+        isolate.
+        """
         return tuple(sorted(self._trusted.get(chaser, ())))
 
     def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
-        """Apply or refuse a command. Of different commands to one thruster in one tick only the first is accepted."""
+        """Apply or refuse a command. Of different commands to one thruster in one tick only the
+        first is accepted.
+        """
         i, thruster = command.chaser, command.thruster
-        reason = validation.why_unknown_chaser(i, self._chasers) or validation.why_stale(command, now_s)
+        reason = validation.why_unknown_chaser(i, self._chasers) or validation.why_stale(
+            command, now_s
+        )
         if not reason and self._thrusters == 0:
             reason = 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
         if reason:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Smooth motions of a reference position: polynomials between states of motion. Pure functions.
 
-A motion from rest to rest is the fifth-degree polynomial of least jerk (T. Flash and N. Hogan, 1985). A motion from
-a moving state adds the polynomial that brings the current motion to rest: a single polynomial with initial acceleration
-overshoots more the longer it takes, and may not reach a bound on its speed. Acceleration is continuous, and so is the
-feed-forward.
+A motion from rest to rest is the fifth-degree polynomial of least jerk (T. Flash and N. Hogan,
+1985). A motion from a moving state adds the polynomial that brings the current motion to rest: a
+single polynomial with initial acceleration overshoots more the longer it takes, and may not reach a
+bound on its speed. Acceleration is continuous, and so is the feed-forward.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ _SAMPLES_PER_PART = np.linspace(0.0, 1.0, 41)
 
 
 class Part(Struct, frozen=True, eq=False, dict=True):
-    """A polynomial over ``duration_s`` with ``coefficients`` (6, 3) of powers of time, metres and seconds. Ends at rest."""
+    """A polynomial over ``duration_s`` with ``coefficients`` (6, 3) of powers of time, metres and
+    seconds. Ends at rest.
+    """
 
     duration_s: float
     coefficients: Array
@@ -81,10 +83,14 @@ class Move(Struct, frozen=True, eq=False, tag=True):
         return self.at(np.array([self.start_s + self.duration_s]))[0][0]
 
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and after."""
+        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and
+        after.
+        """
         t = np.asarray(times_s, dtype=float) - self.start_s
         earliest_s = float(t.min(initial=math.inf))
-        if all(earliest_s > part.duration_s for part in self.parts):  # a chaser that holds, most of the time
+        if all(
+            earliest_s > part.duration_s for part in self.parts
+        ):  # a chaser that holds, most of the time
             position = sum((part.rest(len(t)) for part in self.parts), start=np.zeros((len(t), 3)))
             return position, _at_rest(len(t)), _at_rest(len(t))
         position, velocity, acceleration = np.zeros((3, len(t), 3))
@@ -105,7 +111,9 @@ class Move(Struct, frozen=True, eq=False, tag=True):
         return time_s >= self.start_s + self.duration_s
 
     def _fastest(self) -> float:
-        times = np.concatenate([self.start_s + part.duration_s * _SAMPLES_PER_PART for part in self.parts])
+        times = np.concatenate(
+            [self.start_s + part.duration_s * _SAMPLES_PER_PART for part in self.parts]
+        )
         return float(np.linalg.norm(self.at(times)[1], axis=1).max())
 
 
@@ -119,8 +127,9 @@ def stay(position_m: ArrayLike, time_s: float) -> Move:
 class Glide(Struct, frozen=True, eq=False, tag=True):
     """A straight path at piecewise constant speeds with smooth changes, from rest to rest.
 
-    It begins at ``from_m`` (3,) along the unit vector ``along`` (3,). ``speeds_m_s`` (n,) are held for ``holds_s`` (n,), with
-    ramps of ``ramps_s`` (n + 1,) before, between and after them: cubics in speed with zero slope at both ends.
+    It begins at ``from_m`` (3,) along the unit vector ``along`` (3,). ``speeds_m_s`` (n,) are held
+    for ``holds_s`` (n,), with ramps of ``ramps_s`` (n + 1,) before, between and after them: cubics
+    in speed with zero slope at both ends.
     """
 
     start_s: float
@@ -144,7 +153,9 @@ class Glide(Struct, frozen=True, eq=False, tag=True):
         return time_s >= self.start_s + self.duration_s
 
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and after."""
+        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and
+        after.
+        """
         t = np.asarray(times_s, dtype=float) - self.start_s
         distance, speed, acceleration = np.zeros((3, len(t)))
         begin, v = 0.0, 0.0
@@ -161,14 +172,20 @@ class Glide(Struct, frozen=True, eq=False, tag=True):
             speed += np.where((t >= begin) & (t < begin + hold_s), v, 0.0)
             begin += hold_s
         along = self.along
-        return self.from_m + distance[:, None] * along, speed[:, None] * along, acceleration[:, None] * along
+        return (
+            self.from_m + distance[:, None] * along,
+            speed[:, None] * along,
+            acceleration[:, None] * along,
+        )
 
 
 class Escape(Struct, frozen=True, eq=False, tag=True):
-    """A constant acceleration for ``burn_s`` in addition to a coast, then the coast. Relative to the target's centre, in WRF.
+    """A constant acceleration for ``burn_s`` in addition to a coast, then the coast. Relative to
+    the target's centre, in WRF.
 
-    ``state`` (6,): position and velocity at ``start_s``; ``acceleration_m_s2`` (3,). The coast is that of Clohessy and Wiltshire,
-    in free space (``mean_motion_rad_s`` = 0) a straight line. After ``duration_s`` it counts as complete, and goes on.
+    ``state`` (6,): position and velocity at ``start_s``; ``acceleration_m_s2`` (3,). The coast is
+    that of Clohessy and Wiltshire, in free space (``mean_motion_rad_s`` = 0) a straight line. After
+    ``duration_s`` it counts as complete, and goes on.
     """
 
     start_s: float
@@ -210,10 +227,12 @@ class Escape(Struct, frozen=True, eq=False, tag=True):
 
 
 class Circuit(Struct, frozen=True, eq=False, tag=True):
-    """One turn about an axis through TRF's origin, from rest to rest: the angle follows the polynomial of least jerk.
+    """One turn about an axis through TRF's origin, from rest to rest: the angle follows the
+    polynomial of least jerk.
 
-    ``from_m`` (3,): start; ``axis`` (3,): unit vector. The distance from the origin changes to ``distance_m`` over the first quarter
-    of the time, as smoothly. The end is the start at that distance.
+    ``from_m`` (3,): start; ``axis`` (3,): unit vector. The distance from the origin changes to
+    ``distance_m`` over the first quarter of the time, as smoothly. The end is the start at that
+    distance.
     """
 
     start_s: float
@@ -232,7 +251,9 @@ class Circuit(Struct, frozen=True, eq=False, tag=True):
         return time_s >= self.start_s + self.duration_s
 
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and after."""
+        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and
+        after.
+        """
         t = np.asarray(times_s, dtype=float) - self.start_s
         angle, rate, angular = (2.0 * math.pi * x for x in _least_jerk(t, self.duration_s))
         start_m = float(np.linalg.norm(self.from_m))
@@ -251,7 +272,9 @@ class Circuit(Struct, frozen=True, eq=False, tag=True):
 
 
 def _least_jerk(t: Array, duration_s: float) -> tuple[Array, Array, Array]:
-    """Return the fifth-degree polynomial of least jerk from 0 to 1 at times (K,), with its first and second derivative."""
+    """Return the fifth-degree polynomial of least jerk from 0 to 1 at times (K,), with its first
+    and second derivative.
+    """
     x = np.clip(t / duration_s, 0.0, 1.0)
     value = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
     first = 30.0 * x**2 * (1.0 - x) ** 2 / duration_s
@@ -259,11 +282,14 @@ def _least_jerk(t: Array, duration_s: float) -> tuple[Array, Array, Array]:
     return value, first, second
 
 
-def circuit(from_m: ArrayLike, axis: ArrayLike, distance_m: float, now_s: float, speed_m_s: float) -> Circuit:
-    """Return a turn from rest at ``from_m`` (3,) about ``axis`` (3,), any length, as fast as ``speed_m_s`` at the equator.
+def circuit(
+    from_m: ArrayLike, axis: ArrayLike, distance_m: float, now_s: float, speed_m_s: float
+) -> Circuit:
+    """Return a turn from rest at ``from_m`` (3,) about ``axis`` (3,), any length, as fast as
+    ``speed_m_s`` at the equator.
 
-    The duration does not depend on the start, so that chasers that begin together keep their angles to each other. Raises ValueError
-    for a speed or a distance that is not positive.
+    The duration does not depend on the start, so that chasers that begin together keep their angles
+    to each other. Raises ValueError for a speed or a distance that is not positive.
     """
     if not (speed_m_s > 0.0 and distance_m > 0.0):
         raise ValueError(f"speed and distance must be positive, not {speed_m_s} and {distance_m}")
@@ -278,12 +304,18 @@ Motion = Move | Glide | Escape | Circuit
 
 
 def glide(
-    from_m: ArrayLike, along: ArrayLike, now_s: float, fast: tuple[float, float], slow: tuple[float, float]
+    from_m: ArrayLike,
+    along: ArrayLike,
+    now_s: float,
+    fast: tuple[float, float],
+    slow: tuple[float, float],
 ) -> Glide:
-    """Return a glide from rest at ``from_m`` (3,) along a unit vector (3,): ``fast``, then ``slow``, each (length m, speed m/s).
+    """Return a glide from rest at ``from_m`` (3,) along a unit vector (3,): ``fast``, then
+    ``slow``, each (length m, speed m/s).
 
-    The ramp from fast to slow ends where the first length ends; the second length includes the stop. A length too short
-    for its ramps is flown at the speed that it allows. Raises ValueError for lengths or speeds that are not positive.
+    The ramp from fast to slow ends where the first length ends; the second length includes the
+    stop. A length too short for its ramps is flown at the speed that it allows. Raises ValueError
+    for lengths or speeds that are not positive.
     """
     if min(*fast, *slow) <= 0.0:
         raise ValueError(f"lengths and speeds must be positive, not {fast} and {slow}")
@@ -305,7 +337,8 @@ def glide(
 def stop(current: Motion, now_s: float) -> Move:
     """Return a move that brings ``current`` to rest in 3 s.
 
-    Its velocity is the cubic from the velocity and acceleration of ``current`` to zero velocity and acceleration.
+    Its velocity is the cubic from the velocity and acceleration of ``current`` to zero velocity and
+    acceleration.
     """
     p, v, a = (x[0] for x in current.at(np.array([now_s])))
     if not (v.any() or a.any()):
@@ -321,16 +354,19 @@ def _straight(displacement: Array, duration_s: float) -> Part:
 
 
 def move_to(current: Motion, goal_m: ArrayLike, now_s: float, max_speed_m_s: float) -> Move:
-    """Return a move from the state of ``current`` at ``now_s`` to rest at ``goal_m`` (3,), at most at ``max_speed_m_s``.
+    """Return a move from the state of ``current`` at ``now_s`` to rest at ``goal_m`` (3,), at most
+    at ``max_speed_m_s``.
 
-    Where ``stop`` is faster than that, its speed is the limit (both within half a percent). Raises ValueError unless the
-    speed is positive.
+    Where ``stop`` is faster than that, its speed is the limit (both within half a percent). Raises
+    ValueError unless the speed is positive.
     """
     if not max_speed_m_s > 0.0:
         raise ValueError(f"max_speed_m_s must be positive, not {max_speed_m_s}")
     stopping = stop(current, now_s)
     displacement = np.asarray(goal_m, dtype=float) - stopping.goal_m
-    limit = max(max_speed_m_s, stopping._fastest()) * 1.005  # more than what lies between two samples
+    limit = (
+        max(max_speed_m_s, stopping._fastest()) * 1.005
+    )  # more than what lies between two samples
     duration_s = max(_SHORTEST_S, PEAK_SPEED * float(np.linalg.norm(displacement)) / max_speed_m_s)
     move = Move(now_s, (*stopping.parts, _straight(displacement, duration_s)))
     # Terminates: the longer the displacement takes, the less it adds to the speed of stopping.

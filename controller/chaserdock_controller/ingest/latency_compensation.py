@@ -35,7 +35,8 @@ class CommandHistory:
     def ahead(self, chaser: int, from_ns: int, to_ns: int) -> tuple[tuple[float, Array], ...]:
         """Return what acts between two times as durations (s) and wrenches (6,)."""
         return tuple(
-            ((end - begin) / 1e9, wrench) for begin, end, wrench in self.segments(chaser, from_ns, to_ns)
+            ((end - begin) / 1e9, wrench)
+            for begin, end, wrench in self.segments(chaser, from_ns, to_ns)
         )
 
     def forget_before(self, time_ns: int) -> None:
@@ -48,11 +49,14 @@ class CommandHistory:
 def predict_state(
     odometry: Odometry, ahead: Iterable[tuple[float, Array]], disturbance: Array, body: RigidBody
 ) -> Array:
-    """Return the state (13,) of a chaser after all of ``ahead``: durations (s) and wrenches (6,) that act on it.
+    """Return the state (13,) of a chaser after all of ``ahead``: durations (s) and wrenches (6,)
+    that act on it.
 
     ``disturbance`` (6,) acts as well. Wrenches are force and torque in body axes, N and N m.
     """
-    x = np.array([*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s])
+    x = np.array(
+        [*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s]
+    )
     for duration_s, wrench in ahead:
         x = propagate(x, wrench + disturbance, body, duration_s)
     return x

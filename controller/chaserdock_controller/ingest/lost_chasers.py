@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chasers without odometry for a while. No I/O.
 
-They are taken to coast, as a chaser does whose process has stopped. The margin that other chasers keep grows with the time
-since the last odometry; it covers a chaser that brakes by its fallback for a while. After ``FORGOTTEN_S`` the position is
-unknown, and the chaser is no obstacle any more.
+They are taken to coast, as a chaser does whose process has stopped. The margin that other chasers
+keep grows with the time since the last odometry; it covers a chaser that brakes by its fallback for
+a while. After ``FORGOTTEN_S`` the position is unknown, and the chaser is no obstacle any more.
 """
 
 from __future__ import annotations
@@ -43,13 +43,17 @@ class LostChasers:
                 text = f"chaser {i}: no odometry for {FORGOTTEN_S:g} s; it is no obstacle any more"
                 events.append(("warning", text))
         for i in sorted(lost.keys() - self.reported):
-            events.append(("warning", f"chaser {i}: lost; the others avoid its extrapolated position"))
+            events.append(
+                ("warning", f"chaser {i}: lost; the others avoid its extrapolated position")
+            )
         self.reported = set(lost)
         return events
 
     def absent(self, now_ns: int) -> frozenset[int]:
         """Return the chasers whose last odometry is ``ABSENT_S`` old or older."""
-        return frozenset(i for i, o in self.last.items() if (now_ns - o.sim_time_ns) / 1e9 >= ABSENT_S)
+        return frozenset(
+            i for i, o in self.last.items() if (now_ns - o.sim_time_ns) / 1e9 >= ABSENT_S
+        )
 
     def obstacles(self, now_ns: int) -> dict[int, Odometry]:
         """Return the last odometry of the lost chasers that are obstacles."""

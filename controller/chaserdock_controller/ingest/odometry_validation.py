@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation of odometry: states that no rigid body can have, and jumps that a chaser cannot have made. No I/O.
+"""Validation of odometry: states that no rigid body can have, and jumps that a chaser cannot have
+made. No I/O.
 
-A chaser whose odometry jumps would fly to the wrong place, through the target if that lies between. A jump is
-therefore removed and the state before it continued; a jump back removes the correction. Where sightings contradict the
-state before the jump and have never confirmed it, the jump may lead back to the truth, and is accepted.
+A chaser whose odometry jumps would fly to the wrong place, through the target if that lies between.
+A jump is therefore removed and the state before it continued; a jump back removes the correction.
+Where sightings contradict the state before the jump and have never confirmed it, the jump may lead
+back to the truth, and is accepted.
 """
 
 from __future__ import annotations
@@ -59,12 +61,15 @@ def _why_no_covariances(*covariances: tuple[float, ...]) -> str:
     """Return which of ``COVARIANCES`` is none, or an empty string."""
     named = zip(COVARIANCES, covariances, strict=True)
     return next(
-        (f"{name} is not a covariance" for name, elements in named if not _is_covariance(elements)), ""
+        (f"{name} is not a covariance" for name, elements in named if not _is_covariance(elements)),
+        "",
     )
 
 
 def _is_covariance(elements: tuple[float, ...]) -> bool:
-    """Return whether elements (9,) are a symmetric positive semi-definite (3, 3) matrix, up to rounding."""
+    """Return whether elements (9,) are a symmetric positive semi-definite (3, 3) matrix, up to
+    rounding.
+    """
     matrix = np.array(elements).reshape(3, 3)
     largest = np.abs(matrix).max()
     if not math.isfinite(largest) or np.abs(matrix - matrix.T).max() > _ROUNDING * largest:
@@ -74,7 +79,9 @@ def _is_covariance(elements: tuple[float, ...]) -> bool:
 
 @dataclass
 class Known:
-    """The last corrected odometry of a chaser, and the correction, if any: offset (3,) in WRF, rotation (4,) in CRF."""
+    """The last corrected odometry of a chaser, and the correction, if any: offset (3,) in WRF,
+    rotation (4,) in CRF.
+    """
 
     last: Odometry
     correction: tuple[Array, Array] | None = None
@@ -87,15 +94,19 @@ class OdometryValidation:
         body, errors = scenario.chaser, scenario.navigation.errors()
         # Six sigma of the difference of two.
         self._noise_m = 6 * math.sqrt(2.0) * errors.position_noise_m
-        self._noise_rad = 6 * math.sqrt(2.0) * max(errors.attitude_noise_rad, errors.attitude_roll_noise_rad)
+        self._noise_rad = (
+            6 * math.sqrt(2.0) * max(errors.attitude_noise_rad, errors.attitude_roll_noise_rad)
+        )
         self._velocity_noise_m_s = 6 * errors.velocity_noise_m_s
         self._acceleration_m_s2 = math.sqrt(3.0) * body.force_max_N / body.mass_kg
         self._alpha_rad_s2 = math.sqrt(3.0) * body.torque_max_N_m / min(body.inertia)
         self._known: dict[int, Known] = {}
 
-    def update(self, odometry: Odometry, doubtful: bool = False) -> tuple[Odometry, list[tuple[Level, str]]]:
-        """Return a chaser's next odometry without jumps, and the events to log. ``doubtful``: what was received before it may
-        be wrong."""
+    def update(
+        self, odometry: Odometry, doubtful: bool = False
+    ) -> tuple[Odometry, list[tuple[Level, str]]]:
+        """Return a chaser's next odometry without jumps, and the events to log. ``doubtful``: what
+        was received before it may be wrong."""
         i, known = odometry.chaser, self._known.get(odometry.chaser)
         gap_s = 0.0 if known is None else (odometry.sim_time_ns - known.last.sim_time_ns) / 1e9
         if known is None or not 0.0 < gap_s <= LONGEST_S:

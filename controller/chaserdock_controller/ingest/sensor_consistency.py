@@ -18,31 +18,44 @@ AGREES_S = 0.6
 class SensorConsistency:
     """Chasers whose sightings the estimator keeps rejecting, by a fault of camera or odometry.
 
-    ``confirmed``: chasers whose sightings were accepted for ``AGREES_S`` since their odometry was last interrupted.
+    ``confirmed``: chasers whose sightings were accepted for ``AGREES_S`` since their odometry was
+    last interrupted.
     """
 
     inconsistent: set[int] = field(default_factory=set)
     confirmed: set[int] = field(default_factory=set)
     _interrupted_s: dict[int, float] = field(default_factory=dict)
-    _since_s: dict[int, tuple[bool, float]] = field(default_factory=lambda: defaultdict(lambda: (True, 0.0)))
+    _since_s: dict[int, tuple[bool, float]] = field(
+        default_factory=lambda: defaultdict(lambda: (True, 0.0))
+    )
 
     @property
     def doubtful(self) -> frozenset[int]:
-        """Return the chasers whose odometry may be wrong: a jump between two of its states would have been noticed, but none
-        before its first state, or while it was interrupted."""
+        """Return the chasers whose odometry may be wrong: a jump between two of its states would
+        have been noticed, but none before its first state, or while it was interrupted."""
         return frozenset(self.inconsistent - self.confirmed)
 
     def update(
-        self, now_s: float, accepted: Iterable[int], rejected: Iterable[int], interrupted: Iterable[int] = ()
+        self,
+        now_s: float,
+        accepted: Iterable[int],
+        rejected: Iterable[int],
+        interrupted: Iterable[int] = (),
     ) -> list[tuple[Level, str]]:
-        """Add a tick's accepted and rejected chasers, and those whose odometry was ``interrupted`` before it; return the events."""
+        """Add a tick's accepted and rejected chasers, and those whose odometry was ``interrupted``
+        before it; return the events.
+        """
         events: list[tuple[Level, str]] = []
         self._interrupted_s.update(dict.fromkeys(interrupted, now_s))
         self.confirmed.difference_update(interrupted)
         for agrees, chasers in ((True, accepted), (False, rejected)):
             for i in chasers:
                 before, since_s = self._since_s[i]
-                if agrees and before and now_s - max(since_s, self._interrupted_s.get(i, 0.0)) >= AGREES_S:
+                if (
+                    agrees
+                    and before
+                    and now_s - max(since_s, self._interrupted_s.get(i, 0.0)) >= AGREES_S
+                ):
                     self.confirmed.add(i)
                 if before != agrees:
                     self._since_s[i] = (agrees, now_s)
@@ -52,5 +65,7 @@ class SensorConsistency:
                     events.append(("warning", text))
                 elif agrees and i in self.inconsistent and now_s - since_s >= AGREES_S:
                     self.inconsistent.discard(i)
-                    events.append(("info", f"chaser {i}: sightings agree with the other chasers again"))
+                    events.append(
+                        ("info", f"chaser {i}: sightings agree with the other chasers again")
+                    )
         return events

@@ -48,7 +48,9 @@ def _are_valid(solutions: Sequence[PoseSolution]) -> bool:
 def valid_sightings(
     sightings: Iterable[Sighting],
 ) -> tuple[tuple[Sighting, ...], list[tuple[Level, str]]]:
-    """Return the sightings with their valid solutions only, and an event for each sighting that loses one."""
+    """Return the sightings with their valid solutions only, and an event for each sighting that
+    loses one.
+    """
     valid: list[Sighting] = []
     events: list[tuple[Level, str]] = []
     sightings = tuple(sightings)

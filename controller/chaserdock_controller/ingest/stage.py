@@ -61,7 +61,9 @@ class IngestStage:
         )
 
     def _outdated(self, inputs: TickInputs) -> dict[int, Odometry]:
-        """Return the valid odometry of earlier ticks, with the times of these: the clock of a chaser may be wrong."""
+        """Return the valid odometry of earlier ticks, with the times of these: the clock of a
+        chaser may be wrong.
+        """
         tick_time_ns = self._scenario.timing.tick_time_ns
         return {
             i: msgspec.structs.replace(o, sim_time_ns=tick_time_ns(o.tick))
@@ -72,7 +74,9 @@ class IngestStage:
     def _ahead(
         self, i: int, inputs: TickInputs, effective_ns: int, history: CommandHistory
     ) -> tuple[tuple[float, Array], ...]:
-        """Return what acts on a chaser until ``effective_ns``; an impulse of thrusters is spread evenly."""
+        """Return what acts on a chaser until ``effective_ns``; an impulse of thrusters is spread
+        evenly.
+        """
         impulse = self.thrusters.coming(i, inputs.tick)
         if impulse is None:
             return history.ahead(i, inputs.time_ns, effective_ns)

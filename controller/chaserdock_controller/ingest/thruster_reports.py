@@ -30,7 +30,9 @@ class ThrusterReports:
         return np.minimum(self._nominal, np.abs([*report.force_max_N, *report.torque_max_N_m]))
 
     def coming(self, chaser: int, tick: int) -> Array | None:
-        """Return the impulse (6,), body axes, of pulses that are still to fire before the tick's command acts, if reported."""
+        """Return the impulse (6,), body axes, of pulses that are still to fire before the tick's
+        command acts, if reported.
+        """
         report = self._reports.get(chaser)
         if report is None or report.tick != tick:
             return None
@@ -41,7 +43,9 @@ class ThrusterReports:
         return {i: report.isolated for i, report in self._reports.items() if report.isolated}
 
     def given(self, tick: int) -> dict[int, Array]:
-        """Return the impulses (6,), body axes, that thrusters gave between the tick before and ``tick``, as reported."""
+        """Return the impulses (6,), body axes, that thrusters gave between the tick before and
+        ``tick``, as reported.
+        """
         return {
             i: np.array([*r.given_impulse_N_s, *r.given_angular_impulse_N_m_s])
             for i, r in self._reports.items()
@@ -49,7 +53,9 @@ class ThrusterReports:
         }
 
     def given_by_thruster(self, tick: int) -> dict[int, Array]:
-        """Return the impulses (n,) of every chaser's thrusters between the tick before and ``tick``, as reported."""
+        """Return the impulses (n,) of every chaser's thrusters between the tick before and
+        ``tick``, as reported.
+        """
         return {
             i: np.array(r.given_thrusters_N_s)
             for i, r in self._reports.items()

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collects the messages of a tick: which have arrived, which were lost, which are duplicates or stale. No I/O."""
+"""Collects the messages of a tick: which have arrived, which were lost, which are duplicates or
+stale. No I/O.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ _REMEMBERED_TICKS = 256
 
 
 class TickInputCollector:
-    """The newest message of every chaser on every topic, the sightings since the tick before, and the lost messages."""
+    """The newest message of every chaser on every topic, the sightings since the tick before, and
+    the lost messages.
+    """
 
     def __init__(self, scenario: FlightScenario) -> None:
         self.odometry_validation = OdometryValidation(scenario)
@@ -40,15 +44,19 @@ class TickInputCollector:
         self._forgotten_tick = 0
         self._lost: set[tuple[str, int, int]] = set()
         self._has_thrusters = scenario.chaser.actuation == "thrusters"
-        self._has_port = [scenario.docking.port_of(i) is not None for i in range(len(scenario.chasers))]
+        self._has_port = [
+            scenario.docking.port_of(i) is not None for i in range(len(scenario.chasers))
+        ]
         self._extrapolation_ns = scenario.controller.command_lifetime_s * 1e9
 
     def add_odometry(self, odometry: Odometry, doubtful: bool = False) -> list[LogEntry] | None:
-        """Add an odometry and return the events to log; None if one of that chaser as new is known. ``doubtful``: what was
-        received before it may be wrong."""
+        """Add an odometry and return the events to log; None if one of that chaser as new is known.
+        ``doubtful``: what was received before it may be wrong."""
         if _is_overtaken(odometry, self._odometry.get(odometry.chaser)):
             return None
-        self._odometry[odometry.chaser], events = self.odometry_validation.update(odometry, doubtful)
+        self._odometry[odometry.chaser], events = self.odometry_validation.update(
+            odometry, doubtful
+        )
         return events
 
     def add_docking(self, docking: DockingStatus) -> bool:
@@ -91,11 +99,15 @@ class TickInputCollector:
         missing = []
         if not self._has_arrived(topics.ODOMETRY, self._odometry, i, tick):
             missing.append(topics.ODOMETRY)
-        if self._has_thrusters and not self._has_arrived(topics.THRUSTERS, self._thrusters, i, tick):
+        if self._has_thrusters and not self._has_arrived(
+            topics.THRUSTERS, self._thrusters, i, tick
+        ):
             missing.append(topics.THRUSTERS)
         if self._has_port[i] and not self._has_arrived(topics.DOCKING, self._docking, i, tick):
             missing.append(topics.DOCKING)
-        sighting = (tick.tick, i) in self._received_sightings or self._is_lost(topics.SIGHTING, i, tick)
+        sighting = (tick.tick, i) in self._received_sightings or self._is_lost(
+            topics.SIGHTING, i, tick
+        )
         if tick.images and not sighting:
             missing.append(topics.SIGHTING)
         return missing
@@ -124,7 +136,11 @@ class TickInputCollector:
             commands,
             dict(self._thrusters),
             {i: d for i, d in self._docking.items() if d.tick == tick.tick and i in tick.chasers},
-            {i: o for i, o in sorted(self._odometry.items()) if o.tick < tick.tick and i in tick.chasers},
+            {
+                i: o
+                for i, o in sorted(self._odometry.items())
+                if o.tick < tick.tick and i in tick.chasers
+            },
         )
         self._sightings.clear()
         self._received_sightings = {key for key in self._received_sightings if key[0] > tick.tick}
@@ -138,7 +154,9 @@ class TickInputCollector:
 
     def _odometry_at(self, tick: Tick) -> dict[int, Odometry]:
         """Return the odometry of a tick; a lost one is extrapolated for the lifetime of a command."""
-        odometry = {i: o for i, o in self._odometry.items() if o.tick == tick.tick and i in tick.chasers}
+        odometry = {
+            i: o for i, o in self._odometry.items() if o.tick == tick.tick and i in tick.chasers
+        }
         for i in tick.chasers:
             last = self._odometry.get(i)
             if i in odometry or last is None or not self._is_lost(topics.ODOMETRY, i, tick):

@@ -13,11 +13,15 @@ __all__ = ["BACK_ENDS", "NmpcInput", "NmpcParameters", "NmpcPlan", "NmpcSolver",
 BACK_ENDS = SOLVERS
 
 
-def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int | None = None) -> NmpcSolver:
-    """Create the back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve, counted by the back end.
+def make_solver(
+    name: str, params: NmpcParameters, n: int, max_iterations: int | None = None
+) -> NmpcSolver:
+    """Create the back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve,
+    counted by the back end.
 
-    ``name`` is a built-in back end or an installed ``chaserdock.solvers`` entry point: a function of (params, n,
-    max_iterations). Raises PluginError for an unknown name, ValueError for n < 1 or a package that is not installed.
+    ``name`` is a built-in back end or an installed ``chaserdock.solvers`` entry point: a function
+    of (params, n, max_iterations). Raises PluginError for an unknown name, ValueError for n < 1 or
+    a package that is not installed.
     """
     # Imports are local to avoid the start-up time of unused back ends.
     if name == "rti":

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Back end `alpaqa`: PANOC with an augmented Lagrangian, the solver family of the paper, from the wheel `alpaqa`.
+"""Back end `alpaqa`: PANOC with an augmented Lagrangian, the solver family of the paper, from the
+wheel `alpaqa`.
 
-Single shooting of `problem.build_nlp`: states are eliminated, and the augmented Lagrangian handles the distances; its
-largest penalty corresponds to the slack. CasADi's alpaqa plugin has fixed settings (tolerance 1e-10, L-BFGS memory 2)
-and prints at each call, so the wheel `alpaqa` is used (extra ``chaserdock[alpaqa]``). Limited by iterations, never by
-time.
+Single shooting of `problem.build_nlp`: states are eliminated, and the augmented Lagrangian handles
+the distances; its largest penalty corresponds to the slack. CasADi's alpaqa plugin has fixed
+settings (tolerance 1e-10, L-BFGS memory 2) and prints at each call, so the wheel `alpaqa` is used
+(extra ``chaserdock[alpaqa]``). Limited by iterations, never by time.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ TOLERANCE, DISTANCE_TOLERANCE = 0.5, 1e-3
 class AlpaqaSolver(SingleShootingSolver):
     """Solve with alpaqa for up to ``n_chasers`` chasers, warm-started from the last plans.
 
-    ``max_iterations`` bounds the inner iterations of one outer step, MAX_INNER if None. Raises ValueError for
-    n_chasers < 1 or where alpaqa is not installed.
+    ``max_iterations`` bounds the inner iterations of one outer step, MAX_INNER if None. Raises
+    ValueError for n_chasers < 1 or where alpaqa is not installed.
     """
 
-    def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
+    def __init__(
+        self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
+    ) -> None:
         try:
             import alpaqa  # pyright: ignore[reportMissingImports] (an extra)
         except ImportError:
@@ -76,11 +79,13 @@ class AlpaqaSolver(SingleShootingSolver):
 def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
     """Wrap the problem in alpaqa's callback interface, evaluated by CasADi's virtual machine.
 
-    alpaqa's CasADi loader needs a C compiler or a compatible CasADi file format (1.1.0a2 cannot read files of 3.8).
+    alpaqa's CasADi loader needs a C compiler or a compatible CasADi file format (1.1.0a2 cannot
+    read files of 3.8).
     """
     n = nlp.n
     x, p = nlp.problem["x"], nlp.problem["p"]
-    # Inputs are scaled by their limits, which are the last parameters, so that the box is well scaled.
+    # Inputs are scaled by their limits, which are the last parameters, so that the box is well
+    # scaled.
     w, limits = ca.SX.sym("w", x.numel()), ca.SX.sym("limits", 6 * n)
     f, g = ca.Function("nlp", [x, p], [nlp.problem["f"], nlp.problem["g"]])(
         w * ca.repmat(limits, nlp.stages, 1), p
@@ -94,7 +99,9 @@ def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
     class Callbacks(alpaqa.BoxConstrProblem):
         def __init__(self) -> None:
             super().__init__(w.numel(), g.numel())
-            self.variable_bounds.lower, self.variable_bounds.upper = np.full((2, w.numel()), [[-1.0], [1.0]])
+            self.variable_bounds.lower, self.variable_bounds.upper = np.full(
+                (2, w.numel()), [[-1.0], [1.0]]
+            )
             self.general_bounds.upper = np.full(g.numel(), np.inf)
             self.parameters = np.zeros(parameters.numel())
 
@@ -107,7 +114,9 @@ def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
         def eval_constraints(self, at: Array, out: Array) -> None:
             out[:] = distances(at, self.parameters).full().ravel()
 
-        def eval_constraints_gradient_product(self, at: Array, multipliers: Array, out: Array) -> None:
+        def eval_constraints_gradient_product(
+            self, at: Array, multipliers: Array, out: Array
+        ) -> None:
             out[:] = gradient_product(at, multipliers, self.parameters).full().ravel()
 
     return Callbacks()

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Iteration limit for a real-time budget in seconds, from the measured durations of previous solves.
+"""Iteration limit for a real-time budget in seconds, from the measured durations of previous
+solves.
 
-A solve is limited by iterations and never reads a clock, so its result depends on its inputs and that limit only. In
-lock-step the limit comes from the scenario, which makes flights reproducible.
+A solve is limited by iterations and never reads a clock, so its result depends on its inputs and
+that limit only. In lock-step the limit comes from the scenario, which makes flights reproducible.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ class Bounded(Protocol):
 class SolveBudget:
     """Track the duration of a solve: seconds without iterations, and seconds per iteration.
 
-    Both follow an increase immediately and a decrease by 5 % per solve, so a disturbed solve counts for a while.
-    ``most``: upper bound of the limit. Raises ValueError for a budget that is not positive.
+    Both follow an increase immediately and a decrease by 5 % per solve, so a disturbed solve counts
+    for a while. ``most``: upper bound of the limit. Raises ValueError for a budget that is not
+    positive.
     """
 
     budget_s: float
@@ -38,7 +40,9 @@ class SolveBudget:
             raise ValueError(f"budget_s must be positive, not {self.budget_s!r}")
 
     def iterations(self) -> int:
-        """Return the iteration limit of the next solve; 0 leaves the shifted plan, or a solution without iterations."""
+        """Return the iteration limit of the next solve; 0 leaves the shifted plan, or a solution
+        without iterations.
+        """
         fit = max(0, int((self.budget_s - self.base_s) / self.iteration_s))
         return fit if self.most is None else min(fit, self.most)
 
@@ -47,7 +51,9 @@ class SolveBudget:
         if iterations == 0:
             self.base_s = _update_peak(self.base_s, took_s)
         else:
-            self.iteration_s = _update_peak(self.iteration_s, max(1e-6, (took_s - self.base_s) / iterations))
+            self.iteration_s = _update_peak(
+                self.iteration_s, max(1e-6, (took_s - self.base_s) / iterations)
+            )
 
 
 def _update_peak(kept: float, now: float) -> float:

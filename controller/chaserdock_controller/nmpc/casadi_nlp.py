@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Back ends `ipopt` and `fatrop`: the problem of `problem.build_nlp`, coupled, by CasADi and solvers in its wheel.
+"""Back ends `ipopt` and `fatrop`: the problem of `problem.build_nlp`, coupled, by CasADi and
+solvers in its wheel.
 
-ipopt with MUMPS converges in tens of milliseconds; it is the reference for faster back ends, not a real-time
-controller. fatrop is an interior-point method with a Riccati recursion over the stages. Limited by iterations, never by
-time.
+ipopt with MUMPS converges in tens of milliseconds; it is the reference for faster back ends, not a
+real-time controller. fatrop is an interior-point method with a Riccati recursion over the stages.
+Limited by iterations, never by time.
 """
 
 from __future__ import annotations
@@ -33,14 +34,18 @@ def pack(params: NmpcParameters, task: PreparedProblem) -> Array:
     for i in range(len(p.states)):
         parts += [p.states[i], p.references[i].ravel(), p.u_ref[i].ravel()]
         parts += [p.min_distance_target_m[i], task.corridors[i].ravel()]
-    farthest_m = np.max(np.linalg.norm(p.states[:, :3] - p.references[:, -1, :3], axis=-1), keepdims=True)
+    farthest_m = np.max(
+        np.linalg.norm(p.states[:, :3] - p.references[:, -1, :3], axis=-1), keepdims=True
+    )
     upper = task.between[np.triu_indices(len(p.states), 1)]
     parts += [p.target_positions.ravel(), upper, slack_l1_weight(params, farthest_m)]
     return np.concatenate(parts)
 
 
 def row_floor(nlp: Nlp, task: PreparedProblem) -> Array:
-    """Return the lower bounds (D, rows) of the distances: zero, and inactive where there is no corridor."""
+    """Return the lower bounds (D, rows) of the distances: zero, and inactive where there is no
+    corridor.
+    """
     floor = np.zeros((nlp.stages, nlp.rows))
     used = np.any(task.corridors[:, 1:, :3] != 0.0, axis=-1)
     floor[:, 2 : 3 * nlp.n : 3][~used.T] = -1e4
@@ -51,7 +56,13 @@ def _options(name: str, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
     shared: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     if name == "ipopt":
         # ipopt relaxes bounds by default, which would violate the input box by 1e-8.
-        own = {"print_level": 0, "sb": "yes", "max_iter": max_iterations, "tol": 1e-6, "mu_init": 1e-2}
+        own = {
+            "print_level": 0,
+            "sb": "yes",
+            "max_iter": max_iterations,
+            "tol": 1e-6,
+            "mu_init": 1e-2,
+        }
         return {**shared, "ipopt": {**own, "bound_relax_factor": 0.0}}
     states, inputs, rows = zip(*nlp.stage_sizes, strict=True)
     equality: list[bool] = []
@@ -71,7 +82,9 @@ def _options(name: str, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
 
 
 class CoupledSolver:
-    """Base of the back ends that solve one problem for all chasers, warm-started from the last plans."""
+    """Base of the back ends that solve one problem for all chasers, warm-started from the last
+    plans.
+    """
 
     def __init__(
         self, params: NmpcParameters, n_chasers: int, program: Callable[[int], tuple[Nlp, Any]]
@@ -91,10 +104,15 @@ class SingleShootingSolver(CoupledSolver, ABC):
     def _run(
         self, nlp: Nlp, program: Any, parameters: Array, floor: Array, start: Array
     ) -> tuple[Array, bool, bool, int]:
-        """Return solution, whether it converged, whether the iterations were used up, and their number."""
+        """Return solution, whether it converged, whether the iterations were used up, and their
+        number.
+        """
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
+    def solve(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
+    ) -> NmpcPlan:
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one
+        status.
 
         ``iterations`` counts inner iterations.
         """
@@ -113,14 +131,18 @@ class SingleShootingSolver(CoupledSolver, ABC):
         if usable:
             solution = np.asarray(w).reshape(d, n, 6).transpose(1, 0, 2)
             u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
-        return frame.finish(task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
+        return frame.finish(
+            task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64)
+        )
 
 
 class NlpSolver(CoupledSolver):
-    """Solve with `ipopt` or `fatrop` (``name``) for up to ``n_chasers`` chasers, warm-started from the last plans.
+    """Solve with `ipopt` or `fatrop` (``name``) for up to ``n_chasers`` chasers, warm-started from
+    the last plans.
 
-    The constructor builds a program for every number of chasers, so that a change of the number delays no tick.
-    ``max_iterations`` bounds a solve, MAX_ITERATIONS if None. Raises ValueError for n_chasers < 1.
+    The constructor builds a program for every number of chasers, so that a change of the number
+    delays no tick. ``max_iterations`` bounds a solve, MAX_ITERATIONS if None. Raises ValueError for
+    n_chasers < 1.
     """
 
     def __init__(
@@ -134,10 +156,14 @@ class NlpSolver(CoupledSolver):
 
         super().__init__(params, n_chasers, program)
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
+    def solve(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
+    ) -> NmpcPlan:
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one
+        status.
 
-        ``iterations`` counts those of the solver. The states are the solution's inputs rolled through the model.
+        ``iterations`` counts those of the solver. The states are the solution's inputs rolled
+        through the model.
         """
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
@@ -168,12 +194,18 @@ class NlpSolver(CoupledSolver):
         )
         stats = program.stats()
         flat = np.array(result["x"]).ravel()
-        solution = np.stack([flat[at : at + 6 * n].reshape(n, 6) for at in input_columns[:d]], axis=1)
+        solution = np.stack(
+            [flat[at : at + 6 * n].reshape(n, 6) for at in input_columns[:d]], axis=1
+        )
         code = str(stats.get("return_status", ""))
         solved = bool(stats["success"]) or code in _GOOD
         iterations = int(stats.get("iter_count", 0))
-        late = not solved and (code in _LIMIT or stats.get("unified_return_status") == "SOLVER_RET_LIMITED")
+        late = not solved and (
+            code in _LIMIT or stats.get("unified_return_status") == "SOLVER_RET_LIMITED"
+        )
         usable = (solved or late) and bool(np.isfinite(solution).all())
         if usable:
             u = np.clip(solution, -limits[:, None, :], limits[:, None, :])
-        return frame.finish(task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
+        return frame.finish(
+            task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64)
+        )

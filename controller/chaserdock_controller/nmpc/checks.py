@@ -31,17 +31,19 @@ def _poses(name: str, array: Array, first: int) -> None:
 
 
 def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
-    """Return a copy of ``problem`` with contiguous arrays, unit quaternions and all optional values expanded:
-    (N, D+1) target distances, (N, N) chaser distances, corridors, cuboids and
-    distances of shapes.
+    """Return a copy of ``problem`` with contiguous arrays, unit quaternions and all optional values
+    expanded: (N, D+1) target distances, (N, N) chaser distances, corridors, cuboids and distances
+    of shapes.
 
-    Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off unit
-    length, a negative distance or limit, an asymmetric distance matrix, an invalid corridor, or more than
-    ``n_max`` chasers.
+    Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off
+    unit length, a negative distance or limit, an asymmetric distance matrix, an invalid corridor,
+    or more than ``n_max`` chasers.
     """
     states = np.asarray(problem.states, dtype=np.float64)
     if states.ndim != 2 or not 1 <= len(states) <= n_max:
-        raise ValueError(f"states must have shape (N, 13) with N from 1 to {n_max}, not {states.shape}")
+        raise ValueError(
+            f"states must have shape (N, 13) with N from 1 to {n_max}, not {states.shape}"
+        )
     n, d = len(states), params.stages
     states = _array("states", states, (n, 13))
     references = _array("references", problem.references, (n, d + 1, 7))
@@ -51,7 +53,9 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
     if between.ndim == 0:
         between = np.full((n, n), float(between))
     between = _array("min_distance_chasers_m", between, (n, n))
-    apart = np.zeros((n, n)) if problem.min_distance_shapes_m is None else problem.min_distance_shapes_m
+    apart = (
+        np.zeros((n, n)) if problem.min_distance_shapes_m is None else problem.min_distance_shapes_m
+    )
     apart = _array("min_distance_shapes_m", apart, (n, n))
     for name, value in (("min_distance_chasers_m", between), ("min_distance_shapes_m", apart)):
         if n > 1 and (value != value.T).any():
@@ -120,8 +124,13 @@ def _check_corridors(corridors: Array) -> None:
 
 
 def check_plan(plan: NmpcPlan, n: int, d: int) -> None:
-    """Raise ValueError for a plan of other than ``n`` chasers or ``d`` stages, or with a value that is not finite."""
-    for name, value, shape in (("inputs", plan.inputs, (n, d, 6)), ("states", plan.states, (n, d + 1, 13))):
+    """Raise ValueError for a plan of other than ``n`` chasers or ``d`` stages, or with a value that
+    is not finite.
+    """
+    for name, value, shape in (
+        ("inputs", plan.inputs, (n, d, 6)),
+        ("states", plan.states, (n, d + 1, 13)),
+    ):
         if sign_of(_array(name, value, shape)) == 1:
             raise ValueError(f"{name} holds a value that is not finite")
     if len(plan.status) != n:
@@ -129,7 +138,9 @@ def check_plan(plan: NmpcPlan, n: int, d: int) -> None:
 
 
 def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
-    """Return the chasers' ids, 0..N-1 by default. Raises ValueError for a wrong number or a repetition."""
+    """Return the chasers' ids, 0..N-1 by default. Raises ValueError for a wrong number or a
+    repetition.
+    """
     chosen = tuple(range(n)) if ids is None else tuple(int(i) for i in ids)
     if len(chosen) != n or len(set(chosen)) != n:
         raise ValueError(f"ids must be {n} different numbers, not {chosen}")
@@ -137,7 +148,9 @@ def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
 
 
 def check_shift(shift_s: float) -> float:
-    """Return the time since the previous solve, s. Raises ValueError if it is negative or not finite."""
+    """Return the time since the previous solve, s. Raises ValueError if it is negative or not
+    finite.
+    """
     if not (math.isfinite(shift_s) and shift_s >= 0.0):
         raise ValueError(f"shift_s must be finite and not negative, not {shift_s!r}")
     return float(shift_s)
@@ -146,8 +159,8 @@ def check_shift(shift_s: float) -> float:
 def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
     """Shift piecewise constant inputs (..., D, 6) by ``shift_s`` on the same grid.
 
-    Each new value is the mean of the old plan over its interval, which preserves the impulse. The last value is held
-    beyond the old horizon.
+    Each new value is the mean of the old plan over its interval, which preserves the impulse. The
+    last value is held beyond the old horizon.
     """
     whole, part = divmod(shift_s / dt_s, 1.0)
     return shifted(inputs, int(min(whole, inputs.shape[-2])), part)
@@ -156,7 +169,9 @@ def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
 def warm_start(
     plans: dict[int, Array], names: tuple[int, ...], problem: NmpcInput, shift_s: float, dt_s: float
 ) -> Array:
-    """Return the initial inputs (N, D, 6) within the box: each chaser's shifted plan, or u_ref without a plan."""
+    """Return the initial inputs (N, D, 6) within the box: each chaser's shifted plan, or u_ref
+    without a plan.
+    """
     start = problem.u_ref.copy()
     known = [row for row, name in enumerate(names) if name in plans]
     if known:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passive safety as rows of the QP: half-spaces of position and velocity that keep a plan's coasts outside the keep-out.
+"""Passive safety as rows of the QP: half-spaces of position and velocity that keep a plan's coasts
+outside the keep-out.
 
-The coast from a stage is linear in the state there (chaserdock_models/passive_safety.py). At the moments of its closest approaches
-the keep-out sphere, enlarged by the covariance, is replaced by its tangent plane across the line from the target: a condition that
-is linear in the state, and sufficient at that moment. Only chasers whose plans without these rows are not safe have them.
+The coast from a stage is linear in the state there (chaserdock_models/passive_safety.py). At the
+moments of its closest approaches the keep-out sphere, enlarged by the covariance, is replaced by
+its tangent plane across the line from the target: a condition that is linear in the state, and
+sufficient at that moment. Only chasers whose plans without these rows are not safe have them.
 """
 
 from __future__ import annotations
@@ -20,11 +22,15 @@ from .types import CoastSafety, NmpcParameters
 COASTS = 3
 """Number of approaches of a coast that are restricted."""
 SPARE_SHARE = 0.05
-"""Share of the required margin that plans keep in addition: the approaches, and with them the planes, move as a plan is bent."""
+"""Share of the required margin that plans keep in addition: the approaches, and with them the
+planes, move as a plan is bent.
+"""
 
 
 def certify(safety: CoastSafety, states: Array, targets: Array) -> dict[int, CoastCertificate]:
-    """Return the certificates of the restricted rows of plans ``states`` (N, D+1, 13); ``targets`` as in ``coast_rows``."""
+    """Return the certificates of the restricted rows of plans ``states`` (N, D+1, 13); ``targets``
+    as in ``coast_rows``.
+    """
     origin = _origin(safety, targets)
     return {
         i: safety.coast.certify(states[i, :, :6] - origin, covariance, safety.keep_out_m)
@@ -33,7 +39,9 @@ def certify(safety: CoastSafety, states: Array, targets: Array) -> dict[int, Coa
 
 
 def unsafe_rows(safety: CoastSafety, found: Mapping[int, CoastCertificate]) -> CoastSafety | None:
-    """Return the restriction of those rows whose certificates ``found`` lack the margin; None if none does."""
+    """Return the restriction of those rows whose certificates ``found`` lack the margin; None if
+    none does.
+    """
     least = _planned_sigmas(safety)
     kept = {i: c for i, c in safety.covariances.items() if not found[i].margin_sigmas >= least}
     return replace(safety, covariances=kept) if kept else None
@@ -51,15 +59,18 @@ def _origin(safety: CoastSafety, targets: Array) -> Array:
 def coast_rows(safety: CoastSafety, states: Array, targets: Array, params: NmpcParameters) -> Array:
     """Return half-spaces (N, D+1, C, 7) as in `NmpcInput` about plans ``states`` (N, D+1, 13).
 
-    ``targets`` (D+1, 3): positions of the target. Rows are scaled so that a displacement by 1 m, or the change of velocity that
-    makes it within the horizon, changes a row by at most about 1: they are priced as the distances are.
+    ``targets`` (D+1, 3): positions of the target. Rows are scaled so that a displacement by 1 m, or
+    the change of velocity that makes it within the horizon, changes a row by at most about 1: they
+    are priced as the distances are.
     """
     n, nodes, _ = states.shape
     rows = np.zeros((n, nodes, params.coasts, 7))
     origin, sigmas = _origin(safety, targets[1:]), _planned_sigmas(safety)
     for i, covariance in safety.covariances.items():
         relative = states[i, 1:, :6] - origin
-        planes = safety.coast.tangent_planes(relative, covariance, safety.keep_out_m, sigmas, params.coasts)
+        planes = safety.coast.tangent_planes(
+            relative, covariance, safety.keep_out_m, sigmas, params.coasts
+        )
         planes[..., 6] += np.einsum("kcj,kj->kc", planes[..., :6], origin)
         by_velocity = np.linalg.norm(planes[..., 3:6], axis=2) / (params.stages * params.dt_s)
         scale = np.maximum(np.linalg.norm(planes[..., :3], axis=2), by_velocity)

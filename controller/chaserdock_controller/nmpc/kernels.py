@@ -53,11 +53,16 @@ def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
 def normalize_rows(array: Array, first: int, tolerance: float) -> int:
     """Normalize the quaternions in columns first..first+3 of ``array`` (..., width) in place.
 
-    Returns 1 for a value that is not finite, 2 for a quaternion further off unit length than ``tolerance``, else 0.
+    Returns 1 for a value that is not finite, 2 for a quaternion further off unit length than
+    ``tolerance``, else 0.
     """
     width = array.shape[-1]
     return function("normalize_rows", c_int64)(
-        address(array), c_int64(array.size // width), c_int64(width), c_int64(first), c_double(tolerance)
+        address(array),
+        c_int64(array.size // width),
+        c_int64(width),
+        c_int64(first),
+        c_double(tolerance),
     )
 
 
@@ -67,7 +72,9 @@ def sign_of(array: Array) -> int:
 
 
 def shifted(inputs: Array, whole: int, part: float) -> Array:
-    """Shift piecewise constant inputs (..., D, 6) by ``whole + part`` steps on the same grid; 0 <= part < 1."""
+    """Shift piecewise constant inputs (..., D, 6) by ``whole + part`` steps on the same grid; 0 <=
+    part < 1.
+    """
     out, d = np.empty_like(inputs), inputs.shape[-2]
     n = inputs.size // (6 * d)
     function("shift_inputs")(
@@ -78,15 +85,24 @@ def shifted(inputs: Array, whole: int, part: float) -> Array:
 
 def roll(model: Model, x: Array, u: Array) -> None:
     """Roll out u (N, D, 6) from x[:, 0] into x (N, D+1, 13)."""
-    function("roll")(ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(x))
+    function("roll")(
+        ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(x)
+    )
 
 
 class _Weights(Structure):
-    _fields_ = [("stages", c_int64), ("position", c_void_p), ("orientation", c_void_p), ("input", c_void_p)]
+    _fields_ = [
+        ("stages", c_int64),
+        ("position", c_void_p),
+        ("orientation", c_void_p),
+        ("input", c_void_p),
+    ]
 
 
 class Weights:
-    """The cost's weights: of position and orientation at each stage, each (D+1,), and of the inputs (6,)."""
+    """The cost's weights: of position and orientation at each stage, each (D+1,), and of the inputs
+    (6,).
+    """
 
     def __init__(self, params: NmpcParameters) -> None:
         self.position, self.orientation = params.stage_weights()
@@ -146,8 +162,8 @@ def zones_of(problem: NmpcInput, outer: float, step_s: float = 1.0) -> _Zones:
 
 
 def plan_violation(problem: NmpcInput, x: Array, outer_m: float) -> Array:
-    """Return the deepest violation of the distances, m (N,), by plans x (N, D+1, 13); ``problem`` as `check_input`
-    returns it."""
+    """Return the deepest violation of the distances, m (N,), by plans x (N, D+1, 13); ``problem``
+    as `check_input` returns it."""
     worst, zones = np.empty(len(x)), zones_of(problem, outer_m)
     function("plan_violation")(ctypes.byref(zones), address(x), address(worst))
     return worst
@@ -167,8 +183,8 @@ class _Tick(Structure):
 
 
 def tick_workspace(n: int, d: int, extra: int) -> Array:
-    """Allocate working memory of `solve_tick` for up to ``n`` chasers, ``d`` stages and ``extra`` cuboids and coasts;
-    for one thread at a time."""
+    """Allocate working memory of `solve_tick` for up to ``n`` chasers, ``d`` stages and ``extra``
+    cuboids and coasts; for one thread at a time."""
     return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d), c_int64(extra)))
 
 
@@ -176,11 +192,13 @@ def solve_tick(
     model: Model, weights: Weights, problem: NmpcInput, inputs: Array, outer_m: float, reach_m_per_N: Array, w1: Array,
     w2: float, budget: int, workspace: Array,
 ) -> tuple[IntArray, IntArray]:  # fmt: skip
-    """Run one real-time iteration for every chaser; ``inputs`` (N, D, 6) hold the start and receive the solution.
+    """Run one real-time iteration for every chaser; ``inputs`` (N, D, 6) hold the start and receive
+    the solution.
 
-    ``problem`` from `check_input`. reach_m_per_N (D+1,): displacement of a chaser by each stage for 1 N on each axis.
-    w1 (N,), w2: slack weights. ``budget``: total iterations. ``workspace`` from `tick_workspace`. Returns code and
-    iterations, each (N,); the inputs of a chaser with code BROKEN are unchanged.
+    ``problem`` from `check_input`. reach_m_per_N (D+1,): displacement of a chaser by each stage for
+    1 N on each axis. w1 (N,), w2: slack weights. ``budget``: total iterations. ``workspace`` from
+    `tick_workspace`. Returns code and iterations, each (N,); the inputs of a chaser with code
+    BROKEN are unchanged.
     """
     n = len(inputs)
     zones = zones_of(problem, outer_m, model.step_s)

@@ -16,11 +16,15 @@ from chaserdock_controller.ingest.lost_chasers import margin_m
 from .types import NmpcInput
 
 _LIMIT = 1e-3
-"""Input limit (N, N m) of a lost chaser's row: the solver needs some, and this much moves it by a millimetre."""
+"""Input limit (N, N m) of a lost chaser's row: the solver needs some, and this much moves it by a
+millimetre.
+"""
 
 
 def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
-    """Return positions (K, 3), WRF, extrapolated from a last odometry to ``times_s`` (K,) after ``from_ns``."""
+    """Return positions (K, 3), WRF, extrapolated from a last odometry to ``times_s`` (K,) after
+    ``from_ns``.
+    """
     ahead = extrapolate(last, last.tick, from_ns)
     return np.asarray(ahead.position_m) + times_s[:, None] * np.asarray(ahead.velocity_m_s)
 
@@ -28,7 +32,8 @@ def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
 def with_lost_chasers(
     problem: NmpcInput, lost: Mapping[int, Odometry], from_ns: int, step_s: float
 ) -> NmpcInput:
-    """Return the problem with a row for each lost chaser after the others: it coasts, and only the others avoid it.
+    """Return the problem with a row for each lost chaser after the others: it coasts, and only the
+    others avoid it.
 
     ``from_ns``: the time of stage 0. The margin is that of the end of the horizon.
     """
@@ -57,7 +62,9 @@ def with_lost_chasers(
         states=np.concatenate([problem.states, states]),
         references=np.concatenate([problem.references, references]),
         u_ref=np.concatenate([problem.u_ref, np.zeros((len(lost), *problem.u_ref.shape[1:]))]),
-        min_distance_target_m=np.concatenate([to_target, np.zeros((len(lost), *to_target.shape[1:]))]),
+        min_distance_target_m=np.concatenate(
+            [to_target, np.zeros((len(lost), *to_target.shape[1:]))]
+        ),
         min_distance_chasers_m=between,
         min_distance_shapes_m=None if apart is None else _with_margins(apart, n, margins_m),
         input_max=np.concatenate([problem.input_max, np.full((len(lost), 6), _LIMIT)]),
@@ -67,7 +74,9 @@ def with_lost_chasers(
 
 
 def _with_margins(distances_m: Array | float, n: int, margins_m: Sequence[float]) -> Array:
-    """Return distances (N, N) with a row for each lost chaser: the largest of them and its margin; lost ones ignore each other."""
+    """Return distances (N, N) with a row for each lost chaser: the largest of them and its margin;
+    lost ones ignore each other.
+    """
     total = n + len(margins_m)
     out = np.zeros((total, total))
     out[:n, :n] = distances_m

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Back end `open`: OpEn (Optimization Engine), the paper's own solver, through opengen.
 
-Sopasakis, Fresk and Patrinos, "OpEn: Code generation for embedded nonconvex optimization", IFAC 2020: PANOC over the
-box of inputs, single shooting. A quadratic penalty of fixed weight in the cost enforces the distances: with OpEn's own
-constraints (`with_penalty_constraints`, `with_aug_lagrangian_constraints`) opengen differentiates every distance
-separately and writes tens of megabytes of C for four chasers, too much to compile. opengen writes Rust code for each
-number of chasers; cargo compiles it, which takes a minute once. The library is cached under a digest of the problem in
-``$XDG_CACHE_HOME/chaserdock/open`` (``~/.cache``). Limited by iterations, never by time.
+Sopasakis, Fresk and Patrinos, "OpEn: Code generation for embedded nonconvex optimization", IFAC
+2020: PANOC over the box of inputs, single shooting. A quadratic penalty of fixed weight in the cost
+enforces the distances: with OpEn's own constraints (`with_penalty_constraints`,
+`with_aug_lagrangian_constraints`) opengen differentiates every distance separately and writes tens
+of megabytes of C for four chasers, too much to compile. opengen writes Rust code for each number of
+chasers; cargo compiles it, which takes a minute once. The library is cached under a digest of the
+problem in ``$XDG_CACHE_HOME/chaserdock/open`` (``~/.cache``). Limited by iterations, never by time.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ _SUFFIX = {"win32": ".pyd"}
 
 
 def missing_part() -> str | None:
-    """Return what this machine lacks to compile the solver, as an error message; None if it is complete."""
+    """Return what this machine lacks to compile the solver, as an error message; None if it is
+    complete.
+    """
     if importlib.util.find_spec("opengen") is None:
         return "solver 'open' needs the package opengen: pip install 'chaserdock[open]'"
     if shutil.which("cargo") is None:
@@ -56,7 +59,9 @@ class OpenSolver(SingleShootingSolver):
     n_chasers < 1 or where opengen or cargo is not installed.
     """
 
-    def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
+    def __init__(
+        self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
+    ) -> None:
         missing = missing_part()
         if missing is not None:
             raise ValueError(missing)
@@ -71,7 +76,9 @@ class OpenSolver(SingleShootingSolver):
     def _run(
         self, nlp: Nlp, program: Any, parameters: Array, floor: Array, start: Array
     ) -> tuple[Array, bool, bool, int]:
-        answer = program.run(p=np.concatenate([parameters, floor]).tolist(), initial_guess=start.tolist())
+        answer = program.run(
+            p=np.concatenate([parameters, floor]).tolist(), initial_guess=start.tolist()
+        )
         if not answer.is_ok():
             return start, False, False, 0
         status = answer.get()
@@ -95,7 +102,8 @@ def _load_solver(nlp: Nlp, inner: int) -> Any:
     """Return the compiled solver of a problem, from the cache or newly built."""
     import opengen as og  # pyright: ignore[reportMissingImports] (an extra)
 
-    # Inputs are scaled by their limits, so that the box is well scaled. Lower bounds of the distances are parameters.
+    # Inputs are scaled by their limits, so that the box is well scaled. Lower bounds of the
+    # distances are parameters.
     inputs, distances = 6 * nlp.n * nlp.stages, nlp.stages * nlp.rows
     w, p = ca.MX.sym("w", inputs), ca.MX.sym("p", nlp.problem["p"].numel())
     limits, floor = ca.MX.sym("limits", 6 * nlp.n), ca.MX.sym("floor", distances)
@@ -107,7 +115,10 @@ def _load_solver(nlp: Nlp, inner: int) -> Any:
     whole = ca.Function("whole", [w, p, limits, floor], [cost])
     cost = whole.call([w, *parts], True, False)[0]
     text = ca.Function("all", [w, parameters], [cost]).serialize()
-    name = "open_" + hashlib.sha256(f"{text} {inner} {TOLERANCE} {sys.version}".encode()).hexdigest()[:16]
+    name = (
+        "open_"
+        + hashlib.sha256(f"{text} {inner} {TOLERANCE} {sys.version}".encode()).hexdigest()[:16]
+    )
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "chaserdock" / "open"
     library = cache / f"{name}{_SUFFIX.get(sys.platform, '.so')}"
     if not library.exists():
@@ -120,8 +131,12 @@ def _load_solver(nlp: Nlp, inner: int) -> Any:
     return module.solver()
 
 
-def _build(og: Any, name: str, cache: Path, problem: Any, size: int, inner: int, library: Path) -> None:
-    """Generate Rust code with opengen and compile it to ``library``. Raises RuntimeError with cargo's output."""
+def _build(
+    og: Any, name: str, cache: Path, problem: Any, size: int, inner: int, library: Path
+) -> None:
+    """Generate Rust code with opengen and compile it to ``library``. Raises RuntimeError with
+    cargo's output.
+    """
     problem = problem.with_constraints(og.constraints.Rectangle([-1.0] * size, [1.0] * size))
     solver = (
         og.config.SolverConfiguration()
@@ -155,6 +170,8 @@ def _build(og: Any, name: str, cache: Path, problem: Any, size: int, inner: int,
     )
     if completed.returncode:
         raise RuntimeError(f"cargo failed to compile the OpEn solver:\n{completed.stderr}")
-    built = next(path for path in (target / "release").glob(f"*{name}.*") if path.suffix in _LIBRARY_SUFFIXES)
+    built = next(
+        path for path in (target / "release").glob(f"*{name}.*") if path.suffix in _LIBRARY_SUFFIXES
+    )
     built.replace(library)
     shutil.rmtree(cache / name)

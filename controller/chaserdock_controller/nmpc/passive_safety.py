@@ -20,7 +20,9 @@ FREE_SPACE_S = 600.0
 PERSISTENT_S = 1.0
 """Time for which plans must be safe, or not, to count as such in the log and for an abort."""
 CONVERGED_S, ARMED_AFTER_S = 10.0, 60.0
-"""A chaser whose plans were safe for the first, or known for the second of these times counts: the filter has converged."""
+"""A chaser whose plans were safe for the first, or known for the second of these times counts: the
+filter has converged.
+"""
 
 
 def coast_duration_s(scenario: FlightScenario) -> float:
@@ -31,7 +33,9 @@ def coast_duration_s(scenario: FlightScenario) -> float:
 
 
 class PassiveSafetyMonitor:
-    """Certifies the plans of a tick. ``certificates``: of each chaser's newest plan. See ``guidance.escape`` for what follows."""
+    """Certifies the plans of a tick. ``certificates``: of each chaser's newest plan. See
+    ``guidance.escape`` for what follows.
+    """
 
     def __init__(self, scenario: FlightScenario) -> None:
         limits, orbit = scenario.limits, scenario.orbit
@@ -54,10 +58,11 @@ class PassiveSafetyMonitor:
         time_ns: int = 0,
         known: Mapping[int, CoastCertificate] = MappingProxyType({}),
     ) -> tuple[LogEntry, ...]:
-        """Certify the plans ``states`` (N, D+1, 13) of these chasers; return what has changed since the last tick.
+        """Certify the plans ``states`` (N, D+1, 13) of these chasers; return what has changed since
+        the last tick.
 
-        A plan is safe if its margin is at least ``limits.estimate_margin_sigmas``. Chasers that hold the target are left out.
-        ``known``: certificates that the solver has found, by row.
+        A plan is safe if its margin is at least ``limits.estimate_margin_sigmas``. Chasers that
+        hold the target are left out. ``known``: certificates that the solver has found, by row.
         """
         target, events = estimation.at_effect, []
         if target is None:
@@ -71,7 +76,9 @@ class PassiveSafetyMonitor:
                     by_chaser.pop(i, None)
                 continue
             own = states[row]
-            relative = np.concatenate([own[:, :3] - moving, own[:, 3:6] - target.velocity_m_s], axis=1)
+            relative = np.concatenate(
+                [own[:, :3] - moving, own[:, 3:6] - target.velocity_m_s], axis=1
+            )
             found = known.get(row) or self._coast.certify(relative, covariance, self._keep_out_m)
             safe = found.margin_sigmas >= self._sigmas
             self.certificates[i] = PlanCertificate(found, found.loss * self._step_s, safe)
@@ -84,7 +91,8 @@ class PassiveSafetyMonitor:
     def restriction(
         self, chasers: Sequence[int], enforced: Collection[int], estimation: TargetEstimation
     ) -> CoastSafety | None:
-        """Return the passive safety that the plans of ``chasers``, the rows of a problem, have to keep; None for none.
+        """Return the passive safety that the plans of ``chasers``, the rows of a problem, have to
+        keep; None for none.
 
         It applies to those of ``enforced`` that count (see ``unsafe``).
         """
@@ -99,10 +107,11 @@ class PassiveSafetyMonitor:
         return CoastSafety(self._coast, self._keep_out_m, self._sigmas, target.velocity_m_s, kept)
 
     def unsafe(self, time_ns: int) -> dict[int, str]:
-        """Return why chasers have to abort at ``time_ns``: their plans are not safe for `PERSISTENT_S`.
+        """Return why chasers have to abort at ``time_ns``: their plans are not safe for
+        `PERSISTENT_S`.
 
-        A chaser counts once its plans were safe for `CONVERGED_S`, or `ARMED_AFTER_S` after its first plan: until the filter has
-        converged, plans are safe at times only.
+        A chaser counts once its plans were safe for `CONVERGED_S`, or `ARMED_AFTER_S` after its
+        first plan: until the filter has converged, plans are safe at times only.
         """
         return {
             i: self._text(i, self.certificates[i].coast, False)
@@ -117,7 +126,9 @@ class PassiveSafetyMonitor:
         first_ns = self._first_ns.setdefault(i, time_ns)
         if self._since.get(i, (not safe, 0))[0] != safe:
             self._since[i] = safe, time_ns
-        if (safe and self._persists(i, time_ns, CONVERGED_S)) or time_ns - first_ns >= ARMED_AFTER_S * 1e9:
+        if (
+            safe and self._persists(i, time_ns, CONVERGED_S)
+        ) or time_ns - first_ns >= ARMED_AFTER_S * 1e9:
             self._armed.add(i)
 
     def _text(self, chaser: int, found: CoastCertificate, safe: bool) -> str:

@@ -11,16 +11,20 @@ from chaserdock_models.arrays import Array
 from .types import BUDGET, FAILED, INFEASIBLE_RELAXED, NmpcPlan
 
 FAILED_S = 1.0
-"""Time (s) without a usable plan after which a chaser retreats. Until then it flies its last plan, which is longer (3 s by
-default) but was made for an approach that must not go on without feedback."""
+"""Time (s) without a usable plan after which a chaser retreats. Until then it flies its last plan,
+which is longer (3 s by default) but was made for an approach that must not go on without feedback.
+"""
 DEGRADED_S = 5.0
-"""Time (s) with failed solves, or with plans that violate distances or are cut short, after which a chaser retreats. Such
-plans lead out of a keep-out zone at a few cm/s, which takes seconds. The clock runs back while plans are sound."""
+"""Time (s) with failed solves, or with plans that violate distances or are cut short, after which a
+chaser retreats. Such plans lead out of a keep-out zone at a few cm/s, which takes seconds. The
+clock runs back while plans are sound."""
 
 
 @dataclass(frozen=True)
 class ChaserPlan:
-    """Plan of one chaser from ``time_ns`` on: states (D+1, 13) and inputs (D, 6), as in ``NmpcPlan``."""
+    """Plan of one chaser from ``time_ns`` on: states (D+1, 13) and inputs (D, 6), as in
+    ``NmpcPlan``.
+    """
 
     time_ns: int
     states: Array
@@ -34,13 +38,17 @@ class ChaserPlan:
 
 @dataclass(frozen=True)
 class PlanningFailure:
-    """``without_plan``: no usable plan for `FAILED_S`; otherwise degraded plans for `DEGRADED_S`, until sound ones for as long."""
+    """``without_plan``: no usable plan for `FAILED_S`; otherwise degraded plans for `DEGRADED_S`,
+    until sound ones for as long.
+    """
 
     without_plan: bool
 
     @property
     def refused(self) -> tuple[str, ...]:
-        """Return the operator commands that are refused meanwhile; an operator may lead a chaser out by degraded plans."""
+        """Return the operator commands that are refused meanwhile; an operator may lead a chaser
+        out by degraded plans.
+        """
         always = ("approach", "inspect")
         return (*always, "goto", "calibrate") if self.without_plan else always
 
@@ -64,7 +72,9 @@ class PlanMonitor:
     def update(
         self, chasers: tuple[int, ...], plan: NmpcPlan | None, time_ns: int, effective_ns: int
     ) -> None:
-        """Record the result of the tick at ``time_ns`` for ``chasers``; ``effective_ns``: when its plan begins."""
+        """Record the result of the tick at ``time_ns`` for ``chasers``; ``effective_ns``: when its
+        plan begins.
+        """
         for by_chaser in (self._last, self._failed_since_ns, self._degraded_since_ns):
             for i in by_chaser.keys() - set(chasers):
                 del by_chaser[i]
@@ -81,7 +91,9 @@ class PlanMonitor:
         self._time_ns = time_ns
 
     def plans(self, time_ns: int) -> Mapping[int, ChaserPlan]:
-        """Return what chasers may fly at ``time_ns``: the newest plans, or older ones within `FAILED_S`."""
+        """Return what chasers may fly at ``time_ns``: the newest plans, or older ones within
+        `FAILED_S`.
+        """
         out = {}
         for i, plan in self._last.items():
             failed_ns = time_ns - self._failed_since_ns.get(i, time_ns)
@@ -101,7 +113,9 @@ class PlanMonitor:
         return out
 
     def _follow_degraded(self, i: int, time_ns: int, degraded: bool) -> None:
-        """Let the clock of degraded plans run, or back to zero, where a failure ends; it shows `DEGRADED_S` at most."""
+        """Let the clock of degraded plans run, or back to zero, where a failure ends; it shows
+        `DEGRADED_S` at most.
+        """
         since_ns, limit_ns = self._degraded_since_ns.get(i, time_ns), round(DEGRADED_S * 1e9)
         if time_ns - since_ns >= limit_ns:
             self._degraded.add(i)

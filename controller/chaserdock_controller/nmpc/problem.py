@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The optimal control problem in CasADi, following the paper (section 4, eq. 6 and 7).
 
-State x = [p (3, WRF), v (3, WRF), q_wxyz (4, body to world), omega (3, body)], input u = [F (3), tau (3)] in
-body axes. Every back end solves this problem: `ipopt` this graph, `rti` the same functions in C (`native`), which the
-tests compare with these.
+State x = [p (3, WRF), v (3, WRF), q_wxyz (4, body to world), omega (3, body)], input u = [F (3),
+tau (3)] in body axes. Every back end solves this problem: `ipopt` this graph, `rti` the same
+functions in C (`native`), which the tests compare with these.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ def rotate(q: Any, v: Any) -> Any:
 
 
 def derivative(x: Any, u: Any, params: NmpcParameters) -> Any:
-    """Return x' (13) from the Newton-Euler equations (paper, eq. 1 and 2, with q' in the body-to-world convention)."""
+    """Return x' (13) from the Newton-Euler equations (paper, eq. 1 and 2, with q' in the
+    body-to-world convention).
+    """
     inertia = ca.DM(np.array(params.inertia_kg_m2))
     v, q, omega = x[3:6], x[6:10], x[10:13]
     force, torque = u[0:3], u[3:6]
@@ -48,7 +50,8 @@ def derivative(x: Any, u: Any, params: NmpcParameters) -> Any:
 
 
 def dynamics(params: NmpcParameters, integrator: str | None = None) -> ca.Function:
-    """Return the discrete dynamics (x (13), u (6)) -> x_next (13) over ``params.dt_s``, the input held.
+    """Return the discrete dynamics (x (13), u (6)) -> x_next (13) over ``params.dt_s``, the input
+    held.
 
     ``integrator``: "euler" (the paper's) or "rk4"; ``params.integrator`` if None. The quaternion is
     normalized after the step. Raises ValueError for another integrator.
@@ -73,25 +76,28 @@ def dynamics(params: NmpcParameters, integrator: str | None = None) -> ca.Functi
 def pose_cost(x: Any, reference: Any, weight_position: Any, weight_orientation: Any) -> Any:
     """Return Q_p |p_ref - p|^2 + Q_q |vec(q (x) q_ref*)|^2; ``reference`` (7) is p, q_wxyz.
 
-    The paper weights all four components of q (x) q_ref*, whose norm is always one. The vector part vanishes on the
-    reference, and both signs of a quaternion cost the same.
+    The paper weights all four components of q (x) q_ref*, whose norm is always one. The vector part
+    vanishes on the reference, and both signs of a quaternion cost the same.
     """
     error = multiply(x[6:10], conjugate(reference[3:7]))[1:4]
-    return weight_position * ca.sumsqr(reference[0:3] - x[0:3]) + weight_orientation * ca.sumsqr(error)
+    return weight_position * ca.sumsqr(reference[0:3] - x[0:3]) + weight_orientation * ca.sumsqr(
+        error
+    )
 
 
 @dataclass(frozen=True)
 class Nlp:
     """The nonlinear program of ``n`` chasers over ``stages``, and its layout stage by stage.
 
-    ``problem``: CasADi dictionary x, p, f, g. Multiple shooting: x = for k = 0..D: states of all chasers (13 each),
-    inputs of all (6 each; not at D), slacks of the stage's distances (not at 0). g = for k = 0..D: the defects to
-    stage k + 1 (not at D), the distances of the stage with slack; at 0 instead x - x_0. Single shooting: x is
-    the inputs, stage by stage, chaser by chaser, and g the distances without slack.
-    p = per chaser: x_0 (13), references (7 (D+1)), u_ref (6 D), target distances (D+1), corridors (5 (D+1)); then
-    target positions (3 (D+1)), chaser distances (upper triangle, row by row), L1 weight (1).
-    ``rows``: distances a stage: per chaser target, outer bound, corridor; then the pairs. ``stage_sizes``: (states,
-    inputs and slacks, constraints besides the defects) of stages 0..D.
+    ``problem``: CasADi dictionary x, p, f, g. Multiple shooting: x = for k = 0..D: states of all
+    chasers (13 each), inputs of all (6 each; not at D), slacks of the stage's distances (not at 0).
+    g = for k = 0..D: the defects to stage k + 1 (not at D), the distances of the stage with slack;
+    at 0 instead x - x_0. Single shooting: x is the inputs, stage by stage, chaser by chaser, and g
+    the distances without slack. p = per chaser: x_0 (13), references (7 (D+1)), u_ref (6 D), target
+    distances (D+1), corridors (5 (D+1)); then target positions (3 (D+1)), chaser distances (upper
+    triangle, row by row), L1 weight (1). ``rows``: distances a stage: per chaser target, outer
+    bound, corridor; then the pairs. ``stage_sizes``: (states, inputs and slacks, constraints
+    besides the defects) of stages 0..D.
     """
 
     n: int
@@ -102,13 +108,14 @@ class Nlp:
 
 
 def _norm(a: Any) -> Any:
-    # The constant keeps the gradient finite where two points coincide; it changes 0.35 m by 1e-12 m.
+    # The constant keeps the gradient finite where two points coincide; it changes 0.35 m by 1e-12
+    # m.
     return ca.sqrt(ca.sumsqr(a) + 1e-12)
 
 
 def _corridor(r: Any, corridor: Any) -> Any:
-    """Return the distance from the surface of the corridor's cone, positive inside (`corridor_room` in
-    native/planes.c)."""
+    """Return the distance from the surface of the corridor's cone, positive inside (`corridor_room`
+    in native/planes.c)."""
     axis, half_angle, apex = corridor[0:3], corridor[3], corridor[4]
     along = ca.dot(axis, r)
     return ca.sin(half_angle) * (along - apex) - ca.cos(half_angle) * _norm(r - along * axis)
@@ -116,12 +123,15 @@ def _corridor(r: Any, corridor: Any) -> Any:
 
 def _pose_cost_function() -> ca.Function:
     x, reference, weights = ca.SX.sym("x", 13), ca.SX.sym("reference", 7), ca.SX.sym("weights", 2)
-    return ca.Function("pose", [x, reference, weights], [pose_cost(x, reference, weights[0], weights[1])])
+    return ca.Function(
+        "pose", [x, reference, weights], [pose_cost(x, reference, weights[0], weights[1])]
+    )
 
 
 def _distances(n: int, params: NmpcParameters) -> ca.Function:
-    """Return the constraints of one stage: states (13, n), positions of references (3, n) and target (3), keep-out
-    radii (n), corridors (5, n), pair distances -> margins; per chaser target, outer bound, corridor; then the pairs."""
+    """Return the constraints of one stage: states (13, n), positions of references (3, n) and
+    target (3), keep-out radii (n), corridors (5, n), pair distances -> margins; per chaser target,
+    outer bound, corridor; then the pairs."""
     pairs = [(i, j) for i in range(n) for j in range(i + 1, n)]
     x, p_ref, target = ca.SX.sym("x", 13, n), ca.SX.sym("p_ref", 3, n), ca.SX.sym("target", 3)
     to_target, corridors, apart = (
@@ -137,26 +147,32 @@ def _distances(n: int, params: NmpcParameters) -> ca.Function:
         out.append(_corridor(r, corridors[:, i]))
     for row, (i, j) in enumerate(pairs):
         out.append(_norm(x[0:3, i] - x[0:3, j]) - apart[row])
-    return ca.Function("distances", [x, p_ref, target, to_target, corridors, apart], [ca.vertcat(*out)])
+    return ca.Function(
+        "distances", [x, p_ref, target, to_target, corridors, apart], [ca.vertcat(*out)]
+    )
 
 
 def _stage_sizes(n: int, k: int, stages: int, rows: int, multiple: bool) -> tuple[int, int, int]:
-    """Return the numbers of states, inputs with slacks, and constraints besides the defects of stage ``k``."""
+    """Return the numbers of states, inputs with slacks, and constraints besides the defects of
+    stage ``k``.
+    """
     inputs = 6 * n if k < stages else 0
     if not multiple:
         return 0, inputs, rows if k > 0 else 0
     return (13 * n, inputs + rows, rows) if k > 0 else (13 * n, inputs, 13 * n)
 
 
-def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple", symbol: Any = ca.SX.sym) -> Nlp:
+def build_nlp(
+    n: int, params: NmpcParameters, shooting: str = "multiple", symbol: Any = ca.SX.sym
+) -> Nlp:
     """Build eq. 6 and 7 for ``n`` chasers. Raises ValueError for n < 1.
 
-    ``symbol``: ``ca.SX.sym`` for one graph of scalars, ``ca.MX.sym`` for calls of one function per stage, which
-    generates much shorter C.
+    ``symbol``: ``ca.SX.sym`` for one graph of scalars, ``ca.MX.sym`` for calls of one function per
+    stage, which generates much shorter C.
 
-    The variable bounds contain the input box (4a). The distances (4b to 4d) apply at stages 1..D, as stage 0 cannot be
-    changed. With ``shooting`` "multiple" each has a slack; with "single", for augmented-Lagrangian methods with their
-    own penalty, they have none.
+    The variable bounds contain the input box (4a). The distances (4b to 4d) apply at stages 1..D,
+    as stage 0 cannot be changed. With ``shooting`` "multiple" each has a slack; with "single", for
+    augmented-Lagrangian methods with their own penalty, they have none.
     """
     if n < 1:
         raise ValueError(f"n must be at least 1, not {n}")
@@ -217,7 +233,13 @@ def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple", symbol
 
     parameters: list[Any] = []
     for i in range(n):
-        parameters += [x0[i], ca.vec(references[i]), ca.vec(u_ref[i]), to_target[i], ca.vec(corridors[i])]
+        parameters += [
+            x0[i],
+            ca.vec(references[i]),
+            ca.vec(u_ref[i]),
+            to_target[i],
+            ca.vec(corridors[i]),
+        ]
     return Nlp(
         n=n,
         stages=d,

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default back end: a real-time iteration with one structured QP per chaser and tick (native/tick.c).
+"""Default back end: a real-time iteration with one structured QP per chaser and tick
+(native/tick.c).
 
-Diehl, Bock and Schloeder, SIAM J. Control Optim. 43 (2005): the shifted inputs are rolled through the nonlinear
-dynamics, everything is linearized about that rollout, and one quadratic programme is solved. The vector part
-of q (x) q_ref* is linear in q, so the cost is exactly quadratic and needs no convexification. Limited by
-iterations, never by time, so equal inputs give equal plans.
+Diehl, Bock and Schloeder, SIAM J. Control Optim. 43 (2005): the shifted inputs are rolled through
+the nonlinear dynamics, everything is linearized about that rollout, and one quadratic programme is
+solved. The vector part of q (x) q_ref* is linear in q, so the cost is exactly quadratic and needs
+no convexification. Limited by iterations, never by time, so equal inputs give equal plans.
 """
 
 from __future__ import annotations
@@ -25,16 +26,19 @@ REACH_SAFETY = 1.5
 
 
 class RtiSolver:
-    """Real-time iteration for up to ``n_chasers`` chasers; keeps the last plan of each as its warm start.
+    """Real-time iteration for up to ``n_chasers`` chasers; keeps the last plan of each as its warm
+    start.
 
-    ``max_iterations`` bounds the interior point's iterations of all chasers together in one solve; each
-    chaser may use an even share of the remaining iterations, at most `MAX_ITERATIONS`. It may be changed between
-    solves. A chaser that is stopped by this bound has the status "budget". Solvers share no memory: each may run in its
-    own thread. Raises ValueError for n_chasers < 1 or a
-    negative budget.
+    ``max_iterations`` bounds the interior point's iterations of all chasers together in one solve;
+    each chaser may use an even share of the remaining iterations, at most `MAX_ITERATIONS`. It may
+    be changed between solves. A chaser that is stopped by this bound has the status "budget".
+    Solvers share no memory: each may run in its own thread. Raises ValueError for n_chasers < 1 or
+    a negative budget.
     """
 
-    def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
+    def __init__(
+        self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
+    ) -> None:
         self._frame = Frame(params, n_chasers)
         if max_iterations is not None and max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, not {max_iterations}")
@@ -48,15 +52,22 @@ class RtiSolver:
         """Discard all warm starts."""
         self._frame.plans = {}
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """Solve one tick. ``shift_s``: time since the previous call, s; ``ids``: chasers of the rows, 0..N-1 if None.
+    def solve(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
+    ) -> NmpcPlan:
+        """Solve one tick. ``shift_s``: time since the previous call, s; ``ids``: chasers of the
+        rows, 0..N-1 if None.
 
-        The warm start follows the id: a chaser whose id was not in the previous call starts from its u_ref.
-        Raises ValueError as `check_input`, `check_ids` and `check_shift`.
+        The warm start follows the id: a chaser whose id was not in the previous call starts from
+        its u_ref. Raises ValueError as `check_input`, `check_ids` and `check_shift`.
         """
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
-        budget = self.max_iterations if self.max_iterations is not None else len(task.start) * MAX_ITERATIONS
+        budget = (
+            self.max_iterations
+            if self.max_iterations is not None
+            else len(task.start) * MAX_ITERATIONS
+        )
         u, code, iterations = self._iterate(task.problem, task.start, budget)
         safety, certificates = task.problem.coast_safety, {}
         if safety is not None:
@@ -74,7 +85,9 @@ class RtiSolver:
         return replace(plan, status=tuple(status), coasts=certificates)
 
     def _iterate(self, p: NmpcInput, start: Array, budget: int) -> tuple[Array, IntArray, IntArray]:
-        """Return inputs (N, D, 6), codes and iterations (N,) of one iteration from ``start`` (N, D, 6)."""
+        """Return inputs (N, D, 6), codes and iterations (N,) of one iteration from ``start`` (N, D,
+        6).
+        """
         params, u = self._frame.params, start.copy()
         away = p.states[:, :3] - p.references[:, -1, :3]
         w1 = slack_l1_weight(params, np.sqrt((away * away).sum(axis=1)))

@@ -48,7 +48,9 @@ class PlanHistory(PlanningHistory):
         return self._monitor.failures(time_ns)
 
     def unsafe(self, time_ns: int) -> Mapping[int, str]:
-        """Return why chasers lack passive safety at ``time_ns``; whether they abort is guidance's matter."""
+        """Return why chasers lack passive safety at ``time_ns``; whether they abort is guidance's
+        matter.
+        """
         return {} if self._passive_safety is None else self._passive_safety.unsafe(time_ns)
 
 
@@ -59,7 +61,11 @@ class PlanningStage:
     """
 
     def __init__(
-        self, scenario: FlightScenario, parameters: NmpcParameters, now_s: Callable[[], float], realtime: bool
+        self,
+        scenario: FlightScenario,
+        parameters: NmpcParameters,
+        now_s: Callable[[], float],
+        realtime: bool,
     ) -> None:
         c = scenario.controller
         self._parameters, self._now_s = parameters, now_s
@@ -85,10 +91,11 @@ class PlanningStage:
     def run(
         self, observation: Observation, estimation: TargetEstimation, guidance: GuidanceResult
     ) -> PlanResult:
-        """Plan for the chasers of the guidance horizon, or keep their last plans for a while; lost chasers are obstacles.
+        """Plan for the chasers of the guidance horizon, or keep their last plans for a while; lost
+        chasers are obstacles.
 
-        The problem is solved for the input plus the estimated disturbance, which is then subtracted: the input cost keeps
-        its reference, and the disturbance causes no offset.
+        The problem is solved for the input plus the estimated disturbance, which is then
+        subtracted: the input cost keeps its reference, and the disturbance causes no offset.
         """
         horizon = guidance.horizon
         if horizon is None:
@@ -102,7 +109,9 @@ class PlanningStage:
             problem, observation.lost, observation.effective_ns, self._parameters.dt_s
         )
         if self._passive_safety is not None and guidance.abort_margins:
-            safety = self._passive_safety.restriction(horizon.chasers, guidance.abort_margins, estimation)
+            safety = self._passive_safety.restriction(
+                horizon.chasers, guidance.abort_margins, estimation
+            )
             problem = replace(problem, coast_safety=safety)
         since_ns = 0 if self._last_solve_ns is None else observation.time_ns - self._last_solve_ns
         if self._budget is not None:
@@ -134,14 +143,19 @@ class PlanningStage:
         return {} if self._passive_safety is None else dict(self._passive_safety.certificates)
 
     def problem(
-        self, horizon: HorizonReference, states: Mapping[int, Array], input_limits: Mapping[int, Array]
+        self,
+        horizon: HorizonReference,
+        states: Mapping[int, Array],
+        input_limits: Mapping[int, Array],
     ) -> NmpcInput:
         """Return the problem at the time when the commands take effect, without lost chasers."""
         limits = np.array([input_limits[i] for i in horizon.chasers])
         for row, i in enumerate(horizon.chasers):
             if i in horizon.attached:  # it cannot yield: its inputs only follow the target's motion
                 following = np.abs(horizon.u_ref[row]).max(axis=0)
-                limits[row] = np.minimum(limits[row], _ATTACHED_FACTOR * following + _ATTACHED_MARGIN)
+                limits[row] = np.minimum(
+                    limits[row], _ATTACHED_FACTOR * following + _ATTACHED_MARGIN
+                )
         return NmpcInput(
             states=np.array([states[i] for i in horizon.chasers]),
             references=horizon.references,
@@ -158,7 +172,9 @@ class PlanningStage:
         )
 
     def _between_shapes(self, box_clearance_m: Array | None) -> Array | None:
-        """Return the distances (N, N) of the shapes of chasers: none between two in their corridors or at their ports."""
+        """Return the distances (N, N) of the shapes of chasers: none between two in their corridors
+        or at their ports.
+        """
         if box_clearance_m is None:
             return None
         free = box_clearance_m > 0.0
@@ -166,7 +182,9 @@ class PlanningStage:
 
 
 def _bounded(disturbance: Array, limits: Array) -> Array:
-    """Return a disturbance (6,) of which an actuator with these limits can always cancel the whole and keep half its range."""
+    """Return a disturbance (6,) of which an actuator with these limits can always cancel the whole
+    and keep half its range.
+    """
     return limited(disturbance, _CANCELLED_SHARE * limits)
 
 

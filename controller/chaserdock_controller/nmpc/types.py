@@ -36,12 +36,12 @@ _NOT_NEGATIVE = (
 class NmpcParameters:
     """Constant parameters of the problem. SI units, radians.
 
-    The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2, ``weight_orientation``
-    on the squared vector part of q_err (dimensionless), ``weight_force`` per N^2, ``weight_torque`` per
-    (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full matrix about the centre of mass in
-    body axes. ``boxes``, ``coasts``: most cuboids of the target's shape, and most approaches of a coast, in a problem.
-    ``force_max_N`` and ``torque_max_N_m`` are per body axis.
-    Raises ValueError, naming the field, for an invalid value.
+    The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2,
+    ``weight_orientation`` on the squared vector part of q_err (dimensionless), ``weight_force`` per
+    N^2, ``weight_torque`` per (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full
+    matrix about the centre of mass in body axes. ``boxes``, ``coasts``: most cuboids of the
+    target's shape, and most approaches of a coast, in a problem. ``force_max_N`` and
+    ``torque_max_N_m`` are per body axis. Raises ValueError, naming the field, for an invalid value.
     """
 
     mass_kg: float
@@ -68,13 +68,19 @@ class NmpcParameters:
                 raise ValueError(f"{name} must be positive and finite, not {getattr(self, name)!r}")
         for name in _NOT_NEGATIVE:
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ValueError(f"{name} must be finite and not negative, not {getattr(self, name)!r}")
+                raise ValueError(
+                    f"{name} must be finite and not negative, not {getattr(self, name)!r}"
+                )
         if not (math.isfinite(self.horizon_s) and round(self.horizon_s / self.dt_s) >= 1):
-            raise ValueError(f"horizon_s={self.horizon_s!r} is shorter than one step of dt_s={self.dt_s!r}")
+            raise ValueError(
+                f"horizon_s={self.horizon_s!r} is shorter than one step of dt_s={self.dt_s!r}"
+            )
         if not 0.0 <= self.falloff <= 1.0:
             raise ValueError(f"falloff must lie between 0 and 1, not {self.falloff!r}")
         if self.integrator not in INTEGRATORS:
-            raise ValueError(f"integrator must be one of {', '.join(INTEGRATORS)}, not {self.integrator!r}")
+            raise ValueError(
+                f"integrator must be one of {', '.join(INTEGRATORS)}, not {self.integrator!r}"
+            )
         self._check_inertia()
 
     def _check_inertia(self) -> None:
@@ -92,8 +98,8 @@ class NmpcParameters:
         return round(self.horizon_s / self.dt_s)
 
     def stage_weights(self) -> tuple[Array, Array]:
-        """Return the weights of position and orientation at stages 0..D, each (D+1,), the final ones included (eq.
-        6)."""
+        """Return the weights of position and orientation at stages 0..D, each (D+1,), the final
+        ones included (eq. 6)."""
         scale = 1.0 - self.falloff * np.arange(self.stages + 1) / self.stages
         position, orientation = self.weight_position * scale, self.weight_orientation * scale
         position[-1] += self.weight_final_position
@@ -109,8 +115,9 @@ class NmpcParameters:
 class CoastSafety:
     """Passive safety to keep: the coasts from all stages stay outside of a sphere about the target.
 
-    ``covariances``: of a chaser's position and velocity relative to the target (6, 6), by row of the problem; other rows are free.
-    ``sigmas``: the margin, in standard deviations along the line from the target. ``target_velocity_m_s`` (3,): WRF.
+    ``covariances``: of a chaser's position and velocity relative to the target (6, 6), by row of
+    the problem; other rows are free. ``sigmas``: the margin, in standard deviations along the line
+    from the target. ``target_velocity_m_s`` (3,): WRF.
     """
 
     coast: CoastModel
@@ -125,23 +132,24 @@ class NmpcInput:
     """The problem of one tick for N chasers over D stages.
 
     states (N, 13): p (WRF, m), v (WRF, m/s), q_wxyz (body to world), omega (body, rad/s).
-    references (N, D+1, 7): p (WRF, m), q_wxyz; stage 0 is now.
-    u_ref (N, D, 6): force (N) and torque (N m), body axes, the reference of the input cost.
-    target_positions (D+1, 3): WRF, m. min_distance_target_m (N,) or, for each stage, (N, D+1);
-    min_distance_chasers_m: one float or a symmetric (N, N), diagonal ignored; 0 switches a constraint off.
-    input_max (N, 6): N and N m, body axes; may change from tick to tick.
-    corridors (N, D+1, 5) or None: an approach corridor of a chaser at a stage: a cone about an axis through the
-    target, [axis (3; WRF, unit, from the target outwards; zero: no corridor), half angle (rad, above 0 and below
-    pi/2), distance of the apex from the target's centre along the axis (m; may be negative)]. It applies in addition to
-    the keep-out ball, which is smaller or 0 for a docking chaser.
-    boxes (D+1, C, 15) or None: cuboids of the target's shape at each stage: centre (3; WRF, m), rotation cuboid to WRF (9,
-    row-major), half edges (3; m). box_clearance_m (N,) or None: distance that each chaser's centre keeps from them; 0 switches it
-    off. chaser_shape (S, 15) or None: cuboids of a chaser, as boxes but in body axes: then that distance, and
-    min_distance_shapes_m (N, N), symmetric, between two chasers, 0 for none, are between shapes, in addition to
-    those between centres. Only the back end `rti` keeps these.
-    coast_safety: passive safety to keep, or None. Where a plan without it is not safe, the back end `rti` linearizes it
-    about its start into coasts (N, D+1, C, 7): half-spaces a' p + b' v >= d of position and velocity at a stage,
-    [a (3), b (3), d]; a and b zero for none (`coast_rows`). Other back ends do not keep it.
+    references (N, D+1, 7): p (WRF, m), q_wxyz; stage 0 is now. u_ref (N, D, 6): force (N) and
+    torque (N m), body axes, the reference of the input cost. target_positions (D+1, 3): WRF, m.
+    min_distance_target_m (N,) or, for each stage, (N, D+1); min_distance_chasers_m: one float or a
+    symmetric (N, N), diagonal ignored; 0 switches a constraint off. input_max (N, 6): N and N m,
+    body axes; may change from tick to tick. corridors (N, D+1, 5) or None: an approach corridor of
+    a chaser at a stage: a cone about an axis through the target, [axis (3; WRF, unit, from the
+    target outwards; zero: no corridor), half angle (rad, above 0 and below pi/2), distance of the
+    apex from the target's centre along the axis (m; may be negative)]. It applies in addition to
+    the keep-out ball, which is smaller or 0 for a docking chaser. boxes (D+1, C, 15) or None:
+    cuboids of the target's shape at each stage: centre (3; WRF, m), rotation cuboid to WRF (9,
+    row-major), half edges (3; m). box_clearance_m (N,) or None: distance that each chaser's centre
+    keeps from them; 0 switches it off. chaser_shape (S, 15) or None: cuboids of a chaser, as boxes
+    but in body axes: then that distance, and min_distance_shapes_m (N, N), symmetric, between two
+    chasers, 0 for none, are between shapes, in addition to those between centres. Only the back end
+    `rti` keeps these. coast_safety: passive safety to keep, or None. Where a plan without it is not
+    safe, the back end `rti` linearizes it about its start into coasts (N, D+1, C, 7): half-spaces
+    a' p + b' v >= d of position and velocity at a stage, [a (3), b (3), d]; a and b zero for none
+    (`coast_rows`). Other back ends do not keep it.
     """
 
     states: Array
@@ -164,12 +172,13 @@ class NmpcInput:
 class NmpcPlan:
     """Solution for N chasers, rows in the order of the input.
 
-    inputs (N, D, 6): N and N m, body axes, within ``input_max``. states (N, D+1, 13): those inputs through
-    the nonlinear model. status per chaser: "solved"; "iteration_limit" (best point within the solver's limit);
-    "budget" (best point within the iteration budget, which may violate distances: see ``max_violation_m``);
-    "infeasible_relaxed" (the plan enters a keep-out zone by ``max_violation_m``: no input avoids it, or the start lies
-    inside); "failed" (numerical breakdown: the inputs are the shifted previous plan).
-    iterations (N,): interior-point iterations, 0 if none is needed. cost (N,): eq. 6 on ``states``. coasts: certificates of the
+    inputs (N, D, 6): N and N m, body axes, within ``input_max``. states (N, D+1, 13): those inputs
+    through the nonlinear model. status per chaser: "solved"; "iteration_limit" (best point within
+    the solver's limit); "budget" (best point within the iteration budget, which may violate
+    distances: see ``max_violation_m``); "infeasible_relaxed" (the plan enters a keep-out zone by
+    ``max_violation_m``: no input avoids it, or the start lies inside); "failed" (numerical
+    breakdown: the inputs are the shifted previous plan). iterations (N,): interior-point
+    iterations, 0 if none is needed. cost (N,): eq. 6 on ``states``. coasts: certificates of the
     plans of the rows in ``coast_safety``.
     """
 
@@ -185,6 +194,8 @@ class NmpcPlan:
 class NmpcSolver(Protocol):
     """Interface of the back ends."""
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan: ...
+    def solve(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
+    ) -> NmpcPlan: ...
 
     def reset(self) -> None: ...

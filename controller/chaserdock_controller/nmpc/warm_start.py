@@ -61,8 +61,12 @@ class Frame:
         function("solve_tick")  # load the library before the first tick
         self.model, self.weights = model_of(self.params), Weights(self.params)
 
-    def begin(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None) -> PreparedProblem:
-        """Check the problem and compute the warm start. Raises ValueError as the checks in `checks`."""
+    def begin(
+        self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None
+    ) -> PreparedProblem:
+        """Check the problem and compute the warm start. Raises ValueError as the checks in
+        `checks`.
+        """
         checked = check_input(problem, self.params, self.n_max)
         names = check_ids(ids, len(checked.states))
         start = warm_start(self.plans, names, checked, check_shift(shift_s), self.params.dt_s)
@@ -86,8 +90,9 @@ class Frame:
     ) -> NmpcPlan:
         """Return the plan of inputs ``u`` and keep it as the next warm start.
 
-        ``status``: the back end's status of each row. A row at the iteration limit uses the better of its solution and
-        its start, since an unconverged solution may be worse than the warm start.
+        ``status``: the back end's status of each row. A row at the iteration limit uses the better
+        of its solution and its start, since an unconverged solution may be worse than the warm
+        start.
         """
         x = self.rolled(task, u)
         cost, violation = self.evaluate(task, x, u)

@@ -97,10 +97,14 @@ def geometry_estimate(shape: EstimatedShape) -> GeometryEstimate:
 def expected_pose(
     chaser: int, estimation: TargetEstimation, camera: Camera, time_ns: int, ahead_s: float
 ) -> ExpectedPose:
-    """Return where the target will be in the camera of a chaser, ``ahead_s`` after the estimates of ``time_ns``."""
+    """Return where the target will be in the camera of a chaser, ``ahead_s`` after the estimates of
+    ``time_ns``.
+    """
     target, own = estimation.target, estimation.own[chaser]
     p_own, q_own = _moved(own.position_m, own.velocity_m_s, own.q_wxyz, own.omega_rad_s, ahead_s)
-    p, q = _moved(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s, ahead_s)
+    p, q = _moved(
+        target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s, ahead_s
+    )
     lens, q_camera = camera.irf_pose_in_world(p_own, q_own)
     return ExpectedPose(
         sim_time_ns=time_ns + round(ahead_s * 1e9),
@@ -110,11 +114,17 @@ def expected_pose(
 
 
 def _moved(
-    position_m: ArrayLike, velocity_m_s: ArrayLike, q_wxyz: ArrayLike, omega_rad_s: ArrayLike, time_s: float
+    position_m: ArrayLike,
+    velocity_m_s: ArrayLike,
+    q_wxyz: ArrayLike,
+    omega_rad_s: ArrayLike,
+    time_s: float,
 ) -> tuple[Array, Array]:
     """Return position (3,) and attitude (4,) after a time at constant rates."""
     turn = rotations.exp(np.asarray(omega_rad_s) * time_s)
-    return np.asarray(position_m) + time_s * np.asarray(velocity_m_s), rotations.multiply(q_wxyz, turn)
+    return np.asarray(position_m) + time_s * np.asarray(velocity_m_s), rotations.multiply(
+        q_wxyz, turn
+    )
 
 
 def stack_message(observation: Observation, stack: IdentifiedStack) -> StackEstimate:

@@ -9,8 +9,8 @@ from chaserdock_models.arrays import Array, limited
 COMMAND_STEP = np.array([2.0**-16] * 3 + [2.0**-22] * 3)
 """Resolution of commands: 15 uN and 0.24 uN m, 17 and 18 bits of the paper's actuators.
 
-It also removes differences in the last bits between SIMD levels or BLAS versions, which images in whole grey levels would
-amplify to their own noise.
+It also removes differences in the last bits between SIMD levels or BLAS versions, which images in
+whole grey levels would amplify to their own noise.
 """
 
 

@@ -56,11 +56,15 @@ class OutputStage:
         result: PlanResult,
     ) -> TickOutputs:
         """Return all messages of a tick."""
-        out = TickOutputs(target=target_message(observation, estimation), replies=list(guidance.replies))
+        out = TickOutputs(
+            target=target_message(observation, estimation), replies=list(guidance.replies)
+        )
         if estimation.stack is not None and observation.tick % self._scenario.time.rate_hz == 0:
             out.stack = stack_message(observation, estimation.stack)
         shape = estimation.shape
-        renewed = shape is not None and (shape.changed or observation.tick % self._scenario.time.rate_hz == 0)
+        renewed = shape is not None and (
+            shape.changed or observation.tick % self._scenario.time.rate_hz == 0
+        )
         geometry = geometry_estimate(shape) if shape is not None and renewed else None
         expected = self._expected(observation, estimation)
         events = [*observation.events, *estimation.events, *guidance.events, *result.events]
@@ -70,8 +74,12 @@ class OutputStage:
                 out.references[i] = reference_message(i, observation, directive)
             command = directive.direct
             if command is None:
-                command = self._planned_or_safe(i, observation, estimation, guidance, result, events, out)
-            out.wrenches[i] = self._send(i, observation, guidance, command, geometry, expected.get(i))
+                command = self._planned_or_safe(
+                    i, observation, estimation, guidance, result, events, out
+                )
+            out.wrenches[i] = self._send(
+                i, observation, guidance, command, geometry, expected.get(i)
+            )
         for i, reason in observation.invalid.items():
             if i not in self._without_plan:
                 events.append(("error", f"chaser {i}: invalid odometry, coasting: {reason}"))
@@ -80,18 +88,25 @@ class OutputStage:
             assert command is not None
             out.wrenches[i] = self._send(i, observation, guidance, command, geometry, None)
         self.history.forget_before(observation.time_ns)
-        out.safety = {i: safety_message(i, observation, guidance, c) for i, c in result.certificates.items()}
+        out.safety = {
+            i: safety_message(i, observation, guidance, c) for i, c in result.certificates.items()
+        }
         out.solver = solver_message(observation, self._scenario.controller.solver, result)
         out.events = [event_message(observation, level, text) for level, text in events]
         return out
 
-    def _expected(self, observation: Observation, estimation: TargetEstimation) -> dict[int, ExpectedPose]:
-        """Return where chasers that do not see a target without markers will have it in their next image."""
+    def _expected(
+        self, observation: Observation, estimation: TargetEstimation
+    ) -> dict[int, ExpectedPose]:
+        """Return where chasers that do not see a target without markers will have it in their next
+        image.
+        """
         if self._scenario.perception.name != "model" or not estimation.known:
             return {}
         unseen = [i for i in observation.odometry if i not in estimation.visible_to]
         return {
-            i: expected_pose(i, estimation, self._camera, observation.time_ns, self._period_s) for i in unseen
+            i: expected_pose(i, estimation, self._camera, observation.time_ns, self._period_s)
+            for i in unseen
         }
 
     def _planned_or_safe(
@@ -106,7 +121,8 @@ class OutputStage:
     ) -> DirectCommand:
         """Return the input of a chaser's plan; without one that may be flown, a safe wrench.
 
-        That follows the reference, and so moves with the target. Without a target it brakes to rest in WRF.
+        That follows the reference, and so moves with the target. Without a target it brakes to rest
+        in WRF.
         """
         step_s = self._scenario.controller.dt_s
         plan = result.flyable.get(i)
@@ -142,7 +158,11 @@ class OutputStage:
     ) -> WrenchCommand:
         thrusts = command.thrusts_N
         # The limits hold on all axes at once; commanded thrusters need none but their own.
-        limits = observation.input_limits[i] if thrusts is None else np.abs(command.wrench) + COMMAND_STEP
+        limits = (
+            observation.input_limits[i]
+            if thrusts is None
+            else np.abs(command.wrench) + COMMAND_STEP
+        )
         wrench = in_steps(command.wrench, limits)
         self.history.add(i, observation.effective_ns, wrench)
         directive = guidance.directives[i]
@@ -156,7 +176,9 @@ class OutputStage:
             mode=command.mode,
             force_N=vector(wrench[:3]),
             torque_N_m=vector(wrench[3:]),
-            thrusts_N=() if thrusts is None else vector(np.rint(thrusts / COMMAND_STEP[0]) * COMMAND_STEP[0]),
+            thrusts_N=()
+            if thrusts is None
+            else vector(np.rint(thrusts / COMMAND_STEP[0]) * COMMAND_STEP[0]),
             latch=directive.latch,
             isolated=directive.isolated,
             trusted=directive.trusted,
@@ -172,7 +194,11 @@ def _body_state(x: Array) -> BodyState:
 
 
 def _setpoint(horizon: HorizonReference, row: int, step_s: float) -> Setpoint:
-    """Return the reference at the beginning of the horizon; its rates are those over the first stage."""
+    """Return the reference at the beginning of the horizon; its rates are those over the first
+    stage.
+    """
     now, then = horizon.references[row, :2]
     turn = rotations.log(rotations.multiply(rotations.conjugate(now[3:]), then[3:]))
-    return Setpoint(now[:3], (then[:3] - now[:3]) / step_s, now[3:], turn / step_s, horizon.u_ref[row, 0])
+    return Setpoint(
+        now[:3], (then[:3] - now[:3]) / step_s, now[3:], turn / step_s, horizon.u_ref[row, 0]
+    )

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serialize and restore controller state for a standby that joins late.
 
-Of the filter's buffer only the newest exposure is included: a sighting older than that cannot be used after a restore. The
-state of estimators and solvers of installed packages is not included: they start from their initial state.
+Of the filter's buffer only the newest exposure is included: a sighting older than that cannot be
+used after a restore. The state of estimators and solvers of installed packages is not included:
+they start from their initial state.
 """
 
 from __future__ import annotations
@@ -94,7 +95,9 @@ class ThrusterCommandState(Struct, forbid_unknown_fields=True):
 
 
 class SafetyState(Struct, forbid_unknown_fields=True):
-    """Waiting of the stack for chasers that back out, and margins of the best aborts where passive safety is enforced."""
+    """Waiting of the stack for chasers that back out, and margins of the best aborts where passive
+    safety is enforced.
+    """
 
     _waits: bool
     _abort_margins: dict[int, float]
@@ -190,8 +193,9 @@ class PaperState(Struct, forbid_unknown_fields=True, tag=True):
 
 
 class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
-    """State of a controller after a tick. ``timeline_left``: commands of the scenario's timeline that are not yet due.
-    ``identification``: None without it. ``plans``: warm starts of the NMPC solver, inputs by chaser."""
+    """State of a controller after a tick. ``timeline_left``: commands of the scenario's timeline
+    that are not yet due. ``identification``: None without it. ``plans``: warm starts of the NMPC
+    solver, inputs by chaser."""
 
     core: CoreState
     sightings: SightingState
@@ -225,7 +229,9 @@ class Checkpoint:
         self._core, self._odometry = core, odometry
 
     def _parts(self) -> dict[str, tuple[Any, type[Struct]]]:
-        """Return the objects whose attributes are copied, and what is copied of them, by field of the checkpoint."""
+        """Return the objects whose attributes are copied, and what is copied of them, by field of
+        the checkpoint.
+        """
         core = self._core
         parts: dict[str, tuple[Any, type[Struct]]] = {
             "core": (core, CoreState),
@@ -279,14 +285,22 @@ class Checkpoint:
         chasers = len(self._core.scenario.chasers)
         if len(state.guidance.chasers) != chasers or not 0 <= state.timeline_left <= len(timeline):
             raise CheckpointError("the state is of another mission")
-        count = None if self._core.estimation.shape is None else len(self._core.estimation.shape.parameters)
+        count = (
+            None
+            if self._core.estimation.shape is None
+            else len(self._core.estimation.shape.parameters)
+        )
         if count != (None if state.shape is None else len(state.shape.filter.vector)):
             raise CheckpointError("the state is of another mission")
         self._restore_identification(state.identification)
         for name, (owner, _) in self._parts().items():
             _write(owner, getattr(state, name))
-        vars(self._core.guidance.machine)["_timeline"] = timeline[len(timeline) - state.timeline_left :]
-        if state.estimator is not None and type(state.estimator) is _estimator_kind(self._core.estimator):
+        vars(self._core.guidance.machine)["_timeline"] = timeline[
+            len(timeline) - state.timeline_left :
+        ]
+        if state.estimator is not None and type(state.estimator) is _estimator_kind(
+            self._core.estimator
+        ):
             _write(self._core.estimator, state.estimator)
         frame = self._warm_starts()
         if frame is not None:

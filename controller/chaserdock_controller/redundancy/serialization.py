@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encode and decode controller state as msgpack. Only values of the declared types are decoded; no code travels."""
+"""Encode and decode controller state as msgpack. Only values of the declared types are decoded; no
+code travels.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leader and hot standby of the controller: what to wait for, what to hold back, when to publish. No I/O.
+"""Leader and hot standby of the controller: what to wait for, what to hold back, when to publish.
+No I/O.
 
-In lock-step a standby processes a tick once it has the same inputs and the leader's operator commands of that tick, so that
-both have the same state after each tick. In real time it does not wait. A standby that joins late or has missed ticks
-restores the leader's state first.
+In lock-step a standby processes a tick once it has the same inputs and the leader's operator
+commands of that tick, so that both have the same state after each tick. In real time it does not
+wait. A standby that joins late or has missed ticks restores the leader's state first.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ _MOST_HELD = 100_000
 class HotStandby:
     """Role of this process. ``leads``: it commands the newest tick; ``since``: from which tick on.
 
-    ``leader``: who commands the newest tick, None if no controller does. ``replayed``: in a replay, in which this process commands
-    every tick, the commander in the log.
+    ``leader``: who commands the newest tick, None if no controller does. ``replayed``: in a replay,
+    in which this process commands every tick, the commander in the log.
     """
 
     name: str
@@ -65,17 +66,20 @@ class HotStandby:
             self.leads, self.leader = True, self.replayed
 
     def is_decided(self, tick: Tick) -> bool:
-        """Return whether it is known who commands a tick: in lock-step, once each chaser has stated its lease."""
+        """Return whether it is known who commands a tick: in lock-step, once each chaser has stated
+        its lease.
+        """
         newest = self.newest
         if self.realtime or self.replaying or newest is None or newest.tick > tick.tick:
             return True
         return not self.leases.missing(newest)
 
     def decide(self, processed: Tick | None = None) -> bool:
-        """Determine who commands the newest tick; return whether this process begins to, without any state.
+        """Determine who commands the newest tick; return whether this process begins to, without
+        any state.
 
-        In real time leases of a tick may be on their way: a commander continues until it processes a tick (``processed``) that
-        it does not command, or until another one commands.
+        In real time leases of a tick may be on their way: a commander continues until it processes
+        a tick (``processed``) that it does not command, or until another one commands.
         """
         tick = processed or self.newest
         if tick is None or self.replaying or not self.is_decided(tick):
@@ -118,10 +122,14 @@ class HotStandby:
         return self.leads and tick >= self.since
 
     def hold_back(self, received: ReceivedMessage, done_tick: int) -> bool:
-        """Hold back a message of a tick after the next one to process; return whether it was held back."""
+        """Hold back a message of a tick after the next one to process; return whether it was held
+        back.
+        """
         if self.realtime or self.replaying or received.message.tick < 0:
             return False
-        if self._synced and ((self.leads and not self._held) or received.message.tick <= done_tick + 1):
+        if self._synced and (
+            (self.leads and not self._held) or received.message.tick <= done_tick + 1
+        ):
             return False
         self._held.append(received)
         return True
@@ -144,7 +152,8 @@ class HotStandby:
     def on_idle(self, open_tick: int) -> bool:
         """Return whether to process the open tick although no more messages arrive.
 
-        The world has published a later tick. A standby has missed its messages then, and waits for the leader's state instead.
+        The world has published a later tick. A standby has missed its messages then, and waits for
+        the leader's state instead.
         """
         if self.newest is None or self.newest.tick <= open_tick:
             return False
@@ -153,10 +162,11 @@ class HotStandby:
         return self.leads
 
     def is_deposed(self, state: ControllerState) -> bool:
-        """Return whether the sender of a state message has lost the command, in real time, and may not know it yet.
+        """Return whether the sender of a state message has lost the command, in real time, and may
+        not know it yet.
 
-        A term above all known ones is of a commander whose leases are on their way. In lock-step a standby uses messages of its own
-        tick only.
+        A term above all known ones is of a commander whose leases are on their way. In lock-step a
+        standby uses messages of its own tick only.
         """
         leader = self.leader
         if not self.realtime:
@@ -176,8 +186,12 @@ class HotStandby:
         return tick in self.leader_commands or self.leader is None
 
     def take_leader_commands(self, tick: int) -> tuple[OperatorCommand, ...]:
-        """Return the operator commands of a tick that another leader has accepted; in real time, since the last call."""
-        commands = [c for t, c in sorted(self.leader_commands.items()) if t == tick or self.realtime]
+        """Return the operator commands of a tick that another leader has accepted; in real time,
+        since the last call.
+        """
+        commands = [
+            c for t, c in sorted(self.leader_commands.items()) if t == tick or self.realtime
+        ]
         self.leader_commands = {
             t: c for t, c in self.leader_commands.items() if t > tick and not self.realtime
         }

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Load the numerical kernels: C code that is compiled when the package is built.
 
-Each package with kernels has a folder ``native`` with its C sources, ``kernels.c`` which includes them, and one shared
-library ``kernels.so``. This module loads such libraries and provides the kernels of ``chaserdock_models``.
+Each package with kernels has a folder ``native`` with its C sources, ``kernels.c`` which includes
+them, and one shared library ``kernels.so``. This module loads such libraries and provides the
+kernels of ``chaserdock_models``.
 
-A library contains every function once per instruction set (on x86-64: SSE4, and AVX2 with FMA). The copy is
-chosen at run time; all copies give the same bits. Arguments are C-contiguous float64 arrays (int64 or uint8 where stated),
-passed by ``address``; callers check shapes. Kernels keep nothing between calls and have no static memory: threads may call the
-same kernel at once, each with its own arrays.
+A library contains every function once per instruction set (on x86-64: SSE4, and AVX2 with FMA). The
+copy is chosen at run time; all copies give the same bits. Arguments are C-contiguous float64 arrays
+(int64 or uint8 where stated), passed by ``address``; callers check shapes. Kernels keep nothing
+between calls and have no static memory: threads may call the same kernel at once, each with its own
+arrays.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ _INSTALL = "reinstall chaserdock (in a clone: pip install --no-deps -e .), which
 
 
 class KernelLibrary:
-    """The compiled kernels of one package, loaded on first use from the folder of ``file``, its ``native/__init__.py``."""
+    """The compiled kernels of one package, loaded on first use from the folder of ``file``, its
+    ``native/__init__.py``.
+    """
 
     def __init__(self, file: str) -> None:
         self.path = Path(file).with_name(LIBRARY_NAME)
@@ -35,7 +39,9 @@ class KernelLibrary:
 
     @cached_property
     def library(self) -> ctypes.CDLL:
-        """The shared library. Raises ImportError if it is missing, does not load, or was compiled from other sources."""
+        """The shared library. Raises ImportError if it is missing, does not load, or was compiled
+        from other sources.
+        """
         if not self.path.exists():
             raise ImportError(f"{self.path}: the compiled kernels are missing; {_INSTALL}")
         try:
@@ -46,7 +52,9 @@ class KernelLibrary:
             ) from None
         library.source_digest.restype = ctypes.c_char_p
         if library.source_digest().decode() != source_digest(self.path.parent):
-            raise ImportError(f"{self.path}: compiled from other sources than those beside it; {_INSTALL}")
+            raise ImportError(
+                f"{self.path}: compiled from other sources than those beside it; {_INSTALL}"
+            )
         return library
 
     @cached_property
@@ -55,7 +63,9 @@ class KernelLibrary:
         return int(self.library.level())
 
     def function(self, name: str, result: Any = None, at_level: int | None = None) -> Any:
-        """Return kernel ``name`` for this processor, or its copy for ``at_level``; ``result`` is its ctypes type."""
+        """Return kernel ``name`` for this processor, or its copy for ``at_level``; ``result`` is
+        its ctypes type.
+        """
         kernel = self._functions.get(name) if at_level is None else None
         if kernel is None:
             kernel = self.library[f"v{self.level if at_level is None else at_level}_{name}"]
@@ -66,13 +76,17 @@ class KernelLibrary:
 
 
 address: Callable[[Any], ctypes.Array[ctypes.c_char]] = (ctypes.c_char * 0).from_buffer
-"""Return a writable C-contiguous array as an argument of a kernel: its address, which keeps it alive.
+"""Return a writable C-contiguous array as an argument of a kernel: its address, which keeps it
+alive.
 
-A type without a size rejects arrays that are not contiguous, and takes a fifteenth of the time of ``array.ctypes``."""
+A type without a size rejects arrays that are not contiguous, and takes a fifteenth of the time of
+``array.ctypes``."""
 
 
 def location(array: NDArray[Any]) -> int:
-    """Return the address of a writable C-contiguous array for a field of a structure. Keep the array alive meanwhile."""
+    """Return the address of a writable C-contiguous array for a field of a structure. Keep the
+    array alive meanwhile.
+    """
     return ctypes.addressof(address(array))
 
 

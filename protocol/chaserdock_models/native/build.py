@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compile the kernels: ``python protocol/chaserdock_models/native/build.py``. Building the package does this as well.
+"""Compile the kernels: ``python protocol/chaserdock_models/native/build.py``. Building the package
+does this as well.
 
-The compiler is zig's Clang from the wheel ``ziglang``; no system compiler is needed. The result does not depend on the
-build machine: its headers, C library and processor type are not used. So it can be compiled for another one (TARGETS).
+The compiler is zig's Clang from the wheel ``ziglang``; no system compiler is needed. The result
+does not depend on the build machine: its headers, C library and processor type are not used. So it
+can be compiled for another one (TARGETS).
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ _FREESTANDING = ("-nostdlib", "-s", "-Wl,-z,defs")
 
 @dataclass(frozen=True)
 class BuildTarget:
-    """A kind of machine: its instruction sets, zig's flags for compiling and linking, and the platform tag of its wheel."""
+    """A kind of machine: its instruction sets, zig's flags for compiling and linking, and the
+    platform tag of its wheel.
+    """
 
     levels: tuple[tuple[int, str], ...]
     compile_flags: tuple[str, ...]
@@ -72,7 +76,9 @@ TARGETS = {
 
 
 def this_machine() -> BuildTarget:
-    """Return the target of this machine; one outside TARGETS has the platform tag that Python reports."""
+    """Return the target of this machine; one outside TARGETS has the platform tag that Python
+    reports.
+    """
     system = {"linux": "linux", "darwin": "macos"}.get(sys.platform, sys.platform)
     machine = platform.machine().lower()
     tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
@@ -92,11 +98,14 @@ def source_digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def compile_kernels(folder: Path, target: BuildTarget | None = None, library: Path | None = None) -> Path:
-    """Compile ``kernels.c`` of ``folder`` for ``target`` (default: this machine) into a shared library and return its path.
+def compile_kernels(
+    folder: Path, target: BuildTarget | None = None, library: Path | None = None
+) -> Path:
+    """Compile ``kernels.c`` of ``folder`` for ``target`` (default: this machine) into a shared
+    library and return its path.
 
-    ``library``: the path to write, by default LIBRARY_NAME in ``folder``. Raises RuntimeError with the compiler's output if
-    compilation fails.
+    ``library``: the path to write, by default LIBRARY_NAME in ``folder``. Raises RuntimeError with
+    the compiler's output if compilation fails.
     """
     target = target or this_machine()
     library = library or folder / LIBRARY_NAME
@@ -109,7 +118,9 @@ def compile_kernels(folder: Path, target: BuildTarget | None = None, library: Pa
 
         def zig(*arguments: str) -> None:
             command = [sys.executable, "-m", "ziglang", "cc", *target.compile_flags, *arguments]
-            completed = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+            completed = subprocess.run(
+                command, cwd=folder, env=environment, capture_output=True, text=True
+            )
             if completed.returncode:
                 raise RuntimeError(
                     f"the kernels do not compile: {' '.join(command)}\n{completed.stdout}{completed.stderr}"
@@ -119,7 +130,16 @@ def compile_kernels(folder: Path, target: BuildTarget | None = None, library: Pa
         objects = []
         for level, processor in target.levels:
             objects.append(str(temporary / f"v{level}.o"))
-            zig(*FLAGS, include, processor, f"-DLEVEL=v{level}_", "-c", "kernels.c", "-o", objects[-1])
+            zig(
+                *FLAGS,
+                include,
+                processor,
+                f"-DLEVEL=v{level}_",
+                "-c",
+                "kernels.c",
+                "-o",
+                objects[-1],
+            )
         objects.append(str(temporary / "dispatch.o"))
         digest = f'-DSOURCE_DIGEST="{source_digest(folder)}"'
         zig(*FLAGS, target.levels[0][1], digest, "-c", str(HERE / "dispatch.c"), "-o", objects[-1])
@@ -134,12 +154,16 @@ def compile_kernels(folder: Path, target: BuildTarget | None = None, library: Pa
 
 
 def compile_all(root: Path) -> list[Path]:
-    """Compile the libraries of all packages below ``root``, the source tree, and return their paths."""
+    """Compile the libraries of all packages below ``root``, the source tree, and return their
+    paths.
+    """
     return [compile_kernels(root / folder) for folder in NATIVE_FOLDERS]
 
 
 def compile_into(out: Path, root: Path, target: BuildTarget) -> dict[Path, str]:
-    """Compile all libraries for ``target`` into ``out``; return each one's file, with its place among the packages."""
+    """Compile all libraries for ``target`` into ``out``; return each one's file, with its place
+    among the packages.
+    """
     libraries = {}
     for folder in NATIVE_FOLDERS:
         place = Path(folder).relative_to(Path(folder).parts[0]) / LIBRARY_NAME

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP writer of the logs: the ``mcap`` package's, with faster messages and a compact list of chunk indexes.
+"""MCAP writer of the logs: the ``mcap`` package's, with faster messages and a compact list of chunk
+indexes.
 
-The package keeps one object per chunk until the file is closed. With 60 channels and a flush every 0.5 s that is 4.6 kB
-per chunk, 330 MB in a flight of ten hours, and slows down garbage collection; as bytes it is 0.7 kB. The file is the
-same to the byte (``tests/protocol/test_log.py``).
+The package keeps one object per chunk until the file is closed. With 60 channels and a flush every
+0.5 s that is 4.6 kB per chunk, 330 MB in a flight of ten hours, and slows down garbage collection;
+as bytes it is 0.7 kB. The file is the same to the byte (``tests/protocol/test_log.py``).
 
-A message record and its index are written by one ``struct.pack`` each, as messages are most of a log (measured in
-docs/simulation.md).
+A message record and its index are written by one ``struct.pack`` each, as messages are most of a
+log (measured in docs/simulation.md).
 """
 
 from __future__ import annotations
@@ -38,10 +39,14 @@ def create_writer(output: Any, compressed: bool = True) -> Writer:
 
 
 class _LogFileWriter(Writer):
-    """The package's writer, whose parts for messages are replaced: private attributes, as no option selects them."""
+    """The package's writer, whose parts for messages are replaced: private attributes, as no option
+    selects them.
+    """
 
     def __init__(self, output: Any, compression: CompressionType) -> None:
-        super().__init__(output, chunk_size=CHUNK_BYTES, compression=compression, enable_data_crcs=True)
+        super().__init__(
+            output, chunk_size=CHUNK_BYTES, compression=compression, enable_data_crcs=True
+        )
         private = vars(self)
         self._chunk = private["_Writer__chunk_builder"] = _Chunk(private["_Writer__statistics"])
         private["_Writer__chunk_indices"] = _ChunkIndexes()
@@ -64,7 +69,9 @@ class _Chunk(ChunkBuilder):
         self._statistics = statistics
         self.message_indices: dict[int, Any] = {}
 
-    def append(self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:
+    def append(
+        self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int
+    ) -> None:
         """Append a message record."""
         buffer: BytesIO = self.record_writer._buffer  # pyright: ignore[reportPrivateUsage]
         index = self.message_indices.get(channel)
@@ -72,7 +79,9 @@ class _Chunk(ChunkBuilder):
             index = self.message_indices[channel] = _MessageIndex(channel)
         index.entries += (log_time, buffer.tell())
         length = _HEAD_BYTES + len(data)
-        buffer.write(_pack_message(Opcode.MESSAGE, length, channel, sequence, log_time, publish_time))
+        buffer.write(
+            _pack_message(Opcode.MESSAGE, length, channel, sequence, log_time, publish_time)
+        )
         buffer.write(data)
         if self.num_messages == 0 or log_time < self.message_start_time:
             self.message_start_time = log_time
@@ -101,7 +110,12 @@ class _MessageIndex:
         size = 8 * len(entries)
         stream.write(
             struct.pack(
-                f"<BQHI{len(entries)}Q", Opcode.MESSAGE_INDEX, 6 + size, self._channel, size, *entries
+                f"<BQHI{len(entries)}Q",
+                Opcode.MESSAGE_INDEX,
+                6 + size,
+                self._channel,
+                size,
+                *entries,
             )
         )
 

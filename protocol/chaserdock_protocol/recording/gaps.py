@@ -16,8 +16,8 @@ class SequenceGaps:
     def update(self, key: str, seq: int) -> None:
         """Take the sequence number of a message into account, in order of arrival.
 
-        A restarted publisher counts from zero. Presence is published before the recorder has subscribed: what precedes its
-        first message is not lost.
+        A restarted publisher counts from zero. Presence is published before the recorder has
+        subscribed: what precedes its first message is not lost.
         """
         first = seq - 1 if key.endswith("/presence") else -1
         self.lost[key] += max(0, seq - self._last.get(key, first) - 1)

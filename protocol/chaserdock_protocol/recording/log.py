@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mission log: MCAP files with every message verbatim, one channel per key and encoding.
 
-``log_time`` is simulated time (the message's ``sim_time_ns``, or that of the message before if it has none);
-``publish_time`` is the sender's wall clock. Payloads are the transmitted bytes (msgpack); the schema of a channel is the
-JSON Schema of its type. The resolved scenario, the lock file and the versions are attachments and a metadata record.
-A second layer for viewers, under ``/viewer/``, is optional and never read back.
+``log_time`` is simulated time (the message's ``sim_time_ns``, or that of the message before if it
+has none); ``publish_time`` is the sender's wall clock. Payloads are the transmitted bytes
+(msgpack); the schema of a channel is the JSON Schema of its type. The resolved scenario, the lock
+file and the versions are attachments and a metadata record. A second layer for viewers, under
+``/viewer/``, is optional and never read back.
 """
 
 from __future__ import annotations
@@ -126,7 +127,8 @@ class LogWriter:
 
     Flushes every 0.5 s of both, as lock-step flights run faster or slower than the wall clock.
 
-    Raises LogError if the file cannot be created or written. What was written before stays readable.
+    Raises LogError if the file cannot be created or written. What was written before stays
+    readable.
     """
 
     def __init__(
@@ -149,7 +151,9 @@ class LogWriter:
         self._sink: Any = _Sink(self._file)
         self._writer = create_writer(self._sink, compressed)
         with self._writing():
-            self._writer.start(profile="chaserdock", library=f"chaserdock {provenance.version('chaserdock')}")
+            self._writer.start(
+                profile="chaserdock", library=f"chaserdock {provenance.version('chaserdock')}"
+            )
         self._flushed_s, self._flushed_ns = now_s(), 0
 
     @property
@@ -158,7 +162,9 @@ class LogWriter:
         return self._sink.size
 
     def describe(self, scenario_json: str, run: dict[str, str]) -> None:
-        """Write the resolved scenario, the run's data, the lock file, the package versions and the BLAS in use."""
+        """Write the resolved scenario, the run's data, the lock file, the package versions and the
+        BLAS in use.
+        """
         now = time.time_ns()
         attached = [
             (SCENARIO_ATTACHMENT, "application/json", scenario_json.encode()),
@@ -182,11 +188,15 @@ class LogWriter:
     def write(
         self, key: str, encoding: str, payload: bytes, sent_ns: int, time_ns: int | None = None
     ) -> None:
-        """Append a message, valid or not. ``time_ns``: its ``sim_time_ns`` if the caller has decoded it."""
+        """Append a message, valid or not. ``time_ns``: its ``sim_time_ns`` if the caller has
+        decoded it.
+        """
         channel = self._channels.get((key, encoding))
         if channel is None:
             with self._writing():
-                channel = self._channels[key, encoding] = _ChannelState(self._register(key, encoding))
+                channel = self._channels[key, encoding] = _ChannelState(
+                    self._register(key, encoding)
+                )
         try:
             if time_ns is None:
                 time_ns = max(0, _header.decode(payload).sim_time_ns)
@@ -198,7 +208,9 @@ class LogWriter:
         self.messages += 1
         self.flush_if_due()
 
-    def write_view(self, topic: str, schema: tuple[str, str, bytes], payload: bytes, time_ns: int) -> None:
+    def write_view(
+        self, topic: str, schema: tuple[str, str, bytes], payload: bytes, time_ns: int
+    ) -> None:
         """Append a message of the viewer layer; ``topic`` begins with ``/viewer/``.
 
         ``schema``: name, encoding (also the message's, such as ``protobuf``) and data.
@@ -211,7 +223,9 @@ class LogWriter:
             with self._writing():
                 if name not in self._schemas:
                     self._schemas[name] = self._writer.register_schema(name, encoding, data)
-                channel = _ChannelState(self._writer.register_channel(topic, encoding, self._schemas[name]))
+                channel = _ChannelState(
+                    self._writer.register_channel(topic, encoding, self._schemas[name])
+                )
             self._channels[topic, name] = channel
         self._add(channel, time_ns, payload, time_ns)
 
@@ -291,8 +305,9 @@ def read_log(
 ) -> Iterator[Record]:
     """Yield the valid messages of a log in file order; messages of older versions are upgraded.
 
-    Invalid messages are counted in ``rejected`` as ``key: reason``. Raises LogError if a file cannot be read, is no log,
-    or at the position where it is damaged. A truncated log is read up to its last whole record.
+    Invalid messages are counted in ``rejected`` as ``key: reason``. Raises LogError if a file
+    cannot be read, is no log, or at the position where it is damaged. A truncated log is read up to
+    its last whole record.
     """
     for channel, message in _raw_messages(source, keys):
         found = topics.topic_of_key(channel.topic)
@@ -317,7 +332,8 @@ def count_messages(source: LogSource) -> dict[str, int]:
 
 
 def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
-    """Return the resolved scenario (JSON, present format) and the run's data and versions. Raises LogError without them.
+    """Return the resolved scenario (JSON, present format) and the run's data and versions. Raises
+    LogError without them.
 
     All files of a rotated log must belong to one run.
     """
@@ -331,7 +347,9 @@ def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
 
 
 def logged_scenario(source: LogSource) -> tuple[Scenario, dict[str, str]]:
-    """Return the scenario of a log, and the run's data and versions. Raises LogError, ScenarioError."""
+    """Return the scenario of a log, and the run's data and versions. Raises LogError,
+    ScenarioError.
+    """
     text, run = read_scenario(source)
     return scenario_from_json(text, f"{source}: scenario"), run
 

@@ -38,13 +38,16 @@ def versions_json() -> bytes:
 
 @lru_cache
 def blas_in_use() -> str:
-    """Return name, version and processor type of NumPy's BLAS, such as "openblas 0.3.31 Haswell"; empty if not known.
+    """Return name, version and processor type of NumPy's BLAS, such as "openblas 0.3.31 Haswell";
+    empty if not known.
 
-    OpenBLAS has kernels for each processor type, which differ in the last bits. The environment variable
-    OPENBLAS_CORETYPE overrides the type.
+    OpenBLAS has kernels for each processor type, which differ in the last bits. The environment
+    variable OPENBLAS_CORETYPE overrides the type.
     """
     found = [library for library in threadpool_info() if library["user_api"] == "blas"]
-    own = [library for library in found if "numpy" in Path(library["filepath"]).parent.name] or found
+    own = [
+        library for library in found if "numpy" in Path(library["filepath"]).parent.name
+    ] or found
     names = ("internal_api", "version", "architecture")
     return " ".join(str(own[0][name]) for name in names if own[0].get(name)) if own else ""
 

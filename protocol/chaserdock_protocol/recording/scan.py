@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sequential reader of the records of MCAP log files, with integrity checks. All log readers use it.
+"""Sequential reader of the records of MCAP log files, with integrity checks. All log readers use
+it.
 
-Checks the CRC of each chunk, of the data section of a closed file, of attachments and of our metadata, and that
-``sequence`` has no gaps. Reads a file whose writer was killed up to its last whole record. The ``mcap`` package's
-readers raise at that point, give no record positions, and check neither attachments nor sequences. Its chunk parser is
-used for chunks (2.4 us per message; a parser of our own takes half of it, which is not worth its code).
+Checks the CRC of each chunk, of the data section of a closed file, of attachments and of our
+metadata, and that ``sequence`` has no gaps. Reads a file whose writer was killed up to its last
+whole record. The ``mcap`` package's readers raise at that point, give no record positions, and
+check neither attachments nor sequences. Its chunk parser is used for chunks (2.4 us per message; a
+parser of our own takes half of it, which is not worth its code).
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ METADATA = "chaserdock"
 RECOVERED = "chaserdock.recovered"
 """Name of the metadata record of a repaired log, which may have gaps."""
 
-# Exceeds every record that a recorder writes: chunks close after 1 MB, and a message has 17 MB at most.
+# Exceeds every record that a recorder writes: chunks close after 1 MB, and a message has 17 MB at
+# most.
 MAX_RECORD_BYTES = 1 << 27
 _HEAD = struct.Struct("<BQ")
 _CRC = struct.Struct("<I")
@@ -57,8 +60,8 @@ class LogError(ChaserdockError):
 class FileState:
     """State of a file, complete once all its records were read.
 
-    ``closed``: the writer closed it, and all checksums match. ``cut_bytes``: bytes after the last whole record of a
-    file without end mark. ``place``: offset of the record read last.
+    ``closed``: the writer closed it, and all checksums match. ``cut_bytes``: bytes after the last
+    whole record of a file without end mark. ``place``: offset of the record read last.
     """
 
     closed: bool = False
@@ -73,7 +76,9 @@ def part_name(part: int) -> str:
 
 
 def log_files(source: LogSource) -> list[Path]:
-    """Return the files of a log in order. Raises LogError for a folder without a log or with missing parts."""
+    """Return the files of a log in order. Raises LogError for a folder without a log or with
+    missing parts.
+    """
     if not isinstance(source, Path):
         return list(source)
     if not source.is_dir():
@@ -116,7 +121,9 @@ def records(path: Path, state: FileState | None = None) -> Iterator[tuple[int, b
                 content = file.read(length)
                 if opcode == Opcode.DATA_END:
                     if length != _CRC.size or _CRC.unpack(content)[0] not in (0, crc):
-                        raise LogError(f"{path}: damaged: the checksum over all data does not match")
+                        raise LogError(
+                            f"{path}: damaged: the checksum over all data does not match"
+                        )
                     state.closed = sealed
                     return
                 crc = zlib.crc32(content, zlib.crc32(head, crc))
@@ -131,7 +138,9 @@ def records(path: Path, state: FileState | None = None) -> Iterator[tuple[int, b
 
 
 def record_at(path: Path, place: int) -> bytes:
-    """Return the content of the record at byte ``place``. Raises LogError if the file has changed meanwhile."""
+    """Return the content of the record at byte ``place``. Raises LogError if the file has changed
+    meanwhile.
+    """
     try:
         with path.open("rb") as file:
             file.seek(place)
@@ -155,7 +164,9 @@ def errors_of_parsing(path: Path) -> Iterator[None]:
 
 
 def parse_chunk(content: bytes) -> list[McapMessage | Channel | Schema]:
-    """Parse the channels, schemas and messages of a chunk record and check its CRC. Raises one of ``DAMAGE``."""
+    """Parse the channels, schemas and messages of a chunk record and check its CRC. Raises one of
+    ``DAMAGE``.
+    """
     out: list[McapMessage | Channel | Schema] = []
     for record in breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True):
         if isinstance(record, Channel):
@@ -179,7 +190,9 @@ def with_checksum(data: dict[str, str]) -> dict[str, str]:
 
 
 def parse_metadata(content: bytes) -> Metadata:
-    """Parse a metadata record and check the checksum of ``with_checksum``, if any. Raises one of ``DAMAGE``."""
+    """Parse a metadata record and check the checksum of ``with_checksum``, if any. Raises one of
+    ``DAMAGE``.
+    """
     metadata = Metadata.read(ReadDataStream(BytesIO(content)))
     data = metadata.metadata
     if "crc32" in data and data["crc32"] != f"{_metadata_crc(data):08x}":
@@ -188,11 +201,17 @@ def parse_metadata(content: bytes) -> Metadata:
 
 
 def _metadata_crc(data: dict[str, str]) -> int:
-    return zlib.crc32("\n".join(f"{k}={v}" for k, v in sorted(data.items()) if k != "crc32").encode())
+    return zlib.crc32(
+        "\n".join(f"{k}={v}" for k, v in sorted(data.items()) if k != "crc32").encode()
+    )
 
 
-def stored_messages(path: Path, state: FileState | None = None) -> Iterator[tuple[Channel, McapMessage]]:
-    """Yield every message of a file, not decoded, viewer layer included. Raises LogError as ``records``, or for a gap."""
+def stored_messages(
+    path: Path, state: FileState | None = None
+) -> Iterator[tuple[Channel, McapMessage]]:
+    """Yield every message of a file, not decoded, viewer layer included. Raises LogError as
+    ``records``, or for a gap.
+    """
     state = state if state is not None else FileState()
     channels: dict[int, Channel] = {}
     following: dict[int, int] = {}
@@ -218,7 +237,8 @@ def stored_messages(path: Path, state: FileState | None = None) -> Iterator[tupl
 def read_head(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
     """Return our metadata and all attachments (by name) of a file. Raises LogError.
 
-    The recorder writes them before the first chunk. If they are not there, the whole file is searched.
+    The recorder writes them before the first chunk. If they are not there, the whole file is
+    searched.
     """
     data: dict[str, str] = {}
     attachments: dict[str, bytes] = {}

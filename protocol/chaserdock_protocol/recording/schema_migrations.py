@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Migrate messages and keys of old logs to the present schema.
 
-On the wire only the present version of a message is accepted. When the meaning or the name of a field changes, the
-message's number in ``messages.VERSION`` goes up by one, and a function that converts the old fields is added here; a log
-then reads as if it had been recorded today. A new field with a default needs no migration.
+On the wire only the present version of a message is accepted. When the meaning or the name of a
+field changes, the message's number in ``messages.VERSION`` goes up by one, and a function that
+converts the old fields is added here; a log then reads as if it had been recorded today. A new
+field with a default needs no migration.
 """
 
 from __future__ import annotations
@@ -51,16 +52,23 @@ def _observed_controllers(fields: dict[str, Any]) -> dict[str, Any]:
     """Replace the commander that the world named by the controllers that took part."""
     controllers = dict(fields.get("standing_by", {}))
     if fields.get("controller"):
-        controllers = {fields.get("commander") or "controller": fields.get("instance", ""), **controllers}
+        controllers = {
+            fields.get("commander") or "controller": fields.get("instance", ""),
+            **controllers,
+        }
     names = ("controller", "term", "commander", "instance", "standing_by")
-    return {name: value for name, value in fields.items() if name not in names} | {"controllers": controllers}
+    return {name: value for name, value in fields.items() if name not in names} | {
+        "controllers": controllers
+    }
 
 
 UPGRADES: dict[tuple[str, int], Upgrade] = {
     ("Tick", 1): _renamed(pictures="images"),
     ("Tick", 2): _observed_controllers,
     ("Odometry", 1): _exact_odometry,
-    ("BodyTruth", 1): _renamed(jet_impulse_N_s="thruster_impulse_N_s", jet_open_s="thruster_open_s"),
+    ("BodyTruth", 1): _renamed(
+        jet_impulse_N_s="thruster_impulse_N_s", jet_open_s="thruster_open_s"
+    ),
     ("Sighting", 1): _bad_image,
     ("ActuatorCommand", 1): _each("pulses", _renamed(jet="thruster")),
     ("ThrusterReport", 1): _renamed(jets="thrusters"),
@@ -68,7 +76,8 @@ UPGRADES: dict[tuple[str, int], Upgrade] = {
     ("OperatorCommand", 1): _renamed(jet="thruster"),
     ("ControllerState", 1): _each("operated", _renamed(jet="thruster")),
 }
-"""(type, version) -> function from that version's fields, as plain values, to the next version's."""
+"""(type, version) -> function from that version's fields, as plain values, to the next version's.
+"""
 
 _RENAMED_TYPES = {"JetReport": "ThrusterReport", "JetFaultCommand": "ThrusterFaultCommand"}
 _RENAMED_KEYS = ((re.compile(r"chaser/(\d+)/jets"), r"chaser/\1/thrusters"),)
@@ -85,9 +94,11 @@ def current_key(key: str) -> str:
 
 
 def decode_logged(kind: type[T], payload: bytes, encoding: str) -> T:
-    """Return a message of type ``kind`` from a log, upgraded if it is of an older version, and checked.
+    """Return a message of type ``kind`` from a log, upgraded if it is of an older version, and
+    checked.
 
-    Raises Rejected as ``codec.decode``; with reason ``encoding`` also when no upgrade leads to the present version.
+    Raises Rejected as ``codec.decode``; with reason ``encoding`` also when no upgrade leads to the
+    present version.
     """
     if encoding == encoding_of(kind):
         return decode(kind, payload, encoding)
@@ -97,7 +108,9 @@ def decode_logged(kind: type[T], payload: bytes, encoding: str) -> T:
         or _RENAMED_TYPES.get(found[1], found[1]) != kind.__name__
         or int(found[2]) > VERSION[kind]
     ):
-        raise Rejected("encoding", f"got {encoding!r}, expected {encoding_of(kind)!r} or an older version")
+        raise Rejected(
+            "encoding", f"got {encoding!r}, expected {encoding_of(kind)!r} or an older version"
+        )
     if len(payload) > MAX_BYTES:
         raise Rejected("size", f"{len(payload)} bytes, at most {MAX_BYTES}")
     try:

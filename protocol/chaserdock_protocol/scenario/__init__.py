@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario file: schema, loading, variants and overrides. Flight software receives a ``FlightScenario``."""
+"""The scenario file: schema, loading, variants and overrides. Flight software receives a
+``FlightScenario``.
+"""
 
 from .errors import ScenarioError
 from .flight import FlightScenario, flight_scenario, flight_scenario_from_json, flight_scenario_json

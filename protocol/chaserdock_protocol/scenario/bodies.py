@@ -16,15 +16,24 @@ from chaserdock_models.targets import Box, TargetModel, target_model, target_nam
 from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
 
-from .fields import Name, NotNegative, Oriented, Positive, PositiveVector, Section, UnitQuaternion, Vector
+from .fields import (
+    Name,
+    NotNegative,
+    Oriented,
+    Positive,
+    PositiveVector,
+    Section,
+    UnitQuaternion,
+    Vector,
+)
 from .surface import Surface
 from .target import Geometry
 from .thrusters import MAX_THRUSTERS, Modulation, Thruster, check_layout
 
 
 class MeshKnowledge(Section):
-    """What the flight software knows of a target's mesh. The world draws a mesh that differs: its errors are drawn from the
-    seed with these standard deviations."""
+    """What the flight software knows of a target's mesh. The world draws a mesh that differs: its
+    errors are drawn from the seed with these standard deviations."""
 
     simplification_m: Annotated[float, Field(ge=2e-4, le=0.02, allow_inf_nan=False)] = Field(
         default=0.001,
@@ -151,7 +160,9 @@ class FlightTarget(Section):
 
     def shape(self) -> TargetModel:
         """Return geometry and markers."""
-        return target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
+        return (
+            target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
+        )
 
     def nominal_mesh(self, tolerance_m: float = FINE_M) -> TriangleMesh | None:
         """Return the target's mesh as it was designed; None without one."""
@@ -160,7 +171,9 @@ class FlightTarget(Section):
         return satellite(self.model, tolerance_m) if self.shape().satellite else None
 
     def as_known(self) -> FlightTarget:
-        """Return what the flight software knows: of a mesh from a file, only the simplified surface without missing parts."""
+        """Return what the flight software knows: of a mesh from a file, only the simplified surface
+        without missing parts.
+        """
         surface = None if self.geometry is None else self.geometry.surface
         if self.geometry is None or surface is None or surface.known:
             return self
@@ -176,21 +189,31 @@ class FlightTarget(Section):
                 "knowledge": self.knowledge.model_copy(update={"missing": ()}),
                 # Of the nominal mesh, not of the simplified one.
                 "inertia_kg_m2": tuple(np.diag(inertia).tolist()),
-                "inertia_products_kg_m2": (float(inertia[0, 1]), float(inertia[0, 2]), float(inertia[1, 2])),
+                "inertia_products_kg_m2": (
+                    float(inertia[0, 1]),
+                    float(inertia[0, 2]),
+                    float(inertia[1, 2]),
+                ),
             }
         )
 
     def known_mesh(self) -> TriangleMesh | None:
-        """Return the mesh that the flight software knows: simplified, and without the parts that are missing in it.
+        """Return the mesh that the flight software knows: simplified, and without the parts that
+        are missing in it.
 
-        None for a target without a mesh. Raises ValueError for a missing part that the mesh does not have.
+        None for a target without a mesh. Raises ValueError for a missing part that the mesh does
+        not have.
         """
         tolerance_m, missing = self.knowledge.simplification_m, self.knowledge.missing
         mesh = self.nominal_mesh(tolerance_m)
         surface = None if self.geometry is None else self.geometry.surface
         if mesh is None or (surface is not None and surface.known):
             return mesh
-        return without_parts(mesh, missing) if surface is None else _simplified(mesh, missing, tolerance_m)
+        return (
+            without_parts(mesh, missing)
+            if surface is None
+            else _simplified(mesh, missing, tolerance_m)
+        )
 
 
 @lru_cache(maxsize=8)
@@ -209,7 +232,8 @@ class Target(FlightTarget, Oriented):
         description="Initial attitude, TRF to WRF: unit quaternion, scalar first.",
     )
     velocity_m_s: Vector = Field(
-        default=(0.015, 0.0075, 0.03), description="Initial velocity (WRF), m/s. Ignored by `static`."
+        default=(0.015, 0.0075, 0.03),
+        description="Initial velocity (WRF), m/s. Ignored by `static`.",
     )
     omega_rad_s: Vector = Field(
         default=(0.015, 0.045, 0.03),
@@ -219,11 +243,15 @@ class Target(FlightTarget, Oriented):
 
 def _check_inertia(i: tuple[float, float, float]) -> None:
     if 2 * max(i) > sum(i) * (1 + 1e-9):
-        raise ValueError(f"inertia_kg_m2 {i}: no principal moment may exceed the sum of the other two")
+        raise ValueError(
+            f"inertia_kg_m2 {i}: no principal moment may exceed the sum of the other two"
+        )
 
 
 @lru_cache(maxsize=64)
-def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[float, float, float]:
+def cuboid_inertia(
+    mass_kg: float, size_m: tuple[float, float, float]
+) -> tuple[float, float, float]:
     """Return the principal moments (kg m^2) of a homogeneous cuboid."""
     x, y, z = (s * s for s in size_m)
     return (mass_kg * (y + z) / 12, mass_kg * (x + z) / 12, mass_kg * (x + y) / 12)
@@ -260,7 +288,9 @@ class Body(Section):
         description="`ideal`: the commanded force and torque act on the body. `thrusters`: pulses of `thrusters` do.",
     )
     thrusters: tuple[Thruster, ...] = Field(
-        default=(), max_length=MAX_THRUSTERS, description="Position, direction and thrust of every thruster."
+        default=(),
+        max_length=MAX_THRUSTERS,
+        description="Position, direction and thrust of every thruster.",
     )
     modulation: Modulation = Modulation()
     thruster_test_s: NotNegative = Field(
@@ -276,7 +306,11 @@ class Body(Section):
     @model_validator(mode="before")
     @classmethod
     def _apply_predefined_body(cls, values: Any) -> Any:
-        if isinstance(values, dict) and isinstance(name := values.get("body"), str) and name in BODIES:
+        if (
+            isinstance(values, dict)
+            and isinstance(name := values.get("body"), str)
+            and name in BODIES
+        ):
             return BODIES[name] | values
         return values
 

@@ -74,7 +74,9 @@ class Intrinsics(Section):
     @model_validator(mode="after")
     def _check_coefficients(self) -> Intrinsics:
         if len(self.distortion) not in (0, 4, 5):
-            raise ValueError(f"distortion takes k1, k2, p1, p2[, k3], not {len(self.distortion)} numbers")
+            raise ValueError(
+                f"distortion takes k1, k2, p1, p2[, k3], not {len(self.distortion)} numbers"
+            )
         return self
 
 
@@ -94,7 +96,9 @@ class Eclipse(Section):
 class EarthSection(Section):
     """The Earth in the background."""
 
-    direction: Vector = Field(description="Direction to the Earth's centre (WRF), any length but 0.")
+    direction: Vector = Field(
+        description="Direction to the Earth's centre (WRF), any length but 0."
+    )
     radius_deg: float = Field(
         default=66.0,
         gt=1,
@@ -116,10 +120,15 @@ class FlightCamera(Section):
     width_px: SidePixels = Field(default=1280, description="Image width, pixels.")
     height_px: SidePixels = Field(default=720, description="Image height, pixels.")
     hfov_deg: float = Field(
-        default=60.0, gt=5, lt=150, allow_inf_nan=False, description="Horizontal field of view, degrees."
+        default=60.0,
+        gt=5,
+        lt=150,
+        allow_inf_nan=False,
+        description="Horizontal field of view, degrees.",
     )
     intrinsics: Intrinsics | None = Field(
-        default=None, description="Calibrated camera, in place of `width_px`, `height_px` and `hfov_deg`."
+        default=None,
+        description="Calibrated camera, in place of `width_px`, `height_px` and `hfov_deg`.",
     )
     position_m: Vector = Field(
         default=(0.07, 0.0, 0.075), description="Position of the optical centre (CRF), m."
@@ -138,16 +147,30 @@ class FlightCamera(Section):
             qw, qx, qy, qz = rotations.multiply(turn, q).tolist()
             q = (qw, qx, qy, qz)
         if i is None:
-            c = Camera.from_hfov(self.width_px, self.height_px, math.radians(self.hfov_deg), self.position_m)
-            return Camera(c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px, (), self.position_m, q)
+            c = Camera.from_hfov(
+                self.width_px, self.height_px, math.radians(self.hfov_deg), self.position_m
+            )
+            return Camera(
+                c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px, (), self.position_m, q
+            )
         distortion = i.distortion if any(i.distortion) else ()
         return Camera(
-            i.width_px, i.height_px, i.fx_px, i.fy_px, i.cx_px, i.cy_px, distortion, self.position_m, q
+            i.width_px,
+            i.height_px,
+            i.fx_px,
+            i.fy_px,
+            i.cx_px,
+            i.cy_px,
+            distortion,
+            self.position_m,
+            q,
         )
 
 
 class CameraSection(FlightCamera):
-    """The camera of every chaser, and the light. The camera looks along +X of CRF, its top towards +Z."""
+    """The camera of every chaser, and the light. The camera looks along +X of CRF, its top towards
+    +Z.
+    """
 
     renderer: Literal["exact", "pybullet"] = Field(
         default="exact",
@@ -163,7 +186,9 @@ class CameraSection(FlightCamera):
     sun_direction: Vector = Field(
         default=(-0.4, -0.5, 0.77), description="Direction to the sun (WRF), any length but 0."
     )
-    ambient: Fraction = Field(default=0.35, description="Share of the light that comes from all directions.")
+    ambient: Fraction = Field(
+        default=0.35, description="Share of the light that comes from all directions."
+    )
     eclipse_ambient: Fraction = Field(
         default=0.05, description="Share of `ambient` that remains in an eclipse."
     )

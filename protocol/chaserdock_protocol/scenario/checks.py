@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks across several sections of a scenario. Each raises ValueError with the path of what is wrong."""
+"""Checks across several sections of a scenario. Each raises ValueError with the path of what is
+wrong.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def check_flight(scenario: FlightScenario) -> None:
     _check_named_chasers(scenario)
     _check_perception(scenario)
     if scenario.chaser.actuation == "thrusters":
-        check_pulses(scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz)
+        check_pulses(
+            scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz
+        )
     if scenario.docking.kind == "capture":
         _check_capture(scenario)
     _check_detumble(scenario)
@@ -49,7 +53,9 @@ def check_flight(scenario: FlightScenario) -> None:
             f"ranging: needs a perception by markers ({', '.join(MARKER_PERCEPTIONS)}), not {scenario.perception.name!r}"
         )
     if scenario.plume is not None and scenario.chaser.actuation != "thrusters":
-        raise ValueError('plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"')
+        raise ValueError(
+            'plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"'
+        )
     if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
         raise ValueError(
             'limits.passive_safety: needs the covariance of estimator.name = "joint", '
@@ -101,7 +107,9 @@ def _check_orbit(scenario: Scenario) -> None:
                 "this must be [0, 0, 0]"
             )
     given = {"sun_direction", "eclipses", "earth"} & camera.model_fields_set
-    given -= {key for key in given if getattr(camera, key) == type(camera).model_fields[key].default}
+    given -= {
+        key for key in given if getattr(camera, key) == type(camera).model_fields[key].default
+    }
     if given:
         raise ValueError(f"camera.{min(given)}: follows from [orbit]; leave it out")
 
@@ -129,7 +137,9 @@ def _check_references(scenario: FlightScenario) -> None:
 
 
 def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> float:
-    """Return the distance (m) of a chaser's shape at an offset (3,), TRF, from the cuboids of the target's shape."""
+    """Return the distance (m) of a chaser's shape at an offset (3,), TRF, from the cuboids of the
+    target's shape.
+    """
     pose = _reference_pose(scenario, chaser, offset_m)
     return distance_from_cuboids(
         box_table(scenario.target_model().boxes), box_table(scenario.chaser.boxes()), *pose
@@ -137,12 +147,16 @@ def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike)
 
 
 def shapes_apart_m(scenario: FlightScenario, *places: tuple[int, ArrayLike]) -> float:
-    """Return the distance (m) between the shapes of two chasers at offsets (3,), TRF: ``places`` are (chaser, offset)."""
+    """Return the distance (m) between the shapes of two chasers at offsets (3,), TRF: ``places``
+    are (chaser, offset).
+    """
     one, other = (_reference_pose(scenario, i, offset_m) for i, offset_m in places)
     return distance_between(box_table(scenario.chaser.boxes()), one, other)
 
 
-def _reference_pose(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> tuple[ArrayLike, Array]:
+def _reference_pose(
+    scenario: FlightScenario, chaser: int, offset_m: ArrayLike
+) -> tuple[ArrayLike, Array]:
     """Return an offset (3,) and the attitude (4,) of a chaser that holds there, in TRF."""
     c = scenario.chasers[chaser]
     if scenario.approach.face_target:
@@ -199,7 +213,9 @@ def _check_hold_points(scenario: FlightScenario) -> None:
             _check_in_cone(scenario, f"timeline.{k}.offset_m", i, entry.offset_m)
 
 
-def _check_in_cone(scenario: FlightScenario, path: str, chaser: int, offset_m: tuple[float, ...]) -> None:
+def _check_in_cone(
+    scenario: FlightScenario, path: str, chaser: int, offset_m: tuple[float, ...]
+) -> None:
     cone_deg = scenario.approach.cone_deg
     if cone_deg is None or chaser >= len(scenario.chasers):
         return
@@ -218,7 +234,9 @@ def angle_deg(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
 
 
 def _check_approach_cone(scenario: FlightScenario) -> None:
-    """Check that a chaser in its reference attitude sees the target from everywhere in its approach cone."""
+    """Check that a chaser in its reference attitude sees the target from everywhere in its approach
+    cone.
+    """
     cone_deg, camera = scenario.approach.cone_deg, scenario.camera_model()
     if cone_deg is None or scenario.approach.face_target:
         return
@@ -266,8 +284,14 @@ def _check_mesh_file(scenario: Scenario, geometry: Geometry) -> None:
                 f'{key}: camera.renderer = "pybullet" draws OBJ and STL files, not {geometry.mesh!r}'
             )
         if any(geometry.mesh_origin_m):
-            raise ValueError('target.geometry.mesh_origin_m: camera.renderer = "pybullet" needs (0, 0, 0)')
-    if target.motion == "torque_free" and target.inertia_kg_m2 is None and (mesh := target.nominal_mesh()):
+            raise ValueError(
+                'target.geometry.mesh_origin_m: camera.renderer = "pybullet" needs (0, 0, 0)'
+            )
+    if (
+        target.motion == "torque_free"
+        and target.inertia_kg_m2 is None
+        and (mesh := target.nominal_mesh())
+    ):
         low, high = mesh.bounds_m()
         centre = mass_properties(mesh, target.mass_kg)[0]
         if np.linalg.norm(centre - target.centre_of_mass_m) > 0.01 * np.linalg.norm(high - low):
@@ -287,12 +311,18 @@ def _check_perception(scenario: FlightScenario) -> None:
 
 def _check_named_chasers(scenario: FlightScenario) -> None:
     named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(scenario.timeline)]
-    named += [(f"docking.ports.{i}.chaser", (port.chaser,)) for i, port in enumerate(scenario.docking.ports)]
+    named += [
+        (f"docking.ports.{i}.chaser", (port.chaser,))
+        for i, port in enumerate(scenario.docking.ports)
+    ]
     _check_chaser_numbers(named, len(scenario.chasers))
 
 
 def _check_success(scenario: Scenario) -> None:
-    named = [(f"success.{key}", getattr(scenario.success, key)) for key in ("docked", "latched", "reached")]
+    named = [
+        (f"success.{key}", getattr(scenario.success, key))
+        for key in ("docked", "latched", "reached")
+    ]
     if scenario.success.arrival is not None:
         named.append(("success.arrival.chasers", scenario.success.arrival.chasers))
     _check_chaser_numbers(named, len(scenario.chasers))
@@ -302,7 +332,9 @@ def _check_chaser_numbers(named: Iterable[tuple[str, tuple[int, ...]]], chasers:
     last = chasers - 1
     for path, numbers in named:
         if max(numbers, default=0) > last:
-            raise ValueError(f"{path}: there is no chaser {max(numbers)}; this mission has 0 to {last}")
+            raise ValueError(
+                f"{path}: there is no chaser {max(numbers)}; this mission has 0 to {last}"
+            )
 
 
 def _check_reached(scenario: Scenario) -> None:
@@ -314,7 +346,9 @@ def _check_reached(scenario: Scenario) -> None:
 def _check_thruster_failures(scenario: Scenario) -> None:
     chasers, thrusters = len(scenario.chasers), len(scenario.chaser.thrusters)
     if scenario.thruster_failure and scenario.chaser.actuation != "thrusters":
-        raise ValueError('thruster_failure: thrusters fail only with chaser.actuation = "thrusters"')
+        raise ValueError(
+            'thruster_failure: thrusters fail only with chaser.actuation = "thrusters"'
+        )
     failed: set[tuple[int, int]] = set()
     for k, failure in enumerate(scenario.thruster_failure):
         path = f"thruster_failure.{k}"
@@ -327,7 +361,9 @@ def _check_thruster_failures(scenario: Scenario) -> None:
                 f"{path}.thruster: there is no thruster {failure.thruster}; the body has 0 to {thrusters - 1}"
             )
         if (failure.chaser, failure.thruster) in failed:
-            raise ValueError(f"{path}: thruster {failure.thruster} of chaser {failure.chaser} fails twice")
+            raise ValueError(
+                f"{path}: thruster {failure.thruster} of chaser {failure.chaser} fails twice"
+            )
         failed.add((failure.chaser, failure.thruster))
 
 
@@ -345,9 +381,14 @@ def _check_truth(scenario: Scenario) -> None:
         raise ValueError(f'truth.latch.{key}: latches exist only with docking.kind = "capture"')
     named: set[int | None] = set()
     for k, values in enumerate(scenario.truth.values):
-        path, name = f"truth.values.{k}", "the target" if values.target else f"chaser {values.chaser}"
+        path, name = (
+            f"truth.values.{k}",
+            "the target" if values.target else f"chaser {values.chaser}",
+        )
         if values.chaser is not None and values.chaser >= chasers:
-            raise ValueError(f"{path}.chaser: there is no {name}; this mission has 0 to {chasers - 1}")
+            raise ValueError(
+                f"{path}.chaser: there is no {name}; this mission has 0 to {chasers - 1}"
+            )
         if values.target and not moves_freely:
             raise ValueError(f'{path}.target: needs target.motion = "torque_free"')
         if values.chaser in named:
@@ -369,7 +410,9 @@ def _check_latched(scenario: Scenario) -> None:
 
 
 def _check_load_limits(scenario: Scenario) -> None:
-    """Check that the ports carry what the tumble at the start exerts once their chaser is latched, with nominal masses."""
+    """Check that the ports carry what the tumble at the start exerts once their chaser is latched,
+    with nominal masses.
+    """
     if scenario.docking.kind != "capture":
         return
     target, body = scenario.target, scenario.chaser
@@ -379,7 +422,9 @@ def _check_load_limits(scenario: Scenario) -> None:
         turn = rotations.to_matrix(scenario.chasers[port.chaser].q_wxyz)
         inertia = turn @ np.diag(body.inertia) @ turn.T
         chaser = CarriedBody(body.mass_kg, inertia, centre_offset(port, body.probe_reach_m, 0.0))
-        force, torque = tumble_load(alone, chaser, np.array(port.position_m), np.array(target.omega_rad_s))
+        force, torque = tumble_load(
+            alone, chaser, np.array(port.position_m), np.array(target.omega_rad_s)
+        )
         for key, limit, load, unit in (
             ("force_limit_N", port.force_limit_N, force, "N"),
             ("torque_limit_N_m", port.torque_limit_N_m, torque, "N m"),
@@ -409,7 +454,9 @@ def _check_detumble(scenario: FlightScenario) -> None:
     for k, entry in _detumblings(scenario):
         for i in entry.chasers:
             if scenario.docking.port_of(i) is None:
-                raise ValueError(f"timeline.{k}: chaser {i} has no port and cannot be latched to the target")
+                raise ValueError(
+                    f"timeline.{k}: chaser {i} has no port and cannot be latched to the target"
+                )
         if scenario.chaser.actuation != "thrusters":
             raise ValueError(f'timeline.{k}: detumble needs chaser.actuation = "thrusters"')
         for i, free in plume_free_thrusters(scenario, set(entry.chasers)).items():
@@ -421,9 +468,13 @@ def _check_detumble(scenario: FlightScenario) -> None:
 
 
 def _check_stopping_time(scenario: Scenario) -> None:
-    """Check that detumbling is not longer than allowed even if all thrusters could always push where it helps most."""
+    """Check that detumbling is not longer than allowed even if all thrusters could always push
+    where it helps most.
+    """
     for k, entry in _detumblings(scenario):
-        linear, angular, force_N, torque_N_m, mass_kg = _momentum_and_thrust(scenario, set(entry.chasers))
+        linear, angular, force_N, torque_N_m, mass_kg = _momentum_and_thrust(
+            scenario, set(entry.chasers)
+        )
         least_s = max(linear / force_N, angular / torque_N_m)
         if least_s > scenario.detumble.timeout_s:
             raise ValueError(
@@ -433,9 +484,12 @@ def _check_stopping_time(scenario: Scenario) -> None:
             )
 
 
-def _momentum_and_thrust(scenario: Scenario, chasers: set[int]) -> tuple[float, float, float, float, float]:
-    """Return linear (N s) and angular momentum (N m s) of the target at the start with these chasers fixed to it, upper bounds of
-    force and torque of their plume-free thrusters in any direction, and the mass."""
+def _momentum_and_thrust(
+    scenario: Scenario, chasers: set[int]
+) -> tuple[float, float, float, float, float]:
+    """Return linear (N s) and angular momentum (N m s) of the target at the start with these
+    chasers fixed to it, upper bounds of force and torque of their plume-free thrusters in any
+    direction, and the mass."""
     target, body, mounted = scenario.target, scenario.chaser, {}
     omega = np.array(target.omega_rad_s)
     inertias = [target.inertia_tensor]
@@ -447,7 +501,9 @@ def _momentum_and_thrust(scenario: Scenario, chasers: set[int]) -> tuple[float, 
         places.append(mounted[i].position_m)
     masses = np.array([target.mass_kg] + [body.mass_kg] * len(mounted))
     centre = masses @ np.array(places) / masses.sum()
-    velocity = rotations.rotate_inverse(target.q_wxyz, target.velocity_m_s) + np.cross(omega, centre)
+    velocity = rotations.rotate_inverse(target.q_wxyz, target.velocity_m_s) + np.cross(
+        omega, centre
+    )
     angular = sum(
         inertia @ omega + mass * np.cross(place - centre, np.cross(omega, place - centre))
         for inertia, mass, place in zip(inertias, masses, places, strict=True)
@@ -455,7 +511,9 @@ def _momentum_and_thrust(scenario: Scenario, chasers: set[int]) -> tuple[float, 
     free = np.concatenate(list(plume_free_thrusters(scenario, chasers).values()))
     limits = np.where(free, np.tile(thrusts_max(body.thrusters), len(mounted)), 0.0)
     own = wrench_matrix(body.thrusters)
-    wrenches = np.concatenate([c.wrench_to_stack(own, centre) for c in mounted.values()], axis=1) * limits
+    wrenches = (
+        np.concatenate([c.wrench_to_stack(own, centre) for c in mounted.values()], axis=1) * limits
+    )
     return (
         float(masses.sum() * np.linalg.norm(velocity)),
         float(np.linalg.norm(angular)),
@@ -468,7 +526,8 @@ def _momentum_and_thrust(scenario: Scenario, chasers: set[int]) -> tuple[float, 
 def _largest_sum(vectors: Array) -> float:
     """Return an upper bound of the length of the sum of some of these vectors (3, n).
 
-    The largest sum of components along a direction, over directions of which one is within 0.15 rad of any other.
+    The largest sum of components along a direction, over directions of which one is within 0.15 rad
+    of any other.
     """
     k = np.arange(400) + 0.5
     z, turn = 1.0 - 2.0 * k / len(k), math.pi * (1.0 + math.sqrt(5.0)) * k
@@ -487,7 +546,9 @@ def _check_capture(scenario: FlightScenario) -> None:
         raise ValueError("chaser.probe_reach_m: the probe must reach beyond the body's front")
     nearest_m = scenario.limits.min_distance_target_m
     for k, port in enumerate(scenario.docking.ports):
-        entry_m = math.hypot(*centre_offset(port, scenario.chaser.probe_reach_m, scenario.docking.entry_m))
+        entry_m = math.hypot(
+            *centre_offset(port, scenario.chaser.probe_reach_m, scenario.docking.entry_m)
+        )
         if entry_m <= nearest_m:
             raise ValueError(
                 f"docking.ports.{k}: its corridor begins {entry_m:.3g} m from the target's centre, inside "

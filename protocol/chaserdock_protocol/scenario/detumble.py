@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario section ``[detumble]``: how latched chasers stop the tumble of the target, and when it counts as stopped."""
+"""Scenario section ``[detumble]``: how latched chasers stop the tumble of the target, and when it
+counts as stopped.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,15 @@ class RestLimits(Section):
     """Rates below which the stack of target and latched chasers counts as stopped."""
 
     rate_deg_s: Positive = Field(default=0.05, description="Angular rate, degrees/s.")
-    speed_m_s: Positive = Field(default=0.001, description="Speed of the common centre of mass (WRF), m/s.")
+    speed_m_s: Positive = Field(
+        default=0.001, description="Speed of the common centre of mass (WRF), m/s."
+    )
 
 
 class Identification(Section):
-    """Mass properties of the stack, identified in flight from the odometry of latched chasers and their pulses. What is not known
-    of the target before: `target.mass_sigma_share`, `target.inertia_sigma_share`, `target.centre_of_mass_sigma_m`."""
+    """Mass properties of the stack, identified in flight from the odometry of latched chasers and
+    their pulses. What is not known of the target before: `target.mass_sigma_share`,
+    `target.inertia_sigma_share`, `target.centre_of_mass_sigma_m`."""
 
     enabled: bool = Field(
         default=False,
@@ -28,7 +33,8 @@ class Identification(Section):
         default=10.0, description="Length of the manoeuvre that the command `identify` begins, s."
     )
     thrust_share: Positive = Field(
-        default=0.05, description="Standard deviation of each thruster's thrust, constant in a mission."
+        default=0.05,
+        description="Standard deviation of each thruster's thrust, constant in a mission.",
     )
     pulse_scatter_share: NotNegative = Field(
         default=0.03, description="Standard deviation of each pulse's impulse."
@@ -36,10 +42,13 @@ class Identification(Section):
 
 
 class Detumble(RestLimits):
-    """Stopping the target with the thrusters of the chasers that are latched to it ([detumble.md](detumble.md))."""
+    """Stopping the target with the thrusters of the chasers that are latched to it
+    ([detumble.md](detumble.md)).
+    """
 
     response_s: Positive = Field(
-        default=0.5, description="Time in which the feedback would stop the stack with unlimited thrust, s."
+        default=0.5,
+        description="Time in which the feedback would stop the stack with unlimited thrust, s.",
     )
     timeout_s: Positive = Field(
         default=60.0,

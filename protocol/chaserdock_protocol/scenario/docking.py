@@ -25,11 +25,15 @@ class Port(Section):
 
 
 class Corridor(Section):
-    """Limits relative to the port's axis at the end of the alignment and during the approach, before `final`."""
+    """Limits relative to the port's axis at the end of the alignment and during the approach,
+    before `final`.
+    """
 
     lateral_m: Positive = Field(default=0.03, description="Lateral offset of the probe's tip, m.")
     angle_deg: Positive = Field(default=4.0, description="Attitude error, degrees.")
-    lateral_speed_m_s: Positive = Field(default=0.02, description="Lateral speed of the probe's tip, m/s.")
+    lateral_speed_m_s: Positive = Field(
+        default=0.02, description="Lateral speed of the probe's tip, m/s."
+    )
     closing_m_s: Positive = Field(default=0.04, description="Closing speed, m/s.")
     rate_deg_s: Positive | None = Field(
         default=None, description="Rate relative to the target, degrees/s. Not set: not checked."
@@ -47,11 +51,13 @@ CONTACT_CONDITIONS: dict[str, dict[str, float]] = {
     "atv": {"lateral_m": 0.10, "closing_m_s": 0.10},
     "soyuz": {"closing_m_s": 0.15},
 }
-"""Contact conditions by preset. ``idss``: International Docking System Standard, Interface Definition Document, revision E, October
-2016, table 3.3.1.1-2 (closing 0.05 to 0.10 m/s; the smaller bound is not checked); low-impact docking systems as NASA's NDS follow
-it. ``atv``: ESA, "One hour to docking", 24 February 2011 (blogs.esa.int/orion): within 10 cm, and at less than 10 cm/s; it states
-nothing else. ``soyuz``: S. Cristoforetti, logbook L-210, "Passed my manual docking exam", ESA (outpost42.esa.int): manual docking
-within the allowed range of 6 to 15 cm/s (the smaller bound is not checked); it states nothing else."""
+"""Contact conditions by preset. ``idss``: International Docking System Standard, Interface
+Definition Document, revision E, October 2016, table 3.3.1.1-2 (closing 0.05 to 0.10 m/s; the
+smaller bound is not checked); low-impact docking systems as NASA's NDS follow it. ``atv``: ESA,
+"One hour to docking", 24 February 2011 (blogs.esa.int/orion): within 10 cm, and at less than 10
+cm/s; it states nothing else. ``soyuz``: S. Cristoforetti, logbook L-210, "Passed my manual docking
+exam", ESA (outpost42.esa.int): manual docking within the allowed range of 6 to 15 cm/s (the smaller
+bound is not checked); it states nothing else."""
 
 Preset = Literal["none", "idss", "atv", "soyuz"]
 _PRESET_TEXT = (
@@ -68,7 +74,11 @@ class _ContactConditions(Corridor):
     @model_validator(mode="before")
     @classmethod
     def _fill_in_preset(cls, values: Any) -> Any:
-        stated = CONTACT_CONDITIONS.get(values.get("preset", "none")) if isinstance(values, dict) else None
+        stated = (
+            CONTACT_CONDITIONS.get(values.get("preset", "none"))
+            if isinstance(values, dict)
+            else None
+        )
         return values if stated is None else stated | values
 
 
@@ -77,7 +87,9 @@ class Final(_ContactConditions):
 
     lateral_m: Positive = Field(default=0.008, description="Lateral offset of the probe's tip, m.")
     angle_deg: Positive = Field(default=2.0, description="Attitude error, degrees.")
-    lateral_speed_m_s: Positive = Field(default=0.008, description="Lateral speed of the probe's tip, m/s.")
+    lateral_speed_m_s: Positive = Field(
+        default=0.008, description="Lateral speed of the probe's tip, m/s."
+    )
     closing_m_s: Positive = Field(default=0.016, description="Closing speed, m/s.")
 
 
@@ -86,7 +98,9 @@ class Tolerances(_ContactConditions):
 
     lateral_m: Positive = Field(default=0.01, description="Lateral offset of the probe's tip, m.")
     angle_deg: Positive = Field(default=3.0, description="Attitude error, degrees.")
-    lateral_speed_m_s: Positive = Field(default=0.01, description="Lateral speed of the probe's tip, m/s.")
+    lateral_speed_m_s: Positive = Field(
+        default=0.01, description="Lateral speed of the probe's tip, m/s."
+    )
     closing_m_s: Positive = Field(default=0.02, description="Closing speed at contact, m/s.")
 
 
@@ -134,11 +148,19 @@ class Docking(Section):
         default=2, ge=1, description="Most chasers on their way in at the same time; others wait."
     )
     attempts: int = Field(default=3, ge=1, le=100, description="Attempts before a chaser gives up.")
-    align_timeout_s: Positive = Field(default=60.0, description="Longest alignment before the corridor, s.")
-    approach_timeout_s: Positive = Field(default=60.0, description="Longest approach to the last part, s.")
+    align_timeout_s: Positive = Field(
+        default=60.0, description="Longest alignment before the corridor, s."
+    )
+    approach_timeout_s: Positive = Field(
+        default=60.0, description="Longest approach to the last part, s."
+    )
     final_timeout_s: Positive = Field(default=30.0, description="Longest last part, s.")
-    contact_timeout_s: Positive = Field(default=5.0, description="Longest contact without a latch, s.")
-    settle_s: Positive = Field(default=2.0, description="Wait between the latch and the pull test, s.")
+    contact_timeout_s: Positive = Field(
+        default=5.0, description="Longest contact without a latch, s."
+    )
+    settle_s: Positive = Field(
+        default=2.0, description="Wait between the latch and the pull test, s."
+    )
     pull_N: Positive = Field(default=0.5, description="Force of the pull test, N.")
     pull_s: Positive = Field(
         default=1.0, description="Duration of the pull, and of the push that follows it, s."
@@ -146,7 +168,9 @@ class Docking(Section):
     verify_position_m: Positive = Field(
         default=0.005, description="Largest displacement in the pull test, m."
     )
-    verify_angle_deg: Positive = Field(default=0.5, description="Largest rotation in the pull test, degrees.")
+    verify_angle_deg: Positive = Field(
+        default=0.5, description="Largest rotation in the pull test, degrees."
+    )
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Docking:
@@ -157,7 +181,9 @@ class Docking(Section):
             if chasers.count(chaser) > 1:
                 raise ValueError(f"ports: chaser {chaser} has more than one")
         if self.final_m >= self.entry_m:
-            raise ValueError(f"final_m ({self.final_m:g}) must be less than entry_m ({self.entry_m:g})")
+            raise ValueError(
+                f"final_m ({self.final_m:g}) must be less than entry_m ({self.entry_m:g})"
+            )
         if self.contact_speed_m_s > self.approach_speed_m_s:
             raise ValueError(
                 f"contact_speed_m_s ({self.contact_speed_m_s:g}) must not exceed approach_speed_m_s "

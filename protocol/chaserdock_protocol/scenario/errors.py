@@ -49,7 +49,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
     for e in errors:
         # An invalid element also makes its array too short; report the element only.
         path = e["loc"]
-        if e["type"] == "too_short" and any(len(p) > len(path) and p[: len(path)] == path for p in paths):
+        if e["type"] == "too_short" and any(
+            len(p) > len(path) and p[: len(path)] == path for p in paths
+        ):
             continue
         line = _line(e, root)
         if line not in lines:
@@ -83,7 +85,9 @@ def _line(error: Any, root: SchemaNode) -> str:
         message = f"must be {expected}"
     else:
         message = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    shown = f" (got {value_text(value)})" if isinstance(value, int | float | str | list | tuple) else ""
+    shown = (
+        f" (got {value_text(value)})" if isinstance(value, int | float | str | list | tuple) else ""
+    )
     if kind == "literal_error" and isinstance(value, str) and node is not None:
         close = difflib.get_close_matches(value, [str(c) for c in node.get("enum", ())], 1)
         shown += f"; did you mean {close[0]}?" if close else ""

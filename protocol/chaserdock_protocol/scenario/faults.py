@@ -37,7 +37,9 @@ FaultKind = Literal[
     "latch_open",
     "latch_stuck",
 ]
-TopicName = Literal["image", "odometry", "docking", "sighting", "thrusters", "lease", "wrench", "actuators"]
+TopicName = Literal[
+    "image", "odometry", "docking", "sighting", "thrusters", "lease", "wrench", "actuators"
+]
 
 FAULTY_TOPICS: dict[str, Topic] = {
     "image": topics.IMAGE,
@@ -49,7 +51,9 @@ FAULTY_TOPICS: dict[str, Topic] = {
     "wrench": topics.WRENCH,
     "actuators": topics.ACTUATORS,
 }
-"""Topics that faults may affect. Tick, end, confirmation, presence and farewell belong to the test bed and are exempt."""
+"""Topics that faults may affect. Tick, end, confirmation, presence and farewell belong to the test
+bed and are exempt.
+"""
 
 ON_RECEIPT: frozenset[str] = frozenset(
     {"cut", "drop", "delay", "duplicate", "reorder", "corrupt", "camera_off"}
@@ -71,7 +75,9 @@ class _Signature(NamedTuple):
 
 
 def _signature(required: str, optional: str, roles: str) -> _Signature:
-    return _Signature(frozenset(required.split()), frozenset(optional.split()), frozenset(roles.split()))
+    return _Signature(
+        frozenset(required.split()), frozenset(optional.split()), frozenset(roles.split())
+    )
 
 
 _ALL_BUT_RECORDER = "world controller chaser"
@@ -119,14 +125,17 @@ class Fault(Section):
     kind: FaultKind = Field(description="What happens.")
     at_s: float = Field(gt=0, allow_inf_nan=False, description="Begin, s of mission time.")
     duration_s: Positive | None = Field(
-        default=None, description="Duration, s of mission time; of wall time for `freeze`. `kill` has none."
+        default=None,
+        description="Duration, s of mission time; of wall time for `freeze`. `kill` has none.",
     )
     process: Process = Field(
         description="Process that is affected: `world`, `controller`, `standby`, `chaser/NUMBER` or `recorder`. Faults of "
         "messages affect what it receives; `flood`, `clock_jump`, `lying_sensor` and `odometry_lie` what it publishes; "
         "`latch_slip`, `latch_open` and `latch_stuck` its latch."
     )
-    peer: Process | None = Field(default=None, description="Limits the fault to messages from this process.")
+    peer: Process | None = Field(
+        default=None, description="Limits the fault to messages from this process."
+    )
     topic: TopicName | None = Field(default=None, description="Kind of message that is affected.")
     share: float | None = Field(
         default=None,
@@ -139,9 +148,12 @@ class Fault(Section):
     copies: int | None = Field(
         default=None, ge=1, le=1000, description="Extra copies of each message in a flood."
     )
-    offset_s: Number | None = Field(default=None, description="Error of the process' time stamps, s.")
+    offset_s: Number | None = Field(
+        default=None, description="Error of the process' time stamps, s."
+    )
     offset_m: Vector | None = Field(
-        default=None, description="Error of the position, m: of sightings in IRF, of odometry in WRF."
+        default=None,
+        description="Error of the position, m: of sightings in IRF, of odometry in WRF.",
     )
     rotation_deg: Vector | None = Field(
         default=None,
@@ -149,10 +161,12 @@ class Fault(Section):
     )
 
     force_N: Positive | None = Field(
-        default=None, description="Largest force that a slipping latch transmits, N. Without it: any."
+        default=None,
+        description="Largest force that a slipping latch transmits, N. Without it: any.",
     )
     torque_N_m: Positive | None = Field(
-        default=None, description="Largest torque that a slipping latch transmits, N m. Without it: any."
+        default=None,
+        description="Largest torque that a slipping latch transmits, N m. Without it: any.",
     )
 
     @model_validator(mode="after")
@@ -185,12 +199,18 @@ class Fault(Section):
                 verb, allowed = ("publishes", topics.may_write)
             if not allowed(role, topic):
                 raise ValueError(f"{self.process} {verb} no {self.topic}")
-        if self.peer is not None and (self.peer == self.process or role_of(self.peer) == "recorder"):
-            raise ValueError(f"peer: {self.process} receives no message that can be faulty from {self.peer}")
+        if self.peer is not None and (
+            self.peer == self.process or role_of(self.peer) == "recorder"
+        ):
+            raise ValueError(
+                f"peer: {self.process} receives no message that can be faulty from {self.peer}"
+            )
         return self
 
     def ticks(self, rate_hz: int) -> tuple[int, int]:
-        """Return the first tick of the fault and the first tick after it. A fault lasts at least one tick."""
+        """Return the first tick of the fault and the first tick after it. A fault lasts at least
+        one tick.
+        """
         begin = max(1, math.ceil(self.at_s * rate_hz - 1e-9))
         return begin, begin + max(1, round((self.duration_s or 0.0) * rate_hz))
 
@@ -204,10 +224,11 @@ class Fault(Section):
 
 
 class ProcessFaults(Section):
-    """What the test bed injects at one process. Read by the process' shell, not by its flight software.
+    """What the test bed injects at one process. Read by the process' shell, not by its flight
+    software.
 
-    ``seed``: of the random draws, a hash, so that it does not give away the scenario's. ``reported_failures``: thruster
-    failures that the chaser's hardware reports when they happen.
+    ``seed``: of the random draws, a hash, so that it does not give away the scenario's.
+    ``reported_failures``: thruster failures that the chaser's hardware reports when they happen.
     """
 
     seed: int = Field(default=0, ge=0, lt=2**64)
@@ -216,7 +237,9 @@ class ProcessFaults(Section):
 
 
 def faults_of(scenario: Scenario, process: str) -> ProcessFaults:
-    """Return the faults that a process injects into its own messages; the world announces, and so gets, all."""
+    """Return the faults that a process injects into its own messages; the world announces, and so
+    gets, all.
+    """
     faults = tuple(f for f in scenario.fault if process == "world" or _concerns(f, process))
     digest = hashlib.sha256(f"{scenario.seed}/faults/{process}".encode()).digest()
     return ProcessFaults(
@@ -255,9 +278,13 @@ def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:
                     f"fault.{k}: there is no {name}; this mission has chaser/0 to chaser/{chasers - 1}"
                 )
         if fault.topic == "thrusters" and scenario.chaser.actuation != "thrusters":
-            raise ValueError(f'fault.{k}.topic: thrusters exist only with chaser.actuation = "thrusters"')
+            raise ValueError(
+                f'fault.{k}.topic: thrusters exist only with chaser.actuation = "thrusters"'
+            )
         if fault.topic == "docking" and scenario.docking.kind != "capture":
-            raise ValueError(f'fault.{k}.topic: docking sensors exist only with docking.kind = "capture"')
+            raise ValueError(
+                f'fault.{k}.topic: docking sensors exist only with docking.kind = "capture"'
+            )
         if (
             fault.kind in LATCH_FAULTS
             and scenario.docking.port_of(int(fault.process.partition("/")[2])) is None

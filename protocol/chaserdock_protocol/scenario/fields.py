@@ -22,13 +22,16 @@ from pydantic import (
 LARGEST = 1e12
 """Bound on the magnitude of every number, so that squares and products of values stay finite."""
 
-# Normalization leaves an error of at most 1.5 epsilon. A quaternion within this tolerance is kept to the bit: the
-# resolved scenario is validated again by every process, and a second normalization could change the last bit.
+# Normalization leaves an error of at most 1.5 epsilon. A quaternion within this tolerance is kept
+# to the bit: the resolved scenario is validated again by every process, and a second normalization
+# could change the last bit.
 _UNIT_TOLERANCE = 4.0 * sys.float_info.epsilon
 
 
 def unit(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Normalize a quaternion (w, x, y, z). Idempotent to the bit. Raises ValueError for a length off 1 by over 1e-3."""
+    """Normalize a quaternion (w, x, y, z). Idempotent to the bit. Raises ValueError for a length
+    off 1 by over 1e-3.
+    """
     length = math.hypot(*q)
     if abs(length - 1.0) > 1e-3:
         raise ValueError(
@@ -64,7 +67,9 @@ def _to_tuples(value: Any) -> Any:
 
 
 class Section(BaseModel):
-    """A table of the scenario file. Unknown keys are errors; types are strict, but an integer may stand for a float."""
+    """A table of the scenario file. Unknown keys are errors; types are strict, but an integer may
+    stand for a float.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -75,7 +80,9 @@ class Section(BaseModel):
 
 
 class EulerAngles(Section):
-    """Attitude as intrinsic z-y-x Euler angles: yaw about Z, then pitch about the new Y, then roll about the new X."""
+    """Attitude as intrinsic z-y-x Euler angles: yaw about Z, then pitch about the new Y, then roll
+    about the new X.
+    """
 
     roll: Number = Field(default=0.0, description="Rotation about X, degrees; applied last.")
     pitch: Number = Field(default=0.0, description="Rotation about Y, degrees; applied second.")
@@ -105,7 +112,9 @@ _ON_AXIS = 1e-15
 
 
 def facing_origin(position_m: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    """Return the q_wxyz that points +X from ``position_m`` at the origin without roll (yaw, then pitch)."""
+    """Return the q_wxyz that points +X from ``position_m`` at the origin without roll (yaw, then
+    pitch).
+    """
     # Scaled, so that subnormal coordinates keep their digits.
     largest = max(map(abs, position_m))
     x, y, z = (v / largest for v in position_m)
@@ -113,16 +122,25 @@ def facing_origin(position_m: tuple[float, float, float]) -> tuple[float, float,
     yaw_c, yaw_s = _half_angle(-x / across, -y / across) if across > _ON_AXIS else (1.0, 0.0)
     pitch_c, pitch_s = _half_angle(across / distance, z / distance)
     # yaw about Z times pitch about Y; "+ 0.0" turns -0.0 into 0.0.
-    return (yaw_c * pitch_c + 0.0, -yaw_s * pitch_s + 0.0, yaw_c * pitch_s + 0.0, yaw_s * pitch_c + 0.0)
+    return (
+        yaw_c * pitch_c + 0.0,
+        -yaw_s * pitch_s + 0.0,
+        yaw_c * pitch_s + 0.0,
+        yaw_s * pitch_c + 0.0,
+    )
 
 
 ATTITUDE_KEYS = ("q_wxyz", "attitude_deg", "look_at")
-"""Alternative keys for an attitude. A table may have one of them; an override or a variant of a scenario replaces the others."""
+"""Alternative keys for an attitude. A table may have one of them; an override or a variant of a
+scenario replaces the others.
+"""
 _VECTOR: TypeAdapter[Vector] = TypeAdapter(Vector)
 
 
 class Oriented(Section):
-    """A table whose ``q_wxyz`` may be given as Euler angles instead; the resolved scenario has ``q_wxyz`` alone."""
+    """A table whose ``q_wxyz`` may be given as Euler angles instead; the resolved scenario has
+    ``q_wxyz`` alone.
+    """
 
     attitude_deg: EulerAngles | None = Field(
         default=None,
@@ -144,7 +162,9 @@ class Oriented(Section):
 
 
 def _with_quaternion(values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Replace ``attitude_deg`` or ``look_at`` by ``q_wxyz``. Keys that are not valid remain, and are reported later."""
+    """Replace ``attitude_deg`` or ``look_at`` by ``q_wxyz``. Keys that are not valid remain, and
+    are reported later.
+    """
     resolved = {**values, "q_wxyz": (1.0, 0.0, 0.0, 0.0)}
     try:
         if key == "attitude_deg":

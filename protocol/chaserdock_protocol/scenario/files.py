@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read scenario files, and the target and calibration files that they name.
 
-Their content becomes part of the scenario, because the world sends it to processes that do not have these files.
+Their content becomes part of the scenario, because the world sends it to processes that do not have
+these files.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def resolve_files(values: dict[str, Any], folder: Path) -> None:
-    """Replace the files that a scenario names by their content, in place; paths are relative to ``folder``.
+    """Replace the files that a scenario names by their content, in place; paths are relative to
+    ``folder``.
 
     Raises ScenarioError for files that cannot be read or are not valid.
     """
@@ -79,7 +81,9 @@ def _name_of(path: Path) -> str:
 
 
 def _read_mesh(geometry: dict[str, Any], folder: Path) -> None:
-    """Put the content of the mesh file that a geometry names into it, in place, unless it is there. Raises ScenarioError."""
+    """Put the content of the mesh file that a geometry names into it, in place, unless it is there.
+    Raises ScenarioError.
+    """
     mesh = geometry.get("mesh")
     if not isinstance(mesh, str) or not mesh or mesh in satellite_names():
         if isinstance(mesh, str):
@@ -92,7 +96,11 @@ def _read_mesh(geometry: dict[str, Any], folder: Path) -> None:
     except (ValidationError, TypeError):
         return  # reported by the schema
     held = geometry.get("surface")
-    if isinstance(held, dict) and (held.get("file"), held.get("scale"), tuple(held.get("origin_m", ()))) == (
+    if isinstance(held, dict) and (
+        held.get("file"),
+        held.get("scale"),
+        tuple(held.get("origin_m", ())),
+    ) == (
         str(path),
         scale,
         origin,

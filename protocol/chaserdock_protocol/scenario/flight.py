@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a scenario that flight software receives: chasers, controller and standby (docs/flight_scenario.md).
+"""The part of a scenario that flight software receives: chasers, controller and standby
+(docs/flight_scenario.md).
 
-Ground truth, what is random and what is planned to fail are not in it. A section that flight software receives is a field
-of ``FlightScenario``; any other one is a field of ``Scenario`` (mission.py).
+Ground truth, what is random and what is planned to fail are not in it. A section that flight
+software receives is a field of ``FlightScenario``; any other one is a field of ``Scenario``
+(mission.py).
 """
 
 from __future__ import annotations
@@ -43,11 +45,15 @@ from .schema import (
 
 @lru_cache(maxsize=64)
 def _timing(physics_hz: int, rate_hz: int, image_hz: int, latency_steps: int) -> Timing:
-    return Timing(physics_hz=physics_hz, rate_hz=rate_hz, image_hz=image_hz, latency_steps=latency_steps)
+    return Timing(
+        physics_hz=physics_hz, rate_hz=rate_hz, image_hz=image_hz, latency_steps=latency_steps
+    )
 
 
 class FlightScenario(Section):
-    """The part of a scenario that the flight software receives: nominal bodies and sensors, its own settings, the mission."""
+    """The part of a scenario that the flight software receives: nominal bodies and sensors, its own
+    settings, the mission.
+    """
 
     format: Literal[3] = Field(
         default=FORMAT,
@@ -87,7 +93,9 @@ class FlightScenario(Section):
     @property
     def timing(self) -> Timing:
         time = self.time
-        return _timing(time.physics_hz, time.rate_hz, time.image_hz, round(time.latency_s * time.physics_hz))
+        return _timing(
+            time.physics_hz, time.rate_hz, time.image_hz, round(time.latency_s * time.physics_hz)
+        )
 
     def camera_model(self) -> Camera:
         """Return the camera as calibrated."""
@@ -120,7 +128,9 @@ def flight_scenario_json(scenario: FlightScenario) -> str:
 
 
 def flight_scenario_from_json(text: str, source: str) -> FlightScenario:
-    """Return a flight scenario from JSON. Raises ScenarioError, also for a full scenario, whose keys are unknown."""
+    """Return a flight scenario from JSON. Raises ScenarioError, also for a full scenario, whose
+    keys are unknown.
+    """
     try:
         return FlightScenario.model_validate_json(text)
     except ValidationError as error:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inspection of the target: the flight around it during which its geometry is estimated (docs/markerless.md)."""
+"""Inspection of the target: the flight around it during which its geometry is estimated
+(docs/markerless.md).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from .fields import Positive, Section, Vector
 
 
 class Inspection(Section):
-    """Flight around the target by the command `inspect`, during which panel angles and scale of a known mesh are estimated."""
+    """Flight around the target by the command `inspect`, during which panel angles and scale of a
+    known mesh are estimated.
+    """
 
     distance_m: Positive = Field(default=1.4, description="Distance from the target's centre, m.")
     speed_m_s: Positive = Field(

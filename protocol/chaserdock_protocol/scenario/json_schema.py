@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario's JSON schema: for editors, for the reference page, and for the texts of validation errors."""
+"""The scenario's JSON schema: for editors, for the reference page, and for the texts of validation
+errors.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def node_at(root: SchemaNode, path: Sequence[str | int]) -> SchemaNode | None:
     node: SchemaNode | None = root
     for part in path:
         node = resolved(node, root)
-        node = item_of(node, part) if isinstance(part, int) else node.get("properties", {}).get(part)
+        node = (
+            item_of(node, part) if isinstance(part, int) else node.get("properties", {}).get(part)
+        )
         if node is None:
             return None
     return resolved(node, root)
@@ -71,7 +75,11 @@ def number_text(value: float) -> str:
 
 def range_text(node: SchemaNode, every: bool = False) -> str:
     """Return the range of a number in words. ``every``: include the bound that all numbers have."""
-    bounds = {k: node[k] for k in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum") if k in node}
+    bounds = {
+        k: node[k]
+        for k in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum")
+        if k in node
+    }
     if not every:
         bounds = {k: v for k, v in bounds.items() if abs(v) < LARGEST}
     text = {k: number_text(v) for k, v in bounds.items()}
@@ -94,7 +102,9 @@ def _count_text(node: SchemaNode) -> str:
 
 
 def expected_text(node: SchemaNode, root: SchemaNode, every: bool = False) -> str:
-    """Return in words what a value must be, such as "a number greater than 0"; empty if the schema does not say."""
+    """Return in words what a value must be, such as "a number greater than 0"; empty if the schema
+    does not say.
+    """
     if "enum" in node:
         return f"one of {', '.join(map(str, node['enum']))}"
     if "const" in node:
@@ -106,7 +116,12 @@ def expected_text(node: SchemaNode, root: SchemaNode, every: bool = False) -> st
     if kind == "array":
         item = item_of(node)
         inner = resolved(item, root).get("type") if item else None
-        names = {"number": "numbers", "integer": "whole numbers", "object": "tables", "string": "texts"}
+        names = {
+            "number": "numbers",
+            "integer": "whole numbers",
+            "object": "tables",
+            "string": "texts",
+        }
         return f"an array of {_count_text(node)}{names.get(str(inner), 'values')}"
     return {"boolean": "true or false", "string": "text", "object": "a table"}.get(str(kind), "")
 
@@ -127,9 +142,11 @@ def key_paths(root: SchemaNode) -> Iterator[str]:
 
 
 def editor_schema(model: type[BaseModel]) -> SchemaNode:
-    """Return the schema of scenario files for editors (draft 7, which taplo and VS Code's Even Better TOML support).
+    """Return the schema of scenario files for editors (draft 7, which taplo and VS Code's Even
+    Better TOML support).
 
-    It describes files as written: with ``extends`` no other key is required, and ``model`` may be a path.
+    It describes files as written: with ``extends`` no other key is required, and ``model`` may be a
+    path.
     """
     schema = _simplified(copy.deepcopy(schema_of(model)))
     definitions = schema.pop("$defs")
@@ -175,5 +192,8 @@ def _simplified(node: Any) -> Any:
     if isinstance(reference := out.get("$ref"), str):
         out["$ref"] = reference.replace("#/$defs/", "#/definitions/")
         if len(out) > 1:  # draft 7 ignores everything beside a reference
-            out = {**{k: v for k, v in out.items() if k != "$ref"}, "allOf": [{"$ref": out["$ref"]}]}
+            out = {
+                **{k: v for k, v in out.items() if k != "$ref"},
+                "allOf": [{"$ref": out["$ref"]}],
+            }
     return out

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Load scenarios: files with their variants and overrides, and the JSON that the world sends and logs store."""
+"""Load scenarios: files with their variants and overrides, and the JSON that the world sends and
+logs store.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +27,12 @@ Step = tuple[str, Callable[[Values], Values]]
 
 
 def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Load a scenario file with ``key.path=value`` overrides (values in TOML's notation). Raises ScenarioError.
+    """Load a scenario file with ``key.path=value`` overrides (values in TOML's notation). Raises
+    ScenarioError.
 
-    Paths in a file are relative to it, those in an override to the working directory. The plugins that the scenario
-    names must be installed; this is not required of a scenario from the world or a log.
+    Paths in a file are relative to it, those in an override to the working directory. The plugins
+    that the scenario names must be installed; this is not required of a scenario from the world or
+    a log.
     """
     steps = [(str(file), _merging(values, str(file))) for file, values in _read_with_parents(path)]
     scenario = _validated([*steps, *_override_steps(overrides)], str(path))
@@ -37,7 +41,9 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
 
 
 def parse_scenario(values: dict[str, Any], source: str, overrides: Sequence[str] = ()) -> Scenario:
-    """Return the scenario of nested tables with overrides. Raises ScenarioError with one line per error."""
+    """Return the scenario of nested tables with overrides. Raises ScenarioError with one line per
+    error.
+    """
     _check_format(values, source)
     return _validated([(source, lambda _: values), *_override_steps(overrides)], source)
 
@@ -101,7 +107,9 @@ def _override_steps(overrides: Sequence[str]) -> list[Step]:
 
 def _overriding(text: str) -> Callable[[Values], Values]:
     def step(before: Values) -> Values:
-        values = with_override(before, text, lambda v: Scenario.model_validate(v).model_dump(mode="json"))
+        values = with_override(
+            before, text, lambda v: Scenario.model_validate(v).model_dump(mode="json")
+        )
         _check_format(values, f"--set {text}")
         try:
             resolve_files(values, Path())
@@ -116,7 +124,9 @@ def _overriding(text: str) -> Callable[[Values], Values]:
 
 
 def _check_camera(before: Values, after: Values, source: str) -> None:
-    """Drop the values that ``camera.intrinsics`` replaces, in place. Raise ScenarioError where the source states one."""
+    """Drop the values that ``camera.intrinsics`` replaces, in place. Raise ScenarioError where the
+    source states one.
+    """
     was, now = (v["camera"] if isinstance(v.get("camera"), dict) else {} for v in (before, after))
     for key in REPLACED_BY_INTRINSICS if now.get("intrinsics") else ():
         if now.get(key) != was.get(key):
@@ -132,20 +142,26 @@ def _check_format(values: Values, source: str) -> None:
 
 
 def _validated(steps: Sequence[Step], source: str) -> Scenario:
-    """Apply all steps and validate the result. Raises ScenarioError, each line with the step that caused it."""
+    """Apply all steps and validate the result. Raises ScenarioError, each line with the step that
+    caused it.
+    """
     try:
         values: Values = {}
         for _, step in steps:
             values = step(values)
         return Scenario.model_validate(values)
     except ValidationError as error:
-        raise ScenarioError("\n".join(_with_sources(steps, explain(error, Scenario), source))) from None
+        raise ScenarioError(
+            "\n".join(_with_sources(steps, explain(error, Scenario), source))
+        ) from None
     except RecursionError:
         raise ScenarioError(f"{source}: nested too deeply") from None
 
 
 def _with_sources(steps: Sequence[Step], lines: list[str], source: str) -> list[str]:
-    """Prefix each line with the first step after which it appears. What is missing is missing in ``source``."""
+    """Prefix each line with the first step after which it appears. What is missing is missing in
+    ``source``.
+    """
     first: dict[str, str] = {}
     values: Values = {}
     for label, step in steps:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mesh files (GLB, glTF, OBJ, STL, PLY), read and written through trimesh; every problem is one line that says what would be right.
+"""Mesh files (GLB, glTF, OBJ, STL, PLY), read and written through trimesh; every problem is one
+line that says what would be right.
 
-A part is a node of the file with its material. What the format cannot say (texture, density, joints) is in the extras of nodes and
-scene under ``chaserdock``, as `write_mesh` leaves it.
+A part is a node of the file with its material. What the format cannot say (texture, density,
+joints) is in the extras of nodes and scene under ``chaserdock``, as `write_mesh` leaves it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ _UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (100
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh that was read, what was changed or assumed (``notes``), and the deviation by decimation."""
+    """A mesh that was read, what was changed or assumed (``notes``), and the deviation by
+    decimation.
+    """
 
     mesh: TriangleMesh
     notes: tuple[str, ...]
@@ -47,12 +50,16 @@ def read_surface(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 
 
 
 def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0)) -> MeshFile:
-    """Read a mesh file; ``scale`` is the factor to metres, ``origin_m`` the point of the file that becomes the origin.
+    """Read a mesh file; ``scale`` is the factor to metres, ``origin_m`` the point of the file that
+    becomes the origin.
 
-    Raises ScenarioError with one line for a file that is not a mesh, is not closed, or has an absurd size.
+    Raises ScenarioError with one line for a file that is not a mesh, is not closed, or has an
+    absurd size.
     """
     scene, notes = _load(path), []
-    parts = [_part(path, *solid, notes) for solid in _solids(scene, scale, np.array(origin_m), notes)]
+    parts = [
+        _part(path, *solid, notes) for solid in _solids(scene, scale, np.array(origin_m), notes)
+    ]
     if not parts:
         raise ScenarioError(f"{path}: contains no triangles; a target needs closed surfaces")
     if len(parts) > MAX_PARTS:
@@ -79,7 +86,9 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
 
 
 def write_mesh(mesh: TriangleMesh, path: Path) -> None:
-    """Write a mesh as GLB, or as OBJ with its materials beside it. Raises OSError, and ValueError for another ending."""
+    """Write a mesh as GLB, or as OBJ with its materials beside it. Raises OSError, and ValueError
+    for another ending.
+    """
     import trimesh
     from trimesh.exchange.gltf import export_glb
     from trimesh.exchange.obj import export_obj
@@ -134,14 +143,18 @@ def _load(path: Path) -> Any:
         raise ScenarioError(f"{path}: no such mesh file")
     trimesh.util.log.setLevel(logging.CRITICAL)
     suffix = path.suffix.lower()
-    options: dict[str, Any] = {"split_objects": True, "group_material": False} if suffix == ".obj" else {}
+    options: dict[str, Any] = (
+        {"split_objects": True, "group_material": False} if suffix == ".obj" else {}
+    )
     try:
         if suffix == ".glb" and path.read_bytes()[:4] != b"glTF":
             raise ValueError("it does not begin with 'glTF'")
         return trimesh.load_scene(path, process=False, **options)
     except Exception as error:  # readers of foreign formats raise whatever they stumble over
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ScenarioError(f"{path}: not a {path.suffix[1:].upper()} mesh: {reason[:200]}") from None
+        raise ScenarioError(
+            f"{path}: not a {path.suffix[1:].upper()} mesh: {reason[:200]}"
+        ) from None
 
 
 Solid = tuple[str, Array, IntArray, Any]
@@ -158,7 +171,9 @@ def _solids(scene: Any, scale: float, origin_m: Array, notes: list[str]) -> Iter
             continue
         if not len(geometry.faces):
             continue
-        vertices = np.asarray(geometry.vertices, dtype=float) @ transform[:3, :3].T + transform[:3, 3]
+        vertices = (
+            np.asarray(geometry.vertices, dtype=float) @ transform[:3, :3].T + transform[:3, 3]
+        )
         triangles = np.asarray(geometry.faces, dtype=np.int64)
         if np.linalg.det(transform[:3, :3]) < 0.0:
             triangles = triangles[:, ::-1]
@@ -186,7 +201,9 @@ def _part(
 
 
 def _welded(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
-    """Join vertices of one place, which files split at creases, round them to 32 bits, and drop triangles without area."""
+    """Join vertices of one place, which files split at creases, round them to 32 bits, and drop
+    triangles without area.
+    """
     vertices = vertices.astype(np.float32).astype(float)
     grain = max(float(np.ptp(vertices, axis=0).max()) * _WELD_SHARE, 1e-12)
     _, first, where = np.unique(
@@ -210,7 +227,9 @@ def _with_unique_names(parts: list[MeshPart]) -> list[MeshPart]:
 def _joints(path: Path, scene: Any, scale: float, origin_m: Array) -> dict[str, Vector3]:
     extras = scene.metadata.get(_EXTRAS, {}) if isinstance(scene.metadata, dict) else {}
     try:
-        joints = [SurfaceJoint(name=k, position_m=tuple(at)) for k, at in extras.get("joints", {}).items()]
+        joints = [
+            SurfaceJoint(name=k, position_m=tuple(at)) for k, at in extras.get("joints", {}).items()
+        ]
     except (ValidationError, AttributeError, TypeError):
         raise ScenarioError(
             f"{path}: its extras {_EXTRAS!r} must be as `chaserdock mesh export` writes them"
@@ -225,7 +244,9 @@ def _material(name: str, geometry: Any, notes: list[str]) -> Material:
     if given is None:
         if getattr(visual, "kind", None) in ("vertex", "face"):
             colours = visual.vertex_colors if visual.kind == "vertex" else visual.face_colors
-            return Material("vertex colours", _grey(np.asarray(colours, dtype=float)[:, :3] / 255.0))
+            return Material(
+                "vertex colours", _grey(np.asarray(colours, dtype=float)[:, :3] / 255.0)
+            )
         notes.append(f"{name}: no material; it is drawn in uniform grey of reflectance 0.5")
         return Material("grey")
     label = str(getattr(given, "name", None) or "material")[:64]
@@ -235,10 +256,16 @@ def _material(name: str, geometry: Any, notes: list[str]) -> Material:
         share = _grey(np.asarray(image.convert("RGB"), dtype=float).reshape(-1, 3) / 255.0)
         notes.append(f"{name}: its image texture is drawn as its mean, reflectance {share:.2f}")
     else:
-        notes.append(f"{name}: no texture; uniform surface of {label!r}") if not _has_colour(given) else None
+        notes.append(f"{name}: no texture; uniform surface of {label!r}") if not _has_colour(
+            given
+        ) else None
     if hasattr(given, "baseColorFactor"):
         return _of_pbr(label, given, share)
-    diffuse = share if image is not None else _grey(np.asarray(given.diffuse, dtype=float)[None, :3] / 255.0)
+    diffuse = (
+        share
+        if image is not None
+        else _grey(np.asarray(given.diffuse, dtype=float)[None, :3] / 255.0)
+    )
     specular = _grey(np.asarray(given.specular, dtype=float)[None, :3] / 255.0)
     shininess = float(np.clip(given.glossiness or 20.0, 1.0, 1000.0))
     return Material(label, diffuse, specular, shininess)
@@ -252,16 +279,25 @@ def _has_colour(material: Any) -> bool:
 
 
 def _of_pbr(label: str, given: Any, share: float) -> Material:
-    """Return a material of metallic-roughness shading: a metal reflects mostly in its highlight, whose exponent is 2 / r^4 - 2."""
+    """Return a material of metallic-roughness shading: a metal reflects mostly in its highlight,
+    whose exponent is 2 / r^4 - 2.
+    """
     factor = given.baseColorFactor
     grey = 1.0 if factor is None else _grey(np.asarray(factor, dtype=float)[None, :3] / 255.0)
     if factor is None and share == 1.0:
         grey = 0.5
     grey = float(np.clip(grey * share, 0.0, 1.0))
-    metallic = float(np.clip(given.metallicFactor if given.metallicFactor is not None else 0.0, 0.0, 1.0))
-    roughness = float(np.clip(given.roughnessFactor if given.roughnessFactor is not None else 0.8, 0.1, 1.0))
+    metallic = float(
+        np.clip(given.metallicFactor if given.metallicFactor is not None else 0.0, 0.0, 1.0)
+    )
+    roughness = float(
+        np.clip(given.roughnessFactor if given.roughnessFactor is not None else 0.8, 0.1, 1.0)
+    )
     shininess = float(np.clip(2.0 / roughness**4 - 2.0, 1.0, 200.0))
-    diffuse, specular = grey * (1.0 - 0.5 * metallic), 0.04 * (1.0 - metallic) + 0.8 * grey * metallic
+    diffuse, specular = (
+        grey * (1.0 - 0.5 * metallic),
+        0.04 * (1.0 - metallic) + 0.8 * grey * metallic,
+    )
     return Material(label, round(diffuse, 4), round(specular, 4), round(shininess, 2))
 
 

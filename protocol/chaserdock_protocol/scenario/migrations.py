@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Older scenario formats: scenarios stored in logs are migrated, files get an error that names the new key."""
+"""Older scenario formats: scenarios stored in logs are migrated, files get an error that names the
+new key.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,8 @@ from collections.abc import Iterator
 from typing import Any
 
 FORMAT = 3
-"""Present format of scenario files. Format 1 called thrusters jets, and images pictures. Up to format 2, odometry and cameras
-were exact unless the scenario stated errors."""
+"""Present format of scenario files. Format 1 called thrusters jets, and images pictures. Up to
+format 2, odometry and cameras were exact unless the scenario stated errors."""
 
 _RENAMED_KEYS: dict[tuple[str, ...], str] = {
     ("time", "picture_hz"): "image_hz",
@@ -21,25 +23,34 @@ _RENAMED_KEYS: dict[tuple[str, ...], str] = {
     ("jet_failure", "*", "told"): "reported",
     ("jet_failure",): "thruster_failure",
 }
-"""Path of a key in format 1 (``*``: every element of an array) -> its present name. Parents follow their children."""
+"""Path of a key in format 1 (``*``: every element of an array) -> its present name. Parents follow
+their children.
+"""
 
 _CAMERA_PRIORS = {
     "camera_bias_attitude_deg": "camera_turn_deg",
     "camera_bias_position_m": "camera_shift_m",
     "camera_bias_focal_share": "camera_focal_share",
 }
-"""Key of ``[estimator]`` in format 2 -> key of ``[navigation]``: sigmas of the cameras' errors that the estimator assumed."""
+"""Key of ``[estimator]`` in format 2 -> key of ``[navigation]``: sigmas of the cameras' errors that
+the estimator assumed.
+"""
 _CAMERA_ERRORS = {
     "mounting_deg": ("camera_turn_deg", "turn_deg"),
     "mounting_m": ("camera_shift_m", "shift_m"),
     "focal_length_share": ("camera_focal_share", "focal_share"),
     "centre_px": ("camera_centre_px", "centre_px"),
 }
-"""Key of ``[camera.calibration_error]`` in format 2 -> keys of ``[navigation]`` and of ``[truth.camera]``."""
+"""Key of ``[camera.calibration_error]`` in format 2 -> keys of ``[navigation]`` and of
+``[truth.camera]``.
+"""
 
 _MOVED_KEYS: dict[tuple[str, ...], str] = {
     ("odometry",): 'navigation; state the grade, too ("exact": all other errors are 0)',
-    **{("camera", "calibration_error", old): f"navigation.{new}" for old, (new, _) in _CAMERA_ERRORS.items()},
+    **{
+        ("camera", "calibration_error", old): f"navigation.{new}"
+        for old, (new, _) in _CAMERA_ERRORS.items()
+    },
     **{("estimator", old): f"navigation.{new}" for old, new in _CAMERA_PRIORS.items()},
 }
 """Path of a key in format 2 -> its present path."""
@@ -64,7 +75,9 @@ def old_keys(values: dict[str, Any]) -> list[str]:
     lines = []
     for old, new in _RENAMED_KEYS.items():
         for _, path in _holders(values, old):
-            lines.append(f"{path}: is now called {path.rpartition('.')[0]}.{new}".replace(" .", " "))
+            lines.append(
+                f"{path}: is now called {path.rpartition('.')[0]}.{new}".replace(" .", " ")
+            )
     for old, new in _MOVED_KEYS.items():
         lines += [f"{path}: is now called {new}" for _, path in _holders(values, old)]
     for table, path in _holders(values, ("fault", "*", "topic")):
@@ -85,12 +98,18 @@ def old_format(values: dict[str, Any]) -> list[str]:
                 'odometry and cameras are not exact by default any more (navigation.grade = "exact")'
             )
         changes = "; ".join(lines) or "no key of this file has another name"
-        return [f"format: {stated} is not supported any more; set format = {FORMAT} and change: {changes}"]
-    return [f"format: must be {FORMAT}, the format that this version of chaserdock reads (got {stated!r})"]
+        return [
+            f"format: {stated} is not supported any more; set format = {FORMAT} and change: {changes}"
+        ]
+    return [
+        f"format: must be {FORMAT}, the format that this version of chaserdock reads (got {stated!r})"
+    ]
 
 
 def migrated(text: str) -> str:
-    """Return a resolved scenario (JSON) in the present format. Text that is not JSON is returned unchanged."""
+    """Return a resolved scenario (JSON) in the present format. Text that is not JSON is returned
+    unchanged.
+    """
     try:
         values = json.loads(text)
     except (json.JSONDecodeError, RecursionError):
@@ -114,9 +133,11 @@ def _rename_keys(values: dict[str, Any]) -> None:
 
 
 def _state_navigation(values: dict[str, Any]) -> None:
-    """Migrate from format 2 to 3, in place: exact navigation with the errors that the scenario states.
+    """Migrate from format 2 to 3, in place: exact navigation with the errors that the scenario
+    states.
 
-    The camera's figures are those that the estimator assumed, so that it replays as it flew; errors beyond are ``[truth]``.
+    The camera's figures are those that the estimator assumed, so that it replays as it flew; errors
+    beyond are ``[truth]``.
     """
     navigation: dict[str, Any] = {"grade": "exact"}
     navigation |= {key: value for key, value in _table(values, "odometry").items() if value}

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario in full: the flight scenario, and what only the world and tools for before and after a flight may know."""
+"""The scenario in full: the flight scenario, and what only the world and tools for before and after
+a flight may know.
+"""
 
 from __future__ import annotations
 
@@ -23,30 +25,43 @@ from .world import WorldSection
 
 
 class Chaser(FlightChaser):
-    """One chaser: its reference pose, and its initial state relative to that. It starts without rotation in WRF."""
+    """One chaser: its reference pose, and its initial state relative to that. It starts without
+    rotation in WRF.
+    """
 
     start_offset_m: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="Initial position relative to the reference position (TRF), m."
+        default=(0.0, 0.0, 0.0),
+        description="Initial position relative to the reference position (TRF), m.",
     )
     start_rotation_rad: Vector = Field(
         default=(0.0, 0.0, 0.0),
         description="Initial attitude relative to the reference attitude: rotation vector (CRF), rad.",
     )
-    start_velocity_m_s: Vector = Field(default=(0.0, 0.0, 0.0), description="Initial velocity (WRF), m/s.")
+    start_velocity_m_s: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="Initial velocity (WRF), m/s."
+    )
 
 
 class Success(Section):
-    """Criteria of a successful mission, evaluated on ground truth. Omitted criteria are not evaluated."""
+    """Criteria of a successful mission, evaluated on ground truth. Omitted criteria are not
+    evaluated.
+    """
 
-    docked: tuple[Index, ...] = Field(default=(), description="Chasers that must be docked at the end.")
+    docked: tuple[Index, ...] = Field(
+        default=(), description="Chasers that must be docked at the end."
+    )
     reached: tuple[Index, ...] = Field(
-        default=(), description="Chasers that must be at the destination of their last `goto` at the end."
+        default=(),
+        description="Chasers that must be at the destination of their last `goto` at the end.",
     )
     reached_position_m: Positive = Field(default=0.02, description="Tolerance of `reached`, m.")
     reached_within_s: Positive | None = Field(
-        default=None, description="Longest time from that `goto` until a chaser is there to stay, s."
+        default=None,
+        description="Longest time from that `goto` until a chaser is there to stay, s.",
     )
-    latched: tuple[Index, ...] = Field(default=(), description="Chasers that must be latched at the end.")
+    latched: tuple[Index, ...] = Field(
+        default=(), description="Chasers that must be latched at the end."
+    )
     detumbled: RestLimits | None = Field(
         default=None,
         description="Rates that the stack of target and latched chasers must not exceed at the end.",
@@ -68,7 +83,8 @@ class Success(Section):
         description="Whether `force_limit_N` and `torque_limit_N_m` of `[[docking.ports]]` must be kept in every physics step.",
     )
     steady_position_rms_m: Positive | None = Field(
-        default=None, description="Largest RMS of each chaser's position error in the steady interval, m."
+        default=None,
+        description="Largest RMS of each chaser's position error in the steady interval, m.",
     )
     steady_orientation_rms_deg: Positive | None = Field(
         default=None,
@@ -87,7 +103,9 @@ class Success(Section):
 
 
 class Scenario(FlightScenario):
-    """A mission: the keys of the flight scenario, some with more keys in their tables, and those below."""
+    """A mission: the keys of the flight scenario, some with more keys in their tables, and those
+    below.
+    """
 
     extends: str | None = Field(
         default=None,
@@ -125,9 +143,13 @@ class Scenario(FlightScenario):
         return self
 
     def goal_of(self, chaser: int) -> tuple[float, Vector] | None:
-        """Return time (s) and destination (TRF, m) of a chaser's last ``goto`` in the timeline, or None."""
+        """Return time (s) and destination (TRF, m) of a chaser's last ``goto`` in the timeline, or
+        None.
+        """
         goals = [
-            (e.at_s, e.offset_m) for e in self.timeline if chaser in e.chasers and e.offset_m is not None
+            (e.at_s, e.offset_m)
+            for e in self.timeline
+            if chaser in e.chasers and e.offset_m is not None
         ]
         return max(goals, key=lambda goal: goal[0], default=None)
 

@@ -25,8 +25,12 @@ def nominal_mounting(scenario: FlightScenario, chaser: int) -> MountedChaser:
     return MountedChaser(centre, np.array(scenario.chasers[chaser].q_wxyz))
 
 
-def plume_free_thrusters(scenario: FlightScenario, latched: Set[int]) -> dict[int, NDArray[np.bool_]]:
-    """Return which thrusters (n,) of latched chasers may fire, by their nominal poses, so that noise changes nothing."""
+def plume_free_thrusters(
+    scenario: FlightScenario, latched: Set[int]
+) -> dict[int, NDArray[np.bool_]]:
+    """Return which thrusters (n,) of latched chasers may fire, by their nominal poses, so that
+    noise changes nothing.
+    """
     mounted = {i: nominal_mounting(scenario, i) for i in sorted(latched)}
     free = plume_free(
         mounted,

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario section ``[navigation]``: errors of the chasers' odometry and cameras that the flight software assumes."""
+"""Scenario section ``[navigation]``: errors of the chasers' odometry and cameras that the flight
+software assumes.
+"""
 
 from __future__ import annotations
 
@@ -57,9 +59,11 @@ GRADES: dict[str, dict[str, float]] = {
         "camera_focal_share": 0.003,
     },
 }
-"""Figures of the grades; those that a grade does not have are 0, and time constants those of ``DRIFT_TIMES``.
+"""Figures of the grades; those that a grade does not have are 0, and time constants those of
+``DRIFT_TIMES``.
 
-lab: motion capture. orbit: differential carrier-phase GNSS, star tracker and gyro. poor: three times orbit.
+lab: motion capture. orbit: differential carrier-phase GNSS, star tracker and gyro. poor: three
+times orbit.
 """
 
 DRIFT_TIMES = {"position_drift_time_s": 100.0, "attitude_drift_time_s": 300.0}
@@ -68,11 +72,12 @@ DRIFT_TIMES = {"position_drift_time_s": 100.0, "attitude_drift_time_s": 300.0}
 
 @dataclass(frozen=True)
 class NavigationErrors:
-    """Standard deviations per axis of a chaser's odometry and of its camera against its calibration. SI units and radians.
+    """Standard deviations per axis of a chaser's odometry and of its camera against its
+    calibration. SI units and radians.
 
-    Noise is white, drawn each tick. Drift is a stationary Gauss-Markov process. Bias and the camera's errors are constant
-    in a mission. Position, velocity: WRF. Attitude (rotation vector), rate, camera: CRF; ``attitude_roll_noise_rad`` is
-    about x, ``attitude_noise_rad`` about y and z.
+    Noise is white, drawn each tick. Drift is a stationary Gauss-Markov process. Bias and the
+    camera's errors are constant in a mission. Position, velocity: WRF. Attitude (rotation vector),
+    rate, camera: CRF; ``attitude_roll_noise_rad`` is about x, ``attitude_noise_rad`` about y and z.
     """
 
     position_noise_m: float
@@ -105,8 +110,8 @@ class NavigationErrors:
 
 
 class NavigationSection(Section):
-    """Errors of the chasers' odometry and cameras, known to the flight software: standard deviations per axis. A figure
-    that is not given is that of the grade ([world.md](world.md))."""
+    """Errors of the chasers' odometry and cameras, known to the flight software: standard
+    deviations per axis. A figure that is not given is that of the grade ([world.md](world.md))."""
 
     grade: Literal["exact", "lab", "orbit", "poor"] = Field(
         default="lab",
@@ -117,7 +122,8 @@ class NavigationSection(Section):
         default=None, description="White noise of the position (WRF), m, drawn each tick."
     )
     position_drift_m: Metres | None = Field(
-        default=None, description="Time-correlated error of the position (WRF; Gauss-Markov process), m."
+        default=None,
+        description="Time-correlated error of the position (WRF; Gauss-Markov process), m.",
     )
     position_drift_time_s: Duration | None = Field(
         default=None, description="Correlation time of `position_drift_m`, s. Without it: 100."
@@ -130,7 +136,8 @@ class NavigationSection(Section):
         description="White noise of the attitude about y and z (rotation vector, CRF), degrees, drawn each tick.",
     )
     attitude_roll_noise_deg: Degrees | None = Field(
-        default=None, description="White noise of the attitude about x (CRF), degrees, drawn each tick."
+        default=None,
+        description="White noise of the attitude about x (CRF), degrees, drawn each tick.",
     )
     attitude_drift_deg: Degrees | None = Field(
         default=None,
@@ -140,7 +147,8 @@ class NavigationSection(Section):
         default=None, description="Correlation time of `attitude_drift_deg`, s. Without it: 300."
     )
     omega_noise_deg_s: Degrees | None = Field(
-        default=None, description="White noise of the angular velocity (CRF), degrees/s, drawn each tick."
+        default=None,
+        description="White noise of the angular velocity (CRF), degrees/s, drawn each tick.",
     )
     gyro_bias_deg_s: Degrees | None = Field(
         default=None,

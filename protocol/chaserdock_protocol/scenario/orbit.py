@@ -27,8 +27,9 @@ def _moment(value: Any) -> Any:
 
 
 class Orbit(Section):
-    """The target's orbit: WRF is its Hill frame ([frames.md](frames.md#orbit)). Without this section: free space, and WRF is
-    inertial. Give either `altitude_m` for a circular orbit, or `semi_major_axis_m`."""
+    """The target's orbit: WRF is its Hill frame ([frames.md](frames.md#orbit)). Without this
+    section: free space, and WRF is inertial. Give either `altitude_m` for a circular orbit, or
+    `semi_major_axis_m`."""
 
     altitude_m: Positive | None = Field(
         default=None, description="Altitude of a circular orbit above the equatorial radius, m."
@@ -56,7 +57,8 @@ class Orbit(Section):
         description="Begin of the mission, with a time zone. The direction to the sun depends on it.",
     )
     j2: bool = Field(
-        default=True, description="Whether the Earth's oblateness acts; if not, its gravity is a point's."
+        default=True,
+        description="Whether the Earth's oblateness acts; if not, its gravity is a point's.",
     )
     target_ballistic_coefficient_kg_m2: Positive | None = Field(
         default=None,
@@ -100,7 +102,11 @@ class Orbit(Section):
     @property
     def elements(self) -> OrbitalElements:
         """Osculating elements at the begin of the mission."""
-        radius_m = EARTH_RADIUS_M + self.altitude_m if self.altitude_m is not None else self.semi_major_axis_m
+        radius_m = (
+            EARTH_RADIUS_M + self.altitude_m
+            if self.altitude_m is not None
+            else self.semi_major_axis_m
+        )
         assert radius_m is not None
         return OrbitalElements(
             radius_m,

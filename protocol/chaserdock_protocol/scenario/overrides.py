@@ -17,7 +17,9 @@ Values = dict[str, Any]
 
 
 def merge(base: Values, variant: Values) -> Values:
-    """Return ``base`` with the values of ``variant``: tables are merged, everything else, arrays too, is replaced."""
+    """Return ``base`` with the values of ``variant``: tables are merged, everything else, arrays
+    too, is replaced.
+    """
     out = dict(base)
     for key, value in variant.items():
         _drop_alternatives(out, key, value)
@@ -27,7 +29,9 @@ def merge(base: Values, variant: Values) -> Values:
 
 
 def _drop_alternatives(table: Values, key: str, value: Any) -> None:
-    """Remove from a table what a new value of ``key`` replaces: other forms of an attitude, a target's own geometry."""
+    """Remove from a table what a new value of ``key`` replaces: other forms of an attitude, a
+    target's own geometry.
+    """
     if key in ATTITUDE_KEYS:
         for other in ATTITUDE_KEYS:
             if other != key:
@@ -37,10 +41,11 @@ def _drop_alternatives(table: Values, key: str, value: Any) -> None:
 
 
 def with_override(values: Values, text: str, resolve: Callable[[Values], Values]) -> Values:
-    """Return a copy of nested tables and arrays with ``key.path=value`` set, the value in TOML's notation.
+    """Return a copy of nested tables and arrays with ``key.path=value`` set, the value in TOML's
+    notation.
 
-    ``resolve`` returns the same tables with all defaults; an element of an array that is not in ``values`` is set in a
-    copy of the default. Raises ScenarioError.
+    ``resolve`` returns the same tables with all defaults; an element of an array that is not in
+    ``values`` is set in a copy of the default. Raises ScenarioError.
     """
     values = copy.deepcopy(values)
     path, equals, value = text.partition("=")
@@ -88,7 +93,9 @@ def _assign(table: Any, key: str, value: Any, text: str) -> None:
 def _element(array: list[Any], key: str, text: str) -> Any:
     if not _is_index(key) or int(key) >= len(array):
         valid = (
-            f"must be a number from 0 to {len(array) - 1}" if array else "is no element: the array is empty"
+            f"must be a number from 0 to {len(array) - 1}"
+            if array
+            else "is no element: the array is empty"
         )
         raise ScenarioError(f"--set {text}: {key} {valid}")
     return array[int(key)]

@@ -12,8 +12,9 @@ from .fields import NotNegative, Positive, Section
 
 
 class PlumeSection(Section):
-    """Plumes of thrusters exert force and torque on the target and on the other chasers ([thrusters.md](thrusters.md#plumes)).
-    Without this section: a thruster acts on its own chaser only."""
+    """Plumes of thrusters exert force and torque on the target and on the other chasers
+    ([thrusters.md](thrusters.md#plumes)). Without this section: a thruster acts on its own chaser
+    only."""
 
     limit_deg: float = Field(
         default=60.0,

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario section ``[ranging]``: what is measured of the target where the camera cannot measure its pose."""
+"""Scenario section ``[ranging]``: what is measured of the target where the camera cannot measure
+its pose.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,13 @@ from .fields import Fraction, NotNegative, Positive, Section
 
 
 class Ranging(Section):
-    """Measurements at far range, of a target too small in the image for its markers: its range, from a range sensor, and its attitude,
-    as a cooperative target sends it, with white errors. The bearing is measured in the image, where the target is the spot of the
-    size that it has at that range; with `perception.name = "statistical"`, which has no image, it is drawn with a white error. In
-    images in which markers give the more accurate position, these are used ([estimation.md](estimation.md#far-range)). Without this
-    section: a target whose markers are too small is not seen."""
+    """Measurements at far range, of a target too small in the image for its markers: its range,
+    from a range sensor, and its attitude, as a cooperative target sends it, with white errors. The
+    bearing is measured in the image, where the target is the spot of the size that it has at that
+    range; with `perception.name = "statistical"`, which has no image, it is drawn with a white
+    error. In images in which markers give the more accurate position, these are used
+    ([estimation.md](estimation.md#far-range)). Without this section: a target whose markers are too
+    small is not seen."""
 
     range_noise_m: Positive = Field(
         default=0.02, description="Standard deviation of the range, m, of a target nearby."
@@ -31,11 +35,16 @@ class Ranging(Section):
         '`perception.name = "statistical"` only.',
     )
     attitude_noise_deg: Positive = Field(
-        default=0.02, lt=90, description="Standard deviation of the attitude that the target sends, degrees."
+        default=0.02,
+        lt=90,
+        description="Standard deviation of the attitude that the target sends, degrees.",
     )
     reach_m: NotNegative = Field(default=1000.0, description="Greatest range, m.")
 
     def errors(self) -> RangingErrors:
         """Return the errors in SI units and radians."""
-        bearing, attitude = math.radians(self.bearing_noise_deg), math.radians(self.attitude_noise_deg)
+        bearing, attitude = (
+            math.radians(self.bearing_noise_deg),
+            math.radians(self.attitude_noise_deg),
+        )
         return RangingErrors(self.range_noise_m, self.range_share, bearing, attitude, self.reach_m)

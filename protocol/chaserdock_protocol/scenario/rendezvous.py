@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Success criteria of published rendezvous and docking tasks: speed by distance, cone, arrival, and clearance after an abort."""
+"""Success criteria of published rendezvous and docking tasks: speed by distance, cone, arrival, and
+clearance after an abort.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +13,24 @@ from .fields import Index, NotNegative, Positive, Section, Vector
 
 
 class SpeedLimit(Section):
-    """Largest speed of every chaser relative to the target (WRF) until its first abort: `speed_m_s` + `per_s` x (distance of the
-    centres - `from_m`)."""
+    """Largest speed of every chaser relative to the target (WRF) until its first abort: `speed_m_s`
+    + `per_s` x (distance of the centres - `from_m`)."""
 
     speed_m_s: Positive = Field(description="Speed at the distance `from_m`, m/s.")
     per_s: NotNegative = Field(default=0.0, description="Increase with the distance, 1/s.")
-    from_m: NotNegative = Field(default=0.0, description="Distance at which the limit is `speed_m_s`, m.")
+    from_m: NotNegative = Field(
+        default=0.0, description="Distance at which the limit is `speed_m_s`, m."
+    )
     within_m: Positive | None = Field(
-        default=None, description="Distance up to which the limit applies, m. Without it: everywhere."
+        default=None,
+        description="Distance up to which the limit applies, m. Without it: everywhere.",
     )
 
 
 class ConeLimit(Section):
-    """A cone with its apex at the target's centre that no chaser within `within_m` leaves until its first abort."""
+    """A cone with its apex at the target's centre that no chaser within `within_m` leaves until its
+    first abort.
+    """
 
     half_angle_deg: Annotated[float, Field(gt=0, lt=90, allow_inf_nan=False)] = Field(
         description="Half angle, degrees."
@@ -48,5 +55,6 @@ class Arrival(Section):
         description="Largest speed relative to the target (WRF) on arrival, m/s. Without it: any.",
     )
     within_s: Positive | None = Field(
-        default=None, description="Latest arrival, s of mission time. Without it: the end of the mission."
+        default=None,
+        description="Latest arrival, s of mission time. Without it: the end of the mission.",
     )

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sections of a scenario: every key with type, default, range and description.
 
-Keys are snake_case and end with their unit. Frames: WRF world, CRF chaser, TRF target, IRF image (docs/frames.md).
+Keys are snake_case and end with their unit. Frames: WRF world, CRF chaser, TRF target, IRF image
+(docs/frames.md).
 """
 
 from __future__ import annotations
@@ -29,25 +30,34 @@ MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
 PERCEPTIONS = (*MARKER_PERCEPTIONS, "model")
 ESTIMATORS = ("joint", "mekf", "paper")
 SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
-"""Built-in parts, by the names that a scenario selects them with; others may be installed (see ``plugins``)."""
+"""Built-in parts, by the names that a scenario selects them with; others may be installed (see
+``plugins``).
+"""
 
 MAX_STAGES = 500
 """Longest prediction: more stages could not be solved in time, and messages bound their size."""
 
 MAX_DURATION_S = 90 * 86_400.0
-"""Longest mission: messages count simulated time in nanoseconds up to 2**53 (see ``message_fields``)."""
+"""Longest mission: messages count simulated time in nanoseconds up to 2**53 (see
+``message_fields``).
+"""
 
 
 class Time(Section):
     """Rates and latency of simulated time."""
 
     rate_hz: int = Field(
-        default=15, ge=1, le=240, description="Ticks of control per second, Hz. It must divide `physics_hz`."
+        default=15,
+        ge=1,
+        le=240,
+        description="Ticks of control per second, Hz. It must divide `physics_hz`.",
     )
     image_hz: int = Field(
         default=15, ge=1, le=240, description="Images per second, Hz. It must divide `rate_hz`."
     )
-    physics_hz: int = Field(default=960, ge=60, le=20000, description="Physics steps per second, Hz.")
+    physics_hz: int = Field(
+        default=960, ge=60, le=20000, description="Physics steps per second, Hz."
+    )
     latency_s: NotNegative = Field(
         default=1.0 / 30.0,
         description="Time from a tick to the effect of the commands computed from it, s, rounded to physics steps.",
@@ -56,9 +66,13 @@ class Time(Section):
     @model_validator(mode="after")
     def _check_divisors(self) -> Time:
         if self.physics_hz % self.rate_hz:
-            raise ValueError(f"physics_hz must be a multiple of rate_hz ({self.physics_hz}, {self.rate_hz})")
+            raise ValueError(
+                f"physics_hz must be a multiple of rate_hz ({self.physics_hz}, {self.rate_hz})"
+            )
         if self.rate_hz % self.image_hz:
-            raise ValueError(f"rate_hz must be a multiple of image_hz ({self.rate_hz}, {self.image_hz})")
+            raise ValueError(
+                f"rate_hz must be a multiple of image_hz ({self.rate_hz}, {self.image_hz})"
+            )
         return self
 
 
@@ -93,7 +107,9 @@ class PerceptionSection(Section):
 
 
 class Controller(Section):
-    """The NMPC: solver, horizon and weights ([controller.md](controller.md) relates them to the paper's symbols)."""
+    """The NMPC: solver, horizon and weights ([controller.md](controller.md) relates them to the
+    paper's symbols).
+    """
 
     standby: bool = Field(
         default=False,
@@ -113,14 +129,17 @@ class Controller(Section):
         description="Wall time per solve, s: in real time, limits the iterations to what fits. Only with the solver `rti`.",
     )
     horizon_s: Positive = Field(
-        default=3.0, description=f"Prediction horizon, s: at least one and at most {MAX_STAGES} steps `dt_s`."
+        default=3.0,
+        description=f"Prediction horizon, s: at least one and at most {MAX_STAGES} steps `dt_s`.",
     )
     dt_s: Positive = Field(default=0.1, description="Step of the prediction, s.")
     falloff: Fraction = Field(
         default=0.0,
         description="Linear decrease of the stage weights along the horizon: 0 is constant, 1 ends at zero.",
     )
-    weight_position: NotNegative = Field(default=65.0, description="Weight of the position error, 1/m².")
+    weight_position: NotNegative = Field(
+        default=65.0, description="Weight of the position error, 1/m²."
+    )
     weight_orientation: NotNegative = Field(
         default=35.0,
         description="Weight of the attitude error (squared vector part of the error quaternion).",
@@ -128,12 +147,16 @@ class Controller(Section):
     weight_force: Positive = Field(default=3.5, description="Weight of the force, 1/N².")
     weight_torque: Positive = Field(default=40.0, description="Weight of the torque, 1/(N m)².")
     weight_final_position: NotNegative = Field(
-        default=3250.0, description="Additional weight of the position error at the end of the horizon, 1/m²."
+        default=3250.0,
+        description="Additional weight of the position error at the end of the horizon, 1/m².",
     )
     weight_final_orientation: NotNegative = Field(
-        default=1750.0, description="Additional weight of the attitude error at the end of the horizon."
+        default=1750.0,
+        description="Additional weight of the attitude error at the end of the horizon.",
     )
-    integrator: Literal["rk4", "euler"] = Field(default="rk4", description="Integrator of the prediction.")
+    integrator: Literal["rk4", "euler"] = Field(
+        default="rk4", description="Integrator of the prediction."
+    )
     feed_forward: bool = Field(
         default=True,
         description="Count the input cost from the force and torque that the reference motion needs. Otherwise from zero, "
@@ -146,10 +169,14 @@ class Controller(Section):
     @model_validator(mode="after")
     def _check_consistent(self) -> Controller:
         if self.solve_budget_s is not None and self.solver in SOLVERS[1:]:
-            raise ValueError(f"solve_budget_s goes with the solver rti; {self.solver} has no time limit")
+            raise ValueError(
+                f"solve_budget_s goes with the solver rti; {self.solver} has no time limit"
+            )
         stages = self.horizon_s / self.dt_s
         if round(min(stages, MAX_STAGES)) < 1:
-            raise ValueError(f"horizon_s ({self.horizon_s}) is shorter than one step dt_s ({self.dt_s})")
+            raise ValueError(
+                f"horizon_s ({self.horizon_s}) is shorter than one step dt_s ({self.dt_s})"
+            )
         if stages > MAX_STAGES:
             raise ValueError(f"horizon_s / dt_s is {stages:.0f} stages; at most {MAX_STAGES}")
         return self
@@ -191,14 +218,17 @@ class Limits(Section):
         "corridor of a port.",
     )
     passive_safety_s: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] | None = Field(
-        default=None, description="Length of that coast, s. Without it: two orbits, in free space 600 s."
+        default=None,
+        description="Length of that coast, s. Without it: two orbits, in free space 600 s.",
     )
 
 
 class Approach(Section):
     """Approach to a distance, and when a chaser counts as docked with `docking.kind = "held"`."""
 
-    dock_distance_m: Positive = Field(default=0.40, description="Distance from the target's centre, m.")
+    dock_distance_m: Positive = Field(
+        default=0.40, description="Distance from the target's centre, m."
+    )
     max_speed_m_s: Positive = Field(
         default=0.03,
         description="Speed of the reference relative to the target, m/s. `goto` flies at twice this speed.",
@@ -245,7 +275,9 @@ class FlightChaser(Oriented):
     @model_validator(mode="after")
     def _check_position(self) -> FlightChaser:
         if not any(self.position_m):
-            raise ValueError("position_m must not be the target's origin: the approach line begins there")
+            raise ValueError(
+                "position_m must not be the target's origin: the approach line begins there"
+            )
         return self
 
 
@@ -263,7 +295,10 @@ class TimelineEntry(Section):
     chasers: tuple[Index, ...] = Field(min_length=1, description="Numbers of the chasers, from 0.")
     offset_m: Vector | None = Field(default=None, description="Destination of `goto` (TRF), m.")
     thruster: int | None = Field(
-        default=None, ge=0, le=254, description="Number of the thruster, from 0, for `isolate` and `restore`."
+        default=None,
+        ge=0,
+        le=254,
+        description="Number of the thruster, from 0, for `isolate` and `restore`.",
     )
 
     @model_validator(mode="after")
@@ -271,5 +306,7 @@ class TimelineEntry(Section):
         if (self.command == "goto") != (self.offset_m is not None):
             raise ValueError("offset_m goes with the command goto, and goto needs it")
         if (self.command in ("isolate", "restore")) != (self.thruster is not None):
-            raise ValueError("thruster goes with the commands isolate and restore, and these need it")
+            raise ValueError(
+                "thruster goes with the commands isolate and restore, and these need it"
+            )
         return self

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario section ``[simulation]``: conditions of the simulated network of ``chaserdock simulate`` (docs/simulation.md)."""
+"""Scenario section ``[simulation]``: conditions of the simulated network of ``chaserdock simulate``
+(docs/simulation.md).
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,16 @@ Delay = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class Partition(Section):
-    """A time in which some processes are cut off from all others. What may not be lost arrives when it is over."""
+    """A time in which some processes are cut off from all others. What may not be lost arrives when
+    it is over.
+    """
 
     at_s: NotNegative = Field(description="Begin, s of mission time.")
     duration_s: Positive = Field(description="Duration, s.")
     processes: tuple[Process, ...] = Field(
-        min_length=1, max_length=20, description="Processes on one side; all others are on the other."
+        min_length=1,
+        max_length=20,
+        description="Processes on one side; all others are on the other.",
     )
 
     def separates(self, a: str, b: str) -> bool:
@@ -43,7 +49,9 @@ class ProcessClock(Section):
     """Error of the monotonic clock of a process."""
 
     process: Process = Field(description="Process whose clock is wrong.")
-    offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = Field(default=0.0, description="Offset, s.")
+    offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = Field(
+        default=0.0, description="Offset, s."
+    )
     drift: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
         default=0.0, description="Relative error of its rate."
     )
@@ -62,7 +70,9 @@ class SimulationSection(Section):
         default=0.0, description="Mean of an exponentially distributed further latency, s."
     )
     loss: MessageShare = Field(default=0.0, description="Share of the messages that are lost.")
-    duplicate: MessageShare = Field(default=0.0, description="Share of the messages that arrive twice.")
+    duplicate: MessageShare = Field(
+        default=0.0, description="Share of the messages that arrive twice."
+    )
     reorder: MessageShare = Field(
         default=0.0, description="Share of the messages that later ones may overtake."
     )

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The content of a mesh file as part of a scenario: vertices and triangles as compressed text, materials, joints.
+"""The content of a mesh file as part of a scenario: vertices and triangles as compressed text,
+materials, joints.
 
-Processes without the file receive it in this form; the flight software's version has fewer triangles (`FlightTarget.as_known`).
+Processes without the file receive it in this form; the flight software's version has fewer
+triangles (`FlightTarget.as_known`).
 """
 
 from __future__ import annotations
@@ -50,10 +52,15 @@ class SurfaceMaterial(Section):
     diffuse: Fraction = Field(default=0.5, description="Diffuse reflectance.")
     specular: Fraction = Field(default=0.0, description="Specular reflectance.")
     shininess: float = Field(
-        default=20.0, gt=0, le=1000, allow_inf_nan=False, description="Blinn's exponent of the highlight."
+        default=20.0,
+        gt=0,
+        le=1000,
+        allow_inf_nan=False,
+        description="Blinn's exponent of the highlight.",
     )
     texture: Literal["", "insulation", "cells"] = Field(
-        default="", description="`insulation`: wrinkled foil. `cells`: grid of solar cells. Empty: uniform."
+        default="",
+        description="`insulation`: wrinkled foil. `cells`: grid of solar cells. Empty: uniform.",
     )
     relative_density: Positive = Field(
         default=1.0, description="Density over that of the other parts, for mass properties."
@@ -61,7 +68,12 @@ class SurfaceMaterial(Section):
 
     def material(self) -> Material:
         return Material(
-            self.name, self.diffuse, self.specular, self.shininess, self.texture, self.relative_density
+            self.name,
+            self.diffuse,
+            self.specular,
+            self.shininess,
+            self.texture,
+            self.relative_density,
         )
 
     @classmethod
@@ -97,7 +109,11 @@ class SurfacePart(Section):
         """Return the part. Raises ValueError."""
         vertices = _unpacked(self.vertices, "<f4").astype(float)
         triangles = _unpacked(self.triangles, "<u4").astype(np.int64)
-        if not len(triangles) or not np.all(np.isfinite(vertices)) or triangles.max() >= len(vertices):
+        if (
+            not len(triangles)
+            or not np.all(np.isfinite(vertices))
+            or triangles.max() >= len(vertices)
+        ):
             raise ValueError(f"{self.name}: triangles of vertices that do not exist, or none")
         return MeshPart(self.name, self.material.material(), vertices, triangles, self.joint)
 
@@ -114,7 +130,9 @@ class Surface(Section):
 
     file: str = Field(description="File that it was read from.")
     scale: Positive = Field(default=1.0, description="`mesh_scale` that it was read with.")
-    origin_m: Vector = Field(default=(0.0, 0.0, 0.0), description="`mesh_origin_m` that it was read with.")
+    origin_m: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="`mesh_origin_m` that it was read with."
+    )
     deviation_m: NotNegative = Field(
         default=0.0, description="Largest deviation from the surface of the file, m."
     )
@@ -129,7 +147,9 @@ class Surface(Section):
     def _check_mesh(self) -> Surface:
         mesh = self.mesh("check")
         if mesh.triangle_count > 2 * MAX_TRIANGLES:
-            raise ValueError(f"{mesh.triangle_count} triangles; at most {2 * MAX_TRIANGLES} are allowed")
+            raise ValueError(
+                f"{mesh.triangle_count} triangles; at most {2 * MAX_TRIANGLES} are allowed"
+            )
         if unknown := {p.joint for p in self.parts if p.joint} - set(mesh.joints):
             raise ValueError(f"parts move with a joint {unknown.pop()!r} that is not defined")
         return self
@@ -165,10 +185,16 @@ class Surface(Section):
                 )
                 for p in mesh.parts
             ),
-            joints=tuple(SurfaceJoint(name=name, position_m=at) for name, at in mesh.joints.items()),
+            joints=tuple(
+                SurfaceJoint(name=name, position_m=at) for name, at in mesh.joints.items()
+            ),
         )
 
 
 @lru_cache(maxsize=16)
-def _mesh_of(name: str, parts: tuple[SurfacePart, ...], joints: tuple[SurfaceJoint, ...]) -> TriangleMesh:
-    return TriangleMesh(name, tuple(p.part() for p in parts), {j.name: j.position_m for j in joints})
+def _mesh_of(
+    name: str, parts: tuple[SurfacePart, ...], joints: tuple[SurfaceJoint, ...]
+) -> TriangleMesh:
+    return TriangleMesh(
+        name, tuple(p.part() for p in parts), {j.name: j.position_m for j in joints}
+    )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Custom targets: cuboids, an optional mesh, and markers, in a scenario or in a target file (docs/cameras.md)."""
+"""Custom targets: cuboids, an optional mesh, and markers, in a scenario or in a target file
+(docs/cameras.md).
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,9 @@ _FLAT_M = 1e-6
 
 
 def dictionary_size(name: str) -> int:
-    """Return the number of markers in an ArUco dictionary of OpenCV. Raises ValueError for an unknown name."""
+    """Return the number of markers in an ArUco dictionary of OpenCV. Raises ValueError for an
+    unknown name.
+    """
     plain = re.fullmatch(r"DICT_[4567]X[4567]_(50|100|250|1000)", name)
     if plain is not None and name[5] == name[7]:
         return int(plain[1])
@@ -73,7 +77,8 @@ class Cuboid(Oriented):
     size_m: PositiveVector = Field(description="Edges, m.")
     position_m: Vector = Field(default=(0.0, 0.0, 0.0), description="Centre (TRF), m.")
     q_wxyz: UnitQuaternion = Field(
-        default=(1.0, 0.0, 0.0, 0.0), description="Attitude, cuboid to TRF: unit quaternion, scalar first."
+        default=(1.0, 0.0, 0.0, 0.0),
+        description="Attitude, cuboid to TRF: unit quaternion, scalar first.",
     )
     shade: Fraction = Field(default=0.6, description="Reflectance: 0 is black, 1 is white.")
 
@@ -82,7 +87,9 @@ class Cuboid(Oriented):
 
 
 class MarkerSection(Oriented):
-    """A fiducial marker: on a `face` of a `cuboid`, or at a pose in TRF. Its x points right, y up, z out of it."""
+    """A fiducial marker: on a `face` of a `cuboid`, or at a pose in TRF. Its x points right, y up,
+    z out of it.
+    """
 
     id: Index = Field(description="Number of the marker in its dictionary.")
     side_m: Positive = Field(description="Edge of the black square, m.")
@@ -97,7 +104,8 @@ class MarkerSection(Oriented):
         default=None, description="Centre (TRF), m, in place of `face`; with an attitude."
     )
     q_wxyz: UnitQuaternion | None = Field(
-        default=None, description="Attitude, marker to TRF: unit quaternion, scalar first. With `position_m`."
+        default=None,
+        description="Attitude, marker to TRF: unit quaternion, scalar first. With `position_m`.",
     )
 
     @model_validator(mode="after")
@@ -136,19 +144,25 @@ class Geometry(Section):
         "pieces of the mesh if there are none.",
     )
     markers: tuple[MarkerSection, ...] = Field(
-        default=(), max_length=1000, description="Markers, which may not overlap. Needed without a mesh."
+        default=(),
+        max_length=1000,
+        description="Markers, which may not overlap. Needed without a mesh.",
     )
     mesh: str = Field(
         default="",
         description="Mesh that is drawn in place of the cuboids: path of a file (GLB, glTF, OBJ, STL, PLY), relative to the "
         "file that names it, or name of a shipped satellite.",
     )
-    mesh_scale: Positive = Field(default=1.0, description="Factor from the mesh's unit of length to m.")
+    mesh_scale: Positive = Field(
+        default=1.0, description="Factor from the mesh's unit of length to m."
+    )
     mesh_origin_m: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="Point of the mesh, scaled, that becomes the origin of TRF, m."
+        default=(0.0, 0.0, 0.0),
+        description="Point of the mesh, scaled, that becomes the origin of TRF, m.",
     )
     surface: Surface | None = Field(
-        default=None, description="Content of the mesh file. Written by the program when it reads the file."
+        default=None,
+        description="Content of the mesh file. Written by the program when it reads the file.",
     )
 
     @model_validator(mode="after")
@@ -162,9 +176,13 @@ class Geometry(Section):
         first_use: dict[int, int] = {}
         for k, m in enumerate(self.markers):
             if m.id >= size:
-                raise ValueError(f"markers.{k}.id: {self.dictionary} has markers 0 to {size - 1}, not {m.id}")
+                raise ValueError(
+                    f"markers.{k}.id: {self.dictionary} has markers 0 to {size - 1}, not {m.id}"
+                )
             if m.id in first_use:
-                raise ValueError(f"markers.{k}.id: {m.id} is already used by markers.{first_use[m.id]}")
+                raise ValueError(
+                    f"markers.{k}.id: {m.id} is already used by markers.{first_use[m.id]}"
+                )
             first_use[m.id] = k
             if m.face is not None and m.cuboid > last:
                 have = f"this target has 0 to {last}" if last >= 0 else "give position_m and q_wxyz"
@@ -175,9 +193,13 @@ class Geometry(Section):
         return self
 
     def model(self, name: str) -> TargetModel:
-        """Return the target model; its ``size_m`` is that of the smallest cuboid centred in TRF that contains it."""
+        """Return the target model; its ``size_m`` is that of the smallest cuboid centred in TRF
+        that contains it.
+        """
         mesh = self.nominal_mesh(name)
-        boxes = tuple(c.box() for c in self.cuboids) or (() if mesh is None else mesh_target(mesh).boxes)
+        boxes = tuple(c.box() for c in self.cuboids) or (
+            () if mesh is None else mesh_target(mesh).boxes
+        )
         markers = tuple(m.marker(self.cuboids) for m in self.markers)
         reach = np.max(
             [_reach(b) for b in boxes]
@@ -200,7 +222,9 @@ class Geometry(Section):
         )
 
     def nominal_mesh(self, name: str, tolerance_m: float = FINE_M) -> TriangleMesh | None:
-        """Return the mesh as it was designed; None without one. ``tolerance_m``: of curved surfaces of a shipped satellite."""
+        """Return the mesh as it was designed; None without one. ``tolerance_m``: of curved surfaces
+        of a shipped satellite.
+        """
         if self.surface is not None:
             return self.surface.mesh(name)
         if self.mesh in satellite_names():
@@ -210,11 +234,16 @@ class Geometry(Section):
 
 def _reach(box: Box) -> Array:
     """Return the largest absolute coordinates (3,) of a box in TRF."""
-    return np.abs(box.position_m) + np.abs(rotations.to_matrix(box.q_wxyz)) @ np.array(box.size_m) / 2.0
+    return (
+        np.abs(box.position_m)
+        + np.abs(rotations.to_matrix(box.q_wxyz)) @ np.array(box.size_m) / 2.0
+    )
 
 
 def _check_on_a_face(number: int, marker: Marker, cuboids: tuple[Cuboid, ...]) -> None:
-    """Raise ValueError unless the marker lies within a face, its edges parallel to those of the face."""
+    """Raise ValueError unless the marker lies within a face, its edges parallel to those of the
+    face.
+    """
     corners = marker.corners_trf_m()
     for cuboid in cuboids:
         local = rotations.rotate_inverse(cuboid.q_wxyz, corners - np.array(cuboid.position_m))
@@ -225,11 +254,15 @@ def _check_on_a_face(number: int, marker: Marker, cuboids: tuple[Cuboid, ...]) -
         if flat and abs(normal[axis]) > 1.0 - 1e-9:
             edge = np.abs(local[1] - local[0]) / marker.side_m
             if edge.max() < 1.0 - 1e-6:
-                raise ValueError(f"markers.{number}: its edges must be parallel to those of its face")
+                raise ValueError(
+                    f"markers.{number}: its edges must be parallel to those of its face"
+                )
             if np.any(np.abs(local) > half + _FLAT_M):
                 raise ValueError(f"markers.{number}: reaches beyond its face")
             return
-    raise ValueError(f"markers.{number}: must lie on a face of a cuboid, unless the target has a mesh")
+    raise ValueError(
+        f"markers.{number}: must lie on a face of a cuboid, unless the target has a mesh"
+    )
 
 
 def _check_apart(markers: tuple[Marker, ...]) -> None:

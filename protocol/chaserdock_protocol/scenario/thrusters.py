@@ -15,14 +15,18 @@ from pydantic import Field, model_validator
 from .fields import Index, NotNegative, Positive, Section, UnitVector, Vector
 
 MAX_THRUSTERS = 24
-"""The number of facets of the attainable wrench set grows with the fifth power of the number of thrusters."""
+"""The number of facets of the attainable wrench set grows with the fifth power of the number of
+thrusters.
+"""
 
 
 class Thruster(Section):
     """One on-off thruster."""
 
     position_m: Vector = Field(description="Position of the nozzle (CRF), m.")
-    direction: UnitVector = Field(description="Direction of its force on the body (CRF), unit vector.")
+    direction: UnitVector = Field(
+        description="Direction of its force on the body (CRF), unit vector."
+    )
     thrust_N: Positive = Field(description="Full thrust, N.")
     min_on_s: Positive = Field(
         default=0.010, description="Minimum on-time, s: a shorter pulse does not open the valve."
@@ -32,7 +36,8 @@ class Thruster(Section):
         description="Time of the linear rise of the thrust after the valve opens, s. At most `min_on_s`.",
     )
     fall_s: NotNegative = Field(
-        default=0.002, description="Time of the linear fall of the thrust after the valve closes, s."
+        default=0.002,
+        description="Time of the linear fall of the thrust after the valve closes, s.",
     )
     isp_s: Positive = Field(
         default=70.0, description="Specific impulse, s. It gives the propellant consumption."
@@ -54,7 +59,10 @@ class Modulation(Section):
         "periods, with hysteresis.",
     )
     carrier_hz: int = Field(
-        default=10, ge=1, le=240, description="Carrier frequency, Hz. It must divide `time.physics_hz`."
+        default=10,
+        ge=1,
+        le=240,
+        description="Carrier frequency, Hz. It must divide `time.physics_hz`.",
     )
     resolution_s: Positive = Field(
         default=0.001,
@@ -84,7 +92,9 @@ class Modulation(Section):
         if self.resolution_s < 1e-6:
             raise ValueError(f"resolution_s ({self.resolution_s}) must be at least a microsecond")
         if self.resolution_s > 0.5 / self.carrier_hz:
-            raise ValueError(f"resolution_s ({self.resolution_s}) must be at most half a carrier period")
+            raise ValueError(
+                f"resolution_s ({self.resolution_s}) must be at most half a carrier period"
+            )
         if self.schmitt_off >= self.schmitt_on:
             raise ValueError("schmitt_off must be less than schmitt_on")
         return self
@@ -124,12 +134,18 @@ def thrusts_max(thrusters: Sequence[Thruster]) -> Array:
 
 
 def check_layout(thrusters: Sequence[Thruster], wrench_max: Array) -> None:
-    """Raise ValueError unless the thrusters can give every wrench within ``wrench_max`` (6,), on all axes at once."""
+    """Raise ValueError unless the thrusters can give every wrench within ``wrench_max`` (6,), on
+    all axes at once.
+    """
     if not thrusters:
-        raise ValueError("actuation thrusters needs thrusters, or a body with thrusters: slider, tetra12")
+        raise ValueError(
+            "actuation thrusters needs thrusters, or a body with thrusters: slider, tetra12"
+        )
     scale = wrench_set(wrench_matrix(thrusters)).box_scale(thrusts_max(thrusters), wrench_max)
     if scale <= 1e-6:
-        raise ValueError("thrusters cannot give force and torque in every direction: no 6-DoF control")
+        raise ValueError(
+            "thrusters cannot give force and torque in every direction: no 6-DoF control"
+        )
     if scale < 1.0:
         raise ValueError(
             f"force_max_N {wrench_max[0]:g} and torque_max_N_m {wrench_max[3]:g} on all axes at once are more than "
@@ -138,7 +154,9 @@ def check_layout(thrusters: Sequence[Thruster], wrench_max: Array) -> None:
 
 
 def check_pulses(thrusters: Sequence[Thruster], modulation: Modulation, physics_hz: int) -> None:
-    """Raise ValueError unless pulses fit into carrier periods, and carrier periods into whole physics steps."""
+    """Raise ValueError unless pulses fit into carrier periods, and carrier periods into whole
+    physics steps.
+    """
     carrier = modulation.carrier_hz
     if physics_hz % carrier:
         raise ValueError(

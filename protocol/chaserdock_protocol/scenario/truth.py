@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario section ``[truth]``: errors of the nominal values that the flight software assumes. Only the world reads it."""
+"""Scenario section ``[truth]``: errors of the nominal values that the flight software assumes. Only
+the world reads it.
+"""
 
 from __future__ import annotations
 
@@ -37,15 +39,19 @@ MISMATCH: dict[str, dict[str, float]] = {
 
 
 class ChaserTruth(Section):
-    """Differences of each chaser's body and actuators: standard deviations per axis, drawn from the seed once per chaser
-    and limited to three of them, unless stated otherwise. Without a figure: that of the preset."""
+    """Differences of each chaser's body and actuators: standard deviations per axis, drawn from the
+    seed once per chaser and limited to three of them, unless stated otherwise. Without a figure:
+    that of the preset."""
 
-    mass_share: MismatchShare | None = Field(default=None, description="Relative error of the mass.")
+    mass_share: MismatchShare | None = Field(
+        default=None, description="Relative error of the mass."
+    )
     inertia_share: MismatchShare | None = Field(
         default=None, description="Relative error of each principal moment."
     )
     inertia_turn_deg: Degrees | None = Field(
-        default=None, description="Turn of the principal axes against CRF (rotation vector), degrees."
+        default=None,
+        description="Turn of the principal axes against CRF (rotation vector), degrees.",
     )
     centre_of_mass_m: Offset | None = Field(
         default=None, description="Offset of the centre of mass from CRF's origin, m."
@@ -70,14 +76,17 @@ class ChaserTruth(Section):
         default=None, description="Constant disturbance torque (body axes), N m."
     )
     force_noise_N: Force | None = Field(
-        default=None, description="Time-correlated disturbance force (body axes; Gauss-Markov process), N."
+        default=None,
+        description="Time-correlated disturbance force (body axes; Gauss-Markov process), N.",
     )
     torque_noise_N_m: Torque | None = Field(
-        default=None, description="Time-correlated disturbance torque (body axes; Gauss-Markov process), N m."
+        default=None,
+        description="Time-correlated disturbance torque (body axes; Gauss-Markov process), N m.",
     )
     disturbance_time_s: Duration = Field(default=100.0, description="Correlation time of these, s.")
     delay_s: Seconds | None = Field(
-        default=None, description="Delay of the actuators after the commanded time, s: this value, not drawn."
+        default=None,
+        description="Delay of the actuators after the commanded time, s: this value, not drawn.",
     )
     delay_jitter_s: Seconds | None = Field(
         default=None, description="Standard deviation of that delay, s, drawn for each command."
@@ -90,15 +99,18 @@ class ChaserTruth(Section):
 
 
 class TargetTruth(Section):
-    """Differences of the target: standard deviations per axis. Mass, inertia and centre of mass need
-    `target.motion = "torque_free"`. Without a figure: that of the preset."""
+    """Differences of the target: standard deviations per axis. Mass, inertia and centre of mass
+    need `target.motion = "torque_free"`. Without a figure: that of the preset."""
 
-    mass_share: MismatchShare | None = Field(default=None, description="Relative error of the mass.")
+    mass_share: MismatchShare | None = Field(
+        default=None, description="Relative error of the mass."
+    )
     inertia_share: MismatchShare | None = Field(
         default=None, description="Relative error of each principal moment."
     )
     inertia_turn_deg: Degrees | None = Field(
-        default=None, description="Turn of the principal axes against TRF (rotation vector), degrees."
+        default=None,
+        description="Turn of the principal axes against TRF (rotation vector), degrees.",
     )
     centre_of_mass_m: Offset | None = Field(
         default=None, description="Offset of the centre of mass from TRF's origin, m."
@@ -114,7 +126,9 @@ class CameraTruth(Section):
     turn_deg: Degrees = Field(default=0.0, description="Rotation of the mounting, degrees.")
     shift_m: Metres = Field(default=0.0, description="Shift of the lens, m.")
     focal_share: FocalShare = Field(default=0.0, description="Relative error of the focal length.")
-    centre_px: OffsetPixels = Field(default=0.0, description="Error of the principal point, pixels.")
+    centre_px: OffsetPixels = Field(
+        default=0.0, description="Error of the principal point, pixels."
+    )
 
 
 class SensorTruth(Section):
@@ -126,7 +140,9 @@ class SensorTruth(Section):
 
 
 class LatchTruth(Section):
-    """Imperfections of the latches: strength and play. By default a closed latch is rigid and holds any load."""
+    """Imperfections of the latches: strength and play. By default a closed latch is rigid and holds
+    any load.
+    """
 
     strength_N: Positive | None = Field(
         default=None, description="Force on the port beyond which a closed latch opens, N."
@@ -138,14 +154,17 @@ class LatchTruth(Section):
         default=0.0, description="Free travel of the tip in a closed latch, in any direction, m."
     )
     play_deg: Annotated[float, Field(ge=0, le=5, allow_inf_nan=False)] = Field(
-        default=0.0, description="Free rotation of the chaser in a closed latch, about any axis, degrees."
+        default=0.0,
+        description="Free rotation of the chaser in a closed latch, about any axis, degrees.",
     )
 
 
 class TruthValues(Section):
     """True values of one body, in place of drawn ones."""
 
-    chaser: Index | None = Field(default=None, description="Number of the chaser, from 0; or `target`.")
+    chaser: Index | None = Field(
+        default=None, description="Number of the chaser, from 0; or `target`."
+    )
     target: bool = Field(default=False, description="Whether these are the target's.")
     mass_kg: Positive | None = Field(default=None, description="Mass, kg.")
     inertia_kg_m2: Numbers6 | None = Field(
@@ -153,8 +172,12 @@ class TruthValues(Section):
         description="Inertia tensor about the centre of mass in body axes, kg m²: xx, yy, zz, xy, xz, yz; or a symmetric "
         "3 x 3 matrix.",
     )
-    centre_of_mass_m: Vector | None = Field(default=None, description="Centre of mass (CRF or TRF), m.")
-    force_N: Vector | None = Field(default=None, description="Constant force at the origin (body axes), N.")
+    centre_of_mass_m: Vector | None = Field(
+        default=None, description="Centre of mass (CRF or TRF), m."
+    )
+    force_N: Vector | None = Field(
+        default=None, description="Constant force at the origin (body axes), N."
+    )
     torque_N_m: Vector | None = Field(default=None, description="Constant torque (body axes), N m.")
     thrust_share: tuple[Annotated[float, Field(gt=-1, le=1)], ...] | None = Field(
         default=None,
@@ -179,14 +202,19 @@ class TruthValues(Section):
         if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
             raise ValueError("inertia_kg_m2: must be symmetric")
         xx, yy, zz = np.diag(matrix).tolist()
-        return {**values, "inertia_kg_m2": (xx, yy, zz, *(float(matrix[i, j]) for i, j in _OFF_DIAGONAL))}
+        return {
+            **values,
+            "inertia_kg_m2": (xx, yy, zz, *(float(matrix[i, j]) for i, j in _OFF_DIAGONAL)),
+        }
 
     @model_validator(mode="after")
     def _check_body(self) -> TruthValues:
         if (self.chaser is None) == (not self.target):
             raise ValueError("give either chaser = N or target = true")
         only_chasers = ("force_N", "torque_N_m", "thrust_share", "clock_offset_s")
-        if self.target and (key := next((k for k in only_chasers if getattr(self, k) is not None), None)):
+        if self.target and (
+            key := next((k for k in only_chasers if getattr(self, k) is not None), None)
+        ):
             raise ValueError(f"{key}: the target has none")
         if (inertia := self.inertia) is not None:
             moments = np.linalg.eigvalsh(inertia)
@@ -211,7 +239,9 @@ _OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Resolved figures of a chaser or the target, SI units and radians; standard deviations per axis, ``delay_s`` exact."""
+    """Resolved figures of a chaser or the target, SI units and radians; standard deviations per
+    axis, ``delay_s`` exact.
+    """
 
     mass_share: float = 0.0
     inertia_share: float = 0.0
@@ -232,8 +262,9 @@ class Mismatch:
 
 
 class TruthSection(Section):
-    """Differences between the simulated world and the nominal values that the flight software assumes ([world.md](world.md)).
-    Only the world, the recorder and analysis read them. By default there are none."""
+    """Differences between the simulated world and the nominal values that the flight software
+    assumes ([world.md](world.md)). Only the world, the recorder and analysis read them. By default
+    there are none."""
 
     preset: Literal["nominal", "mismatch"] = Field(
         default="nominal",
@@ -255,7 +286,9 @@ class TruthSection(Section):
         for key in type(section).model_fields:
             given: float | None = getattr(section, key)
             value = preset.get(key, 0.0) if given is None else given
-            resolved[key.replace("_deg", "_rad")] = math.radians(value) if key.endswith("_deg") else value
+            resolved[key.replace("_deg", "_rad")] = (
+                math.radians(value) if key.endswith("_deg") else value
+            )
         return Mismatch(**resolved)
 
     def values_of(self, chaser: int | None) -> TruthValues | None:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Zenoh access-control rules of a mission, derived from the topics table.
 
-The common name in its certificate identifies a process. The router denies everything that no rule allows: a process
-publishes only on its own branch, and receives only topics that its role may read. The router enforces the rules, so
-every other process connects as a client (peers would bypass it).
+The common name in its certificate identifies a process. The router denies everything that no rule
+allows: a process publishes only on its own branch, and receives only topics that its role may read.
+The router enforces the rules, so every other process connects as a client (peers would bypass it).
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ class QueryAccess:
 # A starting world also queries the join key, to detect another world.
 QUERIES = (
     QueryAccess(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
-    QueryAccess(topics.SCENARIO_KEY, frozenset({"recorder", "operator", "analysis", "viewer"}), "world"),
+    QueryAccess(
+        topics.SCENARIO_KEY, frozenset({"recorder", "operator", "analysis", "viewer"}), "world"
+    ),
     QueryAccess(topics.OPERATE_KEY, frozenset({"operator", "viewer", "bridge"}), "controller"),
     QueryAccess(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
 )
@@ -54,7 +56,9 @@ def common_name(process: str) -> str:
 
 
 def identities(chasers: int) -> tuple[Identity, ...]:
-    """Return all processes that may connect to the router of a mission with at most ``chasers`` chasers."""
+    """Return all processes that may connect to the router of a mission with at most ``chasers``
+    chasers.
+    """
     single: tuple[Role, ...] = ("world", "recorder", "operator", "analysis", "viewer", "bridge")
     return (
         *(Identity(role, role) for role in single),
@@ -80,7 +84,9 @@ def writes(who: Identity) -> list[str]:
 
 
 def reads(who: Identity) -> list[str]:
-    """Return the key expressions (without the namespace) that a process may subscribe; ``**`` if it may read all."""
+    """Return the key expressions (without the namespace) that a process may subscribe; ``**`` if it
+    may read all.
+    """
     readable = [t for t in TOPICS if may_read(who.role, t)]
     if len(readable) == len(TOPICS):
         return ["**"]
@@ -88,7 +94,9 @@ def reads(who: Identity) -> list[str]:
 
 
 def access_control(namespace: str, chasers: int) -> dict[str, Any]:
-    """Return Zenoh's ``access_control`` section for the router of a mission. Everything not listed is denied."""
+    """Return Zenoh's ``access_control`` section for the router of a mission. Everything not listed
+    is denied.
+    """
     rules: list[dict[str, Any]] = []
 
     def rule(name: str, flow: str, messages: list[str], keys: list[str]) -> list[str]:
@@ -108,10 +116,18 @@ def access_control(namespace: str, chasers: int) -> dict[str, Any]:
     living = [topics.LIVE_KEY.format(process="**")]
     # Declarations that the router forwards between clients carry no data.
     common = [
-        *rule("all-receive-declarations", "egress", ["declare_subscriber", "declare_queryable"], ["**"]),
+        *rule(
+            "all-receive-declarations",
+            "egress",
+            ["declare_subscriber", "declare_queryable"],
+            ["**"],
+        ),
         *rule("all-receive-liveliness", "egress", ["liveliness_token", "reply"], living),
         *rule(
-            "all-query-liveliness", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], living
+            "all-query-liveliness",
+            "ingress",
+            ["declare_liveliness_subscriber", "liveliness_query"],
+            living,
         ),
     ]
     policies: list[dict[str, Any]] = []

@@ -35,7 +35,9 @@ class BoundedQueue(Generic[T]):
 
     def get(self, timeout_s: float | None) -> T:
         """Remove and return the oldest item. Raises queue.Empty on timeout."""
-        item, size = self._items.get_nowait() if timeout_s == 0 else self._items.get(timeout=timeout_s)
+        item, size = (
+            self._items.get_nowait() if timeout_s == 0 else self._items.get(timeout=timeout_s)
+        )
         with self._lock:
             self._bytes -= size
         return item

@@ -21,9 +21,11 @@ _QUEUES = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
 QUEUE_OPTIONS: dict[str, Any] = {
-    # Zenoh's maximum: droppable messages are dropped for a reader when 16 batches (1 MB) wait for it, instead of 2.
+    # Zenoh's maximum: droppable messages are dropped for a reader when 16 batches (1 MB) wait for
+    # it, instead of 2.
     "transport/link/tx/queue/size": dict.fromkeys(_QUEUES, 16),
-    # The first message then waits this long (us); later ones do not wait until the reader reads again.
+    # The first message then waits this long (us); later ones do not wait until the reader reads
+    # again.
     "transport/link/tx/queue/congestion_control/drop": {
         "wait_before_drop": 2000,
         "max_wait_before_drop_fragments": 4000,
@@ -44,7 +46,9 @@ class NoRouterError(TransportError):
 
 @dataclass(frozen=True)
 class Tls:
-    """PEM files for mutual TLS: certificate authority of the mission, certificate and private key of this process."""
+    """PEM files for mutual TLS: certificate authority of the mission, certificate and private key
+    of this process.
+    """
 
     ca: Path
     certificate: Path
@@ -58,11 +62,12 @@ class Tls:
 
 @dataclass(frozen=True)
 class Link:
-    """Endpoints and options of a Zenoh session. ``lease_ms``: time after which a silent peer counts as lost.
+    """Endpoints and options of a Zenoh session. ``lease_ms``: time after which a silent peer counts
+    as lost.
 
-    ``connect_timeout_s``: wall time after which a client that no router accepts gives up; None: it never does.
-    ``access_control``: rules that a router enforces (see ``access_control.py``). ``network``: carries the messages in place
-    of Zenoh; the other fields have no effect then.
+    ``connect_timeout_s``: wall time after which a client that no router accepts gives up; None: it
+    never does. ``access_control``: rules that a router enforces (see ``access_control.py``).
+    ``network``: carries the messages in place of Zenoh; the other fields have no effect then.
     """
 
     namespace: str = DEFAULT_NAMESPACE
@@ -78,7 +83,9 @@ class Link:
 
 
 class ReceivedMessage(Struct, frozen=True):
-    """A valid message. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped; ``arrived_s`` the clock of this host."""
+    """A valid message. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped; ``arrived_s``
+    the clock of this host.
+    """
 
     topic: Topic
     place: str | None
@@ -102,7 +109,5 @@ def open_error(error: Exception, link: Link) -> str:
         keys = ", and are the keys valid and of its mission" if link.tls is not None else ""
         return f"no router at {connect} accepts the connection; is it running{keys}?"
     if "in use" in text.lower():
-        return (
-            f"cannot listen on {listen}: the port is in use; stop its owner or choose another with --listen"
-        )
+        return f"cannot listen on {listen}: the port is in use; stop its owner or choose another with --listen"
     return f"cannot open the Zenoh session (listen {listen}, connect {connect}): {text}"

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interfaces between a ``Node`` and what carries its messages: Zenoh between processes, or a simulated network.
+"""Interfaces between a ``Node`` and what carries its messages: Zenoh between processes, or a
+simulated network.
 
-A ``Network`` opens one ``Connection`` per node, and gives the ``Host`` that its process runs on: time, waiting, queues
-between threads, unique names, and the process' own end. Processes use no other clock and wait nowhere else, so that they
-run unchanged in virtual time.
+A ``Network`` opens one ``Connection`` per node, and gives the ``Host`` that its process runs on:
+time, waiting, queues between threads, unique names, and the process' own end. Processes use no
+other clock and wait nowhere else, so that they run unchanged in virtual time.
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ class Host(Protocol):
 
 
 class RawSample(Struct, frozen=True):
-    """A sample from the wire, not decoded. ``source``: session that stamped it, which is its publisher's (see ``Connection``)."""
+    """A sample from the wire, not decoded. ``source``: session that stamped it, which is its
+    publisher's (see ``Connection``).
+    """
 
     key: str
     encoding: str
@@ -115,7 +118,8 @@ class Connection(Protocol):
     ) -> Callable[[bytes], None]:
         """Declare a publisher and return the function that sends a payload.
 
-        ``blocking``: a slow reader blocks the publisher, else it misses messages. ``express``: not batched.
+        ``blocking``: a slow reader blocks the publisher, else it misses messages. ``express``: not
+        batched.
         """
         ...
 
@@ -130,17 +134,23 @@ class Connection(Protocol):
     def subscribe(self, expression: str, arrived: Callable[[RawSample], None]) -> None: ...
 
     def subscribe_ring(self, expression: str, depth: int) -> Callable[[], RawSample | None]:
-        """Keep the newest ``depth`` samples; return the function that takes the oldest of them, if any."""
+        """Keep the newest ``depth`` samples; return the function that takes the oldest of them, if
+        any.
+        """
         ...
 
     def declare_queryable(self, key: str, arrived: Callable[[Query], None]) -> Undo: ...
 
-    def query(self, key: str, payload: bytes, encoding: str, timeout_s: float) -> Iterable[Reply]: ...
+    def query(
+        self, key: str, payload: bytes, encoding: str, timeout_s: float
+    ) -> Iterable[Reply]: ...
 
     def declare_liveliness(self, key: str) -> None: ...
 
     def watch_liveliness(self, expression: str, changed: Callable[[str, bool], None]) -> None:
-        """Call ``changed(key, alive)`` for each liveliness token that exists, appears or disappears."""
+        """Call ``changed(key, alive)`` for each liveliness token that exists, appears or
+        disappears.
+        """
         ...
 
     def close(self) -> None:
@@ -194,7 +204,9 @@ class Machine:
         return end
 
     def finish_startup(self) -> None:
-        """Exclude the objects created so far from garbage collection, which would otherwise pause the flight for some 10 ms."""
+        """Exclude the objects created so far from garbage collection, which would otherwise pause
+        the flight for some 10 ms.
+        """
         gc.collect()
         gc.freeze()
 

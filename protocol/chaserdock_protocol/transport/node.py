@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Typed topics on a network: publishers, subscribers and queries of one process.
 
-Callbacks run on the network's threads and only enqueue raw bytes, so that a slow reader of one topic does not delay
-another (head-of-line blocking). The reader's thread decodes and validates.
+Callbacks run on the network's threads and only enqueue raw bytes, so that a slow reader of one
+topic does not delay another (head-of-line blocking). The reader's thread decodes and validates.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ class TrafficCounters:
 
 
 _MOST_REPORTED = 16
-"""Sessions of foreign publishers that are reported; whoever forges an identity per message fills no log."""
+"""Sessions of foreign publishers that are reported; whoever forges an identity per message fills no
+log.
+"""
 _Arrival = tuple[Topic, str | None, RawSample, float]
 """Topic, place and sample of a message, and the time (s) when it arrived."""
 
@@ -50,15 +52,18 @@ class MessageFilter(Protocol):
         ...
 
     def incoming(self, topic: Topic, place: str | None, message: Any, payload: bytes) -> list[Any]:
-        """Return the messages to deliver instead of ``message``, which was decoded from ``payload``."""
+        """Return the messages to deliver instead of ``message``, which was decoded from
+        ``payload``.
+        """
         ...
 
 
 class Node:
-    """One process on the network: publishers, subscribers and queries, restricted by the topics table.
+    """One process on the network: publishers, subscribers and queries, restricted by the topics
+    table.
 
-    Raises TransportError if the session cannot be opened, PermissionError for a topic that this role may
-    not read or write.
+    Raises TransportError if the session cannot be opened, PermissionError for a topic that this
+    role may not read or write.
     """
 
     def __init__(self, name: str, role: Role, link: Link) -> None:
@@ -67,7 +72,9 @@ class Node:
         self.counts = TrafficCounters()
         self.message_filter: MessageFilter | None = None
         self.blocking = True
-        """True (lock-step): a slow reader blocks the publisher. False: it misses messages. Set before publishing."""
+        """True (lock-step): a slow reader blocks the publisher. False: it misses messages. Set
+        before publishing.
+        """
         self._ready: deque[ReceivedMessage] = deque()
         self._latest: dict[str, _Arrival] = {}
         self._latest_lock = threading.Lock()
@@ -78,7 +85,9 @@ class Node:
         self._queryables: dict[str, Undo] = {}
         self._close_callbacks: list[Callable[[], None]] = []
         self._world_source = ""
-        self._on_foreign: Callable[[str, str, Message | None], None] = lambda key, source, newest: None
+        self._on_foreign: Callable[[str, str, Message | None], None] = lambda key, source, newest: (
+            None
+        )
         self._foreign_sources: set[str] = set()
         self._foreign: deque[tuple[str, str]] = deque()
         self._newest: Message | None = None
@@ -96,16 +105,21 @@ class Node:
         """Identity of the session of the mission's world, empty if unknown."""
         return self.source if self.role == "world" else self._world_source
 
-    def expect_world(self, source: str, on_foreign: Callable[[str, str, Message | None], None]) -> None:
-        """Ignore messages on the world's keys that another session than ``source`` publishes; empty: accept all.
+    def expect_world(
+        self, source: str, on_foreign: Callable[[str, str, Message | None], None]
+    ) -> None:
+        """Ignore messages on the world's keys that another session than ``source`` publishes;
+        empty: accept all.
 
-        ``on_foreign(key, source, newest)`` runs on the reader's thread for the first of each session, up to a number of
-        sessions; ``newest``: the last valid message.
+        ``on_foreign(key, source, newest)`` runs on the reader's thread for the first of each
+        session, up to a number of sessions; ``newest``: the last valid message.
         """
         self._world_source, self._on_foreign = source, on_foreign
 
     def _is_foreign(self, raw: RawSample) -> bool:
-        """Count a message on the world's keys that is not the world's. Runs on the network's or the reader's thread."""
+        """Count a message on the world's keys that is not the world's. Runs on the network's or the
+        reader's thread.
+        """
         if raw.source == self._world_source or not self._world_source:
             return False
         if not raw.key.startswith(topics.WORLD_BRANCHES):
@@ -116,7 +130,7 @@ class Node:
             self._foreign.append((raw.key, raw.source))
         return True
 
-    # -- publishing ---------------------------------------------------------------------------------------
+    # -- publishing --------------------------------------------------------------------------------
 
     def advertise(self, topic: Topic, place: int | str | None = None) -> str:
         """Declare a publisher and return its key."""
@@ -157,15 +171,19 @@ class Node:
         return dict(self._next_seq + self._published_before_restart)
 
     def restart_numbering(self) -> None:
-        """Restart ``seq`` at 0 on the keys of this role, on which another process may have published meanwhile."""
+        """Restart ``seq`` at 0 on the keys of this role, on which another process may have
+        published meanwhile.
+        """
         for key in list(self._next_seq):
             found = topics.topic_of_key(key)
             if found is not None and found[0].writer == self.role:
                 self._published_before_restart[key] += self._next_seq.pop(key)
 
-    # -- receiving ----------------------------------------------------------------------------------------
+    # -- receiving ---------------------------------------------------------------------------------
 
-    def subscribe(self, topic: Topic, place: int | str | None = None, *, latest: bool = False) -> None:
+    def subscribe(
+        self, topic: Topic, place: int | str | None = None, *, latest: bool = False
+    ) -> None:
         """Subscribe to a topic, for all chasers or processes if ``place`` is None.
 
         ``latest`` keeps only the newest unread sample of each key (images in real time).
@@ -194,9 +212,11 @@ class Node:
     def subscribe_newest(
         self, topic: Topic, depth: int, place: int | str | None = None
     ) -> Callable[[], list[ReceivedMessage]]:
-        """Subscribe through a ring buffer of the newest ``depth`` samples, and return a function that drains it.
+        """Subscribe through a ring buffer of the newest ``depth`` samples, and return a function
+        that drains it.
 
-        The network drops older samples, so that a slow or stopped reader does not slow down the publishers.
+        The network drops older samples, so that a slow or stopped reader does not slow down the
+        publishers.
         """
         take = self._connection.subscribe_ring(self._key_expression(topic, place), depth)
 
@@ -204,7 +224,9 @@ class Node:
             out: list[ReceivedMessage] = []
             while (raw := take()) is not None and len(out) < depth:
                 found = topics.topic_of_key(raw.key)
-                received = self._decode(topic, found[1], raw) if found and found[0] is topic else None
+                received = (
+                    self._decode(topic, found[1], raw) if found and found[0] is topic else None
+                )
                 if received is not None:
                     out.append(received)
             self._report_foreign()
@@ -213,7 +235,9 @@ class Node:
         return drain
 
     def _key_expression(self, topic: Topic, place: int | str | None) -> str:
-        """Return the key expression of a topic. Raises PermissionError if this role may not read it."""
+        """Return the key expression of a topic. Raises PermissionError if this role may not read
+        it.
+        """
         if not topics.may_read(self.role, topic):
             raise PermissionError(f"{self.role} may not read {topic.key}")
         if place is None and "{" in topic.key:
@@ -221,7 +245,9 @@ class Node:
         return topic.key_of(place)
 
     def subscribe_raw(self, expression: str, arrived: Callable[[RawSample], None]) -> None:
-        """Pass every sample on a key expression to ``arrived`` on the network's thread. Only for recorder and analysis."""
+        """Pass every sample on a key expression to ``arrived`` on the network's thread. Only for
+        recorder and analysis.
+        """
         if self.role not in ("recorder", "analysis"):
             raise PermissionError(f"{self.role} may not read {expression}")
 
@@ -234,7 +260,8 @@ class Node:
     def receive(self, timeout_s: float | None) -> ReceivedMessage | None:
         """Return the next valid message, or None on timeout.
 
-        Counts invalid messages in ``counts.rejected`` by topic and reason, and gaps in ``seq`` in ``counts.lost``.
+        Counts invalid messages in ``counts.rejected`` by topic and reason, and gaps in ``seq`` in
+        ``counts.lost``.
         """
         self._report_foreign()
         if self._ready:
@@ -271,7 +298,9 @@ class Node:
         if self.message_filter is None:
             return received
         delivered = self.message_filter.incoming(topic, place, received.message, raw.payload)
-        self._ready.extend(ReceivedMessage(topic, place, m, raw.sent_ns, arrived_s) for m in delivered)
+        self._ready.extend(
+            ReceivedMessage(topic, place, m, raw.sent_ns, arrived_s) for m in delivered
+        )
         return self._ready.popleft() if self._ready else None
 
     def decode(self, kind: type[T], raw: RawSample) -> T:
@@ -292,7 +321,7 @@ class Node:
             return None
         return ReceivedMessage(topic, place, message, raw.sent_ns, arrived_s)
 
-    # -- queries and liveliness ----------------------------------------------------------------------------
+    # -- queries and liveliness --------------------------------------------------------------------
 
     def declare_queryable(
         self,
@@ -300,9 +329,11 @@ class Node:
         request: type[msgspec.Struct],
         handle: Callable[[Any, Callable[[msgspec.Struct], None]], None],
     ) -> None:
-        """Serve queries on a key: the network's thread calls ``handle(message, reply)``, which must not block.
+        """Serve queries on a key: the network's thread calls ``handle(message, reply)``, which must
+        not block.
 
-        ``reply`` may be called once, later and from any thread. A malformed query gets an error reply.
+        ``reply`` may be called once, later and from any thread. A malformed query gets an error
+        reply.
         """
 
         def arrived(query: Query) -> None:
@@ -312,7 +343,9 @@ class Node:
                 self.counts.rejected[f"{key}:{refusal.reason}"] += 1
                 query.refuse(str(refusal))
                 return
-            handle(message, lambda result: query.reply(codec.encode(result), encoding_of(type(result))))
+            handle(
+                message, lambda result: query.reply(codec.encode(result), encoding_of(type(result)))
+            )
 
         self._queryables[key] = self._connection.declare_queryable(key, arrived)
 
@@ -321,8 +354,12 @@ class Node:
         if key in self._queryables:
             self._queryables.pop(key)()
 
-    def query(self, key: str, request: msgspec.Struct, reply: type[msgspec.Struct], timeout_s: float) -> Any:
-        """Return the first reply to a query, or None without any. Raises TransportError for an error reply."""
+    def query(
+        self, key: str, request: msgspec.Struct, reply: type[msgspec.Struct], timeout_s: float
+    ) -> Any:
+        """Return the first reply to a query, or None without any. Raises TransportError for an
+        error reply.
+        """
         payload, encoding = codec.encode(request), encoding_of(type(request))
         for found in self._connection.query(key, payload, encoding, timeout_s):
             if found.error:
@@ -338,19 +375,26 @@ class Node:
         self._connection.declare_liveliness(topics.LIVE_KEY.format(process=self.name))
 
     def watch_liveliness(self, changed: Callable[[str, bool], None]) -> None:
-        """Call ``changed(process, alive)`` on the network's thread for every process that appears or disappears."""
+        """Call ``changed(process, alive)`` on the network's thread for every process that appears
+        or disappears.
+        """
         prefix = topics.LIVE_KEY.format(process="")
 
         self._connection.watch_liveliness(
-            topics.LIVE_KEY.format(process="**"), lambda key, alive: changed(key.removeprefix(prefix), alive)
+            topics.LIVE_KEY.format(process="**"),
+            lambda key, alive: changed(key.removeprefix(prefix), alive),
         )
 
     def on_close(self, stop: Callable[[], None]) -> None:
-        """Register a callback to run before the connection closes: stops threads that publish on this node."""
+        """Register a callback to run before the connection closes: stops threads that publish on
+        this node.
+        """
         self._close_callbacks.append(stop)
 
     def close(self) -> None:
-        """Run the callbacks of ``on_close``, then close the connection, which first sends all published messages."""
+        """Run the callbacks of ``on_close``, then close the connection, which first sends all
+        published messages.
+        """
         for stop in self._close_callbacks:
             stop()
         self._connection.close()

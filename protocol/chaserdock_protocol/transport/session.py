@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joining a mission, and the discovery barrier before its first tick.
 
-Zenoh propagates declarations one by one, so that a message published too early may miss a subscriber. Every process
-therefore publishes at intervals from which processes it has received ``Presence``. It declares its presence
-subscription after all its other subscriptions. A writer whose presence reaches a reader hence knows all subscriptions
-of that reader, and no later message is lost, for any topology and start order. The world opens the first tick when
-all pairs that exchange messages have received each other's presence.
+Zenoh propagates declarations one by one, so that a message published too early may miss a
+subscriber. Every process therefore publishes at intervals from which processes it has received
+``Presence``. It declares its presence subscription after all its other subscriptions. A writer
+whose presence reaches a reader hence knows all subscriptions of that reader, and no later message
+is lost, for any topology and start order. The world opens the first tick when all pairs that
+exchange messages have received each other's presence.
 """
 
 from __future__ import annotations
@@ -47,11 +48,14 @@ def join(
 ) -> JoinReply | None:
     """Query the world for the mission until it replies. Return None if ``stopped``.
 
-    Raises JoinRefused if the world rejects the process, or after ``patience_s`` of wall time without a reply.
+    Raises JoinRefused if the world rejects the process, or after ``patience_s`` of wall time
+    without a reply.
     """
     begun = node.host.now_s()
     while not stopped():
-        reply = node.query(topics.JOIN_KEY, JoinRequest(process=node.name, instance=instance), JoinReply, 0.5)
+        reply = node.query(
+            topics.JOIN_KEY, JoinRequest(process=node.name, instance=instance), JoinReply, 0.5
+        )
         if reply is not None:
             if not reply.accepted:
                 raise JoinRefused(reply.reason)
@@ -67,13 +71,16 @@ def join(
 def request_scenario(
     node: Node, mission: JoinReply, stopped: Callable[[], bool], patience_s: float = 10.0
 ) -> str | None:
-    """Return the JSON of the mission's full scenario, which flight processes may not have. Return None if ``stopped``.
+    """Return the JSON of the mission's full scenario, which flight processes may not have. Return
+    None if ``stopped``.
 
     Raises JoinRefused when the world gives none within ``patience_s`` of wall time.
     """
     begun = node.host.now_s()
     while not stopped():
-        reply = node.query(topics.SCENARIO_KEY, ScenarioRequest(process=node.name), ScenarioReply, 0.5)
+        reply = node.query(
+            topics.SCENARIO_KEY, ScenarioRequest(process=node.name), ScenarioReply, 0.5
+        )
         if reply is not None and reply.run_id == mission.run_id:
             return reply.scenario_json
         if node.host.now_s() - begun > patience_s:
@@ -85,12 +92,16 @@ def request_scenario(
 
 
 def run_member(
-    name: str, role: Role, options: ProcessOptions, work: Callable[[Node, JoinReply, str, StopSignal], int]
+    name: str,
+    role: Role,
+    options: ProcessOptions,
+    work: Callable[[Node, JoinReply, str, StopSignal], int],
 ) -> int:
-    """Run a process other than the world: open its node, join the mission, and return the status of ``work``.
+    """Run a process other than the world: open its node, join the mission, and return the status of
+    ``work``.
 
-    ``work(node, mission, instance, stop)`` runs once the world has replied. Return 1 if stopped before, or print the
-    text of a ChaserdockError and return 2.
+    ``work(node, mission, instance, stop)`` runs once the world has replied. Return 1 if stopped
+    before, or print the text of a ChaserdockError and return 2.
     """
     node: Node | None = None
     try:
@@ -101,7 +112,8 @@ def run_member(
             return 1
         node.blocking = mission.mode == "lockstep"
         watch_for_foreign_publishers(node, mission.source)
-        node.declare_liveliness()  # before the start-up work (compilation): reserves the process' name
+        # before the start-up work (compilation): reserves the process' name
+        node.declare_liveliness()
         print_status(name, f"joined mission {mission.run_id} ({mission.mode})")
         status = work(node, mission, instance, stop)
         print_status(name, f"ended with status {status}")
@@ -115,13 +127,17 @@ def run_member(
 
 
 def ask_as_world(node: Node) -> JoinReply | None:
-    """Return how the world of this namespace refuses a second one, or None without a world. Reserves no name."""
+    """Return how the world of this namespace refuses a second one, or None without a world.
+    Reserves no name.
+    """
     request = JoinRequest(process="world", instance=node.host.unique_id())
     return node.query(topics.JOIN_KEY, request, JoinReply, 0.5)
 
 
 def find_world(node: Node) -> str | None:
-    """Return the identity of the world's session without joining its mission, or None without a world."""
+    """Return the identity of the world's session without joining its mission, or None without a
+    world.
+    """
     reply = ask_as_world(node)
     return None if reply is None else reply.source
 
@@ -131,19 +147,24 @@ def ignore_foreign_publishers(
 ) -> None:
     """Make a node ignore messages on the world's keys that are not the world's.
 
-    ``warn(detail, newest)`` runs on the reader's thread for each session that publishes such messages; ``detail`` names it.
-    ``newest``: the last valid message.
+    ``warn(detail, newest)`` runs on the reader's thread for each session that publishes such
+    messages; ``detail`` names it. ``newest``: the last valid message.
     """
 
     def on_foreign(key: str, source: str, newest: Message | None) -> None:
         who = "a session without time stamps" if source == node.source else f"session {source}"
-        warn(f"{who} publishes on {key}, which is the world's (session {world_source}); ignored", newest)
+        warn(
+            f"{who} publishes on {key}, which is the world's (session {world_source}); ignored",
+            newest,
+        )
 
     node.expect_world(world_source, on_foreign)
 
 
 def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
-    """Make a node ignore messages on the world's keys that are not the world's, and publish a warning about each session."""
+    """Make a node ignore messages on the world's keys that are not the world's, and publish a
+    warning about each session.
+    """
 
     def warn(detail: str, newest: Message | None) -> None:
         print_status(node.name, f"foreign publisher: {detail}")
@@ -162,17 +183,20 @@ def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
 
 
 def required_peers(process: str, present: set[str]) -> set[str]:
-    """Return the processes among ``present`` with which ``process`` must exchange presence before it flies."""
+    """Return the processes among ``present`` with which ``process`` must exchange presence before
+    it flies.
+    """
     if process.startswith("chaser/"):
         return {"world", *topics.CONTROLLERS} & present
     return present - {process}
 
 
 class Heartbeat:
-    """Publishes this process' presence at intervals in the background, and collects that of the others.
+    """Publishes this process' presence at intervals in the background, and collects that of the
+    others.
 
-    Construct it after all other subscriptions of the node. ``waiting_for``: see ``Presence``. ``stall_s``: after so long
-    without the world's presence the world is gone.
+    Construct it after all other subscriptions of the node. ``waiting_for``: see ``Presence``.
+    ``stall_s``: after so long without the world's presence the world is gone.
     """
 
     def __init__(self, node: Node, instance: str, stall_s: float = DEFAULT_STALL_S) -> None:
@@ -181,7 +205,9 @@ class Heartbeat:
         self._stall_s, self._without_world = stall_s, StallTimer(node.host.now_s)
         self.waiting_for: tuple[str, ...] = ()
         self.hangs: Callable[[], bool] = lambda: False
-        """Whether the process' loop has stopped: its presence, published in the background, then stops, too."""
+        """Whether the process' loop has stopped: its presence, published in the background, then
+        stops, too.
+        """
         self._heard: dict[str, str] = {}
         self._newest: dict[str, str] = {}
         self._replaced: set[str] = set()
@@ -198,7 +224,8 @@ class Heartbeat:
     def take(self, message: Presence) -> None:
         """Record a presence that the process' loop received.
 
-        Ignores that of an earlier mission in this namespace, and that of a process that was replaced and goes on.
+        Ignores that of an earlier mission in this namespace, and that of a process that was
+        replaced and goes on.
         """
         own = self._node.world_source
         if own and message.world and message.world != own:
@@ -216,7 +243,9 @@ class Heartbeat:
     def report_waiting(
         self, received: ReceivedMessage | None, missing_keys: Callable[[], tuple[str, ...]]
     ) -> None:
-        """Let presence name the messages that the process waits for, from when it receives none (``received`` is None)."""
+        """Let presence name the messages that the process waits for, from when it receives none
+        (``received`` is None).
+        """
         if received is None:
             self.waiting_for = missing_keys()
         elif received.topic is not topics.PRESENCE:
@@ -227,10 +256,14 @@ class Heartbeat:
         self._without_world.reset()
 
     def world_is_gone(self) -> bool:
-        """Return, and print, whether the world has been silent for too long. Call it at least twice a second."""
+        """Return, and print, whether the world has been silent for too long. Call it at least twice
+        a second.
+        """
         gone = self._without_world.update() >= self._stall_s
         if gone:
-            print_status(self._node.name, f"the world is gone: no presence of it for {self._stall_s:g} s")
+            print_status(
+                self._node.name, f"the world is gone: no presence of it for {self._stall_s:g} s"
+            )
         return gone
 
     def heard(self) -> dict[str, str]:
@@ -239,10 +272,14 @@ class Heartbeat:
             return dict(sorted(self._heard.items()))
 
     def is_replaced(self, listed: str | None) -> bool:
-        """Return, and print, whether the world lists another instance of this process, which was lost and started again."""
+        """Return, and print, whether the world lists another instance of this process, which was
+        lost and started again.
+        """
         replaced = listed is not None and listed != self._instance
         if replaced:
-            print_status(self._node.name, f"another {self._node.name} has replaced this one, which was lost")
+            print_status(
+                self._node.name, f"another {self._node.name} has replaced this one, which was lost"
+            )
         return replaced
 
     def forget(self, process: str) -> None:
@@ -251,7 +288,9 @@ class Heartbeat:
             self._heard.pop(process, None)
 
     def _publish(self) -> float:
-        """Publish the presence unless the process hangs; return after how many seconds to publish the next."""
+        """Publish the presence unless the process hangs; return after how many seconds to publish
+        the next.
+        """
         if self.hangs():
             return STEADY_PERIOD_S
         message = Presence(
@@ -265,7 +304,9 @@ class Heartbeat:
         return STEADY_PERIOD_S if self.in_flight.is_set() else EARLY_PERIOD_S
 
     def farewell(self, tick: int, time_ns: int) -> None:
-        """Stop the heartbeat and publish this process' last messages: health, and the message count of each key."""
+        """Stop the heartbeat and publish this process' last messages: health, and the message count
+        of each key.
+        """
         self.stop()
         health = create_health(self._node, tick, time_ns)
         self._node.publish(topics.HEALTH, health, self._node.name)

@@ -17,7 +17,15 @@ import zenoh
 
 from chaserdock_protocol import codec
 
-from .config import QUEUE_OPTIONS, Link, NoRouterError, Tls, TransportError, is_unreachable, open_error
+from .config import (
+    QUEUE_OPTIONS,
+    Link,
+    NoRouterError,
+    Tls,
+    TransportError,
+    is_unreachable,
+    open_error,
+)
 from .network import Connection, Host, Machine, Query, RawSample, Reply, T, Undo
 
 _PRIORITY = {
@@ -28,17 +36,21 @@ _PRIORITY = {
 }
 
 _LOG_FILTER = "error,zenoh::api::session=off"
-"""Level of Zenoh's own log without ``RUST_LOG``. A session that joins a flight receives data before the declarations of their
-keys, which Zenoh discards and reports as errors."""
+"""Level of Zenoh's own log without ``RUST_LOG``. A session that joins a flight receives data before
+the declarations of their keys, which Zenoh discards and reports as errors."""
 
 _FIRST_ATTEMPT_S, _LONGEST_ATTEMPT_S = 1.0, 5.0
 """Wall time of the attempts of a client to connect."""
 
 
 def zenoh_config(link: Link) -> zenoh.Config:
-    """Return the Zenoh configuration of a link. Raises TransportError for a bad file, namespace or endpoint."""
+    """Return the Zenoh configuration of a link. Raises TransportError for a bad file, namespace or
+    endpoint.
+    """
     if not link.namespace or any(c in link.namespace for c in "/*$?#@ "):
-        raise TransportError(f"namespace {link.namespace!r}: must be one word without / * $ ? # @ or blanks")
+        raise TransportError(
+            f"namespace {link.namespace!r}: must be one word without / * $ ? # @ or blanks"
+        )
     try:
         config = zenoh.Config.from_file(str(link.config)) if link.config else zenoh.Config()
     except zenoh.ZError as error:
@@ -52,9 +64,15 @@ def zenoh_config(link: Link) -> zenoh.Config:
     retry = {
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 1000,
+            "period_increase_factor": 1.5,
+        },
     }
-    values |= {name: value for name, value in retry.items() if config.get_json(name) in ("null", None)}
+    values |= {
+        name: value for name, value in retry.items() if config.get_json(name) in ("null", None)
+    }
     if link.config is None:
         values |= {
             "mode": link.mode,
@@ -109,7 +127,10 @@ class ZenohNetwork:
         zenoh.init_log_from_env_or(_LOG_FILTER)
         config = zenoh_config(self._link)
         try:
-            if config.get_json("mode") == '"client"' and config.get_json("connect/timeout_ms") == "-1":
+            if (
+                config.get_json("mode") == '"client"'
+                and config.get_json("connect/timeout_ms") == "-1"
+            ):
                 return _ZenohConnection(self._open_client(config, name)), Machine()
             return _ZenohConnection(zenoh.open(config)), Machine()
         except zenoh.ZError as error:
@@ -117,24 +138,29 @@ class ZenohNetwork:
             raise kind(open_error(error, self._link)) from None
 
     def _open_client(self, config: zenoh.Config, name: str) -> zenoh.Session:
-        """Open a client session by attempts of limited duration. Raises ZError after the link's time.
+        """Open a client session by attempts of limited duration. Raises ZError after the link's
+        time.
 
-        Zenoh waits in native code, and Python handles signals such as Ctrl-C only between the attempts. Each is longer
-        than the one before, so that a slow TLS handshake succeeds, too. Prints once that it waits, unless that is
-        soon over.
+        Zenoh waits in native code, and Python handles signals such as Ctrl-C only between the
+        attempts. Each is longer than the one before, so that a slow TLS handshake succeeds, too.
+        Prints once that it waits, unless that is soon over.
         """
         limit_s = self._link.connect_timeout_s
         end_s = math.inf if limit_s is None else time.monotonic() + limit_s
         attempt_s = _FIRST_ATTEMPT_S
         while True:
             left_s = end_s - time.monotonic()
-            config.insert_json5("connect/timeout_ms", str(max(1, round(1000 * min(attempt_s, left_s)))))
+            config.insert_json5(
+                "connect/timeout_ms", str(max(1, round(1000 * min(attempt_s, left_s))))
+            )
             try:
                 return zenoh.open(config)
             except zenoh.ZError as error:
                 if left_s <= attempt_s or not is_unreachable(error):
                     raise
-                if attempt_s == _FIRST_ATTEMPT_S and (limit_s is None or limit_s > _LONGEST_ATTEMPT_S):
+                if attempt_s == _FIRST_ATTEMPT_S and (
+                    limit_s is None or limit_s > _LONGEST_ATTEMPT_S
+                ):
                     print(
                         f"{name}: {open_error(error, self._link)} Waiting for it.",
                         file=sys.stderr,
@@ -192,7 +218,9 @@ class _ZenohConnection:
         return take
 
     def declare_queryable(self, key: str, arrived: Callable[[Query], None]) -> Undo:
-        return self._session.declare_queryable(key, lambda query: arrived(_ZenohQuery(key, query))).undeclare
+        return self._session.declare_queryable(
+            key, lambda query: arrived(_ZenohQuery(key, query))
+        ).undeclare
 
     def query(self, key: str, payload: bytes, encoding: str, timeout_s: float) -> Iterator[Reply]:
         for reply in self._session.get(key, payload=payload, encoding=encoding, timeout=timeout_s):
@@ -211,7 +239,9 @@ class _ZenohConnection:
         def callback(sample: zenoh.Sample) -> None:
             changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        subscriber = self._session.liveliness().declare_subscriber(expression, callback, history=True)
+        subscriber = self._session.liveliness().declare_subscriber(
+            expression, callback, history=True
+        )
         self._declared.append(subscriber)
 
     def close(self) -> None:
@@ -219,9 +249,11 @@ class _ZenohConnection:
 
 
 class PlainSession:
-    """A Zenoh session without a namespace and with attachments, for another protocol than that of a mission.
+    """A Zenoh session without a namespace and with attachments, for another protocol than that of a
+    mission.
 
-    ``mode``: a ``peer``, or a ``router`` that other peers find each other by. Raises TransportError if it cannot be opened.
+    ``mode``: a ``peer``, or a ``router`` that other peers find each other by. Raises TransportError
+    if it cannot be opened.
     """
 
     def __init__(
@@ -243,12 +275,16 @@ class PlainSession:
                 config.insert_json5(name, json.dumps(value))
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise TransportError(open_error(error, Link(connect=connect, listen=listen, mode=mode))) from None
+            raise TransportError(
+                open_error(error, Link(connect=connect, listen=listen, mode=mode))
+            ) from None
         self._declared: list[Any] = []
         self.session_id = str(self._session.zid())
 
     def declare_publisher(self, key: str, *, blocking: bool) -> Callable[[bytes, bytes], None]:
-        """Return a function that publishes a payload with an attachment; ``blocking``: it waits for slow readers."""
+        """Return a function that publishes a payload with an attachment; ``blocking``: it waits for
+        slow readers.
+        """
         control = zenoh.CongestionControl
         publisher = self._session.declare_publisher(
             key, congestion_control=control.BLOCK if blocking else control.DROP
@@ -265,7 +301,9 @@ class PlainSession:
         self._declared.append(self._session.declare_subscriber(key, callback))
 
     def declare_queryable(self, key: str, arrived: Callable[[AttachedQuery], None]) -> None:
-        """Call ``arrived(query)`` on Zenoh's thread for every query on a key, which this session answers completely."""
+        """Call ``arrived(query)`` on Zenoh's thread for every query on a key, which this session
+        answers completely.
+        """
         queryable = self._session.declare_queryable(
             key, lambda query: arrived(AttachedQuery(key, query)), complete=True
         )

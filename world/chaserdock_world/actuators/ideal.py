@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators of a chaser in the simulation: the interface, and ideal actuators that give the commanded wrench.
+"""Actuators of a chaser in the simulation: the interface, and ideal actuators that give the
+commanded wrench.
 
-Commands wait until they take effect; ideal actuators limit each axis of a command to the body's limits.
+Commands wait until they take effect; ideal actuators limit each axis of a command to the body's
+limits.
 """
 
 from __future__ import annotations
@@ -24,9 +26,9 @@ from chaserdock_world.plant import ActuationErrors
 class ActuatorOutput(NamedTuple):
     """Output of a chaser's actuators over an interval.
 
-    ``impulse`` (6,): N s and N m s, body axes; ``absolute_impulse_N_s``: time integral of the force components' absolute
-    values; ``saturated``: a command exceeded the limits; ``late``: number of commands after their effective time;
-    thrusters: see BodyTruth.
+    ``impulse`` (6,): N s and N m s, body axes; ``absolute_impulse_N_s``: time integral of the force
+    components' absolute values; ``saturated``: a command exceeded the limits; ``late``: number of
+    commands after their effective time; thrusters: see BodyTruth.
     """
 
     impulse: Array
@@ -42,22 +44,29 @@ class Actuators(Protocol):
     """Actuators of one chaser. Steps are physics steps."""
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
-        """Queue a command that acts from ``effective_step`` on; a late one acts at once and is counted."""
+        """Queue a command that acts from ``effective_step`` on; a late one acts at once and is
+        counted.
+        """
         ...
 
     def next_change(self, step: int) -> int | None:
-        """Return the first step after ``step`` at which the wrench may change, None if none is known."""
+        """Return the first step after ``step`` at which the wrench may change, None if none is
+        known.
+        """
         ...
 
     def act(self, step: int, steps: int, step_s: float) -> Array:
-        """Return the wrench (6,), body axes, N and N m, from ``step`` on and account for ``steps`` steps of it.
+        """Return the wrench (6,), body axes, N and N m, from ``step`` on and account for ``steps``
+        steps of it.
 
         The wrench must not change in between (see ``next_change``).
         """
         ...
 
     def thrusts(self, step: int) -> Array:
-        """Return the thrust (n,), N, of every thruster from ``step`` on, as long as the wrench does not change."""
+        """Return the thrust (n,), N, of every thruster from ``step`` on, as long as the wrench does
+        not change.
+        """
         ...
 
     def stop(self, step: int) -> None:
@@ -93,7 +102,8 @@ class IdealActuators:
         wrench = np.array([*command.force_N, *command.torque_N_m])
         self.saturated |= bool((np.abs(wrench) > limit * (1 + 1e-6)).any())
         self.late += effective_step < now_step
-        # A restarted chaser counts ``seq`` from zero again; the order of arrival decides, and arrays are never compared.
+        # A restarted chaser counts ``seq`` from zero again; the order of arrival decides, and
+        # arrays are never compared.
         self._received += 1
         wrench = limited(wrench, limit)
         if self.errors is not None:
@@ -133,8 +143,15 @@ class IdealActuators:
 
     def take_output(self, step: int) -> ActuatorOutput:
         """See ``Actuators.take_output``."""
-        output = ActuatorOutput(np.array(self.impulse), self.absolute_impulse_N_s, self.saturated, self.late)
-        self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = [0.0] * 6, 0.0, False, 0
+        output = ActuatorOutput(
+            np.array(self.impulse), self.absolute_impulse_N_s, self.saturated, self.late
+        )
+        self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = (
+            [0.0] * 6,
+            0.0,
+            False,
+            0,
+        )
         return output
 
 
@@ -151,7 +168,9 @@ def _given(errors: ActuationErrors, wrench: Array, step: int) -> Array:
 def fly_to(
     end_step: int, physics: Physics, actuators: Mapping[str, Actuators], step_s: float
 ) -> set[tuple[str, str]]:
-    """Advance the physics to ``end_step`` under the actuators' wrenches; return the pairs of bodies that touched."""
+    """Advance the physics to ``end_step`` under the actuators' wrenches; return the pairs of bodies
+    that touched.
+    """
     touched: set[tuple[str, str]] = set()
     while (step := physics.step_count) < end_step:
         changes = (physics.next_change(step), *(a.next_change(step) for a in actuators.values()))

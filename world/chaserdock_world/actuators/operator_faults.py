@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster faults injected by an operator in flight: requested at any time, applied and answered between ticks."""
+"""Thruster faults injected by an operator in flight: requested at any time, applied and answered
+between ticks.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from .thrusters import ThrusterActuators
 
 
 class ThrusterFaultHandler:
-    """Collects thruster fault commands and applies them at the next tick. The chaser is not informed."""
+    """Collects thruster fault commands and applies them at the next tick. The chaser is not
+    informed.
+    """
 
     def __init__(self, scenario: Scenario, actuators: Mapping[str, Actuators]) -> None:
         self._scenario, self._actuators = scenario, actuators
@@ -31,7 +35,9 @@ class ThrusterFaultHandler:
             self._requests.append((command, reply))
 
     def apply_pending(self, tick: int, timing: Timing) -> list[tuple[str, str]]:
-        """Apply or refuse the queued commands at the opening of ``tick`` and reply; return events (what, detail)."""
+        """Apply or refuse the queued commands at the opening of ``tick`` and reply; return events
+        (what, detail).
+        """
         with self._lock:
             requests, self._requests = self._requests, []
         events = []
@@ -58,9 +64,7 @@ class ThrusterFaultHandler:
     def _refusal(self, command: ThrusterFaultCommand) -> str:
         body, chasers = self._scenario.chaser, len(self._scenario.chasers)
         if not body.thruster_faults_by_command:
-            return (
-                "this mission does not allow thruster faults (set chaser.thruster_faults_by_command = true)"
-            )
+            return "this mission does not allow thruster faults (set chaser.thruster_faults_by_command = true)"
         if command.chaser >= chasers:
             return f"there is no chaser {command.chaser}; this mission has 0 to {chasers - 1}"
         if body.actuation != "thrusters":

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated thrusters of a chaser: valves that open and close as commanded, with failures.
 
-The wrench about the centre of mass is constant in body axes over a physics step and equals the mean over the step.
-Propellant consumption is computed; the body's mass stays constant.
+The wrench about the centre of mass is constant in body axes over a physics step and equals the mean
+over the step. Propellant consumption is computed; the body's mass stays constant.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ _LOOK_AHEAD_STEPS = 32
 class ThrusterActuators:
     """The thrusters of one chaser; implements ``Actuators``.
 
-    Pulses have absolute times. The part of a pulse that has passed when a late command arrives is lost.
+    Pulses have absolute times. The part of a pulse that has passed when a late command arrives is
+    lost.
     """
 
     def __init__(
@@ -44,7 +45,9 @@ class ThrusterActuators:
         self._matrix = wrench_matrix(thrusters)
         self._valves = Valves(thrusters)
         for failure in failures:
-            self._valves.fail(failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor)
+            self._valves.fail(
+                failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor
+            )
         self._wrenches: Array = np.zeros((0, 6))
         self._thrusts: Array = np.zeros((0, len(thrusters)))
         self._wrenches_from = 0
@@ -54,7 +57,9 @@ class ThrusterActuators:
         self._late = 0
         self._taken_step = 0
 
-    def fail(self, thruster: int, kind: FailureKind | None, factor: float | None, step: int) -> None:
+    def fail(
+        self, thruster: int, kind: FailureKind | None, factor: float | None, step: int
+    ) -> None:
         """Make a thruster fail from ``step`` on, or with ``kind`` None work again.
 
         ``take_output`` must have been called up to ``step``.
@@ -147,7 +152,9 @@ def true_thrusters(stated: tuple[Thruster, ...], errors: ActuationErrors) -> tup
                 "direction": tuple(rotations.rotate(rotations.exp(turn), t.direction).tolist()),
             }
         )
-        for t, share, turn in zip(stated, errors.thrust_share.tolist(), errors.thrust_turn_rad, strict=True)
+        for t, share, turn in zip(
+            stated, errors.thrust_share.tolist(), errors.thrust_turn_rad, strict=True
+        )
     )
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Membership of a mission: admits processes, tracks their liveliness and which of them have discovered each other."""
+"""Membership of a mission: admits processes, tracks their liveliness and which of them have
+discovered each other.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,13 @@ JOIN_TIMEOUT_S = 5.0
 
 @dataclass
 class Membership:
-    """The processes of a mission as the world knows them. Thread-safe: called from Zenoh's threads and the main loop.
+    """The processes of a mission as the world knows them. Thread-safe: called from Zenoh's threads
+    and the main loop.
 
-    ``instance`` and ``source``: the world's own instance and session. ``flying``: set at the first tick, from when on
-    connected processes no longer wait for processes that are only joining (see ``connected``). ``scenario_json``: the
-    flight scenario. ``faults_of``: JSON of the faults to inject at a process, by its name.
+    ``instance`` and ``source``: the world's own instance and session. ``flying``: set at the first
+    tick, from when on connected processes no longer wait for processes that are only joining (see
+    ``connected``). ``scenario_json``: the flight scenario. ``faults_of``: JSON of the faults to
+    inject at a process, by its name.
     """
 
     chasers: int
@@ -99,7 +103,9 @@ class Membership:
                 self._departed.append(name)
 
     def update_presence(self, message: Presence) -> bool:
-        """Record which processes a process has heard; return False if that instance is not admitted."""
+        """Record which processes a process has heard; return False if that instance is not
+        admitted.
+        """
         with self._lock:
             if self._admitted.get(message.process) != message.instance:
                 return False
@@ -108,10 +114,14 @@ class Membership:
             return True
 
     def progress(self) -> dict[str, WaitReport]:
-        """Return what each living process waits for by its last presence, and the age of that presence."""
+        """Return what each living process waits for by its last presence, and the age of that
+        presence.
+        """
         with self._lock:
             now_s = self.now_s()
-            return {name: WaitReport(keys, now_s - at_s) for name, (keys, at_s) in self._reports.items()}
+            return {
+                name: WaitReport(keys, now_s - at_s) for name, (keys, at_s) in self._reports.items()
+            }
 
     def take_departed(self) -> list[str]:
         """Return the processes lost since the last call."""
@@ -120,21 +130,28 @@ class Membership:
             return departed
 
     def connected(self, heard_by_world: dict[str, str]) -> set[str]:
-        """Return the processes that are alive and have discovered, and been discovered by, all their partners.
+        """Return the processes that are alive and have discovered, and been discovered by, all
+        their partners.
 
-        ``heard_by_world``: processes that the world has heard, with their instances. Only current instances count: a
-        process that restarts has to be heard again. Before the flight a pair that is not connected holds back both
-        processes. In flight a pair of a flying and a joining process holds back the joining one only, so that no process
-        drops out of the flight because another one joins.
+        ``heard_by_world``: processes that the world has heard, with their instances. Only current
+        instances count: a process that restarts has to be heard again. Before the flight a pair
+        that is not connected holds back both processes. In flight a pair of a flying and a joining
+        process holds back the joining one only, so that no process drops out of the flight because
+        another one joins.
         """
         with self._lock:
             current = {**self._admitted, "world": self.instance}
             heard = {
-                name: {other for other, instance in others.items() if current.get(other) == instance}
+                name: {
+                    other for other, instance in others.items() if current.get(other) == instance
+                }
                 for name, others in {**self._heard, "world": heard_by_world}.items()
                 if name in self._alive or name == "world"
             }
-            present = {"world", *(n for n in heard if n.startswith("chaser/") or n in topics.CONTROLLERS)}
+            present = {
+                "world",
+                *(n for n in heard if n.startswith("chaser/") or n in topics.CONTROLLERS),
+            }
             settled = {*self._connected, "world"}
 
             def pair_is_connected(name: str, partner: str) -> bool:
@@ -145,7 +162,8 @@ class Membership:
             connected = {
                 name
                 for name in heard
-                if name != "world" and all(pair_is_connected(name, p) for p in required_peers(name, present))
+                if name != "world"
+                and all(pair_is_connected(name, p) for p in required_peers(name, present))
             }
             if self.flying:
                 self._connected = set(connected)

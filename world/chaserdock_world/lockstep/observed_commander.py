@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who commands, as the world sees it in the commands that chasers execute. It decides nothing. No I/O; time is passed in."""
+"""Who commands, as the world sees it in the commands that chasers execute. It decides nothing. No
+I/O; time is passed in.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ class ObservedCommander:
     _commanded_s: float = 0.0
 
     def update(self, command: ActuatorCommand, controllers: Mapping[str, str], now_s: float) -> str:
-        """Take an executed command; return the change of commander as text for the log, empty without one.
+        """Take an executed command; return the change of commander as text for the log, empty
+        without one.
 
         ``controllers``: those connected, name to instance.
         """
@@ -33,5 +36,9 @@ class ObservedCommander:
         if not before or (before, instance) == (self.name, self._instance):
             return ""
         connected = controllers.get(before) == instance
-        reason = f"no command of {before} executed for {silent_s:.2f} s" if connected else f"{before} lost"
+        reason = (
+            f"no command of {before} executed for {silent_s:.2f} s"
+            if connected
+            else f"{before} lost"
+        )
         return f"term {self.term}: {self.name} leads: {reason}"

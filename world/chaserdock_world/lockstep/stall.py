@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Explanation of a lock-step tick that does not end: who owes which message, and what it waits for itself. No I/O."""
+"""Explanation of a lock-step tick that does not end: who owes which message, and what it waits for
+itself. No I/O.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ _MOST_NAMED = 12
 
 @dataclass(frozen=True)
 class WaitReport:
-    """A process by its last presence, received ``age_s`` ago: ``waiting_for``, keys of the messages that it waits for."""
+    """A process by its last presence, received ``age_s`` ago: ``waiting_for``, keys of the messages
+    that it waits for.
+    """
 
     waiting_for: tuple[str, ...]
     age_s: float
@@ -34,9 +38,11 @@ def publisher_of(key: str, leader: str) -> str:
 
 
 def explain_stall(owed: Mapping[str, str], leader: str, processes: Mapping[str, WaitReport]) -> str:
-    """Return who owes which message, beginning with the causes: what waits for nothing else, and what was lost.
+    """Return who owes which message, beginning with the causes: what waits for nothing else, and
+    what was lost.
 
-    ``owed``: keys of the messages that the world waits for, by process. ``processes``: living processes by name.
+    ``owed``: keys of the messages that the world waits for, by process. ``processes``: living
+    processes by name.
     """
     todo, seen = deque(owed.items()), set(owed.items())
     causes: list[str] = []

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lock-step barrier: collects the replies that a tick expects, and applies the actuator commands among them."""
+"""Lock-step barrier: collects the replies that a tick expects, and applies the actuator commands
+among them.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +23,18 @@ from .observed_commander import ObservedCommander
 from .stall import explain_stall
 
 RECORDER_WINDOW_TICKS = 8
-"""The flight is at most this far ahead of the recorder's acknowledgements, which bounds the data in the network."""
+"""The flight is at most this far ahead of the recorder's acknowledgements, which bounds the data in
+the network.
+"""
 LONGEST_STEP_S = 5.0
-"""Time (s) without a look at its messages after which the world publishes no presence, as if it were gone."""
+"""Time (s) without a look at its messages after which the world publishes no presence, as if it
+were gone.
+"""
 _STATUS_INTERVAL_S = 5.0
 _POLL_S = 0.02
 _REPEAT_S, _MOST_REPEATS = 2.0, 3
-"""The first tick after all processes have returned is repeated after this wall time without a reply: chasers then state their
-leases again, which the network may have lost while it came up."""
+"""The first tick after all processes have returned is repeated after this wall time without a
+reply: chasers then state their leases again, which the network may have lost while it came up."""
 _MAX_CLOCK_ERROR_NS = 1_000_000_000
 """A command whose effective time differs from its tick's by more comes from a wrong clock."""
 
@@ -36,8 +42,8 @@ _MAX_CLOCK_ERROR_NS = 1_000_000_000
 class TickBarrier:
     """Opens ticks, collects the replies to them and decides when a tick is complete.
 
-    ``chasers``: ids of the chasers whose reply the open tick expects. Who commands is decided by the chasers, which grant
-    leases; this process sees it in the commands that they execute.
+    ``chasers``: ids of the chasers whose reply the open tick expects. Who commands is decided by
+    the chasers, which grant leases; this process sees it in the commands that they execute.
     """
 
     def __init__(
@@ -81,17 +87,23 @@ class TickBarrier:
         self._polled_s = node.host.now_s()
         heartbeat.hangs = lambda: node.host.now_s() - self._polled_s > LONGEST_STEP_S
 
-    # -- before, between and after ticks ---------------------------------------------------------------------
+    # -- before, between and after ticks -----------------------------------------------------------
 
     def missing_processes(self) -> list[str]:
         """Return the expected processes that are not connected yet."""
-        expected = [*self._actuators, "controller", *(["standby"] if self._standby_expected else [])]
+        expected = [
+            *self._actuators,
+            "controller",
+            *(["standby"] if self._standby_expected else []),
+        ]
         expected += ["recorder"] if self._recorder_expected else []
         connected = self._connected()
         return [name for name in expected if name not in connected]
 
     def start_flight(self) -> None:
-        """Start the flight: heartbeats slow down, and joining processes no longer hold back connected ones."""
+        """Start the flight: heartbeats slow down, and joining processes no longer hold back
+        connected ones.
+        """
         self._membership.flying = True
         self._heartbeat.in_flight.set()
 
@@ -101,9 +113,13 @@ class TickBarrier:
         connected = self._connected()
         self.chasers = self._chasers_among(connected)
         self._controllers = {
-            name: self._membership.instance_of(name) for name in topics.CONTROLLERS if name in connected
+            name: self._membership.instance_of(name)
+            for name in topics.CONTROLLERS
+            if name in connected
         }
-        self._instances = {f"chaser/{i}": self._membership.instance_of(f"chaser/{i}") for i in self.chasers}
+        self._instances = {
+            f"chaser/{i}": self._membership.instance_of(f"chaser/{i}") for i in self.chasers
+        }
         present = [*self._instances, *self._controllers]
         self._since = {name: self._since.get(name, tick) for name in present}
         # A recorder that returns paces the flight again.
@@ -120,12 +136,17 @@ class TickBarrier:
             self._node.publish(topics.HEALTH, health, "world")
 
     def is_complete(self) -> bool:
-        """Return whether all expected replies to the open tick have arrived and the recorder keeps up."""
-        keeps_up = not self._recorder_expected or self._recorded_tick >= self._tick - RECORDER_WINDOW_TICKS
+        """Return whether all expected replies to the open tick have arrived and the recorder keeps
+        up.
+        """
+        keeps_up = (
+            not self._recorder_expected or self._recorded_tick >= self._tick - RECORDER_WINDOW_TICKS
+        )
         return keeps_up and self._replied.issuperset(self.chasers)
 
     def await_replies(self, stopped: Callable[[], bool], stall_s: float) -> str:
-        """Process messages until the open tick is complete or ``stopped``; return why it never will be, empty otherwise.
+        """Process messages until the open tick is complete or ``stopped``; return why it never will
+        be, empty otherwise.
 
         Without any reply to the tick for ``stall_s``, the text names who owes which message.
         """
@@ -153,15 +174,20 @@ class TickBarrier:
         return f"stalled: no progress for {stall_s:g} s in tick {self._tick}: {explained}"
 
     def _owed(self) -> dict[str, str]:
-        """Return the keys of the messages that the open tick waits for, by the process that owes them."""
+        """Return the keys of the messages that the open tick waits for, by the process that owes
+        them.
+        """
         late = [i for i in self.chasers if i not in self._replied]
-        return {f"chaser/{i}": topics.ACTUATORS.key_of(i) for i in late} or {"recorder": topics.ACK.key_of()}
+        return {f"chaser/{i}": topics.ACTUATORS.key_of(i) for i in late} or {
+            "recorder": topics.ACK.key_of()
+        }
 
     def lost_all_chasers(self, rejoin_s: float, stopped: Callable[[], bool]) -> bool:
         """Return whether no chaser is left and none returns within ``rejoin_s`` of wall time.
 
-        All processes are lost at once when the router restarts or the world is cut off. In lock-step this waits, with
-        simulated time at rest, until all are back or the time is over; in real time it does not wait.
+        All processes are lost at once when the router restarts or the world is cut off. In
+        lock-step this waits, with simulated time at rest, until all are back or the time is over;
+        in real time it does not wait.
         """
         now_s = self._node.host.now_s()
         if self.chasers or rejoin_s <= 0.0:
@@ -169,7 +195,9 @@ class TickBarrier:
             return not self.chasers
         if self._no_chaser_since_s is None:
             self._no_chaser_since_s = now_s
-            self.publish_warning("all chasers lost", f"waiting up to {rejoin_s:g} s for their return")
+            self.publish_warning(
+                "all chasers lost", f"waiting up to {rejoin_s:g} s for their return"
+            )
         if self._membership.realtime:
             return now_s - self._no_chaser_since_s > rejoin_s
         self._recorder_expected = self._recorder_configured
@@ -180,7 +208,9 @@ class TickBarrier:
         )
         missing = self.missing_processes()
         self._recorder_expected &= "recorder" not in missing
-        self.publish_warning("end of wait for lost processes", f"missing: {', '.join(missing) or 'none'}")
+        self.publish_warning(
+            "end of wait for lost processes", f"missing: {', '.join(missing) or 'none'}"
+        )
         self._no_chaser_since_s, self._repeats = None, _MOST_REPEATS
         return not self._chasers_among(self._connected())
 
@@ -188,7 +218,12 @@ class TickBarrier:
         """Publish an event of level warning, and print it."""
         time_ns = self._timing.tick_time_ns(max(self._tick, 0))
         event = Event(
-            tick=self._tick, sim_time_ns=time_ns, process="world", level="warning", what=what, detail=detail
+            tick=self._tick,
+            sim_time_ns=time_ns,
+            process="world",
+            level="warning",
+            what=what,
+            detail=detail,
         )
         self._node.publish(topics.EVENT, event, "world")
         print_status("world", f"{time_ns / 1e9:.2f} s: {what}: {detail}")
@@ -197,12 +232,14 @@ class TickBarrier:
         """Publish the world's last messages."""
         self._heartbeat.farewell(tick, time_ns)
 
-    # -- receiving -------------------------------------------------------------------------------------------
+    # -- receiving ---------------------------------------------------------------------------------
 
     def wait_until(
         self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]
     ) -> bool:
-        """Process messages until ``done``; return False if ``stopped`` first. Prints at intervals what it waits for."""
+        """Process messages until ``done``; return False if ``stopped`` first. Prints at intervals
+        what it waits for.
+        """
         printed_s = self._node.host.now_s()
         while not done():
             if stopped():
@@ -250,12 +287,16 @@ class TickBarrier:
         self._command_latch(command.chaser, command.latch, effective_step)
 
     def _check_command(self, command: ActuatorCommand) -> str:
-        """Note who commands and record the reply; return why the command is rejected, empty if it is not."""
+        """Note who commands and record the reply; return why the command is rejected, empty if it
+        is not.
+        """
         if f"chaser/{command.chaser}" not in self._actuators or command.tick > self._tick:
             return "unexpected"
         listed = self._instances.get(f"chaser/{command.chaser}", "")
         if listed and command.instance and command.instance != listed:
-            return "replaced"  # by another process of this chaser, while this one was taken for lost
+            return (
+                "replaced"  # by another process of this chaser, while this one was taken for lost
+            )
         if command.tick < self._executed_tick.get(command.chaser, -1):
             return "overtaken"  # by a command that the same chaser has executed later
         if command.source == "command":
@@ -263,14 +304,15 @@ class TickBarrier:
             if reason := self._commander.update(command, self._controllers, self._now_s()):
                 self.publish_warning("hand-over", reason)
         if command.tick == self._tick:
-            # In real time a chaser may brake before its command arrives: the later reply replaces the first.
+            # In real time a chaser may brake before its command arrives: the later reply replaces
+            # the first.
             if command.chaser in self._replied and not self._membership.realtime:
                 return "twice"
             self._replied.add(command.chaser)
         due_ns = self._timing.effective_ns(command.tick)
         return "time" if abs(command.effective_time_ns - due_ns) > _MAX_CLOCK_ERROR_NS else ""
 
-    # -- processes -------------------------------------------------------------------------------------------
+    # -- processes ---------------------------------------------------------------------------------
 
     def _connected(self) -> set[str]:
         return self._membership.connected(self._heartbeat.heard())
@@ -287,13 +329,19 @@ class TickBarrier:
     def _check_watchdogs(self) -> None:
         """Stop actuators that no longer receive commands, as the watchdog of a valve driver does."""
         now_ns = self._timing.tick_time_ns(self._tick)
-        for name in [n for n, since in self._commanded_ns.items() if now_ns - since > self._watchdog_ns]:
+        for name in [
+            n for n, since in self._commanded_ns.items() if now_ns - since > self._watchdog_ns
+        ]:
             self._actuators[name].stop(self._current_step())
             del self._commanded_ns[name]
-            self.publish_warning("actuators stopped", f"{name}: no command for {self._watchdog_ns / 1e9:g} s")
+            self.publish_warning(
+                "actuators stopped", f"{name}: no command for {self._watchdog_ns / 1e9:g} s"
+            )
 
     def _remove_departed(self) -> bool:
-        """Remove processes that were lost; return whether this changes whose reply the open tick expects."""
+        """Remove processes that were lost; return whether this changes whose reply the open tick
+        expects.
+        """
         changed = False
         for name in self._membership.take_departed():
             self._heartbeat.forget(name)
@@ -319,7 +367,9 @@ class TickBarrier:
             images=self._images,
             chasers=self.chasers,
             controllers=self._controllers,
-            chaser_instances={name: self._instances[name] for name in map("chaser/{}".format, self.chasers)},
+            chaser_instances={
+                name: self._instances[name] for name in map("chaser/{}".format, self.chasers)
+            },
             since=self._since,
         )
         self._node.publish(topics.TICK, message)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid bodies in PyBullet (the interface is engine.py); with bullet.py the only module that uses its conventions.
+"""Rigid bodies in PyBullet (the interface is engine.py); with bullet.py the only module that uses
+its conventions.
 
 PyBullet orders quaternions x, y, z, w.
 """
@@ -38,13 +39,16 @@ class BulletEngine:
 
     def __init__(self, setup: EngineSetup) -> None:
         self._bullet = connect()
-        self._client: int = self._bullet._client  # direct calls: the wrapper is too slow for every step
+        self._client: int = (
+            self._bullet._client
+        )  # direct calls: the wrapper is too slow for every step
         self._bullet.setGravity(0, 0, 0)
         self._bullet.setTimeStep(setup.step_s)
         self._ids = [self._add(body, setup) for body in setup.bodies]
         self._numbers = {identity: number for number, identity in enumerate(self._ids)}
         if setup.joints:
-            # Else the solver stops early, and joint reactions lag behind changes of thrust by a few steps.
+            # Else the solver stops early, and joint reactions lag behind changes of thrust by a few
+            # steps.
             self._bullet.setPhysicsEngineParameter(solverResidualThreshold=0.0)
         self._joints: dict[tuple[int, int], int] = {}
         self._step_s = setup.step_s
@@ -57,19 +61,26 @@ class BulletEngine:
             basePosition=body.state.position_m.tolist(),
             baseOrientation=_xyzw(body.state.q_wxyz),
         )
-        self._bullet.changeDynamics(identity, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6)
+        self._bullet.changeDynamics(
+            identity, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6
+        )
         if body.mass_kg > 0:
             self._bullet.changeDynamics(identity, -1, localInertiaDiagonal=list(body.moments_kg_m2))
         if (spring := setup.spring) is not None:
             self._bullet.changeDynamics(
-                identity, -1, contactStiffness=spring.stiffness_N_m, contactDamping=spring.damping_N_s_m
+                identity,
+                -1,
+                contactStiffness=spring.stiffness_N_m,
+                contactDamping=spring.damping_N_s_m,
             )
         self._set_velocity(identity, body.state)
         return identity
 
     def _set_velocity(self, identity: int, state: BodyState) -> None:
         omega_world = rotations.rotate(state.q_wxyz, state.omega_rad_s)
-        pybullet.resetBaseVelocity(identity, state.velocity_m_s.tolist(), omega_world.tolist(), self._client)
+        pybullet.resetBaseVelocity(
+            identity, state.velocity_m_s.tolist(), omega_world.tolist(), self._client
+        )
 
     def _shape(self, solids: Sequence[CollisionSolid]) -> int:
         hulls = [s for s in solids if isinstance(s, SolidHull)]
@@ -78,9 +89,12 @@ class BulletEngine:
         placed = [s for s in solids if not isinstance(s, SolidHull)]
         return self._bullet.createCollisionShapeArray(
             shapeTypes=[
-                pybullet.GEOM_BOX if isinstance(s, SolidBox) else pybullet.GEOM_CAPSULE for s in placed
+                pybullet.GEOM_BOX if isinstance(s, SolidBox) else pybullet.GEOM_CAPSULE
+                for s in placed
             ],
-            halfExtents=[list(s.half_m) if isinstance(s, SolidBox) else [0.0, 0.0, 0.0] for s in placed],
+            halfExtents=[
+                list(s.half_m) if isinstance(s, SolidBox) else [0.0, 0.0, 0.0] for s in placed
+            ],
             radii=[s.radius_m if isinstance(s, SolidCapsule) else 0.0 for s in placed],
             lengths=[s.length_m if isinstance(s, SolidCapsule) else 0.0 for s in placed],
             collisionFramePositions=[s.position_m.tolist() for s in placed],
@@ -110,7 +124,9 @@ class BulletEngine:
     def place(self, body: int, state: BodyState) -> None:
         """See ``RigidBodyEngine.place``. Contacts are not checked."""
         identity, position = self._ids[body], state.position_m.tolist()
-        pybullet.resetBasePositionAndOrientation(identity, position, _xyzw(state.q_wxyz), self._client)
+        pybullet.resetBasePositionAndOrientation(
+            identity, position, _xyzw(state.q_wxyz), self._client
+        )
         self._set_velocity(identity, state)
 
     def push(self, body: int, force: Sequence[float], torque: Sequence[float]) -> None:
@@ -148,7 +164,8 @@ class BulletEngine:
     def contacts(self) -> list[BodyContact]:
         """See ``RigidBodyEngine.contacts``."""
         number = self._numbers
-        # Bullet stops bodies at a distance (c[8]) of zero up to rounding, so the force (c[9]) is checked as well.
+        # Bullet stops bodies at a distance (c[8]) of zero up to rounding, so the force (c[9]) is
+        # checked as well.
         return [
             BodyContact(number[c[1]], number[c[2]], c[5], c[6])
             for c in self._bullet.getContactPoints()

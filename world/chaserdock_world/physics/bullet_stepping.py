@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of free bodies in PyBullet without Python calls for each step and body; the bits are those of these calls.
+"""Steps of free bodies in PyBullet without Python calls for each step and body; the bits are those
+of these calls.
 
-``native/bullet.c`` calls Bullet's C interface, which PyBullet's library exports, with the client that Bullet hands to a
-plugin in the same world.
+``native/bullet.c`` calls Bullet's C interface, which PyBullet's library exports, with the client
+that Bullet hands to a plugin in the same world.
 """
 
 from __future__ import annotations
@@ -53,11 +54,15 @@ def _addresses() -> IntArray | None:
 class _Path(ctypes.Structure):
     """``Path`` of native/bullet.c."""
 
-    _fields_ = [(name, ctypes.c_int64) for name in ("body", "next", "every")] + [("motion", ctypes.c_void_p)]
+    _fields_ = [(name, ctypes.c_int64) for name in ("body", "next", "every")] + [
+        ("motion", ctypes.c_void_p)
+    ]
 
 
 def _motion_of(path: PlacementPath) -> Array:
-    """Return position, attitude x, y, z, w, velocity and rate (K, 13) of the placements, as Bullet takes them."""
+    """Return position, attitude x, y, z, w, velocity and rate (K, 13) of the placements, as Bullet
+    takes them.
+    """
     s = path.states
     motion = np.empty((len(s.position_m), 13))
     motion[:, 0:3], motion[:, 3:6], motion[:, 6] = s.position_m, s.q_wxyz[:, 1:], s.q_wxyz[:, 0]
@@ -68,10 +73,15 @@ def _motion_of(path: PlacementPath) -> Array:
 class BulletStepper:
     """Makes the steps of free bodies in one PyBullet client; ``bodies``: their identities there."""
 
-    def __init__(self, bodies: Sequence[int], functions: IntArray, client: int, step_s: float) -> None:
+    def __init__(
+        self, bodies: Sequence[int], functions: IntArray, client: int, step_s: float
+    ) -> None:
         self._identities = np.array(bodies, dtype=np.int64)
         self._functions, self._client, self._step_s = functions, ctypes.c_void_p(client), step_s
-        self._advance, self._touching = function("advance", ctypes.c_int64), np.zeros(1, dtype=np.int64)
+        self._advance, self._touching = (
+            function("advance", ctypes.c_int64),
+            np.zeros(1, dtype=np.int64),
+        )
 
     def advance(
         self, bodies: IntArray, loads: Array, steps: int, path: PlacementPath | None
@@ -99,7 +109,9 @@ class BulletStepper:
 
 
 def make_stepper(bodies: Sequence[int], client: int, step_s: float) -> BulletStepper | None:
-    """Return a stepper for a PyBullet client, None if this build of PyBullet does not offer what it needs."""
+    """Return a stepper for a PyBullet client, None if this build of PyBullet does not offer what it
+    needs.
+    """
     functions = _addresses()
     if functions is None:
         return None

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convex pieces of a mesh for collisions: the engines need convex shapes.
 
-Each connected surface of a part is cut in two across its longest direction until the convex hull of a piece is at most
-``tolerance_m`` in front of it, or until there are ``MOST_PIECES`` of it. A cuboid, a cylinder and the like stay one piece; a
-ring becomes arcs and a dish facets, so that what is inside a ring or in front of a dish does not touch anything.
+Each connected surface of a part is cut in two across its longest direction until the convex hull of
+a piece is at most ``tolerance_m`` in front of it, or until there are ``MOST_PIECES`` of it. A
+cuboid, a cylinder and the like stay one piece; a ring becomes arcs and a dish facets, so that what
+is inside a ring or in front of a dish does not touch anything.
 """
 
 from __future__ import annotations
@@ -60,7 +61,9 @@ def connected_surfaces(part: MeshPart) -> list[MeshPart]:
     surfaces = []
     for k in np.unique(of_triangle):
         used, triangles = np.unique(part.triangles[of_triangle == k], return_inverse=True)
-        surfaces.append(replace(part, vertices_m=part.vertices_m[used], triangles=triangles.reshape(-1, 3)))
+        surfaces.append(
+            replace(part, vertices_m=part.vertices_m[used], triangles=triangles.reshape(-1, 3))
+        )
     return surfaces
 
 
@@ -109,7 +112,9 @@ def _few(vertices: Array) -> Array:
 
 
 def _gap_m(corners: Array, hull: ConvexHull, cuts: list[Cut]) -> float:
-    """Return the largest distance from a surface (m, 3, 3) along its normal to the hull, whose facets in cuts count as open."""
+    """Return the largest distance from a surface (m, 3, 3) along its normal to the hull, whose
+    facets in cuts count as open.
+    """
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
     solid = length > 1e-12
@@ -130,7 +135,9 @@ def _gap_m(corners: Array, hull: ConvexHull, cuts: list[Cut]) -> float:
 
 
 def _clipped(corners: Array, axis: int, at: float, side: float) -> Array:
-    """Return the parts of triangles (m, 3, 3) with ``side * (x - at) >= 0`` along an axis, as triangles."""
+    """Return the parts of triangles (m, 3, 3) with ``side * (x - at) >= 0`` along an axis, as
+    triangles.
+    """
     height = side * (corners[:, :, axis] - at)
     kept = [corners[(height >= 0.0).all(axis=1)]]
     crossing = ~((height >= 0.0).all(axis=1) | (height <= 0.0).all(axis=1))
@@ -144,11 +151,17 @@ def _clipped(corners: Array, axis: int, at: float, side: float) -> Array:
                 point = p + (q - p) * (hp / (hp - hq))
                 point[axis] = at
                 polygon.append(point)
-        kept.append(np.array([[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]))
+        kept.append(
+            np.array([[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)])
+        )
     return np.concatenate(kept)
 
 
 def triangles_of(vertices: Array) -> IntArray:
     """Return the triangles (m, 3) of the hull of ``vertices`` (n, 3); a plane piece has none."""
     hull = _hull(vertices)
-    return np.zeros((0, 3), dtype=np.int64) if hull is None else np.asarray(hull.simplices, dtype=np.int64)
+    return (
+        np.zeros((0, 3), dtype=np.int64)
+        if hull is None
+        else np.asarray(hull.simplices, dtype=np.int64)
+    )

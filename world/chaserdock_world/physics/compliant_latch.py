@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A closed latch with play, or one that slips: a spring and damper between probe and port, with a dead zone and a grip.
+"""A closed latch with play, or one that slips: a spring and damper between probe and port, with a
+dead zone and a grip.
 
-Within the play nothing acts. Beyond it the latch is as stiff as a contact. A load above the grip moves the place at which the
-probe is held (Coulomb friction). A latch without play that does not slip is a rigid joint instead.
+Within the play nothing acts. Beyond it the latch is as stiff as a contact. A load above the grip
+moves the place at which the probe is held (Coulomb friction). A latch without play that does not
+slip is a rigid joint instead.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ class Grip:
 
 @dataclass
 class CompliantLatch:
-    """A closed latch. ``anchor_m`` (3,) and ``anchor_q_wxyz`` (4,): where it holds the tip and how the chaser is turned, TRF.
+    """A closed latch. ``anchor_m`` (3,) and ``anchor_q_wxyz`` (4,): where it holds the tip and how
+    the chaser is turned, TRF.
 
     ``slipped_m``: displacement of the anchor since the latch closed.
     """
@@ -51,7 +54,8 @@ class CompliantLatch:
     def load(
         self, target: BodyState, chaser: BodyState, reach_m: float, grip: Grip
     ) -> tuple[Array, Array, Array]:
-        """Return force (3,) and torque about the tip (3,) on the port, WRF, and the tip (3,), WRF. Moves the anchor in a slip.
+        """Return force (3,) and torque about the tip (3,) on the port, WRF, and the tip (3,), WRF.
+        Moves the anchor in a slip.
 
         ``reach_m``: distance of the tip from the chaser's origin along +X.
         """
@@ -89,7 +93,9 @@ class CompliantLatch:
 def _transmitted(
     displacement: Array, rate: Array, play: float, spring: tuple[float, float], grip: float
 ) -> tuple[Array, Array]:
-    """Return the load (3,) that a displacement (3,) at a rate (3,) transmits, and by how much the anchor slips (3,)."""
+    """Return the load (3,) that a displacement (3,) at a rate (3,) transmits, and by how much the
+    anchor slips (3,).
+    """
     stiffness, damping = spring
     size = float(np.linalg.norm(displacement))
     if size < play or (size == 0.0 and play > 0.0):

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interface of a rigid-body engine: what the simulation needs of PyBullet or MuJoCo.
 
-Bodies are numbered in the order in which they were defined. The frame of a body is that of its principal axes at its centre of
-mass. Quaternions are scalar first, body to world; rates are in world axes, as an engine's loop over steps needs them. Where a
-call takes or returns sequences of floats, not arrays, it runs for every body in every step.
+Bodies are numbered in the order in which they were defined. The frame of a body is that of its
+principal axes at its centre of mass. Quaternions are scalar first, body to world; rates are in
+world axes, as an engine's loop over steps needs them. Where a call takes or returns sequences of
+floats, not arrays, it runs for every body in every step.
 
-There is no gravity, damping or sleeping. All engines integrate alike: a load acts for one step, on the state at its beginning,
-and the step moves a body with the velocity and rate at its end (semi-implicit Euler). The gyroscopic torque is that at the
-beginning of the step, which gyroscopic.py corrects.
+There is no gravity, damping or sleeping. All engines integrate alike: a load acts for one step, on
+the state at its beginning, and the step moves a body with the velocity and rate at its end
+(semi-implicit Euler). The gyroscopic torque is that at the beginning of the step, which
+gyroscopic.py corrects.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ BodyMotion = tuple[Scalars3, Scalars4, Scalars3, Scalars3]
 
 @dataclass(frozen=True, eq=False)
 class SolidBox:
-    """A cuboid with half edges ``half_m`` (3,). ``position_m`` (3,) and ``q_wxyz`` (4,): its pose in the frame of the body."""
+    """A cuboid with half edges ``half_m`` (3,). ``position_m`` (3,) and ``q_wxyz`` (4,): its pose
+    in the frame of the body.
+    """
 
     half_m: Sequence[float]
     position_m: Array
@@ -36,7 +40,9 @@ class SolidBox:
 
 @dataclass(frozen=True, eq=False)
 class SolidCapsule:
-    """A cylinder of ``length_m`` along z with round ends of ``radius_m``; its pose as that of a ``SolidBox``."""
+    """A cylinder of ``length_m`` along z with round ends of ``radius_m``; its pose as that of a
+    ``SolidBox``.
+    """
 
     radius_m: float
     length_m: float
@@ -46,7 +52,9 @@ class SolidCapsule:
 
 @dataclass(frozen=True, eq=False)
 class SolidHull:
-    """The convex hull of ``vertices_m`` (n, 3) in the frame of the body, and its triangles (m, 3), none for points in a plane."""
+    """The convex hull of ``vertices_m`` (n, 3) in the frame of the body, and its triangles (m, 3),
+    none for points in a plane.
+    """
 
     vertices_m: Array
     triangles: IntArray
@@ -72,8 +80,9 @@ class RigidBodyDefinition:
 class ContactSpring:
     """Compliance of each body in a contact: stiffness along the normal, N/m, and damping, N s/m.
 
-    In a contact of two bodies the stiffnesses are in series, half of one, and the dampings add up, as in PyBullet. ``mass_kg``:
-    effective mass of the contact, for engines that state contacts per mass.
+    In a contact of two bodies the stiffnesses are in series, half of one, and the dampings add up,
+    as in PyBullet. ``mass_kg``: effective mass of the contact, for engines that state contacts per
+    mass.
     """
 
     stiffness_N_m: float
@@ -83,7 +92,8 @@ class ContactSpring:
 
 @dataclass(frozen=True, eq=False)
 class EngineSetup:
-    """The bodies of a simulation with steps of ``step_s``. ``spring``: of all contacts; None: they are hard and do not rebound.
+    """The bodies of a simulation with steps of ``step_s``. ``spring``: of all contacts; None: they
+    are hard and do not rebound.
 
     ``joints``: pairs of bodies that a rigid joint may hold.
     """
@@ -96,7 +106,8 @@ class EngineSetup:
 
 @dataclass(frozen=True, eq=False)
 class PlacementPath:
-    """States at which a body is placed after the ``first`` step from now, and then every ``every`` steps.
+    """States at which a body is placed after the ``first`` step from now, and then every ``every``
+    steps.
 
     ``states``: position (K, 3), velocity (3,), attitude (K, 4) and rate (3,) of K placements.
     """
@@ -136,7 +147,9 @@ class RigidBodyEngine(Protocol):
         ...
 
     def push(self, body: int, force: Sequence[float], torque: Sequence[float]) -> None:
-        """Apply force and torque (3,) each at the centre of mass, in the axes of the body, for the next step."""
+        """Apply force and torque (3,) each at the centre of mass, in the axes of the body, for the
+        next step.
+        """
         ...
 
     def push_at(
@@ -152,11 +165,12 @@ class RigidBodyEngine(Protocol):
     def advance(
         self, bodies: IntArray, loads: Array, steps: int, path: PlacementPath | None = None
     ) -> tuple[int, bool]:
-        """Make at most ``steps`` steps of free ``bodies`` (n,) under constant loads, and stop after one with contacts.
+        """Make at most ``steps`` steps of free ``bodies`` (n,) under constant loads, and stop after
+        one with contacts.
 
-        ``loads`` (n, 9): principal moments, force and torque in body axes; gyroscopic.py corrects the torque. ``path``: of
-        another body; its placement after a step with contacts is left to the caller. Return the number of steps made, and
-        whether ``contacts`` may return any.
+        ``loads`` (n, 9): principal moments, force and torque in body axes; gyroscopic.py corrects
+        the torque. ``path``: of another body; its placement after a step with contacts is left to
+        the caller. Return the number of steps made, and whether ``contacts`` may return any.
         """
         ...
 
@@ -175,8 +189,8 @@ class RigidBodyEngine(Protocol):
     def join(self, a: int, b: int, anchor_a_m: Array, anchor_b_m: Array, q_ab_wxyz: Array) -> None:
         """Join two bodies rigidly.
 
-        ``anchor_*_m`` (3,): a point of each, in its frame, that the joint keeps together. ``q_ab_wxyz`` (4,): attitude of b
-        relative to a.
+        ``anchor_*_m`` (3,): a point of each, in its frame, that the joint keeps together.
+        ``q_ab_wxyz`` (4,): attitude of b relative to a.
         """
         ...
 
@@ -187,7 +201,8 @@ class RigidBodyEngine(Protocol):
     def reaction(self, a: int, b: int) -> Sequence[float]:
         """Return what b exerted on a at their joint in the last step.
 
-        (6,): force, N, in WRF; torque about the anchor, N m, in the axes that b had at the beginning of the step.
+        (6,): force, N, in WRF; torque about the anchor, N m, in the axes that b had at the
+        beginning of the step.
         """
         ...
 

@@ -13,7 +13,9 @@ EngineName = Literal["pybullet", "mujoco"]
 
 
 def make_engine(name: EngineName, setup: EngineSetup) -> RigidBodyEngine:
-    """Return an engine with these bodies. Raises MissingPackageError (see ``requirements.require_packages``)."""
+    """Return an engine with these bodies. Raises MissingPackageError (see
+    ``requirements.require_packages``).
+    """
     if name == "mujoco":
         require_extra("mujoco", "mujoco")
         from .mujoco_engine import MujocoEngine

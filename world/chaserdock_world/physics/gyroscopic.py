@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Correction torque that makes an engine's integration of rotation second order.
 
-The engines evaluate the gyroscopic torque omega x I omega at the beginning of a step, so that angular momentum drifts in
-proportion to the step. The midpoint rule evaluates it in the middle of the step; the difference is applied as an external
-torque.
+The engines evaluate the gyroscopic torque omega x I omega at the beginning of a step, so that
+angular momentum drifts in proportion to the step. The midpoint rule evaluates it in the middle of
+the step; the difference is applied as an external torque.
 """
 
 from __future__ import annotations
@@ -15,18 +15,26 @@ from chaserdock_models.arrays import Array, IntArray
 from .engine import PlacementPath, RigidBodyEngine
 
 
-def _gyroscopic_torque(inertia: Sequence[float], a: float, b: float, c: float) -> tuple[float, float, float]:
+def _gyroscopic_torque(
+    inertia: Sequence[float], a: float, b: float, c: float
+) -> tuple[float, float, float]:
     """Return omega x I omega for principal moments ``inertia`` and rates (a, b, c)."""
     ia, ib, ic = inertia
     return (b * c * (ic - ib), c * a * (ia - ic), a * b * (ib - ia))
 
 
-def _rotate_to_body(q_wxyz: Sequence[float], omega_world: Sequence[float]) -> tuple[float, float, float]:
+def _rotate_to_body(
+    q_wxyz: Sequence[float], omega_world: Sequence[float]
+) -> tuple[float, float, float]:
     """Return a rate in body axes: q* omega q."""
     w, x, y, z = q_wxyz
     u, v, s = omega_world
     tx, ty, tz = 2.0 * (v * z - s * y), 2.0 * (s * x - u * z), 2.0 * (u * y - v * x)
-    return (u + w * tx + ty * z - tz * y, v + w * ty + tz * x - tx * z, s + w * tz + tx * y - ty * x)
+    return (
+        u + w * tx + ty * z - tz * y,
+        v + w * ty + tz * x - tx * z,
+        s + w * tz + tx * y - ty * x,
+    )
 
 
 def midpoint_torque(
@@ -36,10 +44,11 @@ def midpoint_torque(
     torque: Sequence[float],
     step_s: float,
 ) -> tuple[float, float, float]:
-    """Return the torque (3,), N m, body axes, to add to ``torque`` (body axes) for one step of ``step_s``.
+    """Return the torque (3,), N m, body axes, to add to ``torque`` (body axes) for one step of
+    ``step_s``.
 
-    ``inertia``: principal moments, kg m^2; ``q_wxyz``: attitude body to world; ``omega_world``: rate in
-    world axes, rad/s. Plain floats, as this runs for every body in every physics step.
+    ``inertia``: principal moments, kg m^2; ``q_wxyz``: attitude body to world; ``omega_world``:
+    rate in world axes, rad/s. Plain floats, as this runs for every body in every physics step.
     """
     a, b, c = _rotate_to_body(q_wxyz, omega_world)
     ia, ib, ic = inertia
@@ -59,9 +68,11 @@ def midpoint_torque_of_rates(
     omega_world: Sequence[float],
     omega_world_before: Sequence[float],
 ) -> tuple[float, float, float]:
-    """Return the torque of ``midpoint_torque`` for a body with a joint, whose constraint torque is not known in advance.
+    """Return the torque of ``midpoint_torque`` for a body with a joint, whose constraint torque is
+    not known in advance.
 
-    The rate in the middle of the step is extrapolated from that of the previous step, ``omega_world_before``.
+    The rate in the middle of the step is extrapolated from that of the previous step,
+    ``omega_world_before``.
     """
     middle = [a + 0.5 * (a - b) for a, b in zip(omega_world, omega_world_before, strict=True)]
     gx, gy, gz = _gyroscopic_torque(inertia, *_rotate_to_body(q_wxyz, omega_world))
@@ -69,9 +80,14 @@ def midpoint_torque_of_rates(
     return (gx - nx, gy - ny, gz - nz)
 
 
-def split_loads(bodies: IntArray, loads: Array) -> list[tuple[int, list[float], list[float], list[float]]]:
+def split_loads(
+    bodies: IntArray, loads: Array
+) -> list[tuple[int, list[float], list[float], list[float]]]:
     """Return body, principal moments, force and torque of each row of ``RigidBodyEngine.advance``."""
-    return [(b, row[:3], row[3:6], row[6:]) for b, row in zip(bodies.tolist(), loads.tolist(), strict=True)]
+    return [
+        (b, row[:3], row[3:6], row[6:])
+        for b, row in zip(bodies.tolist(), loads.tolist(), strict=True)
+    ]
 
 
 def advance_free(

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State machine of a probe's latch: due commands, faults, and whether a touch closes it. Contains no physics."""
+"""State machine of a probe's latch: due commands, faults, and whether a touch closes it. Contains
+no physics.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ _NEW_TOUCH_AFTER_S = 0.02
 
 @dataclass(frozen=True)
 class LatchFault:
-    """A fault of a latch from physics step ``begin`` to before ``end``. ``grip``: of a latch that slips."""
+    """A fault of a latch from physics step ``begin`` to before ``end``. ``grip``: of a latch that
+    slips.
+    """
 
     kind: str
     begin: int
@@ -71,7 +75,9 @@ class ProbeLatch:
         return next((f for f in self.faults if f.kind == kind and f.begin <= step < f.end), None)
 
     def apply_due_commands(self, step: int) -> bool:
-        """Apply the commands due at ``step``; return whether the latch opens. A stuck one opens when it is free again."""
+        """Apply the commands due at ``step``; return whether the latch opens. A stuck one opens
+        when it is free again.
+        """
         while self._queue and self._queue[0][0] <= step:
             self.armed = heapq.heappop(self._queue)[2] == "arm"
         opens = self.latched and not self.armed and self.fault_at("latch_stuck", step) is None
@@ -87,12 +93,14 @@ class ProbeLatch:
     def touch(self, step: int, before: PortView) -> bool:
         """Handle contact of the tip during ``step``; return whether the latch closes.
 
-        ``before``: relative state at the beginning of the step. Only the first contact of a touch is evaluated, as in the
-        middle of a bounce the tip is at rest, too.
+        ``before``: relative state at the beginning of the step. Only the first contact of a touch
+        is evaluated, as in the middle of a bounce the tip is at rest, too.
         """
         self.touched = True
         last, self._last_touch_step = self._last_touch_step, step
-        if self.latched or (last is not None and step - last <= _NEW_TOUCH_AFTER_S * self.physics_hz):
+        if self.latched or (
+            last is not None and step - last <= _NEW_TOUCH_AFTER_S * self.physics_hz
+        ):
             return False
         refused = "" if self.armed else "not armed"
         refused = refused or before.fault(self.tolerances, self.tolerances.closing_m_s)

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid bodies in MuJoCo (the interface is engine.py); the only module that imports it.
 
-Integrator: ``Euler``, semi-implicit. With the correction of gyroscopic.py its rotation is of second order, and a step exerts
-exactly the constraint forces that it reports, which are the loads at the ports. ``implicitfast`` damps a tumble; ``RK4``
-solves the constraints four times per step and reports the forces of its last stage only.
+Integrator: ``Euler``, semi-implicit. With the correction of gyroscopic.py its rotation is of second
+order, and a step exerts exactly the constraint forces that it reports, which are the loads at the
+ports. ``implicitfast`` damps a tumble; ``RK4`` solves the constraints four times per step and
+reports the forces of its last stage only.
 
-A free body's six velocities are that of its centre of mass in WRF and the rate in its own axes; loads are in the same axes.
-Constraints are soft: a1 + b v + k r = (1 - d) a0, where r is the violation, v its rate, a0 and a1 its acceleration without and
-with the constraint, and d < 1 (MuJoCo, "Computation", Constraint model).
+A free body's six velocities are that of its centre of mass in WRF and the rate in its own axes;
+loads are in the same axes. Constraints are soft: a1 + b v + k r = (1 - d) a0, where r is the
+violation, v its rate, a0 and a1 its acceleration without and with the constraint, and d < 1
+(MuJoCo, "Computation", Constraint model).
 """
 
 from __future__ import annotations
@@ -61,7 +63,8 @@ class MujocoEngine:
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._free = [body.mass_kg > 0.0 for body in setup.bodies]
-        # First of a body's six velocities and seven coordinates; of a placed body, its number among these.
+        # First of a body's six velocities and seven coordinates; of a placed body, its number among
+        # these.
         numbers = {True: 0, False: 0}
         self._index = []
         for free in self._free:
@@ -157,13 +160,17 @@ class MujocoEngine:
         return self._data.ncon > 0
 
     def contacts(self) -> list[BodyContact]:
-        """See ``RigidBodyEngine.contacts``. MuJoCo finds bodies that penetrate each other at the beginning of a step."""
+        """See ``RigidBodyEngine.contacts``. MuJoCo finds bodies that penetrate each other at the
+        beginning of a step.
+        """
         found = []
         body_of = self._model.geom_bodyid
         for contact in self._data.contact:
             a, b = (int(body_of[geom]) - 1 for geom in contact.geom)
             half = 0.5 * contact.dist * contact.frame[:3]  # the normal points from a to b
-            found.append(BodyContact(a, b, (contact.pos - half).tolist(), (contact.pos + half).tolist()))
+            found.append(
+                BodyContact(a, b, (contact.pos - half).tolist(), (contact.pos + half).tolist())
+            )
         return found
 
     def set_collisions(self, a: int, b: int, enabled: bool) -> None:
@@ -191,15 +198,20 @@ class MujocoEngine:
         self._closed = tuple(number for number in self._closed if number != joint)
 
     def reaction(self, a: int, b: int) -> Sequence[float]:
-        """See ``RigidBodyEngine.reaction``: from the joint's constraint forces, which the last step applied as they are."""
+        """See ``RigidBodyEngine.reaction``: from the joint's constraint forces, which the last step
+        applied as they are.
+        """
         data, first = self._data, 6 * self._index[b]
         # The constraints begin with the joints that are closed, six rows each.
         row = 6 * self._solved.index(self._joints[a, b])
         jacobian = data.efc_J.reshape(-1, self._model.nv)[row : row + 6, first : first + 6]
         fx, fy, fz, tx, ty, tz = (data.efc_force[row : row + 6] @ jacobian).tolist()
-        # The attitude at the beginning of the step: a step moves coordinates, but not what follows from them.
+        # The attitude at the beginning of the step: a step moves coordinates, but not what follows
+        # from them.
         w, x, y, z = data.xquat[b + 1].tolist()
-        mx, my, mz = cross_components(*self._anchors[a, b], *rotated_components(w, -x, -y, -z, fx, fy, fz))
+        mx, my, mz = cross_components(
+            *self._anchors[a, b], *rotated_components(w, -x, -y, -z, fx, fy, fz)
+        )
         return -fx, -fy, -fz, mx - tx, my - ty, mz - tz
 
     def close(self) -> None:
@@ -225,8 +237,9 @@ def _set_options(spec: Any, step_s: float) -> None:
 def _contact_reference(spring: ContactSpring | None, step_s: float) -> list[float]:
     """Return ``solref`` of contacts.
 
-    A spring is that of an implicit step, as in PyBullet: F = k (r + h v) + c v with the velocity at the end of the step. Hard
-    contacts are critically damped, with the shortest time constant that MuJoCo takes.
+    A spring is that of an implicit step, as in PyBullet: F = k (r + h v) + c v with the velocity at
+    the end of the step. Hard contacts are critically damped, with the shortest time constant that
+    MuJoCo takes.
     """
     if spring is None:
         return [2.0 * step_s, 1.0]
@@ -269,13 +282,25 @@ def _geometry(spec: Any, name: str, solid: CollisionSolid) -> dict[str, object]:
     """Return type, size and pose of a solid; a hull is added to ``spec`` as a mesh of this name."""
     kinds = mujoco.mjtGeom
     if isinstance(solid, SolidBox):
-        return {"type": kinds.mjGEOM_BOX, "size": solid.half_m, "pos": solid.position_m, "quat": solid.q_wxyz}
+        return {
+            "type": kinds.mjGEOM_BOX,
+            "size": solid.half_m,
+            "pos": solid.position_m,
+            "quat": solid.q_wxyz,
+        }
     if isinstance(solid, SolidCapsule):
         size = [solid.radius_m, solid.length_m / 2, 0.0]
-        return {"type": kinds.mjGEOM_CAPSULE, "size": size, "pos": solid.position_m, "quat": solid.q_wxyz}
+        return {
+            "type": kinds.mjGEOM_CAPSULE,
+            "size": size,
+            "pos": solid.position_m,
+            "quat": solid.q_wxyz,
+        }
     vertices = solid.vertices_m if len(solid.triangles) else _thickened(solid)
     spec.add_mesh(
-        name=name, uservert=vertices.ravel().tolist(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        name=name,
+        uservert=vertices.ravel().tolist(),
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
     return {"type": kinds.mjGEOM_MESH, "meshname": name}
 
@@ -283,11 +308,15 @@ def _geometry(spec: Any, name: str, solid: CollisionSolid) -> dict[str, object]:
 def _thickened(hull: SolidHull) -> Array:
     """Return the vertices (2 n, 3) of a plate from points (n, 3) in a plane."""
     normal = np.linalg.svd(hull.vertices_m - hull.vertices_m.mean(axis=0))[2][2]
-    return np.concatenate([hull.vertices_m + side * _PLANE_HULL_HALF_M * normal for side in (-1.0, 1.0)])
+    return np.concatenate(
+        [hull.vertices_m + side * _PLANE_HULL_HALF_M * normal for side in (-1.0, 1.0)]
+    )
 
 
 def _add_joint(spec: Any, a: int, b: int, step_s: float) -> None:
-    """Add an inactive joint, stiff enough to stop a relative motion in one step: b = 1 / h, k = 1 / (4 h^2)."""
+    """Add an inactive joint, stiff enough to stop a relative motion in one step: b = 1 / h, k = 1 /
+    (4 h^2).
+    """
     spec.add_equality(
         name=f"{a}/{b}",
         type=mujoco.mjtEq.mjEQ_WELD,
@@ -297,6 +326,7 @@ def _add_joint(spec: Any, a: int, b: int, step_s: float) -> None:
         active=False,
         solref=[2.0 * step_s, 1.0],
         solimp=_IMPEDANCE,
-        # Anchor in b, anchor in a, attitude of b relative to a: set when it closes. Then the scale of torques, m.
+        # Anchor in b, anchor in a, attitude of b relative to a: set when it closes. Then the scale
+        # of torques, m.
         data=[0.0] * 6 + [1.0, 0.0, 0.0, 0.0] + [1.0] + [0.0] * (mujoco.mjNEQDATA - 11),
     )

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads by which the motion of free bodies in the Hill frame differs from that in free space, for every physics step.
+"""Loads by which the motion of free bodies in the Hill frame differs from that in free space, for
+every physics step.
 
-The Hill frame of the middle of a tick holds for the whole tick: it changes by about 1e-4 of its rate from one to the next.
+The Hill frame of the middle of a tick holds for the whole tick: it changes by about 1e-4 of its
+rate from one to the next.
 """
 
 from __future__ import annotations
@@ -37,12 +39,18 @@ class OrbitalForces:
         self._drag = (x, y, z)
 
     def force(
-        self, body: int, mass_kg: float, position_m: Scalars3, velocity_m_s: Scalars3, has_drag: bool
+        self,
+        body: int,
+        mass_kg: float,
+        position_m: Scalars3,
+        velocity_m_s: Scalars3,
+        has_drag: bool,
     ) -> list[float]:
         """Return the force (3,), WRF, at a body's centre of mass.
 
-        The engines take the velocity at the end of a step for the whole step. So the acceleration is that at the middle of the
-        step, with the velocity there from the acceleration of the last step: else the Coriolis force adds energy.
+        The engines take the velocity at the end of a step for the whole step. So the acceleration
+        is that at the middle of the step, with the velocity there from the acceleration of the last
+        step: else the Coriolis force adds energy.
         """
         h = 0.5 * self._step_s
         ax, ay, az = self._last.get(body, (0.0, 0.0, 0.0))
@@ -57,7 +65,9 @@ class OrbitalForces:
     def torque(
         self, q_wxyz: Sequence[float], omega_world: Sequence[float], moments: Scalars3
     ) -> tuple[float, ...]:
-        """Return the torque (3,) about a body's principal axes, in these, from its attitude and its rate in world axes."""
+        """Return the torque (3,) about a body's principal axes, in these, from its attitude and its
+        rate in world axes.
+        """
         w, x, y, z = q_wxyz
         a, b, c = rotated_components(w, -x, -y, -z, *omega_world)
         return relative_torque(self._frame, (w, x, y, z), (a, b, c), moments)

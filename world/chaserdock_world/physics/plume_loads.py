@@ -50,7 +50,8 @@ class PlumeLoads:
     def act(
         self, states: Mapping[str, BodyState], thrusts_N: Mapping[str, Array], time_s: float
     ) -> dict[str, Array]:
-        """Return the wrenches (6,), body axes about the body's origin, on the bodies that plumes hit, and add up ``time_s`` of them.
+        """Return the wrenches (6,), body axes about the body's origin, on the bodies that plumes
+        hit, and add up ``time_s`` of them.
 
         ``thrusts_N`` (n,): of each chaser's thrusters.
         """
@@ -72,8 +73,12 @@ class PlumeLoads:
             )
         return loads
 
-    def _wrench_on(self, hit: str, body: BodyState, nozzles: Array, forces: Array, thrusts_N: Array) -> Array:
-        near = np.linalg.norm(nozzles - body.position_m, axis=1) - self._radius_m[hit] <= self._reach_m
+    def _wrench_on(
+        self, hit: str, body: BodyState, nozzles: Array, forces: Array, thrusts_N: Array
+    ) -> Array:
+        near = (
+            np.linalg.norm(nozzles - body.position_m, axis=1) - self._radius_m[hit] <= self._reach_m
+        )
         local = rotations.rotate_inverse(body.q_wxyz, nozzles - body.position_m)
         directions = rotations.rotate_inverse(body.q_wxyz, forces)
         panels = self._panels[hit]

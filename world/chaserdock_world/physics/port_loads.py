@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads at the ports of latched chasers: what a chaser exerts on its port, from the joint's reaction in every physics step.
+"""Loads at the ports of latched chasers: what a chaser exerts on its port, from the joint's
+reaction in every physics step.
 
-A rigid joint stops the relative motion of the bodies in the single step in which its latch closes. The load of that step,
-at all ports, depends on the length of the step; its impulse does not, and is counted instead.
+A rigid joint stops the relative motion of the bodies in the single step in which its latch closes.
+The load of that step, at all ports, depends on the length of the step; its impulse does not, and is
+counted instead.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ _HALF_TURN_ABOUT_Z = (0.0, 0.0, 0.0, 1.0)
 
 
 def port_attitude(q_off_wxyz: Array) -> Array:
-    """Return the attitude (4,) of a port's axes in TRF: x outward, z as that of CRF of the docked chaser.
+    """Return the attitude (4,) of a port's axes in TRF: x outward, z as that of CRF of the docked
+    chaser.
 
     ``q_off_wxyz`` (4,): docked attitude, CRF to TRF, with +X into the port.
     """
@@ -27,10 +30,12 @@ def port_attitude(q_off_wxyz: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class IntervalLoads:
-    """Loads of an interval, port axes: ``force_N`` and ``torque_N_m`` (3,) in its last step, and the largest magnitudes.
+    """Loads of an interval, port axes: ``force_N`` and ``torque_N_m`` (3,) in its last step, and
+    the largest magnitudes.
 
-    ``peak_axial_N``: of the force along the axis; ``peak_shear_N``: across it. ``peak_bending_N_m``: of the torque across the
-    axis. ``closing_impulse_N_s``: sum over the steps in which a latch closed.
+    ``peak_axial_N``: of the force along the axis; ``peak_shear_N``: across it.
+    ``peak_bending_N_m``: of the torque across the axis. ``closing_impulse_N_s``: sum over the steps
+    in which a latch closed.
     """
 
     force_N: Array = field(default_factory=lambda: np.zeros(3))
@@ -45,7 +50,9 @@ class IntervalLoads:
 
 @dataclass
 class PortLoadRecorder:
-    """Collects the loads at one port. ``q_port_wxyz`` (4,): axes of the port in the engine's frame of the target."""
+    """Collects the loads at one port. ``q_port_wxyz`` (4,): axes of the port in the engine's frame
+    of the target.
+    """
 
     q_port_wxyz: Array
     step_s: float
@@ -61,8 +68,9 @@ class PortLoadRecorder:
     ) -> None:
         """Add the load of a step.
 
-        ``reaction`` (6,): force in world axes and torque about the tip in the axes of the engine's frame of the chaser, exerted on
-        the port; ``q_*_wxyz`` (4,): attitudes at the beginning of the step. ``closing``: a latch closes in it.
+        ``reaction`` (6,): force in world axes and torque about the tip in the axes of the engine's
+        frame of the chaser, exerted on the port; ``q_*_wxyz`` (4,): attitudes at the beginning of
+        the step. ``closing``: a latch closes in it.
         """
         if closing:
             x, y, z = reaction[:3]

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid-body simulation of a scenario on one of the engines (engine.py): bodies, disturbances, latches and loads.
+"""Rigid-body simulation of a scenario on one of the engines (engine.py): bodies, disturbances,
+latches and loads.
 
-The interface is in body frames with body rates. The forces of an orbit are applied to every body (orbital_forces.py).
+The interface is in body frames with body rates. The forces of an orbit are applied to every body
+(orbital_forces.py).
 """
 
 from __future__ import annotations
@@ -53,13 +55,16 @@ _NO_WRENCH = np.zeros(6)
 
 
 class Physics:
-    """Simulates the bodies of a scenario on an engine of its own. Raises MissingPackageError without the engine's package."""
+    """Simulates the bodies of a scenario on an engine of its own. Raises MissingPackageError
+    without the engine's package.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self.step_count = 0
         self._scenario = scenario
         self._prescribed = scenario.target.motion != "torque_free"
-        # Interval at which the engine's copy of a prescribed target is moved; ``state`` is exact at every step.
+        # Interval at which the engine's copy of a prescribed target is moved; ``state`` is exact at
+        # every step.
         self._steps_per_target_update = max(1, scenario.time.physics_hz // 120)
         chasers = {f"chaser/{i}": i for i in range(len(scenario.chasers))}
         self.plants = {TARGET: target_plant(scenario)}
@@ -74,7 +79,10 @@ class Physics:
             )
             for p in ports
         }
-        definitions = [self._target_definition(), *(self._chaser_definition(i) for i in chasers.values())]
+        definitions = [
+            self._target_definition(),
+            *(self._chaser_definition(i) for i in chasers.values()),
+        ]
         joints = tuple((self._bodies[TARGET], self._bodies[name]) for name in self.latches)
         setup = EngineSetup(definitions, 1.0 / hz, self._contact_spring(), joints)
         self._engine = make_engine(scenario.world.engine, setup)
@@ -96,13 +104,21 @@ class Physics:
             )
         self.plumes = None if scenario.plume is None else PlumeLoads(scenario, scenario.plume)
         self._noise = {
-            name: _disturbance_noise(scenario, i) for name, i in chasers.items() if _has_noise(scenario)
+            name: _disturbance_noise(scenario, i)
+            for name, i in chasers.items()
+            if _has_noise(scenario)
         }
-        self.port_loads = {name: self._load_recorder(name, p.chaser) for name, p in self.latches.items()}
-        self._joints: list[str] = []  # chasers with a rigid joint, in the order in which they latched
+        self.port_loads = {
+            name: self._load_recorder(name, p.chaser) for name, p in self.latches.items()
+        }
+        self._joints: list[
+            str
+        ] = []  # chasers with a rigid joint, in the order in which they latched
         self._compliant: dict[str, CompliantLatch] = {}
         self._openings: list[tuple[int, str]] = []
-        self._closing = False  # a latch closed in the last step: its joint acts first in the next one
+        self._closing = (
+            False  # a latch closed in the last step: its joint acts first in the next one
+        )
         # Motion of every free body at the beginning of the last step.
         self._before: dict[int, BodyMotion] = {}
 
@@ -137,14 +153,20 @@ class Physics:
     def _chaser_definition(self, i: int) -> RigidBodyDefinition:
         scenario, body, plant = self._scenario, self._scenario.chaser, self.plants[f"chaser/{i}"]
         half = [s / 2 for s in body.size_m]
-        solids: list[CollisionSolid] = [SolidBox(half, *_place(plant, np.zeros(3), rotations.IDENTITY))]
+        solids: list[CollisionSolid] = [
+            SolidBox(half, *_place(plant, np.zeros(3), rotations.IDENTITY))
+        ]
         if scenario.docking.kind == "capture":
             # The probe: a massless capsule from the body's front to the tip.
             length = body.probe_reach_m - half[0] - PROBE_RADIUS_M
             middle = np.array([half[0] + length / 2, 0.0, 0.0])
-            solids.append(SolidCapsule(PROBE_RADIUS_M, length, *_place(plant, middle, _Z_TO_X_WXYZ)))
+            solids.append(
+                SolidCapsule(PROBE_RADIUS_M, length, *_place(plant, middle, _Z_TO_X_WXYZ))
+            )
         position, attitude = scenario.start_pose(i)
-        state = BodyState(position, np.asarray(scenario.chasers[i].start_velocity_m_s), attitude, np.zeros(3))
+        state = BodyState(
+            position, np.asarray(scenario.chasers[i].start_velocity_m_s), attitude, np.zeros(3)
+        )
         state = self._engine_state(f"chaser/{i}", state)
         return RigidBodyDefinition(plant.mass_kg, plant.moments_kg_m2, solids, state)
 
@@ -169,25 +191,32 @@ class Physics:
         self._engine.place(self._bodies[name], self._engine_state(name, state))
 
     def next_change(self, step: int) -> int | None:
-        """Return the first step after ``step`` at which a disturbance changes, None if all are constant."""
+        """Return the first step after ``step`` at which a disturbance changes, None if all are
+        constant.
+        """
         per_tick = self._scenario.timing.steps_per_tick
         return (step // per_tick + 1) * per_tick if self._noise else None
 
     def _wrench_on(self, name: str, wrench: Array) -> Array:
-        """Return force and torque (6,), in the engine's frame of a body, of its actuators and its present disturbances."""
+        """Return force and torque (6,), in the engine's frame of a body, of its actuators and its
+        present disturbances.
+        """
         plant = self.plants[name]
         if name in self._disturbed:
             wrench = wrench + plant.disturbance
         if name in self._noise:
             noise, sigma = self._noise[name]
-            wrench = wrench + sigma * noise.at(self.step_count // self._scenario.timing.steps_per_tick)
+            wrench = wrench + sigma * noise.at(
+                self.step_count // self._scenario.timing.steps_per_tick
+            )
         return wrench if plant.frame is None else plant.frame.wrench(wrench)
 
     def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:
-        """Make ``steps`` physics steps under constant wrenches; return the pairs of bodies that touched.
+        """Make ``steps`` physics steps under constant wrenches; return the pairs of bodies that
+        touched.
 
-        ``wrenches`` maps a chaser's name to force and torque (6,) at its origin in its body axes, N and N m. Disturbances
-        must not change in between (see ``next_change``).
+        ``wrenches`` maps a chaser's name to force and torque (6,) at its origin in its body axes, N
+        and N m. Disturbances must not change in between (see ``next_change``).
         """
         loads = self._loads
         for k, name in enumerate(self._free):
@@ -198,7 +227,9 @@ class Physics:
         end = self.step_count + steps
         while self.step_count < end:
             path = self._target_path(end) if self._moves_target else None
-            made, touching = self._engine.advance(self._free_bodies, loads, end - self.step_count, path)
+            made, touching = self._engine.advance(
+                self._free_bodies, loads, end - self.step_count, path
+            )
             self.step_count += made
             if touching:
                 touched.update(self._process_contacts())
@@ -206,7 +237,9 @@ class Physics:
         return touched
 
     def _target_path(self, end: int) -> PlacementPath | None:
-        """Return where the engine's copy of a prescribed target is placed until the step ``end``, None if nowhere."""
+        """Return where the engine's copy of a prescribed target is placed until the step ``end``,
+        None if nowhere.
+        """
         every = self._steps_per_target_update
         first = self.step_count - self.step_count % every + every
         if first > end:
@@ -221,7 +254,9 @@ class Physics:
             self.place(TARGET, self.state(TARGET))
 
     def _advance_by_step(self, steps: int, wrenches: Array) -> set[tuple[str, str]]:
-        """Make steps in which loads depend on the motion: with latches, or in an orbit. ``wrenches``: as ``_loads``."""
+        """Make steps in which loads depend on the motion: with latches, or in an orbit.
+        ``wrenches``: as ``_loads``.
+        """
         step_s = 1.0 / self._scenario.time.physics_hz
         loads = split_loads(self._free_bodies, wrenches)
         touched: set[tuple[str, str]] = set()
@@ -260,7 +295,9 @@ class Physics:
         return pairs
 
     def _update_joints(self) -> set[int]:
-        """Execute the latches' commands and faults that are due; return the bodies with a closed latch."""
+        """Execute the latches' commands and faults that are due; return the bodies with a closed
+        latch.
+        """
         for name, latch in self.latches.items():
             if latch.apply_due_commands(self.step_count):
                 self._detach(name)
@@ -280,7 +317,9 @@ class Physics:
         self._engine.push(body, _ZERO, torque)
 
     def _record_loads(self) -> None:
-        """Record the loads at the ports with rigid joints in the last step; open latches that they are too large for."""
+        """Record the loads at the ports with rigid joints in the last step; open latches that they
+        are too large for.
+        """
         closing, self._closing = self._closing, False
         target = self._bodies[TARGET]
         for name in tuple(self._joints):
@@ -306,14 +345,18 @@ class Physics:
             self._compliant[name] = self._compliant_latch(name)
 
     def _apply_compliant_latches(self) -> None:
-        """Apply the loads of latches with play, and of those that slip, to target and chasers for one step."""
+        """Apply the loads of latches with play, and of those that slip, to target and chasers for
+        one step.
+        """
         reach_m, target = self._scenario.chaser.probe_reach_m, self.state(TARGET)
         for name, compliant in tuple(self._compliant.items()):
             slip = self.latches[name].fault_at("latch_slip", self.step_count)
             grip = Grip() if slip is None else slip.grip
             force, torque, tip = compliant.load(target, self.state(name), reach_m, grip)
             for body, sign in ((self._bodies[TARGET], 1.0), (self._bodies[name], -1.0)):
-                self._engine.push_at(body, (sign * force).tolist(), (sign * torque).tolist(), tip.tolist())
+                self._engine.push_at(
+                    body, (sign * force).tolist(), (sign * torque).tolist(), tip.tolist()
+                )
             q_chaser = self._before[self._bodies[name]][1]
             self._record_load(name, [*force, *rotations.rotate_inverse(q_chaser, torque)])
             if name in self._compliant and compliant.slipped_m > ENGAGED_M:
@@ -326,12 +369,16 @@ class Physics:
         self._detach(name)
 
     def take_openings(self) -> list[tuple[int, str]]:
-        """Return the latches that have opened without a command since the last call: chaser and reason."""
+        """Return the latches that have opened without a command since the last call: chaser and
+        reason.
+        """
         openings, self._openings = self._openings, []
         return openings
 
     def contacts(self) -> tuple[tuple[str, str], ...]:
-        """Return the pairs of bodies in contact after the last step, sorted, without probe tips on the target."""
+        """Return the pairs of bodies in contact after the last step, sorted, without probe tips on
+        the target.
+        """
         return self._find_contacts()[0]
 
     def _find_contacts(self) -> tuple[tuple[tuple[str, str], ...], set[str]]:
@@ -367,7 +414,9 @@ class Physics:
             latch.command(command, effective_step)
 
     def close_latch(self, chaser: int) -> None:
-        """Latch a chaser to the target in their present relative pose, without contact: the start of a flight as a stack."""
+        """Latch a chaser to the target in their present relative pose, without contact: the start
+        of a flight as a stack.
+        """
         latch = self.latches[f"chaser/{chaser}"]
         latch.armed = latch.latched = True
         self._attach(f"chaser/{chaser}")
@@ -375,7 +424,9 @@ class Physics:
     def _update_latches(self, tips: set[str]) -> None:
         """Pass the contacts of the last step to the latches of these chasers."""
         for name in sorted(tips):
-            chaser, target = (self._body_state(n, self._before[self._bodies[n]]) for n in (name, TARGET))
+            chaser, target = (
+                self._body_state(n, self._before[self._bodies[n]]) for n in (name, TARGET)
+            )
             latch = self.latches[name]
             q_off = np.asarray(self._scenario.chasers[latch.chaser].q_wxyz)
             reach_m = self._scenario.chaser.probe_reach_m
@@ -419,7 +470,10 @@ class Physics:
         chaser = self.state(name)
         tip = np.array([self._scenario.chaser.probe_reach_m, 0.0, 0.0])
         tip_world = chaser.position_m + rotations.rotate(chaser.q_wxyz, tip)
-        chaser, target = self._engine_state(name, chaser), self._engine_state(TARGET, self.state(TARGET))
+        chaser, target = (
+            self._engine_state(name, chaser),
+            self._engine_state(TARGET, self.state(TARGET)),
+        )
         if self.plants[name].frame is not None:
             tip = rotations.rotate_inverse(chaser.q_wxyz, tip_world - chaser.position_m)
         relative = rotations.multiply(rotations.conjugate(target.q_wxyz), chaser.q_wxyz)
@@ -457,21 +511,26 @@ def _place(plant: Plant, position_m: Array, q_wxyz: Array) -> tuple[Array, Array
 def _box_solids(model: TargetModel, plant: Plant) -> list[SolidBox]:
     return [
         SolidBox(
-            [s / 2 for s in box.size_m], *_place(plant, np.array(box.position_m), np.asarray(box.q_wxyz))
+            [s / 2 for s in box.size_m],
+            *_place(plant, np.array(box.position_m), np.asarray(box.q_wxyz)),
         )
         for box in model.boxes
     ]
 
 
 def _hull_solids(hulls: Sequence[Array], plant: Plant) -> list[SolidHull]:
-    return [SolidHull(_place(plant, hull, rotations.IDENTITY)[0], triangles_of(hull)) for hull in hulls]
+    return [
+        SolidHull(_place(plant, hull, rotations.IDENTITY)[0], triangles_of(hull)) for hull in hulls
+    ]
 
 
 def _state_of(motion: BodyMotion) -> BodyState:
     """Return the state of the engine's frame of a body."""
     position, q_wxyz, velocity, omega_world = motion
     q = rotations.normalize(q_wxyz)
-    return BodyState(np.array(position), np.array(velocity), q, rotations.rotate_inverse(q, omega_world))
+    return BodyState(
+        np.array(position), np.array(velocity), q, rotations.rotate_inverse(q, omega_world)
+    )
 
 
 def prescribed_state(scenario: Scenario, time_s: float) -> BodyState:

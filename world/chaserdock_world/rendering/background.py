@@ -48,8 +48,9 @@ def _draw_star_field(generator: np.random.Generator) -> tuple[Array, NDArray[np.
 class Light:
     """Illumination of the scene.
 
-    ``to_sun_w``: direction (3,) in WRF, any length. ``sun`` and ``ambient``: shares of full light from the sun and from all
-    directions. ``lamp``: grey level of a white surface facing the camera's lamp at 1 m (inverse square, Lambert).
+    ``to_sun_w``: direction (3,) in WRF, any length. ``sun`` and ``ambient``: shares of full light
+    from the sun and from all directions. ``lamp``: grey level of a white surface facing the
+    camera's lamp at 1 m (inverse square, Lambert).
 
     Raises ValueError for a zero direction.
     """
@@ -74,8 +75,8 @@ class Light:
     def level(self, cosine: float, to_camera: Array, normal: Array) -> float:
         """Return the grey level of a white face.
 
-        ``cosine``: of the angle between the sun and the face's normal; ``to_camera`` (3,): from the face to the lamp beside
-        the lens, metres, in the axes of ``normal`` (3,).
+        ``cosine``: of the angle between the sun and the face's normal; ``to_camera`` (3,): from the
+        face to the lamp beside the lens, metres, in the axes of ``normal`` (3,).
         """
         level = WHITE_LEVEL * (self.ambient + self.sun * max(0.0, cosine))
         if self.lamp > 0.0:
@@ -93,7 +94,9 @@ class Earth:
 
 
 class Background:
-    """Draws the background of ideal images that start at ``origin_px`` and have ``size_px`` (width, height)."""
+    """Draws the background of ideal images that start at ``origin_px`` and have ``size_px`` (width,
+    height).
+    """
 
     def __init__(
         self, camera: Camera, origin_px: Array, size_px: tuple[int, int], earth: Earth | None = None
@@ -109,7 +112,9 @@ class Background:
             self._rays = _rays(camera, origin_px, size_px, _EARTH_STEP_PX)
 
     def draw(self, q_w_irf_wxyz: Array, light: Light | None = None) -> NDArray[np.uint8]:
-        """Return the ideal image (h, w), uint8, of stars and Earth; ``light`` illuminates the Earth."""
+        """Return the ideal image (h, w), uint8, of stars and Earth; ``light`` illuminates the
+        Earth.
+        """
         width, height = self._size
         canvas = np.full((height, width), SPACE_LEVEL, dtype=np.uint8)
         turn = rotations.to_matrix(q_w_irf_wxyz)
@@ -122,7 +127,9 @@ class Background:
             self._draw_earth(canvas, turn, self._earth, light or Light())
         return canvas
 
-    def _draw_earth(self, canvas: NDArray[np.uint8], turn: Array, earth: Earth, light: Light) -> None:
+    def _draw_earth(
+        self, canvas: NDArray[np.uint8], turn: Array, earth: Earth, light: Light
+    ) -> None:
         """Draw a Lambertian sphere with clouds fixed to it."""
         centre = np.array(earth.direction_w) / np.linalg.norm(earth.direction_w)
         rays = self._rays @ turn.T  # in WRF, unit
@@ -157,7 +164,9 @@ class Background:
 
 
 def _rays(camera: Camera, origin_px: Array, size_px: tuple[int, int], step_px: int) -> Array:
-    """Return unit rays (rows, columns, 3) in IRF through the centres of blocks of ``step_px`` ideal pixels."""
+    """Return unit rays (rows, columns, 3) in IRF through the centres of blocks of ``step_px`` ideal
+    pixels.
+    """
     columns, rows = -(-size_px[0] // step_px), -(-size_px[1] // step_px)
     u = (np.arange(columns) + 0.5) * size_px[0] / columns - 0.5 + origin_px[0]
     v = (np.arange(rows) + 0.5) * size_px[1] / rows - 0.5 + origin_px[1]
@@ -173,5 +182,8 @@ def _albedo_map(generator: np.random.Generator) -> NDArray[np.float32]:
         size = (8 << octave, 4 << octave)
         noise = generator.standard_normal((size[1], size[0])).astype(np.float32)
         noise[:, -1] = noise[:, 0]
-        clouds += cv2.resize(noise, (_MAP_COLUMNS, _MAP_ROWS), interpolation=cv2.INTER_CUBIC) * 0.6**octave
+        clouds += (
+            cv2.resize(noise, (_MAP_COLUMNS, _MAP_ROWS), interpolation=cv2.INTER_CUBIC)
+            * 0.6**octave
+        )
     return (_SEA + _CLOUDS * np.clip(0.35 + 0.4 * clouds, 0.0, 1.0)).astype(np.float32)

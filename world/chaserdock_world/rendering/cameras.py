@@ -75,7 +75,9 @@ class Cameras:
         def renderer(camera: Camera) -> Renderer | MeshRenderer | TinyRenderer:
             try:
                 if mesh is not None and section.renderer == "exact":
-                    return MeshRenderer(camera, mesh, background, effects.point_spread_px, substitutes)
+                    return MeshRenderer(
+                        camera, mesh, background, effects.point_spread_px, substitutes
+                    )
                 kind = Renderer if section.renderer == "exact" else _tiny_renderer()
                 return kind(camera, self._target, background, effects.point_spread_px)
             except ValueError as error:
@@ -87,13 +89,17 @@ class Cameras:
         first = self._cameras[0]
         self._effects = CameraEffects(first.width_px, first.height_px, effects, scenario.seed)
         self._jpeg_quality = effects.jpeg_quality
-        self._day = Light(section.sun_direction, 1.0 - section.ambient, section.ambient, section.lamp)
+        self._day = Light(
+            section.sun_direction, 1.0 - section.ambient, section.ambient, section.lamp
+        )
         night = section.ambient * section.eclipse_ambient
         self._night = Light(section.sun_direction, 0.0, night, section.lamp)
         # A chaser's own body is behind its lens, its probe is not.
         self._own, self._others = (probe,), (body, probe)
         # PyBullet's renderer is shared by all cameras and not thread-safe.
-        self._second_thread = ThreadPoolExecutor(1, "images") if section.renderer == "exact" else None
+        self._second_thread = (
+            ThreadPoolExecutor(1, "images") if section.renderer == "exact" else None
+        )
 
     def images(
         self, chasers: Sequence[int], number: int, tick: int, time_ns: int, states: States
@@ -107,11 +113,15 @@ class Cameras:
         return [images[i] if i in images else futures[i].result() for i in chasers]
 
     def image(self, chaser: int, number: int, tick: int, time_ns: int, states: States) -> Image:
-        """Return image ``number`` of a chaser of the bodies ``states``; the exposure is centred on ``time_ns``."""
+        """Return image ``number`` of a chaser of the bodies ``states``; the exposure is centred on
+        ``time_ns``.
+        """
         camera = self._cameras[chaser]
         pixels = self.render(chaser, number, time_ns, states)
         if self._jpeg_quality:
-            data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])[1].tobytes()
+            data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])[
+                1
+            ].tobytes()
         else:
             data = pixels.tobytes()
         return Image(
@@ -132,13 +142,17 @@ class Cameras:
             return self._night if dark else self._day
         share = orbit.sunlit_share(time_s)
         x, y, z = orbit.to_sun(time_s).tolist()
-        ambient = section.ambient * (section.eclipse_ambient + (1.0 - section.eclipse_ambient) * share)
+        ambient = section.ambient * (
+            section.eclipse_ambient + (1.0 - section.eclipse_ambient) * share
+        )
         return Light((x, y, z), (1.0 - section.ambient) * share, ambient, section.lamp)
 
     def render(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:
         """Return the image (h, w), uint8, before compression."""
         light = self.light_at(time_ns * 1e-9)
-        samples = [self._render_sharp(chaser, s, light) for s in self._sample_exposure(chaser, states)]
+        samples = [
+            self._render_sharp(chaser, s, light) for s in self._sample_exposure(chaser, states)
+        ]
         image = samples[0]
         if len(samples) > 1:
             total = np.sum(samples, axis=0, dtype=np.uint16)
@@ -147,7 +161,9 @@ class Cameras:
         if glare is not None and light.sun > 0.0:
             position, attitude = self._camera_pose(chaser, states)
             target = (self._target.boxes, states[TARGET].position_m, states[TARGET].q_wxyz)
-            if not is_occluded(position, light.direction_w, [target, *self._bodies(chaser, states)]):
+            if not is_occluded(
+                position, light.direction_w, [target, *self._bodies(chaser, states)]
+            ):
                 image = glare.add(image, rotations.rotate_inverse(attitude, light.direction_w))
         return self._effects.apply(image, chaser, number)
 
@@ -172,10 +188,14 @@ class Cameras:
         ]
 
     def _sample_exposure(self, chaser: int, states: States) -> list[States]:
-        """Return the bodies at times spread over the exposure, as many as the motion of the target in the image needs."""
+        """Return the bodies at times spread over the exposure, as many as the motion of the target
+        in the image needs.
+        """
         if self._exposure_s == 0.0:
             return [states]
-        ends = [self._corners(chaser, _propagate(states, s * self._exposure_s)) for s in (-0.5, 0.5)]
+        ends = [
+            self._corners(chaser, _propagate(states, s * self._exposure_s)) for s in (-0.5, 0.5)
+        ]
         motion = np.abs(ends[1] - ends[0])
         motion_px = float(motion[np.isfinite(motion)].max(initial=0.0))
         n = min(math.ceil(motion_px / _BLUR_STEP_PX), _BLUR_SAMPLES_MAX)
@@ -187,8 +207,12 @@ class Cameras:
         """Return the pixels (8, 2) of the corners of a cuboid around the target."""
         position, attitude = self._camera_pose(chaser, states)
         target = states[TARGET]
-        at_w = rotations.rotate(target.q_wxyz, cuboid_corners(self._target.size_m)) + target.position_m
-        return self._cameras[chaser].project_ideal(rotations.rotate_inverse(attitude, at_w - position))
+        at_w = (
+            rotations.rotate(target.q_wxyz, cuboid_corners(self._target.size_m)) + target.position_m
+        )
+        return self._cameras[chaser].project_ideal(
+            rotations.rotate_inverse(attitude, at_w - position)
+        )
 
 
 def _propagate(states: States, time_s: float) -> States:

@@ -10,10 +10,11 @@ Rectangle = tuple[int, int, int, int]
 
 
 def merge_overlapping(rectangles: Sequence[Rectangle]) -> list[tuple[Rectangle, frozenset[int]]]:
-    """Return disjoint rectangles that cover ``rectangles``, each with the indices of those that it covers.
+    """Return disjoint rectangles that cover ``rectangles``, each with the indices of those that it
+    covers.
 
-    Bodies that are far apart in the image are painted separately: a common rectangle would be mostly background and allow
-    fewer samples per pixel.
+    Bodies that are far apart in the image are painted separately: a common rectangle would be
+    mostly background and allow fewer samples per pixel.
     """
     merged: list[tuple[Rectangle, frozenset[int]]] = []
     for index, rectangle in enumerate(rectangles):

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera effects on the rendered image: exposure, noise. Point spread and distortion are part of rendering (``lens``).
+"""Camera effects on the rendered image: exposure, noise. Point spread and distortion are part of
+rendering (``lens``).
 
-Deterministic: the noise of an image depends on the seed, the chaser and the image number only. It is added in C
-(native/noise.c): 1280 x 960 pixels take 0.3 ms, with NumPy 4 ms, with OpenCV 7 ms.
+Deterministic: the noise of an image depends on the seed, the chaser and the image number only. It
+is added in C (native/noise.c): 1280 x 960 pixels take 0.3 ms, with NumPy 4 ms, with OpenCV 7 ms.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 
 from .native import function
 
-# The noise bank exceeds an image by these (coprime) numbers of pixels, which gives as many different offsets.
+# The noise bank exceeds an image by these (coprime) numbers of pixels, which gives as many
+# different offsets.
 _SPARE_ROWS, _SPARE_COLUMNS = 251, 256
 # Fixed-point steps per unit of white noise: 16 bits hold eight standard deviations.
 _NOISE_STEPS = 4096.0
@@ -25,14 +27,18 @@ _METERED_SHARE, _LARGEST_GAIN = 0.01, 8.0
 
 
 def exposure_gain(image: NDArray[np.uint8], level: float) -> float:
-    """Return the factor, 1/8 to 8, that brings the darkest of the brightest hundredth of the pixels to ``level``."""
+    """Return the factor, 1/8 to 8, that brings the darkest of the brightest hundredth of the pixels
+    to ``level``.
+    """
     above = np.cumsum(np.bincount(image.ravel(), minlength=256)[::-1])
     bright = 255 - int(np.searchsorted(above, _METERED_SHARE * image.size))
     return float(np.clip(level / max(bright, 1), 1.0 / _LARGEST_GAIN, _LARGEST_GAIN))
 
 
 class CameraEffects:
-    """Applies gain, read noise and shot noise of ``effects`` to images of one size; ``seed`` fixes all noise."""
+    """Applies gain, read noise and shot noise of ``effects`` to images of one size; ``seed`` fixes
+    all noise.
+    """
 
     def __init__(self, width_px: int, height_px: int, effects: Effects, seed: int):
         self.effects = effects
@@ -42,13 +48,14 @@ class CameraEffects:
         sigma = np.sqrt(effects.read_noise**2 + effects.shot_noise * level)
         self._bank: NDArray[np.int16] | None = None
         if sigma.any():
-            # One bank of white noise, read at a random offset for each image: generating new noise for every image costs
-            # several times as much as all other effects.
+            # One bank of white noise, read at a random offset for each image: generating new noise
+            # for every image costs several times as much as all other effects.
             generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, 0])))
             size = (height_px + _SPARE_ROWS, width_px + _SPARE_COLUMNS)
             noise = generator.standard_normal(size, dtype=np.float32) * np.float32(_NOISE_STEPS)
             self._bank = np.clip(np.rint(noise), -32767, 32767).astype(np.int16)
-            # Fixed-point steps per grey level of standard deviation: the largest power of two that 16 bits hold.
+            # Fixed-point steps per grey level of standard deviation: the largest power of two that
+            # 16 bits hold.
             steps = 2.0 ** min(np.floor(np.log2(32767.0 / sigma.max())), 64.0)
             self._sigma = np.rint(sigma * steps).astype(np.int16)
             self._to_levels = 1.0 / (_NOISE_STEPS * steps)
@@ -59,7 +66,9 @@ class CameraEffects:
         Raises ValueError for an image of another size or type than the camera's.
         """
         if image.shape != self._shape or image.dtype != np.uint8:
-            raise ValueError(f"expected a uint8 image of {self._shape}, got {image.dtype} {image.shape}")
+            raise ValueError(
+                f"expected a uint8 image of {self._shape}, got {image.dtype} {image.shape}"
+            )
         out = image
         gain = (
             exposure_gain(image, self.effects.auto_exposure)
@@ -80,7 +89,8 @@ class CameraEffects:
         row, column = int(seeds[0]) % (_SPARE_ROWS + 1), int(seeds[1]) % (_SPARE_COLUMNS + 1)
         noise = bank[row : row + self._shape[0], column : column + self._shape[1]]
         sign = 1.0 if seeds[2] & 1 else -1.0
-        # Noise is rounded to whole grey levels before it is added, which is exact as the levels are whole.
+        # Noise is rounded to whole grey levels before it is added, which is exact as the levels are
+        # whole.
         image, noisy = np.ascontiguousarray(image), np.empty(self._shape, dtype=np.uint8)
         function("add_noise")(
             c_void_p(image.ctypes.data), c_void_p(noise.ctypes.data), c_int64(bank.shape[1]), address(self._sigma),

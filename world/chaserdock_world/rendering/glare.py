@@ -19,7 +19,8 @@ _STEP_PX = 4
 
 
 class Glare:
-    """Adds the sun's disc, and stray light inversely proportional to the squared angle from the sun.
+    """Adds the sun's disc, and stray light inversely proportional to the squared angle from the
+    sun.
 
     ``level_at_1_deg``: grey levels at one degree (W. S. Stiles, J. Holladay, 1929).
     """
@@ -31,7 +32,10 @@ class Glare:
         u = (np.arange(columns) + 0.5) * width / columns - 0.5
         v = (np.arange(rows) + 0.5) * height / rows - 0.5
         ideal = camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))
-        x, y = (ideal[..., 0] - camera.cx_px) / camera.fx_px, (ideal[..., 1] - camera.cy_px) / camera.fy_px
+        x, y = (
+            (ideal[..., 0] - camera.cx_px) / camera.fx_px,
+            (ideal[..., 1] - camera.cy_px) / camera.fy_px,
+        )
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
@@ -46,7 +50,9 @@ class Glare:
         angle2 = np.maximum(2.0 * (1.0 - self._rays @ to_sun_irf), SUN_RADIUS_RAD**2)
         stray = np.minimum(self._level * np.deg2rad(1.0) ** 2 / angle2, 255.0).astype(np.float32)
         size = (image.shape[1], image.shape[0])
-        scattered = np.rint(cv2.resize(stray, size, interpolation=cv2.INTER_LINEAR)).astype(np.uint8)
+        scattered = np.rint(cv2.resize(stray, size, interpolation=cv2.INTER_LINEAR)).astype(
+            np.uint8
+        )
         out = np.asarray(cv2.add(image, scattered), dtype=np.uint8)
         px = self._camera.project(to_sun_irf)
         radius_px = self._camera.fx_px * SUN_RADIUS_RAD
@@ -57,7 +63,9 @@ class Glare:
 
 
 def is_occluded(origin_w_m: Array, direction_w: Array, bodies: Sequence[Obstacle]) -> bool:
-    """Return whether a ray from ``origin_w_m`` (3,) along ``direction_w`` (3,) hits a box of the bodies (slab method)."""
+    """Return whether a ray from ``origin_w_m`` (3,) along ``direction_w`` (3,) hits a box of the
+    bodies (slab method).
+    """
     for boxes, p_w, q_w in bodies:
         for box in boxes:
             q = rotations.multiply(q_w, box.q_wxyz)

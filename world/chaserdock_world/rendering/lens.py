@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lens: point spread, the extent of the ideal image that a distorted image needs, and the mapping between them."""
+"""The lens: point spread, the extent of the ideal image that a distorted image needs, and the
+mapping between them.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from numpy.typing import NDArray
 
 
 def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
-    """Return an image (h, w) after the lens' point spread, a Gaussian with this standard deviation; itself if that is 0."""
+    """Return an image (h, w) after the lens' point spread, a Gaussian with this standard deviation;
+    itself if that is 0.
+    """
     if sigma_px == 0.0:
         return image
     size = (2 * math.ceil(3.0 * sigma_px) + 1,) * 2
@@ -23,9 +27,9 @@ def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8
 class Lens:
     """Maps the ideal image, which renderers draw, to the distorted image of ``camera``.
 
-    ``origin_px`` (2,): ideal pixel coordinates of the ideal image's first pixel; ``size_px``: its width and height, larger
-    than the frame where the lens covers more. Raises ValueError if the distortion is not invertible everywhere in the
-    image.
+    ``origin_px`` (2,): ideal pixel coordinates of the ideal image's first pixel; ``size_px``: its
+    width and height, larger than the frame where the lens covers more. Raises ValueError if the
+    distortion is not invertible everywhere in the image.
     """
 
     def __init__(self, camera: Camera):
@@ -64,7 +68,9 @@ class Lens:
         self._maps = (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]))
 
     def distort(self, ideal: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the distorted image (h, w) of an ideal image of ``size_px``; without distortion the image itself."""
+        """Return the distorted image (h, w) of an ideal image of ``size_px``; without distortion
+        the image itself.
+        """
         if self._maps is None:
             return ideal
         return np.asarray(cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)

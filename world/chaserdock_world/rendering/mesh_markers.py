@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Markers as meshes: thin plates whose white and black cells are triangles, so that their edges are as sharp as any other."""
+"""Markers as meshes: thin plates whose white and black cells are triangles, so that their edges are
+as sharp as any other.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,10 @@ from .textures import BLACK, WHITE, marker_cells
 ABOVE_M = 2e-4
 """Height of a marker's front above its plane, so that the surface below does not hide it."""
 _BELOW_M = 1e-3
-_PAPER = {True: Material("white print", diffuse=WHITE), False: Material("black print", diffuse=BLACK)}
+_PAPER = {
+    True: Material("white print", diffuse=WHITE),
+    False: Material("black print", diffuse=BLACK),
+}
 
 
 def with_markers(mesh: TriangleMesh, model: TargetModel) -> TriangleMesh:
@@ -27,7 +32,9 @@ def with_markers(mesh: TriangleMesh, model: TargetModel) -> TriangleMesh:
 
 
 def marker_parts(model: TargetModel, marker: Marker) -> tuple[MeshPart, MeshPart]:
-    """Return the white part, with border, sides and back, and the black part of a marker; together they are closed."""
+    """Return the white part, with border, sides and back, and the black part of a marker; together
+    they are closed.
+    """
     cells = marker_cells(model.dictionary, marker.id) > 0
     edges = np.linspace(-0.5, 0.5, len(cells) + 1) * marker.side_m
     white = np.flipud(cells)  # row 0 of the cells is on top
@@ -56,7 +63,10 @@ def marker_parts(model: TargetModel, marker: Marker) -> tuple[MeshPart, MeshPart
     name = f"marker_{marker.id}"
     return (
         MeshPart(
-            f"{name}_white", _PAPER[True], at, _halves(np.concatenate([quads[white.ravel()], sides, back]))
+            f"{name}_white",
+            _PAPER[True],
+            at,
+            _halves(np.concatenate([quads[white.ravel()], sides, back])),
         ),
         MeshPart(f"{name}_black", _PAPER[False], at, _halves(quads[~white.ravel()])),
     )

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renderer of triangle meshes: z-buffer with eight samples per pixel, shadow maps, specular reflection, textures.
+"""Renderer of triangle meshes: z-buffer with eight samples per pixel, shadow maps, specular
+reflection, textures.
 
-The arithmetic is in C (native/mesh.c). Every body casts shadows from the sun onto every other one and onto itself. The lamp is at
-the lens, which sees none of the shadows that it casts. Each body in view has a shadow map of its own, whose texels are half a
-pixel wide at its nearest point, as far as ``_MAP_TEXELS`` allow.
+The arithmetic is in C (native/mesh.c). Every body casts shadows from the sun onto every other one
+and onto itself. The lamp is at the lens, which sees none of the shadows that it casts. Each body in
+view has a shadow map of its own, whose texels are half a pixel wide at its nearest point, as far as
+``_MAP_TEXELS`` allow.
 """
 
 from __future__ import annotations
@@ -56,7 +58,9 @@ _POSE_BYTES, _TRIANGLE_BYTES = 96, 156
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A mesh as arrays: ``corners`` and ``normals`` (m, 3, 3), ``uv`` (m, 3, 2), ``surface`` (m,) rows of ``surfaces`` (k, 4)."""
+    """A mesh as arrays: ``corners`` and ``normals`` (m, 3, 3), ``uv`` (m, 3, 2), ``surface`` (m,)
+    rows of ``surfaces`` (k, 4).
+    """
 
     corners: Array
     normals: Array
@@ -69,14 +73,22 @@ class _Body:
         """Corners (8, 3) of the cuboid around the body, body axes, and the centre (3,) of it."""
         points = self.corners.reshape(-1, 3)
         low, high = points.min(axis=0), points.max(axis=0)
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+        corners = (
+            np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low)
+            + low
+        )
         return corners, (low + high) / 2.0
 
 
 def _body_of(mesh: TriangleMesh) -> _Body:
     soup = triangle_soup(mesh)
     rows = [
-        (p.material.diffuse, p.material.specular, p.material.shininess, _TEXTURES[p.material.texture])
+        (
+            p.material.diffuse,
+            p.material.specular,
+            p.material.shininess,
+            _TEXTURES[p.material.texture],
+        )
         for p in mesh.parts
     ]
     uv = np.concatenate([_texture_coordinates(part) for part in mesh.parts])
@@ -87,14 +99,18 @@ def _body_of(mesh: TriangleMesh) -> _Body:
 
 
 def _texture_coordinates(part: MeshPart) -> Array:
-    """Return coordinates (m, 3, 2) on the side that a triangle faces of the cuboid around the part, m from the edges."""
+    """Return coordinates (m, 3, 2) on the side that a triangle faces of the cuboid around the part,
+    m from the edges.
+    """
     around = box_around(part)
     axes = rotations.to_matrix(around.q_wxyz)
     local = (part.vertices_m - np.array(around.position_m)) @ axes + np.array(around.size_m) / 2.0
     corners = local[part.triangles]
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     others = np.array([(1, 2), (0, 2), (0, 1)])[np.argmax(normal, axis=1)]
-    return np.ascontiguousarray(np.take_along_axis(corners, np.repeat(others[:, None], 3, axis=1), axis=2))
+    return np.ascontiguousarray(
+        np.take_along_axis(corners, np.repeat(others[:, None], 3, axis=1), axis=2)
+    )
 
 
 @lru_cache(maxsize=64)
@@ -102,7 +118,8 @@ def _joined(bodies: tuple[_Body, ...]) -> tuple[_Body, IntArray]:
     """Return all triangles of several bodies, and the first one (n + 1,) of each body."""
     rows = np.cumsum([0, *(len(b.surfaces) for b in bodies[:-1])])
     corners, normals, uv, surfaces = (
-        np.concatenate([getattr(b, key) for b in bodies]) for key in ("corners", "normals", "uv", "surfaces")
+        np.concatenate([getattr(b, key) for b in bodies])
+        for key in ("corners", "normals", "uv", "surfaces")
     )
     surface = np.concatenate([b.surface + row for b, row in zip(bodies, rows, strict=True)])
     first = np.cumsum([0, *(len(b.corners) for b in bodies)]).astype(np.int64)
@@ -114,7 +131,9 @@ def mesh_of_boxes(boxes: Sequence[Box]) -> TriangleMesh:
     parts = []
     for number, b in enumerate(boxes):
         x, y, z = rotations.log(np.array(b.q_wxyz)).tolist()
-        parts.append(box(f"box_{number}", Material("paint", b.shade), b.size_m, b.position_m, (x, y, z)))
+        parts.append(
+            box(f"box_{number}", Material("paint", b.shade), b.size_m, b.position_m, (x, y, z))
+        )
     return TriangleMesh("boxes", tuple(parts), {})
 
 
@@ -127,7 +146,12 @@ def _wrinkles() -> NDArray[np.float32]:
         noise = np.tile(generator.standard_normal((cells, cells)).astype(np.float32), (3, 3))
         smooth = cv2.resize(noise, (3 * _WRINKLES, 3 * _WRINKLES), interpolation=cv2.INTER_CUBIC)
         # Foil is flat between sharp creases.
-        height += weight * np.abs(smooth[_WRINKLES : 2 * _WRINKLES, _WRINKLES : 2 * _WRINKLES]) * 16 / cells
+        height += (
+            weight
+            * np.abs(smooth[_WRINKLES : 2 * _WRINKLES, _WRINKLES : 2 * _WRINKLES])
+            * 16
+            / cells
+        )
     slope_x = (np.roll(height, -1, axis=1) - np.roll(height, 1, axis=1)) * 1.6
     slope_y = (np.roll(height, -1, axis=0) - np.roll(height, 1, axis=0)) * 1.6
     tone = 0.12 * (height - height.mean())
@@ -137,9 +161,9 @@ def _wrinkles() -> NDArray[np.float32]:
 class MeshRenderer:
     """Renders what ``camera`` sees of a target with a mesh and of other bodies.
 
-    Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard deviation of a Gaussian.
-    ``substitutes``: meshes that are drawn in place of boxes. Raises ValueError if the camera's distortion is not invertible
-    everywhere in the image.
+    Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard
+    deviation of a Gaussian. ``substitutes``: meshes that are drawn in place of boxes. Raises
+    ValueError if the camera's distortion is not invertible everywhere in the image.
     """
 
     def __init__(
@@ -186,13 +210,20 @@ class MeshRenderer:
     def _body(self, boxes: tuple[Box, ...]) -> _Body:
         if boxes not in self._bodies:
             plain = [b for b in boxes if b not in self._substitutes]
-            parts = [part for b in boxes if b in self._substitutes for part in self._substitutes[b].parts]
+            parts = [
+                part for b in boxes if b in self._substitutes for part in self._substitutes[b].parts
+            ]
             parts += mesh_of_boxes(plain).parts
             self._bodies[boxes] = _body_of(TriangleMesh("body", tuple(parts), {}))
         return self._bodies[boxes]
 
     def _draw(
-        self, canvas: NDArray[np.uint8], camera: Array, bodies: list[_Body], poses: Array, light: Light
+        self,
+        canvas: NDArray[np.uint8],
+        camera: Array,
+        bodies: list[_Body],
+        poses: Array,
+        light: Light,
     ) -> None:
         scene, first = _joined(tuple(bodies))
         corners, normals, uv, surface, surfaces = (
@@ -204,7 +235,9 @@ class MeshRenderer:
         depth = self._memory("depth", 4 * texels)
         placed = self._memory("placed", _POSE_BYTES * len(bodies))
         triangles = self._memory("triangles", _TRIANGLE_BYTES * count)
-        spans = self._memory("spans", 8 * (count + count // _GROUP + 1 + self._size[1] // _BAND_ROWS + 1))
+        spans = self._memory(
+            "spans", 8 * (count + count // _GROUP + 1 + self._size[1] // _BAND_ROWS + 1)
+        )
         samples = self._memory("samples", _BAND_ROWS * self._size[0] * _SAMPLES * 8)
         wrinkles = _wrinkles()
         function("draw_meshes")(
@@ -215,7 +248,9 @@ class MeshRenderer:
         )  # fmt: skip
 
     def _memory(self, name: str, size: int) -> NDArray[np.uint8]:
-        """Return working memory of this thread of at least ``size`` bytes: fresh pages would cost more than drawing."""
+        """Return working memory of this thread of at least ``size`` bytes: fresh pages would cost
+        more than drawing.
+        """
         held = self._threads.__dict__
         if name not in held or len(held[name]) < size:
             held[name] = np.empty(size, np.uint8)
@@ -226,13 +261,23 @@ class MeshRenderer:
         sun = rotations.rotate_inverse(q_w_irf, light.direction_w)
         across = np.cross(sun, np.eye(3)[int(np.argmin(np.abs(sun)))])
         across /= np.linalg.norm(across)
-        out[0] = (sun, light.sun, light.ambient, light.lamp, WHITE_LEVEL, across, np.cross(sun, across))
+        out[0] = (
+            sun,
+            light.sun,
+            light.ambient,
+            light.lamp,
+            WHITE_LEVEL,
+            across,
+            np.cross(sun, across),
+        )
         return out
 
     def _shadow_maps(
         self, illumination: NDArray[np.void], camera: Array, bodies: list[_Body], poses: Array
     ) -> tuple[NDArray[np.void], int]:
-        """Return the shadow map of every body, unused for those out of view, and the number of texels of all."""
+        """Return the shadow map of every body, unused for those out of view, and the number of
+        texels of all.
+        """
         maps = np.zeros(len(bodies), _SHADOW_MAP)
         across, along = illumination["across"][0], illumination["along"][0]
         offset = 0

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that see the pose of the target instead of a picture, for the perception ``statistical``; the range sensor of others."""
+"""Cameras that see the pose of the target instead of a picture, for the perception ``statistical``;
+the range sensor of others.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from .cameras import Cameras, States
 
 
 class PoseSensor:
-    """The pose of the target in each chaser's camera, which has the mounting and focal length that the world gives it."""
+    """The pose of the target in each chaser's camera, which has the mounting and focal length that
+    the world gives it.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self._seed = scenario.seed
@@ -33,7 +37,9 @@ class PoseSensor:
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
 
     def seen_pose(self, chaser: int, states: States) -> tuple[Array, Array]:
-        """Return the pose as `pose`; with a longer focal length than calibrated, the target seems nearer."""
+        """Return the pose as `pose`; with a longer focal length than calibrated, the target seems
+        nearer.
+        """
         position, q = self.pose(chaser, states)
         return position * [1.0, 1.0, self._focal_px / self._cameras[chaser].fx_px], q
 
@@ -46,14 +52,18 @@ class PoseSensor:
 
     def drawn(self, chaser: int, number: int) -> tuple[int, int]:
         """Return the numbers below 2^32 that the errors of image ``number`` are drawn from."""
-        drawn = hashlib.blake2s(f"{self._seed}/image/{chaser}/{number}".encode(), digest_size=8).digest()
+        drawn = hashlib.blake2s(
+            f"{self._seed}/image/{chaser}/{number}".encode(), digest_size=8
+        ).digest()
         return int.from_bytes(drawn[:4], "little"), int.from_bytes(drawn[4:], "little")
 
 
 class PoseCameras:
-    """Makes the images of all chasers of a scenario as ``Cameras`` does; an image depends on its arguments only.
+    """Makes the images of all chasers of a scenario as ``Cameras`` does; an image depends on its
+    arguments only.
 
-    Light, blur, noise of the sensor and what stands between camera and target are not in these images.
+    Light, blur, noise of the sensor and what stands between camera and target are not in these
+    images.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -80,7 +90,9 @@ class PoseCameras:
 
 
 class RangingCameras:
-    """Makes rendered images as ``Cameras`` does, with the range and the sent attitude of ``[ranging]`` at the same time."""
+    """Makes rendered images as ``Cameras`` does, with the range and the sent attitude of
+    ``[ranging]`` at the same time.
+    """
 
     def __init__(self, scenario: Scenario, ranging: Ranging) -> None:
         self._cameras, self._sensor = Cameras(scenario), PoseSensor(scenario)
@@ -95,7 +107,9 @@ class RangingCameras:
 
     def image(self, chaser: int, number: int, tick: int, time_ns: int, states: States) -> Image:
         """Return image ``number`` of a chaser, which sees the target as in ``states``."""
-        return self._ranged(self._cameras.image(chaser, number, tick, time_ns, states), number, states)
+        return self._ranged(
+            self._cameras.image(chaser, number, tick, time_ns, states), number, states
+        )
 
     def _ranged(self, image: Image, number: int, states: States) -> Image:
         position, q = self._sensor.pose(image.chaser, states)
@@ -116,4 +130,8 @@ def make_cameras(scenario: Scenario) -> Cameras | PoseCameras | RangingCameras:
     """Return the cameras that the scenario's perception needs."""
     if scenario.perception.name == "statistical":
         return PoseCameras(scenario)
-    return Cameras(scenario) if scenario.ranging is None else RangingCameras(scenario, scenario.ranging)
+    return (
+        Cameras(scenario)
+        if scenario.ranging is None
+        else RangingCameras(scenario, scenario.ranging)
+    )

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rasterizer of textured cuboids: each visible face is exactly projected, warped with OpenCV and supersampled.
+"""Rasterizer of textured cuboids: each visible face is exactly projected, warped with OpenCV and
+supersampled.
 
-The point spread acts on the samples, before pixels average them: on pixels it would shift edges by up to 0.03 px, depending
-on their place between pixels.
+The point spread acts on the samples, before pixels average them: on pixels it would shift edges by
+up to 0.03 px, depending on their place between pixels.
 
-Painting order: boxes do not overlap, so any two have a separating plane; the box on the camera's side of it can occlude the
-other and is painted later.
+Painting order: boxes do not overlap, so any two have a separating plane; the box on the camera's
+side of it can occlude the other and is painted later.
 """
 
 from __future__ import annotations
@@ -26,10 +27,19 @@ from . import textures
 from .background import Background, Earth, Light
 from .dirty_rects import Rectangle, merge_overlapping
 from .lens import Lens, spread_points
-from .scene_geometry import Frustum, Obstacle, Shapes, paint_order, place_texture, shape_table, visible_faces
+from .scene_geometry import (
+    Frustum,
+    Obstacle,
+    Shapes,
+    paint_order,
+    place_texture,
+    shape_table,
+    visible_faces,
+)
 
-# Samples per pixel along each axis: the largest number that keeps the samples of a patch below the limit.
-# (Textures are area averages, so even one sample per pixel places corners to within 0.03 px.)
+# Samples per pixel along each axis: the largest number that keeps the samples of a patch below the
+# limit. (Textures are area averages, so even one sample per pixel places corners to within 0.03
+# px.)
 _SAMPLES = ((4, 600_000), (2, 1_000_000))
 
 DAYLIGHT = Light()
@@ -37,8 +47,8 @@ DAYLIGHT = Light()
 
 @dataclass(frozen=True)
 class _Scene:
-    """A scene to be painted: the shape number of each visible box, the visible faces, and the grey level of each face at
-    reflectance 1."""
+    """A scene to be painted: the shape number of each visible box, the visible faces, and the grey
+    level of each face at reflectance 1."""
 
     shapes: Shapes
     box_shapes: list[int]
@@ -64,17 +74,23 @@ def halve(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 class Renderer:
     """Renders what ``camera`` sees of a target and of other bodies.
 
-    Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard deviation of a Gaussian.
-    Raises ValueError if the camera's distortion is not invertible everywhere in the image.
+    Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard
+    deviation of a Gaussian. Raises ValueError if the camera's distortion is not invertible
+    everywhere in the image.
     """
 
     def __init__(
-        self, camera: Camera, model: TargetModel, earth: Earth | None = None, point_spread_px: float = 0.0
+        self,
+        camera: Camera,
+        model: TargetModel,
+        earth: Earth | None = None,
+        point_spread_px: float = 0.0,
     ):
         self.camera = camera
         self.model = model
         self._point_spread_px = point_spread_px
-        # By box, face and the number of times its width and height are halved; coarser levels are made on demand.
+        # By box, face and the number of times its width and height are halved; coarser levels are
+        # made on demand.
         self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {
             (index, face, 0, 0): textures.finest_texture(model, index, face)
             for index in range(len(model.boxes))
@@ -107,7 +123,9 @@ class Renderer:
         bodies: list[Obstacle] = [(self.model.boxes, target_p_w_m, target_q_w_trf_wxyz), *obstacles]
         shapes = shape_table(tuple(tuple(boxes) for boxes, _, _ in bodies))
         poses = np.array([np.concatenate([p, q]) for _, p, q in bodies], dtype=float)
-        visible, faces = visible_faces(self._frustum, shapes, np.concatenate([position, q_w_irf]), poses)
+        visible, faces = visible_faces(
+            self._frustum, shapes, np.concatenate([position, q_w_irf]), poses
+        )
         background = self._background.draw(q_w_irf, light)
         canvas = spread_points(background, self._point_spread_px)
         if not len(visible):
@@ -123,13 +141,17 @@ class Renderer:
             faces_of_box[int(box)].append(k)
         order = paint_order(visible)
         scene = _Scene(shapes, visible["shape"].astype(int).tolist(), faces, levels)
-        for patch, members in merge_overlapping(self._covered_pixels(visible["low_px"], visible["high_px"])):
+        for patch, members in merge_overlapping(
+            self._covered_pixels(visible["low_px"], visible["high_px"])
+        ):
             faces_of_patch = [k for i in order if i in members for k in faces_of_box[i]]
             self._paint(canvas, background, patch, scene, faces_of_patch)
         return self._lens.distort(canvas)
 
     def _covered_pixels(self, low: Array, high: Array) -> list[Rectangle]:
-        """Return the pixels of the canvas that outlines between ``low`` and ``high`` (n, 2) can touch."""
+        """Return the pixels of the canvas that outlines between ``low`` and ``high`` (n, 2) can
+        touch.
+        """
         margin = 1 + math.ceil(3.0 * self._point_spread_px)
         least = np.maximum(np.floor(low).astype(int) - margin, 0).tolist()
         most = np.minimum(np.ceil(high).astype(int) + margin + 1, self._size).tolist()
@@ -143,7 +165,9 @@ class Renderer:
         scene: _Scene,
         faces: list[int],
     ) -> None:
-        """Paint faces, back to front, onto a supersampled ``patch`` of the background; average its samples on the canvas."""
+        """Paint faces, back to front, onto a supersampled ``patch`` of the background; average its
+        samples on the canvas.
+        """
         x0, y0, x1, y1 = patch
         if x1 <= x0 or y1 <= y0:
             return
@@ -152,8 +176,11 @@ class Renderer:
         fine = upsample(view, samples) if samples > 1 else view.copy()
         for k in faces:
             face, shape = scene.faces[k], scene.box_shapes[int(scene.faces["box"][k])]
-            # Ideal pixel of the camera -> sample of the fine patch; pixel centres are integers in both.
-            outline = (face["outline_px"][: int(face["count"])] - (x0, y0)) * samples + (samples - 1) / 2.0
+            # Ideal pixel of the camera -> sample of the fine patch; pixel centres are integers in
+            # both.
+            outline = (face["outline_px"][: int(face["count"])] - (x0, y0)) * samples + (
+                samples - 1
+            ) / 2.0
             side, number = int(face["side"]), scene.shapes.numbers[shape]
             if scene.shapes.bodies[shape] == 0 and self._texture(number, side, 0, 0) is not None:
                 self._paint_texture(fine, scene, k, number, (samples, x0, y0), outline)
@@ -177,10 +204,14 @@ class Renderer:
         at: tuple[int, int, int],
         outline: Array,
     ) -> None:
-        """Paint face ``k`` of the target's ``box`` onto a ``patch`` with ``at[0]`` samples per pixel from pixel ``at[1:]`` on."""
+        """Paint face ``k`` of the target's ``box`` onto a ``patch`` with ``at[0]`` samples per
+        pixel from pixel ``at[1:]`` on.
+        """
         face, finest = scene.faces[k], self._texture(box, int(scene.faces["side"][k]), 0, 0)
         assert finest is not None
-        placement = place_texture(self._frustum, scene.faces[k : k + 1], at, patch.shape, finest.shape)
+        placement = place_texture(
+            self._frustum, scene.faces[k : k + 1], at, patch.shape, finest.shape
+        )
         if placement is None:
             return
         (x0, y0, x1, y1), halved, homography = placement
@@ -194,13 +225,18 @@ class Renderer:
             # A transparent border blends over half a texel on either side of the face's edge.
             cv2.warpPerspective(lit, homography, size, roi, flags, cv2.BORDER_TRANSPARENT)
             return
-        # Part of the face is behind the camera, where the homography mirrors it: paint the visible part only.
+        # Part of the face is behind the camera, where the homography mirrors it: paint the visible
+        # part only.
         warped = cv2.warpPerspective(lit, homography, size, None, flags, cv2.BORDER_REPLICATE)
         mask = np.zeros(roi.shape, dtype=np.uint8)
-        cv2.fillConvexPoly(mask, np.rint((outline - (x0, y0)) * 16.0).astype(np.int32), 255, cv2.LINE_8, 4)
+        cv2.fillConvexPoly(
+            mask, np.rint((outline - (x0, y0)) * 16.0).astype(np.int32), 255, cv2.LINE_8, 4
+        )
         cv2.copyTo(warped, mask, roi)
 
-    def _texture(self, box_index: int, face: int, level_x: int, level_y: int) -> NDArray[np.uint8] | None:
+    def _texture(
+        self, box_index: int, face: int, level_x: int, level_y: int
+    ) -> NDArray[np.uint8] | None:
         key = (box_index, face, level_x, level_y)
         if key not in self._textures:
             finest = self._textures[box_index, face, 0, 0]

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scene geometry: visible faces of boxes, their outlines in the image, and their painting order.
 
-The arithmetic is in C (native/scene.c): an image shows about a dozen faces, too few to vectorize with NumPy.
+The arithmetic is in C (native/scene.c): an image shows about a dozen faces, too few to vectorize
+with NumPy.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ Shape = np.dtype(
         ("radius", float),
     ]
 )
-"""native/scene.c: a box in its body's axes, metres; ``half`` edges, ``radius`` of the bounding sphere."""
+"""native/scene.c: a box in its body's axes, metres; ``half`` edges, ``radius`` of the bounding
+sphere.
+"""
 
 VisibleBox = np.dtype(
     [
@@ -45,7 +48,9 @@ VisibleBox = np.dtype(
         ("low_px", float, 2), ("high_px", float, 2),
     ]
 )  # fmt: skip
-"""native/scene.c: a visible box: number of its shape, pose in IRF, and the pixels that bound its outline."""
+"""native/scene.c: a visible box: number of its shape, pose in IRF, and the pixels that bound its
+outline.
+"""
 
 VisibleFace = np.dtype(
     [
@@ -54,8 +59,9 @@ VisibleFace = np.dtype(
         ("count", float), ("outline_px", float, (10, 2)),
     ]
 )  # fmt: skip
-"""native/scene.c: a visible face in IRF: index of its visible box, ``side`` of it, whether all of it is ``in_front`` of the
-camera, and its clipped outline, ``count`` points in pixels of the canvas."""
+"""native/scene.c: a visible face in IRF: index of its visible box, ``side`` of it, whether all of
+it is ``in_front`` of the camera, and its clipped outline, ``count`` points in pixels of the canvas.
+"""
 
 _FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in range(6)])
 
@@ -71,11 +77,13 @@ class _Frustum(Structure):
 
 
 class Frustum:
-    """View frustum of a canvas: the image of ``camera`` from pixel ``origin_px`` (2,), ``size_px`` wide and high."""
+    """View frustum of a canvas: the image of ``camera`` from pixel ``origin_px`` (2,), ``size_px``
+    wide and high.
+    """
 
     def __init__(self, camera: Camera, origin_px: Array, size_px: Sequence[int]):
-        # Planes n x + d >= 0 (n_x, n_y, n_z, d) of points in front and on the canvas, with a margin of one pixel, and
-        # inward unit normals of the canvas' borders.
+        # Planes n x + d >= 0 (n_x, n_y, n_z, d) of points in front and on the canvas, with a margin
+        # of one pixel, and inward unit normals of the canvas' borders.
         left, top = (origin_px - 1.0 - (camera.cx_px, camera.cy_px)).tolist()
         right, bottom = left + size_px[0] + 1.0, top + size_px[1] + 1.0
         planes = np.array(
@@ -98,8 +106,8 @@ class Frustum:
 
 @dataclass(frozen=True)
 class Shapes:
-    """The boxes of several bodies: ``table`` (n,) of Shape, and for each box the number of its body, its number within that
-    body, and its reflectance."""
+    """The boxes of several bodies: ``table`` (n,) of Shape, and for each box the number of its
+    body, its number within that body, and its reflectance."""
 
     table: NDArray[np.void]
     bodies: list[int]
@@ -110,7 +118,9 @@ class Shapes:
 @lru_cache(maxsize=256)
 def shape_table(bodies: tuple[tuple[Box, ...], ...]) -> Shapes:
     """Return the boxes of these bodies, in their order."""
-    boxes = [(body, number, box) for body, own in enumerate(bodies) for number, box in enumerate(own)]
+    boxes = [
+        (body, number, box) for body, own in enumerate(bodies) for number, box in enumerate(own)
+    ]
     table = np.zeros(len(boxes), dtype=Shape)
     for row, (body, _, box) in zip(table, boxes, strict=True):
         half = np.array(box.size_m) / 2.0
@@ -122,19 +132,28 @@ def shape_table(bodies: tuple[tuple[Box, ...], ...]) -> Shapes:
         )
         row["rotation"] = rotations.to_matrix(box.q_wxyz)
     return Shapes(
-        table, [b for b, _, _ in boxes], [n for _, n, _ in boxes], [box.shade for _, _, box in boxes]
+        table,
+        [b for b, _, _ in boxes],
+        [n for _, n, _ in boxes],
+        [box.shade for _, _, box in boxes],
     )
 
 
 def visible_faces(
     frustum: Frustum, shapes: Shapes, camera_pose: Array, poses: Array
 ) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    """Return the visible boxes (b,) and their visible faces (f,), in the order of ``shapes`` and sides.
+    """Return the visible boxes (b,) and their visible faces (f,), in the order of ``shapes`` and
+    sides.
 
-    ``camera_pose`` (7,): position in WRF and attitude IRF to WRF; ``poses`` (bodies, 7): of the bodies, body to WRF.
+    ``camera_pose`` (7,): position in WRF and attitude IRF to WRF; ``poses`` (bodies, 7): of the
+    bodies, body to WRF.
     """
     n = len(shapes.table)
-    boxes, faces, counts = np.empty(n, VisibleBox), np.empty(6 * n, VisibleFace), np.zeros(2, np.int64)
+    boxes, faces, counts = (
+        np.empty(n, VisibleBox),
+        np.empty(6 * n, VisibleFace),
+        np.zeros(2, np.int64),
+    )
     function("visible_faces")(
         byref(frustum.native), address(camera_pose), address(poses), c_int64(n), address(shapes.table),
         address(_FACE_AXES), address(boxes), address(faces), address(counts),
@@ -143,9 +162,11 @@ def visible_faces(
 
 
 def paint_order(boxes: NDArray[np.void]) -> list[int]:
-    """Return the indices of ``boxes`` (n,) of VisibleBox in painting order: every box after those that it occludes.
+    """Return the indices of ``boxes`` (n,) of VisibleBox in painting order: every box after those
+    that it occludes.
 
-    Boxes that occlude one another cyclically (long thin ones can) have no such order; the farthest is painted first.
+    Boxes that occlude one another cyclically (long thin ones can) have no such order; the farthest
+    is painted first.
     """
     n = len(boxes)
     occluded, order = np.empty(n * n, np.uint8), np.empty(n, np.int64)
@@ -160,12 +181,14 @@ def place_texture(
     patch: tuple[int, ...],
     finest: tuple[int, ...],
 ) -> tuple[list[int], list[int], Array] | None:
-    """Place the texture of ``face`` (1,) on a patch (rows, columns) of the canvas; None if they do not overlap.
+    """Place the texture of ``face`` (1,) on a patch (rows, columns) of the canvas; None if they do
+    not overlap.
 
-    ``at``: samples per pixel of the patch, and its first pixel (x, y); ``finest`` (rows, columns): size of the texture at
-    textures.FINEST_TEXEL_M. Returns the region of the patch (left, top, right, bottom); how often the texture's width and
-    height are halved so that a texel is about a sample at the centre of the outline; and the homography (3, 3) from the
-    region's samples to texels.
+    ``at``: samples per pixel of the patch, and its first pixel (x, y); ``finest`` (rows, columns):
+    size of the texture at textures.FINEST_TEXEL_M. Returns the region of the patch (left, top,
+    right, bottom); how often the texture's width and height are halved so that a texel is about a
+    sample at the centre of the outline; and the homography (3, 3) from the region's samples to
+    texels.
     """
     sizes = np.array([patch[1], patch[0], finest[1], finest[0]], dtype=np.int64)
     out, matrix = np.empty(6, dtype=np.int64), np.empty((3, 3))

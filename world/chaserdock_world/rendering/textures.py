@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Textures of a target's faces: markers, exactly averaged over the area of each texel.
 
-A texel's value is the mean over its area at every resolution, so that rendering from a coarser texture blurs a marker but
-does not shift its edges.
+A texel's value is the mean over its area at every resolution, so that rendering from a coarser
+texture blurs a marker but does not shift its edges.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ WHITE, BLACK = 0.95, 0.05
 
 
 def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
-    """Return the cells (n, n) of an ArUco marker with its black border, row 0 on top: 1 white, 0 black.
+    """Return the cells (n, n) of an ArUco marker with its black border, row 0 on top: 1 white, 0
+    black.
 
     Raises ValueError for a dictionary that OpenCV does not have or an id that is not in it.
     """
@@ -37,17 +38,20 @@ def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
 
 
 def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marker, Array, int]]:
-    """Return the markers on one face of a box, each with its centre (2,) in the face's axes (x right, y up; metres)
-    and the number of counter-clockwise quarter turns of its image.
+    """Return the markers on one face of a box, each with its centre (2,) in the face's axes (x
+    right, y up; metres) and the number of counter-clockwise quarter turns of its image.
 
-    Raises ValueError for a marker in the face's plane whose rotation is not a multiple of a quarter turn.
+    Raises ValueError for a marker in the face's plane whose rotation is not a multiple of a quarter
+    turn.
     """
     found = []
     q_box_face = face_rotation(face)
     depth = face_extent(box.size_m, face)[2]
     q_trf_face = rotations.multiply(box.q_wxyz, q_box_face)
     for marker in model.markers:
-        centre = rotations.rotate_inverse(q_trf_face, np.array(marker.position_trf_m) - box.position_m)
+        centre = rotations.rotate_inverse(
+            q_trf_face, np.array(marker.position_trf_m) - box.position_m
+        )
         turn = rotations.to_matrix(
             rotations.multiply(rotations.conjugate(q_trf_face), marker.q_trf_marker_wxyz)
         )
@@ -62,10 +66,11 @@ def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marke
 
 @lru_cache(maxsize=64)
 def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.uint8] | None:
-    """Return reflectance times 255 (rows, columns) of one face at FINEST_TEXEL_M; None for a face without markers.
+    """Return reflectance times 255 (rows, columns) of one face at FINEST_TEXEL_M; None for a face
+    without markers.
 
-    Column 0 is at the left and row 0 on top, as seen from outside with the face's up direction upwards.
-    The array is read-only and shared between callers.
+    Column 0 is at the left and row 0 on top, as seen from outside with the face's up direction
+    upwards. The array is read-only and shared between callers.
     """
     box = model.boxes[box_index]
     markers = markers_on_face(model, box, face)
@@ -80,14 +85,18 @@ def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.
         _print(texture, white, centre, half, width, height)
     for marker, centre, quarters in markers:
         cells = np.rot90(marker_cells(model.dictionary, marker.id), quarters)
-        _print(texture, np.where(cells > 0, WHITE, BLACK), centre, marker.side_m / 2.0, width, height)
+        _print(
+            texture, np.where(cells > 0, WHITE, BLACK), centre, marker.side_m / 2.0, width, height
+        )
     finished = np.rint(texture * np.float32(255.0)).astype(np.uint8)
     finished.setflags(write=False)
     return finished
 
 
 def label_texture(model: TargetModel, marker: Marker) -> NDArray[np.uint8]:
-    """Return reflectance times 255 (n, n) of one marker with its white border, as a label on a surface."""
+    """Return reflectance times 255 (n, n) of one marker with its white border, as a label on a
+    surface.
+    """
     side = marker.side_m + 2.0 * model.white_margin_m
     texture = np.full((max(2, round(side / FINEST_TEXEL_M)),) * 2, WHITE, dtype=np.float32)
     cells = np.where(marker_cells(model.dictionary, marker.id) > 0, WHITE, BLACK)
@@ -96,7 +105,12 @@ def label_texture(model: TargetModel, marker: Marker) -> NDArray[np.uint8]:
 
 
 def _print(
-    texture: NDArray[np.float32], cells: Array, centre: Array, half_m: float, width_m: float, height_m: float
+    texture: NDArray[np.float32],
+    cells: Array,
+    centre: Array,
+    half_m: float,
+    width_m: float,
+    height_m: float,
 ) -> None:
     """Print a square of cells, in place, weighted by the share of each texel that a cell covers."""
     rows, columns = texture.shape

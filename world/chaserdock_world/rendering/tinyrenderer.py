@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adapter to PyBullet's software renderer TinyRenderer, for targets of any shape.
 
-Renders a scene of its own, separate from the physics, with the camera at the origin (x right, y up, looking along -z).
-TinyRenderer samples half a pixel off, which is compensated here, and does not supersample, so the image is rendered
-``supersampled`` times as wide and high and averaged.
+Renders a scene of its own, separate from the physics, with the camera at the origin (x right, y up,
+looking along -z). TinyRenderer samples half a pixel off, which is compensated here, and does not
+supersample, so the image is rendered ``supersampled`` times as wide and high and averaged.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ _LIFT_M = 2e-4
 
 
 class TinyRenderer:
-    """Renders what ``camera`` sees with TinyRenderer; the interface is that of `rasterizer.Renderer`.
+    """Renders what ``camera`` sees with TinyRenderer; the interface is that of
+    `rasterizer.Renderer`.
 
-    ``model.mesh``, if given, replaces the target's boxes. ``supersampled``: samples per pixel along each axis. Raises
-    ValueError for a mesh that PyBullet cannot read, and as `Lens` does.
+    ``model.mesh``, if given, replaces the target's boxes. ``supersampled``: samples per pixel along
+    each axis. Raises ValueError for a mesh that PyBullet cannot read, and as `Lens` does.
     """
 
     def __init__(
@@ -63,8 +64,8 @@ class TinyRenderer:
             self._target = self._mesh_parts() if model.mesh else self._box_parts()
         width, height = self._lens.size_px
         left, top = (self._lens.origin_px - (camera.cx_px, camera.cy_px)).tolist()
-        # Borders of the image at the near plane. TinyRenderer samples at the upper left corners of its pixels,
-        # counted from the bottom: half a sample to the left and half a sample up.
+        # Borders of the image at the near plane. TinyRenderer samples at the upper left corners of
+        # its pixels, counted from the bottom: half a sample to the left and half a sample up.
         left, top = left - 0.5 + 0.5 / supersampled, top - 0.5 - 0.5 / supersampled
         bounds = (
             left / camera.fx_px,
@@ -86,7 +87,8 @@ class TinyRenderer:
     ) -> NDArray[np.uint8]:
         """Return the image (h, w), uint8; arguments as for `rasterizer.Renderer.render`.
 
-        TinyRenderer has a single light: in the dark the camera's lamp replaces the sun, without inverse-square falloff.
+        TinyRenderer has a single light: in the dark the camera's lamp replaces the sun, without
+        inverse-square falloff.
         """
         q_w_irf = np.asarray(camera_q_w_irf_wxyz, dtype=float)
         eye = np.asarray(camera_position_w_m, dtype=float)
@@ -98,7 +100,9 @@ class TinyRenderer:
             for body, p_body, q_body in bodies:
                 at = p + rotations.rotate(q, p_body)
                 turn = rotations.multiply(q, q_body).tolist()
-                self._bullet.resetBasePositionAndOrientation(body, at.tolist(), [*turn[1:], turn[0]])
+                self._bullet.resetBasePositionAndOrientation(
+                    body, at.tolist(), [*turn[1:], turn[0]]
+                )
 
         place(self._target, target_p_w_m, target_q_w_trf_wxyz)
         used: dict[tuple[Box, ...], int] = {}
@@ -112,7 +116,9 @@ class TinyRenderer:
         drawn = self._draw(self._background.draw(q_w_irf, light), q_gl_w, light)
         return self._lens.distort(spread_points(drawn, self._point_spread_px))
 
-    def _draw(self, background: NDArray[np.uint8], q_gl_w: Array, light: Light) -> NDArray[np.uint8]:
+    def _draw(
+        self, background: NDArray[np.uint8], q_gl_w: Array, light: Light
+    ) -> NDArray[np.uint8]:
         height, width = background.shape
         n = self._samples
         full = WHITE_LEVEL / 255.0
@@ -133,13 +139,17 @@ class TinyRenderer:
             lightSpecularCoeff=0.0,
             renderer=pybullet.ER_TINY_RENDERER,
         )
-        grey = np.ascontiguousarray(np.reshape(rgba, (n * height, n * width, 4))[..., 0], dtype=np.uint8)
+        grey = np.ascontiguousarray(
+            np.reshape(rgba, (n * height, n * width, 4))[..., 0], dtype=np.uint8
+        )
         behind = np.reshape(segments, grey.shape) < 0
         far = cv2.resize(background, (n * width, n * height), interpolation=cv2.INTER_NEAREST)
         np.copyto(grey, np.asarray(far, dtype=np.uint8), where=behind)
         if n == 1:
             return grey
-        return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return np.asarray(
+            cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+        )
 
     def _obstacle(self, kind: tuple[Box, ...], k: int) -> list[tuple[int, Array, Array]]:
         """Return the parts of the k-th body made of the boxes ``kind``."""
@@ -147,7 +157,9 @@ class TinyRenderer:
         while len(bodies) < (k + 1) * len(kind):
             bodies += [self._box(box) for box in kind]
         mine = bodies[k * len(kind) : (k + 1) * len(kind)]
-        return [(i, np.array(b.position_m), np.array(b.q_wxyz)) for i, b in zip(mine, kind, strict=True)]
+        return [
+            (i, np.array(b.position_m), np.array(b.q_wxyz)) for i, b in zip(mine, kind, strict=True)
+        ]
 
     def _box(self, box: Box) -> int:
         return self._body(
@@ -191,7 +203,9 @@ class TinyRenderer:
             q = np.array(marker.q_trf_marker_wxyz)
             side = marker.side_m + 2.0 * self.model.white_margin_m
             at = np.array(marker.position_trf_m) + rotations.rotate(q, [0.0, 0.0, _LIFT_M])
-            parts.append((self._quad(side, side, textures.label_texture(self.model, marker)), at, q))
+            parts.append(
+                (self._quad(side, side, textures.label_texture(self.model, marker)), at, q)
+            )
         return parts
 
     def _quad(self, width_m: float, height_m: float, texture: NDArray[np.uint8]) -> int:
@@ -207,7 +221,9 @@ class TinyRenderer:
         )
         path = self._folder / f"{body}.png"
         cv2.imwrite(str(path), cv2.cvtColor(texture, cv2.COLOR_GRAY2BGR))
-        self._bullet.changeVisualShape(body, -1, textureUniqueId=self._bullet.loadTexture(str(path)))
+        self._bullet.changeVisualShape(
+            body, -1, textureUniqueId=self._bullet.loadTexture(str(path))
+        )
         return body
 
     def close(self) -> None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor errors: cameras against their calibration, and noise, drift and bias of the chasers' odometry.
+"""Sensor errors: cameras against their calibration, and noise, drift and bias of the chasers'
+odometry.
 
-Camera errors and biases are drawn once per chaser, noise and drift once per tick, from the scenario's seed, the chaser's
-number and the tick only.
+Camera errors and biases are drawn once per chaser, noise and drift once per tick, from the
+scenario's seed, the chaser's number and the tick only.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ _NO_DRIFT = np.zeros(6)
 
 @dataclass(frozen=True, eq=False)
 class CameraErrors:
-    """Errors of one camera against its calibration: rotation vector (3,) and shift (3,) in CRF, relative focal length,
-    principal point (2,) in pixels."""
+    """Errors of one camera against its calibration: rotation vector (3,) and shift (3,) in CRF,
+    relative focal length, principal point (2,) in pixels."""
 
     turn_rad: Array
     shift_m: Array
@@ -37,7 +38,9 @@ class CameraErrors:
 
 
 def camera_errors(scenario: Scenario, chaser: int) -> CameraErrors:
-    """Return the errors of a chaser's camera: those of ``[navigation]`` and those of ``[truth.camera]``."""
+    """Return the errors of a chaser's camera: those of ``[navigation]`` and those of
+    ``[truth.camera]``.
+    """
     stated, unknown = scenario.navigation.errors(), scenario.truth.camera
     known = generator(scenario.seed, Stream.CALIBRATION, chaser).standard_normal(9)
     beyond = generator(scenario.seed, Stream.UNKNOWN_CALIBRATION, chaser).standard_normal(9)
@@ -52,7 +55,9 @@ def camera_errors(scenario: Scenario, chaser: int) -> CameraErrors:
 def true_camera(scenario: Scenario, chaser: int) -> Camera:
     """Return the true camera of a chaser: the calibrated one with its errors."""
     calibrated, error = scenario.camera_model(), camera_errors(scenario, chaser)
-    if not (error.turn_rad.any() or error.shift_m.any() or error.focal_share or error.centre_px.any()):
+    if not (
+        error.turn_rad.any() or error.shift_m.any() or error.focal_share or error.centre_px.any()
+    ):
         return calibrated
     scale = 1.0 + error.focal_share
     turned = rotations.multiply(rotations.exp(error.turn_rad), calibrated.q_crf_irf_wxyz)
@@ -71,7 +76,9 @@ def true_camera(scenario: Scenario, chaser: int) -> Camera:
 
 
 def white_covariances(errors: NavigationErrors) -> dict[str, Square3]:
-    """Return the covariance fields of ``Odometry``: what is new in every tick, without drift and bias."""
+    """Return the covariance fields of ``Odometry``: what is new in every tick, without drift and
+    bias.
+    """
     cross, roll = errors.attitude_noise_rad, errors.attitude_roll_noise_rad
     sigmas = {
         "position_covariance_m2": np.full(3, errors.position_noise_m),
@@ -92,9 +99,13 @@ class OdometrySensor:
         self._noise_factor = scenario.truth.sensors.noise_factor
         self._bias = [generator(seed, Stream.BIAS, i).standard_normal(9) for i in chasers]
         # In standard deviations: position (3), attitude (3).
-        times_s = np.repeat([self._errors.position_drift_time_s, self._errors.attitude_drift_time_s], 3)
+        times_s = np.repeat(
+            [self._errors.position_drift_time_s, self._errors.attitude_drift_time_s], 3
+        )
         period_s = 1.0 / scenario.time.rate_hz
-        self._drift = [GaussMarkov(seed, Stream.DRIFT, i, times_s.tolist(), period_s) for i in chasers]
+        self._drift = [
+            GaussMarkov(seed, Stream.DRIFT, i, times_s.tolist(), period_s) for i in chasers
+        ]
         self._drifts = bool(self._errors.position_drift_m or self._errors.attitude_drift_rad)
         self.covariances = white_covariances(self._errors)
         cross, roll = self._errors.attitude_noise_rad, self._errors.attitude_roll_noise_rad
@@ -103,11 +114,15 @@ class OdometrySensor:
             self._errors.velocity_noise_m_s,
             self._errors.omega_noise_rad_s,
         )
-        self._sigmas = np.array([*[position] * 3, roll, cross, cross, *[velocity] * 3, *[omega] * 3])
+        self._sigmas = np.array(
+            [*[position] * 3, roll, cross, cross, *[velocity] * 3, *[omega] * 3]
+        )
         self._biases = [self.biases(i) for i in chasers]
 
     def biases(self, chaser: int) -> tuple[Array, Array, Array]:
-        """Return the constant errors of a chaser: position (3,), m, attitude (3,), rad, and rate (3,), rad/s."""
+        """Return the constant errors of a chaser: position (3,), m, attitude (3,), rad, and rate
+        (3,), rad/s.
+        """
         errors, bias = self._errors, self._bias[chaser]
         return (
             errors.position_bias_m * bias[:3],
@@ -120,8 +135,14 @@ class OdometrySensor:
         errors = self._errors
         if self._exact:
             return state
-        noise = generator(self._seed, Stream.NOISE, chaser, tick).standard_normal(12) * self._noise_factor
-        white, (position_bias, attitude_bias, gyro_bias) = self._sigmas * noise, self._biases[chaser]
+        noise = (
+            generator(self._seed, Stream.NOISE, chaser, tick).standard_normal(12)
+            * self._noise_factor
+        )
+        white, (position_bias, attitude_bias, gyro_bias) = (
+            self._sigmas * noise,
+            self._biases[chaser],
+        )
         drift = self._drift[chaser].at(tick) if self._drifts else _NO_DRIFT
         turn = attitude_bias + white[3:6] + errors.attitude_drift_rad * drift[3:]
         offset = position_bias + errors.position_drift_m * drift[:3]

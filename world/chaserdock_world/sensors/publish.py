@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish the world's messages at the beginning of a tick: odometry, docking sensors and ground truth."""
+"""Publish the world's messages at the beginning of a tick: odometry, docking sensors and ground
+truth.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,9 @@ def docking_status(latch: ProbeLatch, tick: int, time_ns: int) -> DockingStatus:
 def publish_docking(node: Node, latches: dict[str, ProbeLatch], tick: int, timing: Timing) -> None:
     """Publish the docking sensors of the chasers that have a port."""
     for latch in latches.values():
-        node.publish(topics.DOCKING, docking_status(latch, tick, timing.tick_time_ns(tick)), latch.chaser)
+        node.publish(
+            topics.DOCKING, docking_status(latch, tick, timing.tick_time_ns(tick)), latch.chaser
+        )
 
 
 def publish_truth(
@@ -79,7 +83,9 @@ def publish_truth(
     contacts: set[tuple[str, str]],
     latches: dict[str, ProbeLatch],
 ) -> None:
-    """Publish the ground truth of all bodies, and actuator outputs and touches since the last tick, which this takes."""
+    """Publish the ground truth of all bodies, and actuator outputs and touches since the last tick,
+    which this takes.
+    """
     time_ns = timing.tick_time_ns(tick)
     saturated, late = [], 0
     for name, state in states.items():
@@ -97,7 +103,9 @@ def publish_truth(
             late += taken.late
             if taken.saturated:
                 saturated.append(int(name.partition("/")[2]))
-        message = BodyTruth(tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **output)
+        message = BodyTruth(
+            tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **output
+        )
         node.publish(topics.TRUTH_BODY, message, name)
     world = WorldTruth(
         tick=tick,
@@ -157,9 +165,13 @@ def drawn_truth(scenario: Scenario, sensor: OdometrySensor) -> DrawnTruth:
     """Return everything that was drawn once for this mission."""
     chasers = tuple(_drawn_chaser(scenario, sensor, i) for i in range(len(scenario.chasers)))
     pairs = zip(scenario.target_model().markers, true_target(scenario).markers, strict=True)
-    shifts = tuple(b - a for x, y in pairs for a, b in zip(x.position_trf_m, y.position_trf_m, strict=True))
+    shifts = tuple(
+        b - a for x, y in pairs for a, b in zip(x.position_trf_m, y.position_trf_m, strict=True)
+    )
     target = DrawnBody(
-        body="target", marker_shift_m=shifts if any(shifts) else (), **_plant_fields(target_plant(scenario))
+        body="target",
+        marker_shift_m=shifts if any(shifts) else (),
+        **_plant_fields(target_plant(scenario)),
     )
     return DrawnTruth(tick=0, bodies=(target, *chasers))
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the target in an image: from markers (ArUco detection, edge-fitted corners, PnP with covariance) or from its shape."""
+"""Pose of the target in an image: from markers (ArUco detection, edge-fitted corners, PnP with
+covariance) or from its shape.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class PerceptionMethod(Protocol):
 
 
 class FarPerception:
-    """A perception by markers that measures a target too far for these by its bearing, at a measured range."""
+    """A perception by markers that measures a target too far for these by its bearing, at a
+    measured range.
+    """
 
     def __init__(self, by_markers: Perception, by_bearing: BearingFinder) -> None:
         self.by_markers, self.by_bearing = by_markers, by_bearing
@@ -40,11 +44,11 @@ class FarPerception:
 
 
 def make_perception(scenario: FlightScenario, single_images: bool = False) -> PerceptionMethod:
-    """Return the perception that the scenario names: a built-in one, or an installed ``chaserdock.perceptions`` entry point,
-    a function of (camera: Camera, target: TargetModel).
+    """Return the perception that the scenario names: a built-in one, or an installed
+    ``chaserdock.perceptions`` entry point, a function of (camera: Camera, target: TargetModel).
 
-    ``single_images``: images do not follow each other, so that an acquisition ends in the image in which it begins. Raises
-    PluginError for a perception that is not installed.
+    ``single_images``: images do not follow each other, so that an acquisition ends in the image in
+    which it begins. Raises PluginError for a perception that is not installed.
     """
     camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:
@@ -57,7 +61,9 @@ def make_perception(scenario: FlightScenario, single_images: bool = False) -> Pe
         case "statistical":
             return StatisticalPerception(camera, target, scenario.ranging)
         case "model":
-            perception = ModelPerception(camera, tracker_mesh(scenario.target), single_images=single_images)
+            perception = ModelPerception(
+                camera, tracker_mesh(scenario.target), single_images=single_images
+            )
             perception.prepare()
             return perception
         case name:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The perception of the paper, as a baseline: undistort the image, ArUco, EPnP on all corners.
 
-Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC 2023, sec. 4.
-Corners by OpenCV's sub-pixel refinement. EPnP is OpenCV's and fails on about half of the views of a single
-face; that is part of the baseline. The authors' public code calls OpenCV's ``estimatePoseBoard`` instead, which is the
-iterative PnP without an initial guess. The only check is that the result is a finite pose in front of the camera.
+Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC
+2023, sec. 4. Corners by OpenCV's sub-pixel refinement. EPnP is OpenCV's and fails on about half of
+the views of a single face; that is part of the baseline. The authors' public code calls OpenCV's
+``estimatePoseBoard`` instead, which is the iterative PnP without an initial guess. The only check
+is that the result is a finite pose in front of the camera.
 """
 
 from __future__ import annotations
@@ -20,11 +21,15 @@ from . import pnp
 from .detect import NOTHING, Detections
 
 
-def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dictionary) -> Detections:
+def detect(
+    image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dictionary
+) -> Detections:
     """Detect markers with OpenCV's default settings and sub-pixel corners, in ideal pixels."""
     if camera.distortion:
         matrix = camera.matrix()
-        image = np.asarray(cv2.undistort(image, matrix, np.array(camera.distortion)), dtype=np.uint8)
+        image = np.asarray(
+            cv2.undistort(image, matrix, np.array(camera.distortion)), dtype=np.uint8
+        )
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
@@ -38,9 +43,11 @@ def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dicti
 def solve(
     camera: Camera, points_trf_m: Array, corners_ideal_px: Array, iterative: bool = False
 ) -> tuple[pnp.TargetPose, ...]:
-    """Solve EPnP, or iterative PnP, with all corners (n, 4, 2), ideal pixels, of markers with corners ``points_trf_m`` (n, 4, 3).
+    """Solve EPnP, or iterative PnP, with all corners (n, 4, 2), ideal pixels, of markers with
+    corners ``points_trf_m`` (n, 4, 3).
 
-    Returns one pose, or none if it is not finite or behind the camera; its covariance is first-order, from its residuals.
+    Returns one pose, or none if it is not finite or behind the camera; its covariance is
+    first-order, from its residuals.
     """
     if not len(points_trf_m):
         return ()

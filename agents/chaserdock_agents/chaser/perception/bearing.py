@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Position of a target too far for markers: its bearing in the image, at a measured range and a known attitude.
+"""Position of a target too far for markers: its bearing in the image, at a measured range and a
+known attitude.
 
-The target is the spot that has the size of the known shape at that range. The centre of the body is where the silhouette's centroid
-is that of the spot.
+The target is the spot that has the size of the known shape at that range. The centre of the body is
+where the silhouette's centroid is that of the spot.
 """
 
 from __future__ import annotations
@@ -23,25 +24,35 @@ from .pnp import TargetPose
 POINT_SPREAD_PX = 0.65
 """Standard deviation per axis of the image of a point."""
 _LEVELS, _SIGMAS = 6.0, 5.0
-"""A spot is brighter than the background by so many grey levels and standard deviations of the noise."""
+"""A spot is brighter than the background by so many grey levels and standard deviations of the
+noise.
+"""
 _MARGIN_PX = 2
 """Pixels around a spot that belong to it."""
 _SATURATION_PX, _SATURATION_MIN, _SATURATION_MAX, _SATURATION_LEVELS = 0.6, 0.1, 0.8, 8.0
-"""Grey levels count up to a share of the spot's brightness: the first, divided by the radius, within the next two; at least the
-last. So differently lit faces of a large spot count alike, and pixels of a small one in proportion to what they show of the target."""
+"""Grey levels count up to a share of the spot's brightness: the first, divided by the radius,
+within the next two; at least the last. So differently lit faces of a large spot count alike, and
+pixels of a small one in proportion to what they show of the target."""
 _GRID_SHARE_PX, _LIGHT_SHARE = 0.2, 0.013
-"""Standard deviation of the centroid by pixel grid and compression (at a radius of 1 px; falls with its square root), and by
-markers and light (as a share of the radius). Measured: ``benchmarks/vision.py --only bearing``."""
+"""Standard deviation of the centroid by pixel grid and compression (at a radius of 1 px; falls with
+its square root), and by markers and light (as a share of the radius). Measured:
+``benchmarks/vision.py --only bearing``."""
 _SIZE_SHARE, _SIZE_SIGMAS = 0.25, 5.0
-"""A spot's radius may differ from the expected one by this share and so many standard deviations by noise."""
+"""A spot's radius may differ from the expected one by this share and so many standard deviations by
+noise.
+"""
 _LEVEL_MIN, _LEVEL_MAX = 10.0, 255.0
 """Grey level of the target above the background, on an average over its silhouette."""
 _NEAR_PX = 8.0
 """Greatest distance of the target from the predicted place."""
 _CLEAR_RATIO = 1.5
-"""Without a prediction, the target is the brightest spot of its size, by this ratio to the next one."""
+"""Without a prediction, the target is the brightest spot of its size, by this ratio to the next
+one.
+"""
 _STAR_PX, _AIM_RAD = 1.2, math.radians(2.0)
-"""Below this expected radius stars are as bright, and a first sighting must be within this angle of the optical axis."""
+"""Below this expected radius stars are as bright, and a first sighting must be within this angle of
+the optical axis.
+"""
 _NEAREST, _FARTHEST = 2.0, 1e4
 """Least and greatest range, in radii of the target."""
 _RASTER = 256
@@ -60,8 +71,8 @@ class Silhouette(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """A bright spot: centroid (2,), root mean square radius, sum of the grey levels above the background; standard deviation of the
-    centroid per axis by the noise of the image."""
+    """A bright spot: centroid (2,), root mean square radius, sum of the grey levels above the
+    background; standard deviation of the centroid per axis by the noise of the image."""
 
     centroid_px: Array
     radius_px: float
@@ -70,7 +81,9 @@ class Spot(NamedTuple):
 
 
 class RangedTarget(NamedTuple):
-    """Range of the target with its standard deviation, and its attitude, TRF to IRF (4,), with covariance (3, 3) in TRF axes."""
+    """Range of the target with its standard deviation, and its attitude, TRF to IRF (4,), with
+    covariance (3, 3) in TRF axes.
+    """
 
     range_m: float
     range_sigma_m: float
@@ -81,8 +94,8 @@ class RangedTarget(NamedTuple):
 class BearingFinder:
     """Finds the target as a spot in images of a camera. Stateless.
 
-    ``focal_share``: standard deviation of the relative error of the focal length. The range does not depend on it, while estimators
-    expect depths as seen through the camera.
+    ``focal_share``: standard deviation of the relative error of the focal length. The range does
+    not depend on it, while estimators expect depths as seen through the camera.
     """
 
     def __init__(self, camera: Camera, model: TargetModel, focal_share: float = 0.0) -> None:
@@ -96,19 +109,27 @@ class BearingFinder:
         self._reach_m = float(np.linalg.norm(self._corners, axis=-1).max())
 
     def find(
-        self, image: NDArray[np.uint8], target: RangedTarget, predicted_irf_m: ArrayLike | None = None
+        self,
+        image: NDArray[np.uint8],
+        target: RangedTarget,
+        predicted_irf_m: ArrayLike | None = None,
     ) -> TargetPose:
-        """Return the pose of the target in a grey image (h, w), ``predicted_irf_m`` (3,) near its predicted position.
+        """Return the pose of the target in a grey image (h, w), ``predicted_irf_m`` (3,) near its
+        predicted position.
 
         Raises BearingError if no spot is clearly the target.
         """
         if not _NEAREST * self._reach_m < target.range_m < _FARTHEST * self._reach_m:
-            raise BearingError(f"a range of {target.range_m:.3g} m is too near or too far for a bearing")
+            raise BearingError(
+                f"a range of {target.range_m:.3g} m is too near or too far for a bearing"
+            )
         expected = self._silhouette(np.array([0.0, 0.0, target.range_m]), target.q_wxyz)
         spots = find_spots(image, expected.radius_px)
         plausible = [(s, v) for s in spots if (v := self._shape_at(s, target)) is not None]
         if not plausible:
-            sizes = ", ".join(f"{s.radius_px:.1f}" for s in sorted(spots, key=lambda s: -s.flux)[:3])
+            sizes = ", ".join(
+                f"{s.radius_px:.1f}" for s in sorted(spots, key=lambda s: -s.flux)[:3]
+            )
             raise BearingError(
                 f"no spot of the target's size, a radius of {_blurred(expected.radius_px):.1f} px at {target.range_m:.1f} m"
                 + (f"; the brightest have {sizes} px" if spots else "")
@@ -121,27 +142,40 @@ class BearingFinder:
         return self._pose(centre, sigma_px, target)
 
     def _choose(
-        self, plausible: list[tuple[Spot, Silhouette]], predicted_irf_m: ArrayLike | None, starlike: bool
+        self,
+        plausible: list[tuple[Spot, Silhouette]],
+        predicted_irf_m: ArrayLike | None,
+        starlike: bool,
     ) -> tuple[Spot, Silhouette]:
         if predicted_irf_m is not None:
             place = self._camera.project(predicted_irf_m)
-            near = min(plausible, key=lambda found: float(np.linalg.norm(found[0].centroid_px - place)))
+            near = min(
+                plausible, key=lambda found: float(np.linalg.norm(found[0].centroid_px - place))
+            )
             if float(np.linalg.norm(near[0].centroid_px - place)) < _NEAR_PX + near[1].radius_px:
                 return near
         found = [p for p in plausible if not starlike or self._off_axis(p[0]) < _AIM_RAD]
         if not found:
-            raise BearingError("spots of the target's size may be stars, away from the optical axis")
+            raise BearingError(
+                "spots of the target's size may be stars, away from the optical axis"
+            )
         first, *others = sorted(found, key=lambda candidate: -candidate[0].flux)
         if others and first[0].flux < _CLEAR_RATIO * others[0][0].flux:
-            raise BearingError(f"{len(found)} spots of the target's size, none much brighter than the others")
+            raise BearingError(
+                f"{len(found)} spots of the target's size, none much brighter than the others"
+            )
         return first
 
     def _off_axis(self, spot: Spot) -> float:
         """Return the angle between a spot and the optical axis."""
-        return math.acos(min(float(self._along(self._camera.undistort(spot.centroid_px), 1.0)[2]), 1.0))
+        return math.acos(
+            min(float(self._along(self._camera.undistort(spot.centroid_px), 1.0)[2]), 1.0)
+        )
 
     def _shape_at(self, spot: Spot, target: RangedTarget) -> Silhouette | None:
-        """Return the silhouette expected at a spot, None if the spot does not have its size and brightness."""
+        """Return the silhouette expected at a spot, None if the spot does not have its size and
+        brightness.
+        """
         ideal = self._camera.undistort(spot.centroid_px)
         if not np.all(np.isfinite(ideal)):
             return None
@@ -160,7 +194,9 @@ class BearingFinder:
         return ray * (range_m / float(np.linalg.norm(ray)))
 
     def _pose(self, centre_px: Array, sigma_px: float, target: RangedTarget) -> TargetPose:
-        """Return the pose with its covariance: an error in pixels acts across the optical axis, one of the range along the ray."""
+        """Return the pose with its covariance: an error in pixels acts across the optical axis, one
+        of the range along the ray.
+        """
         position = self._along(centre_px, target.range_m)
         c, along = self._camera, position / target.range_m
         # d(ray) / d(pixel), without the part along the ray.
@@ -168,13 +204,17 @@ class BearingFinder:
         across = across - np.outer(along, along @ across)
         range_sigma = math.hypot(target.range_sigma_m, self._focal_share * target.range_m)
         covariance = np.zeros((6, 6))
-        covariance[:3, :3] = sigma_px**2 * across @ across.T + range_sigma**2 * np.outer(along, along)
+        covariance[:3, :3] = sigma_px**2 * across @ across.T + range_sigma**2 * np.outer(
+            along, along
+        )
         covariance[3:, 3:] = target.attitude_covariance_rad2
         return TargetPose(position, target.q_wxyz, covariance, sigma_px)
 
 
 def bias_px(radius_px: float) -> float:
-    """Return the standard deviation per axis of a spot's centroid by pixel grid, compression, markers and light."""
+    """Return the standard deviation per axis of a spot's centroid by pixel grid, compression,
+    markers and light.
+    """
     return math.hypot(_GRID_SHARE_PX / math.sqrt(max(radius_px, 1.0)), _LIGHT_SHARE * radius_px)
 
 
@@ -182,8 +222,12 @@ def _blurred(radius_px: float) -> float:
     return math.hypot(radius_px, math.sqrt(2.0) * POINT_SPREAD_PX)
 
 
-def silhouette(camera: Camera, corners_trf_m: Array, q_wxyz: Array, position_irf_m: Array) -> Silhouette:
-    """Return the silhouette of cuboids with corners (n, 8, 3) in TRF, at a pose in front of the camera."""
+def silhouette(
+    camera: Camera, corners_trf_m: Array, q_wxyz: Array, position_irf_m: Array
+) -> Silhouette:
+    """Return the silhouette of cuboids with corners (n, 8, 3) in TRF, at a pose in front of the
+    camera.
+    """
     px = camera.project_ideal(rotations.rotate(q_wxyz, corners_trf_m) + position_irf_m)
     low = px.min(axis=(0, 1))
     scale = (_RASTER - 3) / float((px.max(axis=(0, 1)) - low).max())
@@ -197,7 +241,9 @@ def silhouette(camera: Camera, corners_trf_m: Array, q_wxyz: Array, position_irf
 
 
 def find_spots(image: NDArray[np.uint8], radius_px: float) -> list[Spot]:
-    """Return the bright spots of an image (h, w) that do not touch its border and may have this root mean square radius."""
+    """Return the bright spots of an image (h, w) that do not touch its border and may have this
+    root mean square radius.
+    """
     # No shape extends beyond four times its radius; ``_shape_at`` decides.
     largest = 4.0 * _blurred(radius_px) + 2.0 * _MARGIN_PX
     share = min(max(_SATURATION_PX / radius_px, _SATURATION_MIN), _SATURATION_MAX)
@@ -209,7 +255,10 @@ def find_spots(image: NDArray[np.uint8], radius_px: float) -> list[Spot]:
     spots = []
     for label, (x, y, w, h, area) in enumerate(stats.tolist()):
         inside = (
-            x > _MARGIN_PX and y > _MARGIN_PX and x + w + _MARGIN_PX < width and y + h + _MARGIN_PX < height
+            x > _MARGIN_PX
+            and y > _MARGIN_PX
+            and x + w + _MARGIN_PX < width
+            and y + h + _MARGIN_PX < height
         )
         if label == 0 or area < 2 or max(w, h) > largest or not inside:
             continue
@@ -221,7 +270,9 @@ def find_spots(image: NDArray[np.uint8], radius_px: float) -> list[Spot]:
 
 
 def _measure(above: Any, mask: NDArray[np.bool_], sigma: float, share: float) -> Spot:
-    """Return the spot of a mask in grey levels above the background (h, w), with noise ``sigma``; ``share``: saturation."""
+    """Return the spot of a mask in grey levels above the background (h, w), with noise ``sigma``;
+    ``share``: saturation.
+    """
     kernel = np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), dtype=np.uint8)
     around = cv2.dilate(mask.astype(np.uint8), kernel)
     above = above * around
@@ -232,5 +283,7 @@ def _measure(above: Any, mask: NDArray[np.bool_], sigma: float, share: float) ->
     centre = np.array([(weights * x).sum(), (weights * y).sum()]) / total
     distance2 = (x - centre[0]) ** 2 + (y - centre[1]) ** 2
     radius = math.sqrt(max(float((weights * distance2).sum()) / total, 0.0))
-    noise = sigma / limit / total * math.sqrt(float((distance2 * (weights < 1.0) * around).sum()) / 2.0)
+    noise = (
+        sigma / limit / total * math.sqrt(float((distance2 * (weights < 1.0) * around).sum()) / 2.0)
+    )
     return Spot(centre, radius, float(above.sum()), noise)

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Marker corners from lines fitted to the sides, in undistorted coordinates.
 
-Contours and corner filters bias the corners of a black square inwards. Here a coarse step moves each side to the centroids of
-the grey-level gradient across it. Then the grey levels of the pixels along a side are fitted by those of a blurred edge; a white
-border that ends at a known distance is fitted with its outer edge. Sides are curves in the distorted image, so the place of each
-pixel is mapped through the lens. Pixels are not interpolated: that would bias an edge by its place between pixels.
+Contours and corner filters bias the corners of a black square inwards. Here a coarse step moves
+each side to the centroids of the grey-level gradient across it. Then the grey levels of the pixels
+along a side are fitted by those of a blurred edge; a white border that ends at a known distance is
+fitted with its outer edge. Sides are curves in the distorted image, so the place of each pixel is
+mapped through the lens. Pixels are not interpolated: that would bias an edge by its place between
+pixels.
 
-The arithmetic is in C (native/corners.c): a few markers are too little work to vectorize with NumPy.
+The arithmetic is in C (native/corners.c): a few markers are too little work to vectorize with
+NumPy.
 """
 
 from __future__ import annotations
@@ -31,22 +34,29 @@ class _Settings(Structure):
         (name, c_double) for name in (
             # Length inwards across a side: at most this share of a cell, at least so many pixels.
             "reach_cells", "reach_least_px",
-            # Minimum contrast; minimum share of usable lines across a side; maximum correction of a corner.
+            # Minimum contrast; minimum share of usable lines across a side; maximum correction of a
+            # corner.
             "min_contrast", "min_rows_share", "max_move_px",
-            # Coarse step: the part of a side, lines across it, samples on each, length to either side, and as share of the border.
+            # Coarse step: the part of a side, lines across it, samples on each, length to either
+            # side, and as share of the border.
             "first", "last", "rows", "taps", "coarse_reach_px", "border_share",
-            # Fit: lines of pixels across a side; its ends are excluded by so many pixels, at most this share.
+            # Fit: lines of pixels across a side; its ends are excluded by so many pixels, at most
+            # this share.
             "columns", "end_px", "end_share",
-            # Length outwards across a side, at most to so much before a border's outer edge, or to so much beyond it.
+            # Length outwards across a side, at most to so much before a border's outer edge, or to
+            # so much beyond it.
             "reach_px", "clear_px", "beyond_px",
-            # The outer edge is used of narrower borders (the second: of such that end at neighbours beside a part of the side), or
-            # if grey levels fall by this share of the rise at the side, and it agrees with the side to so many pixels.
+            # The outer edge is used of narrower borders (the second: of such that end at neighbours
+            # beside a part of the side), or if grey levels fall by this share of the rise at the
+            # side, and it agrees with the side to so many pixels.
             "strip_px", "partial_px", "least_fall", "agreement_px",
-            # Logarithm of an edge's sigma, pixels (pixel and lens together), and how well that is known, a standard deviation.
+            # Logarithm of an edge's sigma, pixels (pixel and lens together), and how well that is
+            # known, a standard deviation.
             "log_edge_sigma", "edge_sigma_spread",
             "rounds", "iterations", "strip_iterations",
-            # Corners of markers with cells or borders of few pixels, and of such with little contrast, are less accurate:
-            # relative sigma sqrt(1 + (this / width)^2 + (this / contrast)^2), fitted to the errors in rendered images.
+            # Corners of markers with cells or borders of few pixels, and of such with little
+            # contrast, are less accurate: relative sigma sqrt(1 + (this / width)^2 + (this /
+            # contrast)^2), fitted to the errors in rendered images.
             "uncertain_px", "uncertain_level",
         )
     ]  # fmt: skip
@@ -69,8 +79,9 @@ _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 
 @dataclass(frozen=True)
 class Refined:
-    """``corners_px`` (n, 4, 2), ideal pixels; ``good`` (n,): markers with four good sides (corners of the others are
-    unchanged); ``relative_sigma`` (n,): uncertainty relative to a large marker of high contrast, at least 1.
+    """``corners_px`` (n, 4, 2), ideal pixels; ``good`` (n,): markers with four good sides (corners
+    of the others are unchanged); ``relative_sigma`` (n,): uncertainty relative to a large marker of
+    high contrast, at least 1.
     """
 
     corners_px: Array
@@ -84,18 +95,24 @@ class Refined:
     def with_others(self, which: NDArray[np.bool_], others: Refined) -> Refined:
         """Return a copy in which ``others`` replace the markers ``which`` (n,)."""
         corners, good, sigma = self.corners_px.copy(), self.good.copy(), self.relative_sigma.copy()
-        corners[which], good[which], sigma[which] = others.corners_px, others.good, others.relative_sigma
+        corners[which], good[which], sigma[which] = (
+            others.corners_px,
+            others.good,
+            others.relative_sigma,
+        )
         return Refined(corners, good, sigma)
 
 
 def inside_border(corners_px: Array, margin_share: Array) -> Array:
-    """Return the corners (n, 4, 2) of the black squares, given the outer corners of their white borders.
+    """Return the corners (n, 4, 2) of the black squares, given the outer corners of their white
+    borders.
 
     ``margin_share`` (n,): width of the border over the side of the square.
     """
     inner = [
         cv2.perspectiveTransform(
-            _SQUARE[None] / (1.0 + 2.0 * share), cv2.getPerspectiveTransform(_SQUARE, quad.astype(np.float32))
+            _SQUARE[None] / (1.0 + 2.0 * share),
+            cv2.getPerspectiveTransform(_SQUARE, quad.astype(np.float32)),
         )[0]
         for quad, share in zip(corners_px, margin_share.tolist(), strict=True)
     ]
@@ -112,10 +129,10 @@ def refine(
 ) -> Refined:
     """Refine corners by lines fitted along the sides of the black squares.
 
-    ``image``: the distorted grey image. ``corners_ideal_px`` (n, 4, 2), ideal pixels: initial corners to within
-    about two pixels, clockwise in the image. ``cells``: number of cells along a side, the black
-    border included. ``margin_share`` (n,): width of the white border over the side of the marker.
-    Raises ValueError for an image less than two pixels wide or high.
+    ``image``: the distorted grey image. ``corners_ideal_px`` (n, 4, 2), ideal pixels: initial
+    corners to within about two pixels, clockwise in the image. ``cells``: number of cells along a
+    side, the black border included. ``margin_share`` (n,): width of the white border over the side
+    of the marker. Raises ValueError for an image less than two pixels wide or high.
     """
     corners = np.array(corners_ideal_px, dtype=float, order="C")
     n = len(corners)

@@ -30,15 +30,17 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Detections:
-    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the image: top left, top right, bottom right, bottom
-    left of the upright marker. An id can occur more than once."""
+    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the image: top left, top right, bottom right,
+    bottom left of the upright marker. An id can occur more than once."""
 
     ids: NDArray[np.int64]
     corners_px: Array
 
 
 class _Windows(NamedTuple):
-    """Threshold windows, and the distance, over a marker's perimeter, within which two candidates are one."""
+    """Threshold windows, and the distance, over a marker's perimeter, within which two candidates
+    are one.
+    """
 
     least_px: int
     most_px: int
@@ -68,13 +70,15 @@ def detect(
     thorough: bool = False,
     enough: int | None = None,
 ) -> Detections:
-    """Detect markers of ``dictionary`` in a grey image or its ``region`` (left, top, right, bottom; pixels,
-    right and bottom excluded). Corners are those of OpenCV's contours, accurate to about a pixel.
+    """Detect markers of ``dictionary`` in a grey image or its ``region`` (left, top, right, bottom;
+    pixels, right and bottom excluded). Corners are those of OpenCV's contours, accurate to about a
+    pixel.
 
-    A threshold window of 7 px detects nearly as many markers as 7 and 23 px together, in half the time; the second is used
-    if the first detects fewer than two. ``thorough`` uses 3, 13 and 23 px and separates adjacent candidates: slower, for
-    narrow white borders. With ``enough`` a large image is searched at half size first, in a third of the time; the result
-    is used if it has that many markers.
+    A threshold window of 7 px detects nearly as many markers as 7 and 23 px together, in half the
+    time; the second is used if the first detects fewer than two. ``thorough`` uses 3, 13 and 23 px
+    and separates adjacent candidates: slower, for narrow white borders. With ``enough`` a large
+    image is searched at half size first, in a third of the time; the result is used if it has that
+    many markers.
     """
     left, top, right, bottom = region or (0, 0, image.shape[1], image.shape[0])
     part = image[top:bottom, left:right]
@@ -94,8 +98,12 @@ def detect(
 
 
 @lru_cache(maxsize=4096)
-def _detector(dictionary: cv2.aruco.Dictionary, windows: _Windows, longer_px: int) -> cv2.aruco.ArucoDetector:
-    """Return OpenCV's detector for images with this longer side; cached, as a flight uses few sizes."""
+def _detector(
+    dictionary: cv2.aruco.Dictionary, windows: _Windows, longer_px: int
+) -> cv2.aruco.ArucoDetector:
+    """Return OpenCV's detector for images with this longer side; cached, as a flight uses few
+    sizes.
+    """
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = windows.least_px
     parameters.adaptiveThreshWinSizeMax = windows.most_px
@@ -110,7 +118,9 @@ def _detector(dictionary: cv2.aruco.Dictionary, windows: _Windows, longer_px: in
     return cv2.aruco.ArucoDetector(dictionary, parameters)
 
 
-def _detect(part: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, windows: _Windows) -> Detections:
+def _detect(
+    part: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, windows: _Windows
+) -> Detections:
     corners, ids, _ = _detector(dictionary, windows, max(part.shape)).detectMarkers(part)
     if ids is None or len(ids) == 0:
         return NOTHING
@@ -140,7 +150,9 @@ def region_of(
 
 
 def _grown(px: list[float], end: int) -> tuple[int, int] | None:
-    """Return the interval of these coordinates with margins on an axis of ``end`` pixels; None if not finite."""
+    """Return the interval of these coordinates with margins on an axis of ``end`` pixels; None if
+    not finite.
+    """
     low, high = min(px), max(px)
     grow = _REGION_SHARE * (high - low) + _REGION_MARGIN_PX
     if not math.isfinite(grow):

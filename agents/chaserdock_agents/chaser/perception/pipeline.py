@@ -26,9 +26,10 @@ Method = Literal["default", "paper", "paper_iterative"]
 class GeometryInformation:
     """Information of one image about the k errors of the geometry, in their standard deviations.
 
-    ``matrix`` (k, k) and ``vector`` (k,), the matrix times the estimate: whatever the pose; empty for an image without a new view.
-    ``position_m`` (3,), IRF: of a target whose geometry has no errors; ``position_by_errors`` (3, k): its change by the errors;
-    ``position_covariance`` (3, 3), m²: for known errors.
+    ``matrix`` (k, k) and ``vector`` (k,), the matrix times the estimate: whatever the pose; empty
+    for an image without a new view. ``position_m`` (3,), IRF: of a target whose geometry has no
+    errors; ``position_by_errors`` (3, k): its change by the errors; ``position_covariance`` (3, 3),
+    m²: for known errors.
     """
 
     matrix: Array
@@ -42,10 +43,12 @@ class GeometryInformation:
 class PerceptionResult:
     """Result for one image.
 
-    ``solutions``: best first; empty without a trustworthy pose, two if a plane's tilt is ambiguous. ``marker_ids`` (n,)
-    and ``corners_px`` (n, 4, 2), distorted image: the used markers. ``rejected_ids``: detected but not used, ascending: not
-    on this target, duplicate, inconsistent with the others, or with an unusable side. ``geometry``: what the image tells about the
-    errors of a known shape, by a perception that estimates them. ``acquiring``: work on an earlier image has not ended.
+    ``solutions``: best first; empty without a trustworthy pose, two if a plane's tilt is ambiguous.
+    ``marker_ids`` (n,) and ``corners_px`` (n, 4, 2), distorted image: the used markers.
+    ``rejected_ids``: detected but not used, ascending: not on this target, duplicate, inconsistent
+    with the others, or with an unusable side. ``geometry``: what the image tells about the errors
+    of a known shape, by a perception that estimates them. ``acquiring``: work on an earlier image
+    has not ended.
     """
 
     solutions: tuple[TargetPose, ...]
@@ -59,13 +62,16 @@ class PerceptionResult:
 class Perception:
     """Estimates the pose of one target model in the images of one camera.
 
-    Stateless: `estimate` depends on its arguments only. ``method``: "default", or for the paper's baseline "paper" (EPnP) or
-    "paper_iterative". Raises ValueError for another method, or for an unknown marker dictionary.
+    Stateless: `estimate` depends on its arguments only. ``method``: "default", or for the paper's
+    baseline "paper" (EPnP) or "paper_iterative". Raises ValueError for another method, or for an
+    unknown marker dictionary.
     """
 
     def __init__(self, camera: Camera, model: TargetModel, method: Method = "default"):
         if method not in get_args(Method):
-            raise ValueError(f"unknown perception method {method!r}; known: {', '.join(get_args(Method))}")
+            raise ValueError(
+                f"unknown perception method {method!r}; known: {', '.join(get_args(Method))}"
+            )
         self.camera = camera
         self.model = model
         self.method: Method = method
@@ -80,18 +86,24 @@ class Perception:
     ) -> PerceptionResult:
         """Estimate the target's pose in a grey image (h, w), uint8.
 
-        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; it selects the region that is
-        searched first and does not affect the result. Raises ValueError for an image of another shape or type than the
-        camera's.
+        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; it
+        selects the region that is searched first and does not affect the result. Raises ValueError
+        for an image of another shape or type than the camera's.
         """
         shape = (self.camera.height_px, self.camera.width_px)
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
-            got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            got = (
+                f"{image.dtype} {image.shape}"
+                if isinstance(image, np.ndarray)
+                else type(image).__name__
+            )
             raise ValueError(f"expected a uint8 image of {shape}, got {got}")
         image = np.ascontiguousarray(image)
         if self.method != "default":
             return self._estimate_paper(image)
-        region = None if predicted is None else detect.region_of(self.camera, self.model, *predicted)
+        region = (
+            None if predicted is None else detect.region_of(self.camera, self.model, *predicted)
+        )
         if region is not None:
             sighting = self._estimate_in(image, region)
             if sighting.solutions:
@@ -116,7 +128,8 @@ class Perception:
         margin, outlined = self._table.margin_share[rows], self._table.outlined[rows]
         refined = corners.refine(image, self.camera, px, cells, margin, outlined)
         if not refined.good.all():
-            # The detector may have mistaken the outer edge of the white border for that of the marker.
+            # The detector may have mistaken the outer edge of the white border for that of the
+            # marker.
             lost = ~refined.good
             inner = corners.inside_border(px[lost], margin[lost])
             refined = refined.with_others(
@@ -134,7 +147,9 @@ class Perception:
         kept = np.array([int(i) in once for i in found.ids], dtype=bool)
         ids, px = found.ids[kept], found.corners_px[kept]
         rows = np.array([self._rows[int(i)] for i in ids], dtype=np.intp)
-        solutions = paper.solve(self.camera, self._table.corners[rows], px, iterative=self.method != "paper")
+        solutions = paper.solve(
+            self.camera, self._table.corners[rows], px, iterative=self.method != "paper"
+        )
         if not solutions:
             ids, px = ids[:0], px[:0]
         return self._sighting(found.ids, solutions, ids, px)
@@ -149,4 +164,6 @@ class Perception:
         rejected = found_ids.tolist()
         for i in ids.tolist():
             rejected.remove(i)
-        return PerceptionResult(solutions, ids, self.camera.distort(ideal_px), tuple(sorted(rejected)))
+        return PerceptionResult(
+            solutions, ids, self.camera.distort(ideal_px), tuple(sorted(rejected))
+        )

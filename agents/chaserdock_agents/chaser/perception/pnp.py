@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose of a target from the corners of its markers, in ideal (undistorted) pixels.
 
-Candidates from SQPnP (G. Terzakis, M. Lourakis, ECCV 2020) and IPPE (T. Collins, A. Bartoli, IJCV 2014), a
-consensus over markers against false ids, Levenberg-Marquardt on the reprojection error, and sigma^2 (J'J)^-1 as covariance.
-OpenCV's EPnP is not used, as it fails on coplanar points.
+Candidates from SQPnP (G. Terzakis, M. Lourakis, ECCV 2020) and IPPE (T. Collins, A. Bartoli, IJCV
+2014), a consensus over markers against false ids, Levenberg-Marquardt on the reprojection error,
+and sigma^2 (J'J)^-1 as covariance. OpenCV's EPnP is not used, as it fails on coplanar points.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ Indices = NDArray[np.intp]
 
 # Lower bound of the corner noise, pixels; a single marker leaves only two degrees of freedom.
 SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.015, 0.013
-# Residuals above this noise come from light, compression or the pixel grid, which move the four corners of a marker together:
-# with several markers, their variance averages out over markers, not over corners.
+# Residuals above this noise come from light, compression or the pixel grid, which move the four
+# corners of a marker together: with several markers, their variance averages out over markers, not
+# over corners.
 COMMON_PER_MARKER = 4.0
 # A single marker at a more grazing angle determines its tilt poorly, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
@@ -38,12 +39,14 @@ MIN_SINGLE_COSINE = 0.25
 _COARSE_GATE_PX, _FINE_GATE_PX = 6.0, 1.5
 _FINE_GATE_SIGMAS = 5.0
 MAX_RMS_PX = 2.0
-# The second solution of a plane is kept if its -2 log likelihood exceeds the first's by at most this.
+# The second solution of a plane is kept if its -2 log likelihood exceeds the first's by at most
+# this.
 _AMBIGUITY_LIMIT = 25.0
 _CANDIDATE_MARKERS = 6
 # A coarse pose of a plane with a larger error is rejected.
 _PLANE_RMS_PX = 1.0
-# Of a plane's two coarse poses, one whose angle to the refined pose is this share of the other's is the same pose.
+# Of a plane's two coarse poses, one whose angle to the refined pose is this share of the other's is
+# the same pose.
 _SAME_POSE_SHARE = 0.25
 # A single marker is a false id if this many others should be as visible and none is detected.
 _MAX_MISSING = 2
@@ -54,9 +57,10 @@ _FRAME_MARGIN_PX = 8.0
 class TargetPose:
     """Pose of the target in the camera.
 
-    ``position_irf_m`` (3,); ``q_irf_trf_wxyz`` (4,) rotates TRF -> IRF; ``covariance`` (6, 6): position in
-    IRF axes (m), then dtheta (rad) in TRF axes with q_true = q (x) exp(dtheta); ``reprojection_rms_px``: root
-    of the mean squared distance between detected and projected corners.
+    ``position_irf_m`` (3,); ``q_irf_trf_wxyz`` (4,) rotates TRF -> IRF; ``covariance`` (6, 6):
+    position in IRF axes (m), then dtheta (rad) in TRF axes with q_true = q (x) exp(dtheta);
+    ``reprojection_rms_px``: root of the mean squared distance between detected and projected
+    corners.
     """
 
     position_irf_m: Array
@@ -67,9 +71,9 @@ class TargetPose:
 
 @dataclass(frozen=True)
 class MarkerTable:
-    """The m markers of a target as arrays: ``ids`` (m,), ``corners`` (m, 4, 3), ``origins`` (m, 3) and
-    ``rotations`` (m, 3, 3), marker -> TRF, in metres in TRF; ``margin_share`` (m,): white border over side; ``outlined``
-    (m,): whether the border ends there on all sides."""
+    """The m markers of a target as arrays: ``ids`` (m,), ``corners`` (m, 4, 3), ``origins`` (m, 3)
+    and ``rotations`` (m, 3, 3), marker -> TRF, in metres in TRF; ``margin_share`` (m,): white
+    border over side; ``outlined`` (m,): whether the border ends there on all sides."""
 
     ids: NDArray[np.int64]
     corners: Array
@@ -91,7 +95,9 @@ class MarkerTable:
     @staticmethod
     @lru_cache(maxsize=8)
     def of(model: TargetModel) -> MarkerTable:
-        """Return the table of a model's markers, in their order; not to be written to, as it is shared."""
+        """Return the table of a model's markers, in their order; not to be written to, as it is
+        shared.
+        """
         markers = model.markers
         margins_m = np.array([clear_margin_m(model, m) for m in markers])
         return MarkerTable(
@@ -107,8 +113,8 @@ class MarkerTable:
 
 @dataclass(frozen=True)
 class _DetectedMarkers:
-    """n detections: ``which`` marker of the table each is, ``points`` (n, 4, 3) in TRF, ``pixels`` (n, 4, 2) and
-    ``sigma`` (n,), relative."""
+    """n detections: ``which`` marker of the table each is, ``points`` (n, 4, 3) in TRF, ``pixels``
+    (n, 4, 2) and ``sigma`` (n,), relative."""
 
     camera: Camera
     table: MarkerTable
@@ -136,20 +142,31 @@ class _DetectedMarkers:
         if len(of) == len(self.which):  # indices are ascending and distinct: all of them
             return self
         return _DetectedMarkers(
-            self.camera, self.table, self.which[of], self.points[of], self.pixels[of], self.sigma[of]
+            self.camera,
+            self.table,
+            self.which[of],
+            self.points[of],
+            self.pixels[of],
+            self.sigma[of],
         )
 
 
 def solve(
-    camera: Camera, table: MarkerTable, which: Indices, corners_ideal_px: Array, relative_sigma: Array
+    camera: Camera,
+    table: MarkerTable,
+    which: Indices,
+    corners_ideal_px: Array,
+    relative_sigma: Array,
 ) -> tuple[tuple[TargetPose, ...], Indices]:
-    """Return the poses, best first, that explain the detected markers, and the indices of the detections used.
+    """Return the poses, best first, that explain the detected markers, and the indices of the
+    detections used.
 
-    ``which`` (n,): row of ``table`` of each detection, a row may occur more than once; ``corners_ideal_px``
-    (n, 4, 2); ``relative_sigma`` (n,): uncertainty of a detection's corners, relative to the best.
-    No pose (and no indices) if nothing is explained well, if a single marker is seen at a grazing angle or without others
-    that its pose would show, or if two equally large groups of detections contradict each other. Two poses if the markers
-    are coplanar and their tilt is ambiguous.
+    ``which`` (n,): row of ``table`` of each detection, a row may occur more than once;
+    ``corners_ideal_px`` (n, 4, 2); ``relative_sigma`` (n,): uncertainty of a detection's corners,
+    relative to the best. No pose (and no indices) if nothing is explained well, if a single marker
+    is seen at a grazing angle or without others that its pose would show, or if two equally large
+    groups of detections contradict each other. Two poses if the markers are coplanar and their tilt
+    is ambiguous.
     """
     nothing: tuple[tuple[TargetPose, ...], Indices] = ((), np.zeros(0, dtype=np.intp))
     if not len(which):
@@ -197,11 +214,13 @@ def pose_covariance(
     sigma: Array,
     common: float = 1.0,
 ) -> tuple[Array, float] | None:
-    """Return the covariance (6, 6), as in `TargetPose`, and the weighted sum of squared residuals of a pose.
+    """Return the covariance (6, 6), as in `TargetPose`, and the weighted sum of squared residuals
+    of a pose.
 
-    The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma`` (n,). It is
-    s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of which the part above the floor counts ``common``
-    times. None if the pose is not observable or has points behind the camera.
+    The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma``
+    (n,). It is s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of which the part
+    above the floor counts ``common`` times. None if the pose is not observable or has points behind
+    the camera.
     """
     pose = PoseInCamera(position, rotation)
     found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
@@ -229,7 +248,9 @@ def pose_covariance(
 def reprojection_rms_px(
     camera: Camera, points_trf_m: Array, pixels: Array, position: Array, rotation: Array
 ) -> float:
-    """Return the root mean squared distance, ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2)."""
+    """Return the root mean squared distance, ideal pixels, of projected points (n, 3) from
+    ``pixels`` (n, 2).
+    """
     squares = squared_errors(camera, points_trf_m, pixels, PoseInCamera(position, rotation))
     return math.sqrt(float(squares.sum()) / len(squares))
 
@@ -297,16 +318,23 @@ def _refined(seen: _DetectedMarkers, pose: PoseInCamera) -> PoseInCamera | None:
 
 
 def _plane_poses(seen: _DetectedMarkers) -> list[PoseInCamera]:
-    """Return both IPPE poses from points in the plane of the first marker, or SQPnP's pose where IPPE fails."""
+    """Return both IPPE poses from points in the plane of the first marker, or SQPnP's pose where
+    IPPE fails.
+    """
     to_trf, origin = seen.table.rotations[seen.which[0]], seen.table.origins[seen.which[0]]
     flat = (seen.points.reshape(-1, 3) - origin) @ to_trf
     flat[:, 2] = 0.0  # IPPE requires exactly zero
     pixels, matrix = seen.pixels.reshape(-1, 2), seen.camera.matrix()
     try:
-        _, rvecs, tvecs, rms_px = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+        _, rvecs, tvecs, rms_px = cv2.solvePnPGeneric(
+            flat, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE
+        )
         if not np.asarray(rms_px).min() < _PLANE_RMS_PX:
-            # Face-on, OpenCV's IPPE returns an arbitrary rotation vector for a rotation by 180 degrees.
-            _, rvecs, tvecs, _ = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP)
+            # Face-on, OpenCV's IPPE returns an arbitrary rotation vector for a rotation by 180
+            # degrees.
+            _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+                flat, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP
+            )
     except cv2.error:  # degenerate corners
         return []
     poses = []
@@ -323,7 +351,9 @@ def _all_finite(values: Array) -> bool:
 
 
 def _other_than(pose: PoseInCamera, candidates: list[PoseInCamera]) -> list[PoseInCamera]:
-    """Return ``candidates`` without the one that converges to the refined ``pose``, if of two one is several times nearer."""
+    """Return ``candidates`` without the one that converges to the refined ``pose``, if of two one
+    is several times nearer.
+    """
     if len(candidates) != 2:
         return candidates
     a, b = (_angle(candidate.rotation, pose.rotation) for candidate in candidates)
@@ -333,12 +363,16 @@ def _other_than(pose: PoseInCamera, candidates: list[PoseInCamera]) -> list[Pose
 
 
 def _angle(a: Array, b: Array) -> float:
-    """Return the angle, 0 to pi, between two rotation matrices (their Frobenius distance is sqrt(8) sin(angle / 2))."""
+    """Return the angle, 0 to pi, between two rotation matrices (their Frobenius distance is sqrt(8)
+    sin(angle / 2)).
+    """
     difference = (a - b).ravel()
     return 2.0 * math.asin(min(math.sqrt(float(difference @ difference) / 8.0), 1.0))
 
 
-def _solutions(seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: float) -> list[TargetPose]:
+def _solutions(
+    seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: float
+) -> list[TargetPose]:
     """Return refined, distinct poses, best first; later ones are about as likely as the first."""
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     sigma = np.repeat(seen.sigma, 4)
@@ -350,7 +384,9 @@ def _solutions(seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: floa
             continue
         position, rotation = refined.position, refined.rotation
         common = COMMON_PER_MARKER if len(seen.which) > 1 else 1.0
-        result = pose_covariance(seen.camera, points, pixels, position, rotation, floor_px, sigma, common)
+        result = pose_covariance(
+            seen.camera, points, pixels, position, rotation, floor_px, sigma, common
+        )
         if result is None:
             continue
         kept.append(rotation)
@@ -366,7 +402,9 @@ def _solutions(seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: floa
 
 
 def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[int]:
-    """Return the indices, ascending, of the detections within the gate, for each marker that of least error."""
+    """Return the indices, ascending, of the detections within the gate, for each marker that of
+    least error.
+    """
     kept: dict[int, int] = {}
     for k in sorted(range(len(error)), key=error.__getitem__):
         if error[k] < gate_px:
@@ -378,8 +416,12 @@ def _marker_errors(seen: _DetectedMarkers, pose: PoseInCamera) -> list[float]:
     return marker_errors(seen.camera, seen.points, seen.normals, seen.pixels, pose)
 
 
-def _is_single_marker_valid(camera: Camera, table: MarkerTable, row: int, solution: TargetPose) -> bool:
-    """Return whether the pose of a single marker is observable and consistent with no other marker being detected."""
+def _is_single_marker_valid(
+    camera: Camera, table: MarkerTable, row: int, solution: TargetPose
+) -> bool:
+    """Return whether the pose of a single marker is observable and consistent with no other marker
+    being detected.
+    """
     pose = PoseInCamera(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
     missing, cosine = count_visible_markers(camera, table.surface, row, pose, _FRAME_MARGIN_PX)
     return cosine >= MIN_SINGLE_COSINE and missing < _MAX_MISSING

@@ -18,7 +18,9 @@ _ZERO = np.zeros(3)
 
 @dataclass(frozen=True)
 class PoseInCamera:
-    """Pose of a target in the camera: ``position`` (3,) in IRF, metres; ``rotation`` (3, 3), TRF -> IRF."""
+    """Pose of a target in the camera: ``position`` (3,) in IRF, metres; ``rotation`` (3, 3), TRF ->
+    IRF.
+    """
 
     position: Array
     rotation: Array
@@ -32,11 +34,11 @@ def rotation_matrix(rotation_vector: object) -> Array:
 def residual_of(
     matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
 ) -> tuple[Array, Array] | None:
-    """Return the weighted reprojection error (2n,) and its Jacobian (2n, 6) by a rotation phi in camera axes and by
-    position, R_true = exp([phi]x) R; None for points behind the camera.
+    """Return the weighted reprojection error (2n,) and its Jacobian (2n, 6) by a rotation phi in
+    camera axes and by position, R_true = exp([phi]x) R; None for points behind the camera.
 
-    ``matrix`` (3, 3) of the camera; ``points`` (n, 3) in TRF, metres; ``pixels`` (n, 2), ideal; ``weight``
-    (2n,): of each coordinate.
+    ``matrix`` (3, 3) of the camera; ``points`` (n, 3) in TRF, metres; ``pixels`` (n, 2), ideal;
+    ``weight`` (2n,): of each coordinate.
     """
     turned = points @ pose.rotation.T
     if not float(turned[:, 2].min()) + float(pose.position[2]) > 1e-6:
@@ -49,7 +51,8 @@ def residual_of(
 def refine(
     matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
 ) -> PoseInCamera | None:
-    """Return the pose of minimum weighted squared error near ``pose``; None if points are behind the camera.
+    """Return the pose of minimum weighted squared error near ``pose``; None if points are behind
+    the camera.
 
     Arguments as for `residual_of`; implemented in native/pose.c.
     """
@@ -57,5 +60,7 @@ def refine(
     given = [np.ascontiguousarray(a, dtype=float) for a in (points, pixels, weight)]
     out = np.empty(12)
     out[:3], out[3:] = pose.position, pose.rotation.ravel()
-    refined = function("refine_pose", c_int64)(lens, *map(address, given), c_int64(len(points)), address(out))
+    refined = function("refine_pose", c_int64)(
+        lens, *map(address, given), c_int64(len(points)), address(out)
+    )
     return PoseInCamera(out[:3], out[3:].reshape(3, 3)) if refined else None

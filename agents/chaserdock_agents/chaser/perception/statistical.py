@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistical perception: draws the measured pose around the true one, with the errors that images of the pose have.
+"""Statistical perception: draws the measured pose around the true one, with the errors that images
+of the pose have.
 
-Markers count as seen if they are large enough, face the camera and lie in the image. Corner noise of ``SIGMA_PX`` then
-gives the covariance of the pose, as in ``pnp``, and the error is drawn from it. ``tests/missions/test_statistical.py``
-compares both with rendered images. Where no marker is seen, ``[ranging]`` gives bearing, range and attitude.
+Markers count as seen if they are large enough, face the camera and lie in the image. Corner noise
+of ``SIGMA_PX`` then gives the covariance of the pose, as in ``pnp``, and the error is drawn from
+it. ``tests/missions/test_statistical.py`` compares both with rendered images. Where no marker is
+seen, ``[ranging]`` gives bearing, range and attitude.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ MIN_SIDE_PX = 14.0
 """Shortest side of a marker that is detected, pixels."""
 MIN_COSINE = 0.3
 _MARGIN_PX = 2.0
-_LIMITS = (c_double * 6)(SIGMA_PX, SMALL_SIDE_PX, MIN_SIDE_PX, MIN_COSINE, MIN_SINGLE_COSINE, _MARGIN_PX)
+_LIMITS = (c_double * 6)(
+    SIGMA_PX, SMALL_SIDE_PX, MIN_SIDE_PX, MIN_COSINE, MIN_SINGLE_COSINE, _MARGIN_PX
+)
 """``MarkerLimits`` of native/statistical.c."""
 _NOTHING = PerceptionResult((), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
 
@@ -46,13 +50,20 @@ class StatisticalPerception:
         self._camera, self._ranging = camera, ranging.errors() if ranging else None
         self._table = MarkerTable.of(model)
         self._lens = (c_double * 6)(
-            camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
+            camera.fx_px,
+            camera.fy_px,
+            camera.cx_px,
+            camera.cy_px,
+            camera.width_px,
+            camera.height_px,
         )
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:
-        """Return one solution, or none if too little of the target is in view. Raises ValueError for a rendered image."""
+        """Return one solution, or none if too little of the target is in view. Raises ValueError
+        for a rendered image.
+        """
         position, q, seed = decode_pose(image)
         white = generator(seed).standard_normal(6)
         table = self._table
@@ -64,7 +75,10 @@ class StatisticalPerception:
             np.empty((6, 6)),
             np.empty(6),
         )
-        surface, outputs = (table.corners, table.origins, table.normals), (seen, px, covariance, error)
+        surface, outputs = (
+            (table.corners, table.origins, table.normals),
+            (seen, px, covariance, error),
+        )
         count = function("measure_pose", c_int64)(
             self._lens,
             _LIMITS,
@@ -77,15 +91,22 @@ class StatisticalPerception:
         if count == 0:
             return self._by_range(position, q, white) or _NOTHING
         found = TargetPose(
-            position + error[:3], rotations.multiply(q, rotations.exp(error[3:])), covariance, SIGMA_PX
+            position + error[:3],
+            rotations.multiply(q, rotations.exp(error[3:])),
+            covariance,
+            SIGMA_PX,
         )
         used = seen != 0
         return PerceptionResult((found,), table.ids[used], self._camera.distort(px[used]), ())
 
     def _by_range(self, position: Array, q: Array, white: Array) -> PerceptionResult | None:
-        """Return the pose from bearing, range and the attitude that the target sends; None out of the image or of reach."""
+        """Return the pose from bearing, range and the attitude that the target sends; None out of
+        the image or of reach.
+        """
         found = (
-            None if self._ranging is None else ranged_pose(self._ranging, self._camera, position, q, white)
+            None
+            if self._ranging is None
+            else ranged_pose(self._ranging, self._camera, position, q, white)
         )
         if found is None:
             return None

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thruster allocation: thrusts that produce a wrench (docs/thrusters.md).
 
-Feasible wrenches: of all thrusts in [0, max] that produce the wrench exactly, those with minimum sum, and of these the
-minimum norm. As an exact regularization of the linear program this is one strictly convex quadratic program (M. P.
-Friedlander and P. Tseng, SIAM J. Optim. 18, 2008), so the solution is unique and continuous in the wrench. Infeasible
-wrenches: the closest thrusts in a norm scaled by ``force_max_N`` and ``torque_max_N_m``. Both are solved by daqp, a
-deterministic dual active-set method.
+Feasible wrenches: of all thrusts in [0, max] that produce the wrench exactly, those with minimum
+sum, and of these the minimum norm. As an exact regularization of the linear program this is one
+strictly convex quadratic program (M. P. Friedlander and P. Tseng, SIAM J. Optim. 18, 2008), so the
+solution is unique and continuous in the wrench. Infeasible wrenches: the closest thrusts in a norm
+scaled by ``force_max_N`` and ``torque_max_N_m``. Both are solved by daqp, a deterministic dual
+active-set method.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ _SOLVED = 1
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """``thrusts_N`` (n,) within their limits; ``exact``: they produce the wrench, else they are the closest."""
+    """``thrusts_N`` (n,) within their limits; ``exact``: they produce the wrench, else they are the
+    closest.
+    """
 
     thrusts_N: Array
     exact: bool
@@ -46,8 +49,11 @@ class Allocator:
         self._scale = scale
         self._cost = self._full_N / self._full_N.max()
 
-    def allocate(self, wrench: Array, thrusts_max_N: Array, cost_factors: Array | None = None) -> Allocation:
-        """Return thrusts for a wrench (6,), N and N m, body axes, within limits (n,) N, which may be zero.
+    def allocate(
+        self, wrench: Array, thrusts_max_N: Array, cost_factors: Array | None = None
+    ) -> Allocation:
+        """Return thrusts for a wrench (6,), N and N m, body axes, within limits (n,) N, which may
+        be zero.
 
         ``cost_factors`` (n,): how much more the thrust of each costs than otherwise.
 
@@ -68,13 +74,17 @@ class Allocator:
         if not exact:
             x, flag = _closest(rows, target, most)
             if flag != _SOLVED:
-                raise RuntimeError(f"thruster allocation: daqp failed with flag {flag} for wrench {wrench}")
+                raise RuntimeError(
+                    f"thruster allocation: daqp failed with flag {flag} for wrench {wrench}"
+                )
         thrusts[able] = np.clip(x, 0.0, most) * self._full_N[able]
         return Allocation(thrusts, exact)
 
 
 def _cheapest(rows: Array, cost: Array, target: Array, most: Array) -> tuple[Array, int]:
-    """Solve min cost . x + small |x|^2 with rows x = target, 0 <= x <= most; return daqp's solution and flag."""
+    """Solve min cost . x + small |x|^2 with rows x = target, 0 <= x <= most; return daqp's solution
+    and flag.
+    """
     n = len(most)
     upper, lower = np.concatenate([most, target]), np.concatenate([np.zeros(n), target])
     sense = np.array([0] * n + [_EQUALITY] * 6, dtype=np.int32)
@@ -83,18 +93,30 @@ def _cheapest(rows: Array, cost: Array, target: Array, most: Array) -> tuple[Arr
 
 
 def _closest(rows: Array, target: Array, most: Array) -> tuple[Array, int]:
-    """Solve min |slack|^2 + small |x|^2 with rows x + slack = target, 0 <= x <= most; return daqp's solution and flag."""
+    """Solve min |slack|^2 + small |x|^2 with rows x + slack = target, 0 <= x <= most; return daqp's
+    solution and flag.
+    """
     n = len(most)
     free = np.full(6, 1e30)
-    upper, lower = np.concatenate([most, free, target]), np.concatenate([np.zeros(n), -free, target])
+    upper, lower = (
+        np.concatenate([most, free, target]),
+        np.concatenate([np.zeros(n), -free, target]),
+    )
     sense = np.array([0] * (n + 6) + [_EQUALITY] * 6, dtype=np.int32)
     hessian = np.diag([_SMALL] * n + [1.0] * 6)
     x, _, flag, _ = daqp.solve(
-        hessian, np.zeros(n + 6), np.ascontiguousarray(np.hstack([rows, np.eye(6)])), upper, lower, sense
+        hessian,
+        np.zeros(n + 6),
+        np.ascontiguousarray(np.hstack([rows, np.eye(6)])),
+        upper,
+        lower,
+        sense,
     )
     return x[:n], flag
 
 
 def allocator_of(body: Body) -> Allocator:
-    """Return the thruster allocation of a body; the units of the norm are its maximum force and torque."""
+    """Return the thruster allocation of a body; the units of the norm are its maximum force and
+    torque.
+    """
     return Allocator(body.thrusters, body.wrench_max)

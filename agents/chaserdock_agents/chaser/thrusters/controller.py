@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster controller of a chaser: wrench to thrusts to pulses, fault detection and capability report. No I/O."""
+"""Thruster controller of a chaser: wrench to thrusts to pulses, fault detection and capability
+report. No I/O.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ from .plume_avoidance import PlumeAvoidance
 from .self_test import ThrusterSelfTest
 
 _MIN_SCALE = 0.02
-"""Share of the body's limits that is reported even if the remaining thrusters cannot produce every wrench."""
+"""Share of the body's limits that is reported even if the remaining thrusters cannot produce every
+wrench.
+"""
 _MAX_TEST_PULSES = 10
 """Thrusters are tested if at most this many minimum pulses prove that one works."""
 _HISTORY_NS = 1_000_000_000
@@ -46,12 +50,15 @@ _MAX_PERIOD_NS = 1_000_000_000
 
 
 class ThrusterController:
-    """Controls the thrusters of one chaser. Call ``observe`` with every odometry, then ``add_pulses`` with every command.
+    """Controls the thrusters of one chaser. Call ``observe`` with every odometry, then
+    ``add_pulses`` with every command.
 
     ``events`` (level, what, detail) accumulate until ``drain_events``.
     """
 
-    def __init__(self, scenario: FlightScenario, chaser: int, noise: ImpulseNoise | None = None) -> None:
+    def __init__(
+        self, scenario: FlightScenario, chaser: int, noise: ImpulseNoise | None = None
+    ) -> None:
         body = scenario.chaser
         self._body, self._timing, self._chaser = body, scenario.timing, chaser
         self._allocator = allocator_of(body)
@@ -71,7 +78,8 @@ class ThrusterController:
         information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
         # Neither pulses of whole periods nor pulses below the noise can test a single thruster.
         testable = (
-            body.modulation.modulator == "pwm" and _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
+            body.modulation.modulator == "pwm"
+            and _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
         )
         self._self_test = ThrusterSelfTest(
             self._allocator,
@@ -79,7 +87,9 @@ class ThrusterController:
             body.thruster_test_s if testable else 0.0,
             SUFFICIENT_INFORMATION,
         )
-        self._avoidance = None if scenario.plume is None else PlumeAvoidance(scenario, scenario.plume)
+        self._avoidance = (
+            None if scenario.plume is None else PlumeAvoidance(scenario, scenario.plume)
+        )
         self._cost_factors: Array | None = None
         self._test_allowed = False
         self._reports_each = scenario.detumble.identification.enabled
@@ -101,9 +111,11 @@ class ThrusterController:
         return {thruster for thruster, fault in self._failed.items() if fault.kind != "weak"}
 
     def observe(self, odometry: Odometry, touched: bool = False) -> ThrusterReport:
-        """Run fault detection on the motion since the last odometry; return the thrusters' capability.
+        """Run fault detection on the motion since the last odometry; return the thrusters'
+        capability.
 
-        ``touched``: the docking sensor reported contact since then, so the motion is not due to the thrusters only.
+        ``touched``: the docking sensor reported contact since then, so the motion is not due to the
+        thrusters only.
         """
         before, self._odometry = self._odometry, odometry
         now_ns = odometry.sim_time_ns
@@ -131,7 +143,9 @@ class ThrusterController:
         noise = covariance(self._noise, self._body, self._matrix, thrusters, before, after)
         time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
         suspects = self._suspects(before.sim_time_ns)
-        mismatch = mismatch_signatures(self._mismatch, self._body, self._matrix, thrusters, before, after)
+        mismatch = mismatch_signatures(
+            self._mismatch, self._body, self._matrix, thrusters, before, after
+        )
         fault = self._detector.update(residual, noise, thrusters, time_s, suspects, mismatch)
         if fault is not None:
             self._add_fault(fault, after.sim_time_ns, "detected")
@@ -139,7 +153,9 @@ class ThrusterController:
             self._self_test.add_information(self._detector.information, after.sim_time_ns)
 
     def _suspects(self, at_ns: int) -> Flags:
-        """Return the thrusters (n,) whose failure can be detected: not isolated, failed or trusted by command."""
+        """Return the thrusters (n,) whose failure can be detected: not isolated, failed or trusted
+        by command.
+        """
         excluded = {*self._failed, *self._valves.shut_at(at_ns), *self._trusted}
         return np.array([thruster not in excluded for thruster in range(len(self._full_N))])
 
@@ -149,7 +165,9 @@ class ThrusterController:
         self._valves.fail(fault.thruster, kind, at_ns, fault.factor)
         self._detector.reset()
         effect = f", {fault.factor:.2f} of its thrust left" if kind == "weak" else ", isolated"
-        self.events.append(("warning", f"thruster {fault.thruster} {kind.replace('_', ' ')}", how + effect))
+        self.events.append(
+            ("warning", f"thruster {fault.thruster} {kind.replace('_', ' ')}", how + effect)
+        )
 
     def _impulses(self, from_ns: int, to_ns: int) -> Array:
         return self._valves.impulses(np.array([from_ns, to_ns]))[0]
@@ -168,12 +186,15 @@ class ThrusterController:
             text = f"wrench limits are {scale:.3f} of the body's"
             if scale < _MIN_SCALE:
                 text = f"the remaining thrusters cannot produce every wrench ({scale:.3f} of the limits)"
-            self.events.append(("warning" if scale < _MIN_SCALE else "info", "thrusters changed", text))
+            self.events.append(
+                ("warning" if scale < _MIN_SCALE else "info", "thrusters changed", text)
+            )
         self._scale = scale
         limits = self._box * max(scale, _MIN_SCALE)
         effective_ns = self._timing.effective_ns(odometry.tick)
         self._valves.set_shut(self.isolated, effective_ns)
-        # Pulses that extend beyond the effective time of the next command, less the part that belongs to that command.
+        # Pulses that extend beyond the effective time of the next command, less the part that
+        # belongs to that command.
         pulses_N_s = self._impulses(odometry.sim_time_ns, effective_ns + _MAX_PERIOD_NS)
         coming = self._matrix @ (pulses_N_s - self._modulator.advance_N_s(effective_ns))
         total = self._matrix @ given
@@ -213,14 +234,19 @@ class ThrusterController:
         elif self._free_since_ns is None:
             self._free_since_ns = command.sim_time_ns
 
-    def add_pulses(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> ActuatorCommand:
+    def add_pulses(
+        self, command: ActuatorCommand, thrusts_N: Array | None = None
+    ) -> ActuatorCommand:
         """Return the command with the pulses of the carrier periods that begin while it acts.
 
-        ``thrusts_N`` (n,): thrust of every thruster, in place of an allocation of the command's force and torque.
+        ``thrusts_N`` (n,): thrust of every thruster, in place of an allocation of the command's
+        force and torque.
         """
         available_N = self._available_N()
         thrusts = (
-            self._allocate(command, available_N) if thrusts_N is None else np.minimum(thrusts_N, available_N)
+            self._allocate(command, available_N)
+            if thrusts_N is None
+            else np.minimum(thrusts_N, available_N)
         )
         begin_ns, isolated = command.effective_time_ns, self.isolated
         end_ns = self._timing.effective_ns(command.tick + 1)
@@ -237,8 +263,8 @@ class ThrusterController:
         return msgspec.structs.replace(command, pulses=tuple(pulses), isolated=isolated)
 
     def avoid_plumes(self, target: TargetEstimate | None) -> None:
-        """Make the thrusters whose plume hits the target or another chaser dear from now on; ``target``: an estimate of it and of the
-        chasers' poses, None if unknown."""
+        """Make the thrusters whose plume hits the target or another chaser dear from now on;
+        ``target``: an estimate of it and of the chasers' poses, None if unknown."""
         self._cost_factors = None
         if self._avoidance is not None and target is not None and target.status != "none":
             self._cost_factors = self._avoidance.cost_factors(self._odometry, target)

@@ -12,11 +12,15 @@ from chaserdock_protocol.scenario.thrusters import FailureKind, ThrusterFailure
 class FailureReceiver(Protocol):
     """What a report is delivered to."""
 
-    def report_failure(self, thruster: int, kind: FailureKind, factor: float, at_ns: int) -> None: ...
+    def report_failure(
+        self, thruster: int, kind: FailureKind, factor: float, at_ns: int
+    ) -> None: ...
 
 
 class FailureReports:
-    """The reports of one chaser's hardware that are still to come. The flight software sees none before its time."""
+    """The reports of one chaser's hardware that are still to come. The flight software sees none
+    before its time.
+    """
 
     def __init__(self, failures: Iterable[ThrusterFailure] = ()) -> None:
         self._coming = list(failures)
@@ -26,4 +30,6 @@ class FailureReports:
         for failure in [f for f in self._coming if round(f.at_s * 1e9) <= now_ns]:
             self._coming.remove(failure)
             factor = 1.0 if failure.kind == "stuck_on" else failure.factor or 0.0
-            receiver.report_failure(failure.thruster, failure.kind, factor, round(failure.at_s * 1e9))
+            receiver.report_failure(
+                failure.thruster, failure.kind, factor, round(failure.at_s * 1e9)
+            )

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thruster fault detection from the residual of commanded and observed impulse (docs/thrusters.md).
 
-Two hypotheses are tested for every thruster, each with its signature: stuck on (constant full thrust: the residual is the
-part that was not commanded) and weak or stuck off (the residual is the negative of a share of what was commanded). A
-hypothesis is accepted if the residuals are much more likely under it than without a fault (likelihood ratio), are consistent
-with it (chi-square), and neither another thruster nor a loss of whole commands, which no thruster gave, explains them nearly as
-well. Single faults only. No I/O.
+Two hypotheses are tested for every thruster, each with its signature: stuck on (constant full
+thrust: the residual is the part that was not commanded) and weak or stuck off (the residual is the
+negative of a share of what was commanded). A hypothesis is accepted if the residuals are much more
+likely under it than without a fault (likelihood ratio), are consistent with it (chi-square), and
+neither another thruster nor a loss of whole commands, which no thruster gave, explains them nearly
+as well. Single faults only. No I/O.
 
-Mass properties and thrusts that differ from the model cause residuals too, the same ones at every tick. All likelihoods are
-those after integration over these constant differences with their prior, so that only what they cannot explain counts.
+Mass properties and thrusts that differ from the model cause residuals too, the same ones at every
+tick. All likelihoods are those after integration over these constant differences with their prior,
+so that only what they cannot explain counts.
 """
 
 from __future__ import annotations
@@ -26,14 +28,17 @@ from numpy.typing import NDArray
 Flags = NDArray[np.bool_]
 
 _MIN_GAIN = 20.0
-"""Minimum log-likelihood ratio to the fault-free hypothesis: 1 in 5e8, at some thousand tests per minute and thruster."""
+"""Minimum log-likelihood ratio to the fault-free hypothesis: 1 in 5e8, at some thousand tests per
+minute and thruster.
+"""
 _MIN_ENERGY = 1.9 * _MIN_GAIN
-"""Energy r'r of whitened residuals below which no hypothesis is accepted: none gains more than half of it (Cauchy-Schwarz),
-and the mismatch only reduces it. 5 % are left for rounding."""
+"""Energy r'r of whitened residuals below which no hypothesis is accepted: none gains more than half
+of it (Cauchy-Schwarz), and the mismatch only reduces it. 5 % are left for rounding."""
 _MIN_MARGIN = 8.0
 """Minimum log-likelihood ratio to the second-best thruster."""
 _ON_WINDOWS = (2, 3, 4, 6, 8)
-"""Numbers of consecutive ticks tested for a thruster stuck on; a single one may be a disturbance."""
+"""Numbers of consecutive ticks tested for a thruster stuck on; a single one may be a disturbance.
+"""
 _OFF_WINDOWS = (2, 3, 4, 6, 9, 15, 30)
 """Numbers of latest ticks with commanded thrust that are tested together."""
 _STUCK_OFF_LOSS, _WEAK_LOSS = 0.85, 0.3
@@ -43,8 +48,8 @@ _OWN_SCATTER = 0.1
 _LOSS_SIGMA = 0.07
 """Maximum standard deviation of the loss for a decision."""
 SUFFICIENT_INFORMATION = 2.0 / _LOSS_SIGMA**2
-"""Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known that well: half of it is
-lost to the uncertainty of the nominal thrust (5 %)."""
+"""Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known
+that well: half of it is lost to the uncertainty of the nominal thrust (5 %)."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +62,9 @@ class ThrusterFault:
 
 
 class _Evidence:
-    """Sums over ticks, as one vector each, of whitened quantities: residual r, signatures f (6, n) of the hypotheses of all
-    thrusters, and signatures m (6, q) of the mismatch per standard deviation."""
+    """Sums over ticks, as one vector each, of whitened quantities: residual r, signatures f (6, n)
+    of the hypotheses of all thrusters, and signatures m (6, q) of the mismatch per standard
+    deviation."""
 
     def __init__(self, thrusters: int, differences: int) -> None:
         n, q = thrusters, differences
@@ -77,8 +83,8 @@ class _Evidence:
         )
 
     def marginal(self, total: Array) -> tuple[float, Array, Array]:
-        """Return energy r'r, f'r (n,) and f'f (n,) with the inverse covariance I - m (I + m'm)^-1 m' that the mismatch
-        gives to the residuals."""
+        """Return energy r'r, f'r (n,) and f'f (n,) with the inverse covariance I - m (I + m'm)^-1
+        m' that the mismatch gives to the residuals."""
         n = self._n
         parts = total[1 + 2 * n :].reshape(self._shape)
         information = parts[:, 1 + n :] + np.eye(len(parts))
@@ -90,13 +96,16 @@ class _Evidence:
 
 
 class ThrusterFaultDetector:
-    """Accumulates the residuals of the last ticks; ``matrix`` (6, n): see ``wrench_matrix``; ``differences``: number of
-    constant differences between plant and model.
+    """Accumulates the residuals of the last ticks; ``matrix`` (6, n): see ``wrench_matrix``;
+    ``differences``: number of constant differences between plant and model.
 
-    ``information`` (n,): inverse variance of every thruster's loss from the last update, for a plant as modelled.
+    ``information`` (n,): inverse variance of every thruster's loss from the last update, for a
+    plant as modelled.
     """
 
-    def __init__(self, matrix: Array, full_N: Array, min_pulse_N_s: Array, differences: int) -> None:
+    def __init__(
+        self, matrix: Array, full_N: Array, min_pulse_N_s: Array, differences: int
+    ) -> None:
         self._matrix, self._full_N, self._min_pulse_N_s = matrix, full_N, min_pulse_N_s
         self._on_evidence = _Evidence(len(full_N), differences)
         # The last hypothesis: whole commands are lost.
@@ -122,9 +131,9 @@ class ThrusterFaultDetector:
     ) -> ThrusterFault | None:
         """Add the residual of one tick; return a fault if one is detected.
 
-        ``residual`` (6,): observed minus expected impulse; ``noise`` (6, 6): its covariance; ``commanded_N_s`` (n,):
-        expected impulse of every thruster in ``time_s``; ``suspects`` (n,): thrusters that may have failed; ``mismatch``
-        (6, differences): see ``mismatch_signatures``.
+        ``residual`` (6,): observed minus expected impulse; ``noise`` (6, 6): its covariance;
+        ``commanded_N_s`` (n,): expected impulse of every thruster in ``time_s``; ``suspects`` (n,):
+        thrusters that may have failed; ``mismatch`` (6, differences): see ``mismatch_signatures``.
         """
         whiten = np.linalg.inv(np.linalg.cholesky(noise))
         white, columns = whiten @ residual, whiten @ self._matrix
@@ -138,7 +147,9 @@ class ThrusterFaultDetector:
         lost = self._off_evidence.of_tick(white, signatures, constant)
         for thruster in np.flatnonzero(fired):
             self._off[thruster].append(lost)
-        return self._detect_stuck_on(suspects) or self._detect_loss(np.flatnonzero(fired).tolist(), suspects)
+        return self._detect_stuck_on(suspects) or self._detect_loss(
+            np.flatnonzero(fired).tolist(), suspects
+        )
 
     def _detect_stuck_on(self, suspects: Flags) -> ThrusterFault | None:
         for length, total in _totals(self._on, _ON_WINDOWS):
@@ -157,7 +168,9 @@ class ThrusterFaultDetector:
             for length, total in _totals(self._off[thruster], _OFF_WINDOWS):
                 energy, along, squared = self._off_evidence.marginal(total)
                 loss = np.where(
-                    squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0
+                    squared > 0.0,
+                    np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0),
+                    0.0,
                 )
                 gain = np.where(possible, loss * along - loss**2 * squared / 2.0, -math.inf)
                 known = squared[thruster] * _LOSS_SIGMA**2 >= 1.0
@@ -176,7 +189,9 @@ class ThrusterFaultDetector:
 
 
 def _totals(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
-    """Yield the sums over the last ticks, for each of the ``windows`` that is full and has enough energy for a fault."""
+    """Yield the sums over the last ticks, for each of the ``windows`` that is full and has enough
+    energy for a fault.
+    """
     if sum([float(tick[0]) for tick in ticks]) < _MIN_ENERGY:
         return
     total, first = np.zeros_like(ticks[-1]), len(ticks)
@@ -195,9 +210,12 @@ def _is_distinct(gain: Array, best: int) -> bool:
 
 
 def is_consistent(energy: float, explained: float, squared: float, ticks: int) -> bool:
-    """Return whether the ``energy`` of the residuals less the share that the hypothesis explains is noise.
+    """Return whether the ``energy`` of the residuals less the share that the hypothesis explains is
+    noise.
 
     Chi-square test with 6 degrees of freedom per tick, five sigma.
     """
     freedoms = 6.0 * ticks
-    return energy - explained < freedoms + 5.0 * math.sqrt(2.0 * freedoms) + _OWN_SCATTER**2 * squared
+    return (
+        energy - explained < freedoms + 5.0 * math.sqrt(2.0 * freedoms) + _OWN_SCATTER**2 * squared
+    )

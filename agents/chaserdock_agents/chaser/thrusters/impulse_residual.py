@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observed impulse of a chaser and the covariance of its residual to the expected impulse. Pure functions."""
+"""Observed impulse of a chaser and the covariance of its residual to the expected impulse. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,12 @@ from chaserdock_protocol.scenario.navigation import NavigationErrors
 
 @dataclass(frozen=True)
 class ImpulseNoise:
-    """Standard deviations of the difference between observed and expected motion of a healthy chaser.
+    """Standard deviations of the difference between observed and expected motion of a healthy
+    chaser.
 
-    ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of the odometry, per axis. ``scatter``: of a thruster's impulse,
-    relative. ``floor_*``: of the prediction (attitude within a tick, rounding), per axis; N s and N m s.
+    ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of the odometry, per axis. ``scatter``: of
+    a thruster's impulse, relative. ``floor_*``: of the prediction (attitude within a tick,
+    rounding), per axis; N s and N m s.
     """
 
     velocity_m_s: float = 0.0
@@ -32,11 +36,12 @@ class ImpulseNoise:
 
 @dataclass(frozen=True)
 class PlantMismatch:
-    """Standard deviations of the constant differences between a chaser and its model, from which residuals of a healthy chaser
-    follow.
+    """Standard deviations of the constant differences between a chaser and its model, from which
+    residuals of a healthy chaser follow.
 
-    ``mass``, ``inertia`` (per principal moment) and ``thrust`` (per thruster): relative. ``centre_of_mass_m`` per axis; it also
-    covers thrusters that are turned by a degree. ``force_N``, ``torque_N_m``: external, per body axis.
+    ``mass``, ``inertia`` (per principal moment) and ``thrust`` (per thruster): relative.
+    ``centre_of_mass_m`` per axis; it also covers thrusters that are turned by a degree.
+    ``force_N``, ``torque_N_m``: external, per body axis.
     """
 
     mass: float = 0.1
@@ -61,10 +66,11 @@ def noise_of(errors: NavigationErrors) -> ImpulseNoise:
 
 
 def observed_impulse(before: Odometry, after: Odometry, body: Body) -> Array:
-    """Return impulse and angular impulse (6,), N s and N m s, body axes, from the motion between two odometries.
+    """Return impulse and angular impulse (6,), N s and N m s, body axes, from the motion between
+    two odometries.
 
-    The impulse is expressed in the mean attitude, as force rotates with the body. Torque by Euler's equation
-    I omega' + omega x I omega = tau with the mean rate.
+    The impulse is expressed in the mean attitude, as force rotates with the body. Torque by Euler's
+    equation I omega' + omega x I omega = tau with the mean rate.
     """
     inertia = np.asarray(body.inertia)
     turn = rotations.log(rotations.multiply(rotations.conjugate(before.q_wxyz), after.q_wxyz))
@@ -78,16 +84,26 @@ def observed_impulse(before: Odometry, after: Odometry, body: Body) -> Array:
 
 
 def covariance(
-    noise: ImpulseNoise, body: Body, matrix: Array, thrusters_N_s: Array, before: Odometry, after: Odometry
+    noise: ImpulseNoise,
+    body: Body,
+    matrix: Array,
+    thrusters_N_s: Array,
+    before: Odometry,
+    after: Odometry,
 ) -> Array:
     """Return the covariance (6, 6) of observed minus expected impulse.
 
-    ``thrusters_N_s`` (n,): expected impulses; ``matrix`` (6, n): wrench of unit thrusts. The mean attitude is less
-    accurate at higher rates: a quarter of the rotation is counted as one sigma.
+    ``thrusters_N_s`` (n,): expected impulses; ``matrix`` (6, n): wrench of unit thrusts. The mean
+    attitude is less accurate at higher rates: a quarter of the rotation is counted as one sigma.
     """
-    turned = float(np.linalg.norm(after.omega_rad_s)) * (after.sim_time_ns - before.sim_time_ns) * 1e-9
+    turned = (
+        float(np.linalg.norm(after.omega_rad_s)) * (after.sim_time_ns - before.sim_time_ns) * 1e-9
+    )
     relative = noise.scatter**2 + (turned / 4.0) ** 2 + noise.attitude_rad**2
-    return np.diag(quiescent_variance(noise, body)) + (matrix * (relative * thrusters_N_s**2)) @ matrix.T
+    return (
+        np.diag(quiescent_variance(noise, body))
+        + (matrix * (relative * thrusters_N_s**2)) @ matrix.T
+    )
 
 
 def mismatch_signatures(
@@ -98,10 +114,11 @@ def mismatch_signatures(
     before: Odometry,
     after: Odometry,
 ) -> Array:
-    """Return the residuals (6, 13 + n) for one standard deviation of each part of ``mismatch``: mass, three moments of
-    inertia, centre of mass, force, torque, and the thrust of every thruster.
+    """Return the residuals (6, 13 + n) for one standard deviation of each part of ``mismatch``:
+    mass, three moments of inertia, centre of mass, force, torque, and the thrust of every thruster.
 
-    To first order, with motion and forces at the origin of CRF and the centre of mass c: m (a + omega' x c
+    To first order, with motion and forces at the origin of CRF and the centre of mass c: m (a +
+    omega' x c
     + omega x (omega x c)) = F and I omega' + omega x I omega = tau - c x F.
     """
     time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
@@ -114,7 +131,9 @@ def mismatch_signatures(
     signatures[3:, 1:4] = -mismatch.inertia * (
         np.diag(inertia * (last - first)) + turning @ np.diag(inertia * omega) * time_s
     )
-    signatures[:3, 4:7] = -mismatch.centre_of_mass_m * body.mass_kg * (turned + turning @ turning * time_s)
+    signatures[:3, 4:7] = (
+        -mismatch.centre_of_mass_m * body.mass_kg * (turned + turning @ turning * time_s)
+    )
     signatures[3:, 4:7] = mismatch.centre_of_mass_m * rotations.skew(force)
     signatures[:3, 7:10] = mismatch.force_N * time_s * np.eye(3)
     signatures[3:, 10:13] = mismatch.torque_N_m * time_s * np.eye(3)

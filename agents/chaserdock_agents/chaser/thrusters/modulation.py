@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pulse modulation: thrusts to pulses, one carrier period after the other (docs/thrusters.md).
 
-Every thruster has an impulse deficit: what was commanded and not yet delivered. The pulse of a period delivers the deficit
-and the current thrust, held to the period's end; when the thrust changes within a period, the deficit takes up the
-difference. So the delivered impulse follows the commanded one for any ratio of tick rate and carrier frequency.
+Every thruster has an impulse deficit: what was commanded and not yet delivered. The pulse of a
+period delivers the deficit and the current thrust, held to the period's end; when the thrust
+changes within a period, the deficit takes up the difference. So the delivered impulse follows the
+commanded one for any ratio of tick rate and carrier frequency.
 """
 
 from __future__ import annotations
@@ -19,12 +20,15 @@ from numpy.typing import NDArray
 
 
 class Modulator:
-    """Modulates the thrusters of one chaser; the first carrier period begins when a command can first take effect.
+    """Modulates the thrusters of one chaser; the first carrier period begins when a command can
+    first take effect.
 
     ``deficit_N_s`` (n,): commanded minus delivered impulse.
     """
 
-    def __init__(self, thrusters: Sequence[Thruster], modulation: Modulation, timing: Timing) -> None:
+    def __init__(
+        self, thrusters: Sequence[Thruster], modulation: Modulation, timing: Timing
+    ) -> None:
         self._m, self._timing = modulation, timing
         self._period_steps = timing.physics_hz // modulation.carrier_hz
         self._first_step = timing.latency_steps % self._period_steps
@@ -42,7 +46,9 @@ class Modulator:
         self.period_s = self._period_steps / timing.physics_hz
 
     def advance_N_s(self, now_ns: int) -> Array:
-        """Return the impulse (n,) that current pulses deliver in advance of thrust commanded after ``now_ns``."""
+        """Return the impulse (n,) that current pulses deliver in advance of thrust commanded after
+        ``now_ns``.
+        """
         return self._period_thrust_N * (max(self._period_end_ns - now_ns, 0) * 1e-9)
 
     def _account(self, until_ns: int) -> None:
@@ -52,12 +58,19 @@ class Modulator:
         self._accounted_ns = max(self._accounted_ns, until_ns)
 
     def pulses(
-        self, thrusts_N: Array, available_N: Array, begin_ns: int, end_ns: int, extra_N_s: Array | None = None
+        self,
+        thrusts_N: Array,
+        available_N: Array,
+        begin_ns: int,
+        end_ns: int,
+        extra_N_s: Array | None = None,
     ) -> list[ThrusterPulse]:
-        """Return the pulses of the periods that begin while thrusts (n,) are commanded: from ``begin_ns`` to ``end_ns``.
+        """Return the pulses of the periods that begin while thrusts (n,) are commanded: from
+        ``begin_ns`` to ``end_ns``.
 
-        ``available_N`` (n,): thrust of open thrusters; those without thrust get no pulses. Every period gets its pulses
-        once. ``extra_N_s`` (n,): impulse in addition to the thrusts, delivered from the next period on.
+        ``available_N`` (n,): thrust of open thrusters; those without thrust get no pulses. Every
+        period gets its pulses once. ``extra_N_s`` (n,): impulse in addition to the thrusts,
+        delivered from the next period on.
         """
         self._account(begin_ns)
         if extra_N_s is not None:
@@ -106,17 +119,26 @@ class Modulator:
         for thruster in np.flatnonzero(width_s > 0.0):
             width_ns = min(round(width_s[thruster] * 1e9), period_ns)
             open_ns = begin_ns + (period_ns - width_ns) // 2
-            out.append(ThrusterPulse(thruster=int(thruster), open_ns=open_ns, close_ns=open_ns + width_ns))
+            out.append(
+                ThrusterPulse(thruster=int(thruster), open_ns=open_ns, close_ns=open_ns + width_ns)
+            )
         return out
 
     def _widths_s(self, wanted_s: Array, period_s: float) -> Array:
-        """Return pulse widths (n,) for on-times (n,) at full thrust: whole steps between the minimum and the period."""
+        """Return pulse widths (n,) for on-times (n,) at full thrust: whole steps between the
+        minimum and the period.
+        """
         resolution_s = self._m.resolution_s
         exact = (wanted_s + self._lag_s) / resolution_s
         steps = np.floor(exact + 0.5)
         width_s = np.where(wanted_s > 0.0, steps * resolution_s, 0.0)
-        # Below the minimum rounded to the nearest as well, so that thrusters with small equal commands fire together.
-        nearest_s = np.where(wanted_s + self._lag_s >= 0.5 * self._shortest_s, self._shortest_s, 0.0)
+        # Below the minimum rounded to the nearest as well, so that thrusters with small equal
+        # commands fire together.
+        nearest_s = np.where(
+            wanted_s + self._lag_s >= 0.5 * self._shortest_s, self._shortest_s, 0.0
+        )
         width_s = np.where(width_s < self._shortest_s, nearest_s, width_s)
         # A gap too short for the thrust to fall is closed.
-        return np.where(width_s > period_s - np.maximum(self._shortest_gap_s, 0.5e-9), period_s, width_s)
+        return np.where(
+            width_s > period_s - np.maximum(self._shortest_gap_s, 0.5e-9), period_s, width_s
+        )

@@ -16,7 +16,9 @@ from chaserdock_protocol.scenario.plume import PlumeSection
 
 
 class PlumeAvoidance:
-    """Cost factors of the thrusters of one chaser, from its pose and those of other chasers relative to the target."""
+    """Cost factors of the thrusters of one chaser, from its pose and those of other chasers
+    relative to the target.
+    """
 
     def __init__(self, scenario: FlightScenario, plume: PlumeSection) -> None:
         self._nozzles = np.array([t.position_m for t in scenario.chaser.thrusters])
@@ -28,8 +30,9 @@ class PlumeAvoidance:
         self._reach_m, self._factor = plume.reach_m, 1.0 + plume.avoid_factor
 
     def cost_factors(self, own: Odometry | None, target: TargetEstimate) -> Array | None:
-        """Return the factors (n,), above 1 for thrusters whose plume hits the target or the body of a chaser whose pose ``target``
-        states; None without an own state, or with nothing within reach.
+        """Return the factors (n,), above 1 for thrusters whose plume hits the target or the body of
+        a chaser whose pose ``target`` states; None without an own state, or with nothing within
+        reach.
 
         The states may be those of different ticks, a fraction of a second apart.
         """
@@ -45,16 +48,22 @@ class PlumeAvoidance:
         ]
         if not boxes and not others:
             return None
-        nozzles = rotations.rotate_inverse(target.q_wxyz, away + rotations.rotate(own.q_wxyz, self._nozzles))
+        nozzles = rotations.rotate_inverse(
+            target.q_wxyz, away + rotations.rotate(own.q_wxyz, self._nozzles)
+        )
         forces = rotations.rotate_inverse(target.q_wxyz, rotations.rotate(own.q_wxyz, self._forces))
         hits = [
-            plume_hits(nozzle, force, self._half_angle_rad, (*boxes, *self._near(nozzle, force, others)))
+            plume_hits(
+                nozzle, force, self._half_angle_rad, (*boxes, *self._near(nozzle, force, others))
+            )
             for nozzle, force in zip(nozzles, forces, strict=True)
         ]
         return np.where(hits, self._factor, 1.0)
 
     def _near(self, nozzle: Array, force: Array, others: list[RelativeEstimate]) -> list[Box]:
-        """Return the bodies (TRF) of the chasers whose bounding sphere the plume of a thruster meets."""
+        """Return the bodies (TRF) of the chasers whose bounding sphere the plume of a thruster
+        meets.
+        """
         near = []
         for r in others:
             centre = np.array(r.position_m)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Self-test of thrusters that have not been observed recently (docs/thrusters.md).
 
-A thruster that is rarely used would show a failure only when it is needed. A test burn fires it for one minimum pulse
-together with the cheapest other thrusters that cancel its wrench: healthy thrusters do not change the motion, a failed one
-does. No I/O; times are simulated nanoseconds.
+A thruster that is rarely used would show a failure only when it is needed. A test burn fires it for
+one minimum pulse together with the cheapest other thrusters that cancel its wrench: healthy
+thrusters do not change the motion, a failed one does. No I/O; times are simulated nanoseconds.
 """
 
 from __future__ import annotations
@@ -25,12 +25,16 @@ _MAX_DUTY = 0.9
 
 
 class ThrusterSelfTest:
-    """Schedules test burns for thrusters with too little information within the last ``every_s`` (0: no tests).
+    """Schedules test burns for thrusters with too little information within the last ``every_s``
+    (0: no tests).
 
-    ``sufficient``: information (see ``ThrusterFaultDetector.information``) from which on a thruster's loss is known.
+    ``sufficient``: information (see ``ThrusterFaultDetector.information``) from which on a
+    thruster's loss is known.
     """
 
-    def __init__(self, allocator: Allocator, min_pulse_N_s: Array, every_s: float, sufficient: float) -> None:
+    def __init__(
+        self, allocator: Allocator, min_pulse_N_s: Array, every_s: float, sufficient: float
+    ) -> None:
         self._allocator, self._min_pulse_N_s = allocator, min_pulse_N_s
         self._every_ns = round(every_s * 1e9)
         self._sufficient = sufficient
@@ -62,10 +66,11 @@ class ThrusterSelfTest:
     def schedule(
         self, now_ns: int, suspects: Flags, available_N: Array, commanded_N: Array, period_s: float
     ) -> Array | None:
-        """Return impulses (n,), N s, of a test burn in addition to thrusts ``commanded_N`` (n,); None if no test is due.
+        """Return impulses (n,), N s, of a test burn in addition to thrusts ``commanded_N`` (n,);
+        None if no test is due.
 
-        ``suspects`` (n,): thrusters whose failure can be detected; ``available_N`` (n,): their known thrust when open;
-        ``period_s``: carrier period.
+        ``suspects`` (n,): thrusters whose failure can be detected; ``available_N`` (n,): their
+        known thrust when open; ``period_s``: carrier period.
         """
         if self._every_ns == 0 or now_ns < self._last_burn_ns + _INTERVAL_NS:
             return None
@@ -81,7 +86,9 @@ class ThrusterSelfTest:
         return None
 
     def _balanced(self, thruster: int, max_N_s: Array) -> Array | None:
-        """Return a minimum pulse of ``thruster`` and the pulses that cancel it, (n,) N s; None if that is not possible."""
+        """Return a minimum pulse of ``thruster`` and the pulses that cancel it, (n,) N s; None if
+        that is not possible.
+        """
         others = max_N_s.copy()
         others[thruster] = 0.0
         push = self._allocator.matrix[:, thruster] * self._min_pulse_N_s[thruster]

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mass properties of the stack of a target and latched chasers, from their odometry and thruster pulses. No I/O.
+"""Mass properties of the stack of a target and latched chasers, from their odometry and thruster
+pulses. No I/O.
 
-Extended Kalman filter in the parameters of the composite. Error state, with N chasers of n thrusters:
+Extended Kalman filter in the parameters of the composite. Error state, with N chasers of n
+thrusters:
 
-position and velocity of the centre of mass (WRF), attitude (TRF axes), rate (TRF); logarithm of the mass, centre of mass (TRF),
-inertia about it (TRF axes; xx, yy, zz, xy, xz, yz); position (TRF) and attitude (CRF) of every chaser; relative thrust error of
-every thruster that may fire; bias of every chaser's rate, if its sensor has one.
+position and velocity of the centre of mass (WRF), attitude (TRF axes), rate (TRF); logarithm of the
+mass, centre of mass (TRF), inertia about it (TRF axes; xx, yy, zz, xy, xz, yz); position (TRF) and
+attitude (CRF) of every chaser; relative thrust error of every thruster that may fire; bias of every
+chaser's rate, if its sensor has one.
 
-A filter in the parameters of the target alone is not consistent: subtracting the chasers amplifies linearization errors.
+A filter in the parameters of the target alone is not consistent: subtracting the chasers amplifies
+linearization errors.
 """
 
 from __future__ import annotations
@@ -40,8 +44,9 @@ for _k, (_i, _j) in enumerate(INERTIA_ROWS):
 class IdentificationParameters:
     """Standard deviations of the prior and of the noise.
 
-    mount_m, mount_rad: of a latched chaser's pose in TRF. thrust_share: of a thruster's thrust, constant. scatter_share: of each
-    pulse. floor_velocity_m_s, floor_omega_rad_s: of the motion per tick.
+    mount_m, mount_rad: of a latched chaser's pose in TRF. thrust_share: of a thruster's thrust,
+    constant. scatter_share: of each pulse. floor_velocity_m_s, floor_omega_rad_s: of the motion per
+    tick.
     """
 
     mount_m: float = 0.003
@@ -54,7 +59,9 @@ class IdentificationParameters:
 
 @dataclass(frozen=True, eq=False)
 class CompositeEstimate:
-    """Nominal state of the filter; ``thrusts``: relative errors (N n,) of all thrusters; ``biases`` (N, 3) of the rates."""
+    """Nominal state of the filter; ``thrusts``: relative errors (N n,) of all thrusters; ``biases``
+    (N, 3) of the rates.
+    """
 
     position_m: Array
     velocity_m_s: Array
@@ -69,7 +76,9 @@ class CompositeEstimate:
 
 @dataclass(frozen=True, eq=False)
 class CompositeFilterState:
-    """All that the filter knows after a tick: nominal state, covariance (size, size) of its error, and number of updates."""
+    """All that the filter knows after a tick: nominal state, covariance (size, size) of its error,
+    and number of updates.
+    """
 
     estimate: CompositeEstimate
     covariance: Array
@@ -78,8 +87,9 @@ class CompositeFilterState:
 
 @dataclass(frozen=True, eq=False)
 class StackPrediction:
-    """``transition`` of the error state; ``pushed`` (6, u): change of velocity (WRF) and rate (TRF) by 1 N s of each thruster that
-    may fire; ``impulses_N_s`` (u,) that they were to give in ``step_s``."""
+    """``transition`` of the error state; ``pushed`` (6, u): change of velocity (WRF) and rate (TRF)
+    by 1 N s of each thruster that may fire; ``impulses_N_s`` (u,) that they were to give in
+    ``step_s``."""
 
     transition: Array
     pushed: Array
@@ -89,7 +99,9 @@ class StackPrediction:
 
 @dataclass(frozen=True, eq=False)
 class StackInnovation:
-    """``matrix`` (K, size) of the measurement, ``gain`` (size, K), ``residual`` (K,) and its expected ``covariance`` (K, K)."""
+    """``matrix`` (K, size) of the measurement, ``gain`` (size, K), ``residual`` (K,) and its
+    expected ``covariance`` (K, K).
+    """
 
     matrix: Array
     gain: Array
@@ -98,11 +110,12 @@ class StackInnovation:
 
 
 class CompositeIdentification:
-    """Filter for the stack of ``chasers``; call ``predict`` with the pulses since the last tick, then ``update``.
+    """Filter for the stack of ``chasers``; call ``predict`` with the pulses since the last tick,
+    then ``update``.
 
-    ``prior``: mass properties of the stack, as from ``attach``. ``measured``: how many chasers, the first ones, have a measured
-    state; without it all. ``usable`` (n,) of every chaser: thrusters that may fire; the
-    scale of the others is not estimated.
+    ``prior``: mass properties of the stack, as from ``attach``. ``measured``: how many chasers, the
+    first ones, have a measured state; without it all. ``usable`` (n,) of every chaser: thrusters
+    that may fire; the scale of the others is not estimated.
     """
 
     def __init__(
@@ -142,12 +155,18 @@ class CompositeIdentification:
         return CompositeFilterState(self._estimate, self.covariance.copy(), self.ticks)
 
     def load(self, state: CompositeFilterState) -> None:
-        """Replace the state by a saved one of a filter with the same chasers. Raises ValueError for another one."""
+        """Replace the state by a saved one of a filter with the same chasers. Raises ValueError for
+        another one.
+        """
         if state.covariance.shape != self.covariance.shape:
             raise ValueError("the state is of another stack")
-        self._estimate, self.covariance, self.ticks = state.estimate, state.covariance.copy(), state.ticks
+        self._estimate, self.covariance, self.ticks = (
+            state.estimate,
+            state.covariance.copy(),
+            state.ticks,
+        )
 
-    # -- layout ----------------------------------------------------------------------------------------------
+    # -- layout ------------------------------------------------------------------------------------
 
     def _mount(self, row: int) -> slice:
         return slice(_MOUNTS + 6 * row, _MOUNTS + 6 * row + 6)
@@ -185,15 +204,19 @@ class CompositeIdentification:
         covariance[self._scales, self._scales] = p.thrust_share**2 * np.eye(len(self._usable))
         return covariance
 
-    # -- prediction ------------------------------------------------------------------------------------------
+    # -- prediction --------------------------------------------------------------------------------
 
     def predict(
-        self, impulses_N_s: Mapping[int, Array], step_s: float, unknown: Mapping[int, Array] | None = None
+        self,
+        impulses_N_s: Mapping[int, Array],
+        step_s: float,
+        unknown: Mapping[int, Array] | None = None,
     ) -> StackPrediction:
-        """Advance by ``step_s`` with the impulses (n,) that the thrusters of every chaser were to give since the last tick.
+        """Advance by ``step_s`` with the impulses (n,) that the thrusters of every chaser were to
+        give since the last tick.
 
-        Half of the impulse acts at the begin and half at the end. ``unknown`` (n,): standard deviations of further impulses
-        by chaser, whose thrusters were not reported.
+        Half of the impulse acts at the begin and half at the end. ``unknown`` (n,): standard
+        deviations of further impulses by chaser, whose thrusters were not reported.
         """
         x, p = self._estimate, self._parameters
         stated = self._of_all(impulses_N_s)
@@ -269,7 +292,9 @@ class CompositeIdentification:
     def _by_pulses(
         self, rotation: Array, inverse: Array, stated: Array, impulses: Array
     ) -> tuple[Array, Array]:
-        """Return the matrices (3, size) of the changes of velocity (WRF) and rate (TRF) by pulses over the error state."""
+        """Return the matrices (3, size) of the changes of velocity (WRF) and rate (TRF) by pulses
+        over the error state.
+        """
         x, size = self._estimate, len(self.covariance)
         mass = x.body.mass_kg
         pushes, turns = np.zeros((3, size)), np.zeros((3, size))
@@ -295,13 +320,17 @@ class CompositeIdentification:
             by_turn = -turned @ rotations.skew(own[:3])
             pushes[:, attitude : attitude + 3] = rotation @ by_turn / mass
             turns[:, place : place + 3] = -inverse @ rotations.skew(force)
-            turns[:, attitude : attitude + 3] = inverse @ (arm @ by_turn - turned @ rotations.skew(own[3:]))
+            turns[:, attitude : attitude + 3] = inverse @ (
+                arm @ by_turn - turned @ rotations.skew(own[3:])
+            )
         return pushes, turns
 
-    # -- update ----------------------------------------------------------------------------------------------
+    # -- update ------------------------------------------------------------------------------------
 
     def update(self, states: Mapping[int, BodyState]) -> StackInnovation | None:
-        """Take the measured states of the chasers at this tick; return the innovation, None without any state."""
+        """Take the measured states of the chasers at this tick; return the innovation, None without
+        any state.
+        """
         self.ticks += 1
         rows = [row for row, chaser in enumerate(self.chasers) if chaser in states]
         if not rows:
@@ -328,13 +357,16 @@ class CompositeIdentification:
             self.covariance[part, part] += sigma**2 * np.eye(3)
 
     def pulse_gains(self, impulse_N_s: float, noise: Array, scale: Array) -> Array:
-        """Return how much a pulse of each thruster that may fire reduces the variances of the mass properties, in units of
-        ``scale`` (10,), if the change of velocity and rate is then measured with standard deviations ``noise`` (6,)."""
+        """Return how much a pulse of each thruster that may fire reduces the variances of the mass
+        properties, in units of ``scale`` (10,), if the change of velocity and rate is then measured
+        with standard deviations ``noise`` (6,)."""
         x = self._estimate
         rotation, inverse = rotations.to_matrix(x.q_wxyz), _inverse(x.body.inertia_kg_m2)
         rows = [*range(3, 6), *range(9, 12)]
         none = np.zeros(self._n * len(self.chasers))
-        rest = self._transition(rotation, inverse, x.omega_rad_s, np.zeros(3), none, none, 0.0)[rows]
+        rest = self._transition(rotation, inverse, x.omega_rad_s, np.zeros(3), none, none, 0.0)[
+            rows
+        ]
         unit = scale.copy()
         unit[0] /= x.body.mass_kg
         gains = []
@@ -343,7 +375,9 @@ class CompositeIdentification:
             stated[k] = impulse_N_s
             given = stated * (1.0 + x.thrusts)
             effect = (
-                self._transition(rotation, inverse, x.omega_rad_s, np.zeros(3), stated, given, 0.0)[rows]
+                self._transition(rotation, inverse, x.omega_rad_s, np.zeros(3), stated, given, 0.0)[
+                    rows
+                ]
                 - rest
             )
             cross = effect @ self.covariance
@@ -353,7 +387,9 @@ class CompositeIdentification:
         return np.array(gains)
 
     def _measurement(self, row: int, measured: BodyState) -> tuple[Array, Array]:
-        """Return the matrix (12, size) of a chaser's odometry, and its residual: position, velocity, attitude, rate."""
+        """Return the matrix (12, size) of a chaser's odometry, and its residual: position,
+        velocity, attitude, rate.
+        """
         x = self._estimate
         rotation, turned = rotations.to_matrix(x.q_wxyz), rotations.to_matrix(x.mounts_wxyz[row])
         arm = x.mounts_m[row] - x.body.centre_trf_m
@@ -400,16 +436,23 @@ class CompositeIdentification:
             x.omega_rad_s + d[RATE],
             body,
             x.mounts_m + mounts[:, :3],
-            np.array([rotations.multiply(x.mounts_wxyz[k], rotations.exp(mounts[k, 3:])) for k in chasers]),
+            np.array(
+                [
+                    rotations.multiply(x.mounts_wxyz[k], rotations.exp(mounts[k, 3:]))
+                    for k in chasers
+                ]
+            ),
             thrusts,
             x.biases + d[self._scales.stop :].reshape(-1, 3) if self._biases else x.biases,
         )
 
-    # -- results ---------------------------------------------------------------------------------------------
+    # -- results -----------------------------------------------------------------------------------
 
     @property
     def usable(self) -> list[tuple[int, int]]:
-        """Return chaser and number of the thrusters that may fire, in the order of ``StackPrediction``."""
+        """Return chaser and number of the thrusters that may fire, in the order of
+        ``StackPrediction``.
+        """
         return [(self.chasers[k // self._n], int(k % self._n)) for k in self._usable]
 
     @property
@@ -425,7 +468,9 @@ class CompositeIdentification:
     def mounted(self) -> dict[int, MountedChaser]:
         """Return the estimated poses of the chasers in TRF."""
         x = self._estimate
-        return {i: MountedChaser(x.mounts_m[k], x.mounts_wxyz[k]) for k, i in enumerate(self.chasers)}
+        return {
+            i: MountedChaser(x.mounts_m[k], x.mounts_wxyz[k]) for k, i in enumerate(self.chasers)
+        }
 
     def target(self, body: RigidBody) -> MassProperties:
         """Return the mass properties of the target alone; ``body``: those of every chaser."""
@@ -433,7 +478,9 @@ class CompositeIdentification:
 
     @property
     def motion(self) -> BodyState:
-        """Return position and velocity of the centre of mass (WRF), attitude (TRF to WRF) and rate (TRF)."""
+        """Return position and velocity of the centre of mass (WRF), attitude (TRF to WRF) and rate
+        (TRF).
+        """
         x = self._estimate
         return BodyState(x.position_m, x.velocity_m_s, x.q_wxyz, x.omega_rad_s)
 
@@ -449,12 +496,17 @@ def _inverse(matrix: Array) -> Array:
 
 
 def _start(
-    body: TargetBody, mounts_m: Array, mounts_wxyz: Array, states: Sequence[BodyState], thrusters: int
+    body: TargetBody,
+    mounts_m: Array,
+    mounts_wxyz: Array,
+    states: Sequence[BodyState],
+    thrusters: int,
 ) -> CompositeEstimate:
     """Return the state of the filter by the first measurements."""
     q = rotations.multiply(states[0].q_wxyz, rotations.conjugate(mounts_wxyz[0]))
     omega = np.mean(
-        [rotations.rotate(m, s.omega_rad_s) for m, s in zip(mounts_wxyz, states, strict=False)], axis=0
+        [rotations.rotate(m, s.omega_rad_s) for m, s in zip(mounts_wxyz, states, strict=False)],
+        axis=0,
     )
     arms = mounts_m[: len(states)] - body.centre_trf_m
     places = [s.position_m - rotations.rotate(q, arm) for s, arm in zip(states, arms, strict=True)]

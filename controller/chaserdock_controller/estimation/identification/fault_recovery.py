@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification that recovers from a failed thruster: the time from before the failure on is filtered again. No I/O.
+"""Identification that recovers from a failed thruster: the time from before the failure on is
+filtered again. No I/O.
 
-Until a failure is detected, the filter explains the impulse that is missing, or is too much, by mass properties and thrust errors.
-Widening their covariance afterwards does not undo that. Therefore the inputs of the last seconds are kept, with the filter's state
-once a second; after a detection the filter starts again from a state before the failure, with what the thruster really gave.
+Until a failure is detected, the filter explains the impulse that is missing, or is too much, by
+mass properties and thrust errors. Widening their covariance afterwards does not undo that.
+Therefore the inputs of the last seconds are kept, with the filter's state once a second; after a
+detection the filter starts again from a state before the failure, with what the thruster really
+gave.
 """
 
 from __future__ import annotations
@@ -29,7 +32,9 @@ _CLOSING_S = 0.4
 
 @dataclass(frozen=True, eq=False)
 class _TickRecord:
-    """Inputs of the filter in one tick; ``before``: its state before them, if it was saved. See ``predict`` and ``update``."""
+    """Inputs of the filter in one tick; ``before``: its state before them, if it was saved. See
+    ``predict`` and ``update``.
+    """
 
     before: CompositeFilterState | None
     step_s: float
@@ -41,7 +46,9 @@ class _TickRecord:
 
 @dataclass(frozen=True, eq=False)
 class RecoveryState:
-    """State of filter and detection, for a standby controller. The inputs of the last seconds are not part of it."""
+    """State of filter and detection, for a standby controller. The inputs of the last seconds are
+    not part of it.
+    """
 
     composite: CompositeFilterState
     detector: DetectorState
@@ -49,7 +56,8 @@ class RecoveryState:
 
 
 class FaultTolerantIdentification:
-    """``filter`` of the stack, and detection of thrusters that are stuck off or on. ``full_N`` (n,): full thrusts of a chaser.
+    """``filter`` of the stack, and detection of thrusters that are stuck off or on. ``full_N``
+    (n,): full thrusts of a chaser.
 
     Call ``predict`` and ``update`` once a tick.
     """
@@ -57,7 +65,9 @@ class FaultTolerantIdentification:
     def __init__(self, identification: CompositeIdentification, full_N: Array) -> None:
         self.filter, self._full_N = identification, full_N
         full = np.array([full_N[thruster] for _, thruster in identification.usable])
-        self._detector = StackFaultDetector(identification.usable, len(identification.covariance), full)
+        self._detector = StackFaultDetector(
+            identification.usable, len(identification.covariance), full
+        )
         self._records: deque[_TickRecord] = deque()
         self._closing: list[StackFault] = []
 
@@ -68,8 +78,9 @@ class FaultTolerantIdentification:
         unknown_N_s: Mapping[int, Array] | None = None,
         shock: tuple[float, float] | None = None,
     ) -> None:
-        """Advance by ``step_s``; impulses as in ``CompositeIdentification.predict``. ``shock``: standard deviations per axis of an
-        unknown change of velocity (m/s) and rate (rad/s) at the end."""
+        """Advance by ``step_s``; impulses as in ``CompositeIdentification.predict``. ``shock``:
+        standard deviations per axis of an unknown change of velocity (m/s) and rate (rad/s) at the
+        end."""
         tick = _TickRecord(None, step_s, given_N_s, unknown_N_s or {}, shock)
         for fault in self._closing:
             tick = self._with_fault(tick, fault, certain=fault.kind == "stuck_off")
@@ -79,8 +90,8 @@ class FaultTolerantIdentification:
         self._predict(tick, self._detector)
 
     def update(self, states: Mapping[int, BodyState], suspects: BoolArray) -> StackFault | None:
-        """Take the measured states of the chasers; return a thruster whose failure they prove. ``suspects`` (u,): thrusters in
-        question."""
+        """Take the measured states of the chasers; return a thruster whose failure they prove.
+        ``suspects`` (u,): thrusters in question."""
         if self._records:
             self._records[-1] = replace(self._records[-1], states=states)
         innovation = self.filter.update(states)
@@ -136,17 +147,22 @@ class FaultTolerantIdentification:
             self.filter.update(tick.states)
 
     def _with_fault(self, tick: _TickRecord, fault: StackFault, certain: bool) -> _TickRecord:
-        """Return a tick's inputs with what a failed thruster gave: nothing or full thrust if it had failed for ``certain``, else
-        anything from that to what it should have given."""
+        """Return a tick's inputs with what a failed thruster gave: nothing or full thrust if it had
+        failed for ``certain``, else anything from that to what it should have given."""
         if fault.chaser not in tick.given_N_s:
             return tick
         given = tick.given_N_s[fault.chaser].copy()
         unknown = np.array(tick.unknown_N_s.get(fault.chaser, np.zeros(len(given))))
-        failed = 0.0 if fault.kind == "stuck_off" else float(self._full_N[fault.thruster]) * tick.step_s
+        failed = (
+            0.0 if fault.kind == "stuck_off" else float(self._full_N[fault.thruster]) * tick.step_s
+        )
         if certain:
             given[fault.thruster] = failed
         else:
-            between = (given[fault.thruster] + failed) / 2.0, abs(given[fault.thruster] - failed) / 2.0
+            between = (
+                (given[fault.thruster] + failed) / 2.0,
+                abs(given[fault.thruster] - failed) / 2.0,
+            )
             given[fault.thruster] = between[0]
             unknown[fault.thruster] = np.hypot(unknown[fault.thruster], between[1])
         return replace(

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thrusters of latched chasers that are stuck off or on, detected on the motion of the whole stack. No I/O.
+"""Thrusters of latched chasers that are stuck off or on, detected on the motion of the whole stack.
+No I/O.
 
-Generalized likelihood ratio on the innovations of the identification filter (A. S. Willsky and H. L. Jones, IEEE Trans. Automatic
-Control 21, 1976): for every thruster and kind of failure the signature of the failure in the filter's state is propagated, and the
-log-likelihood ratio to the fault-free hypothesis is summed. A sum that falls below zero starts again, as in a CUSUM test.
+Generalized likelihood ratio on the innovations of the identification filter (A. S. Willsky and H.
+L. Jones, IEEE Trans. Automatic Control 21, 1976): for every thruster and kind of failure the
+signature of the failure in the filter's state is propagated, and the log-likelihood ratio to the
+fault-free hypothesis is summed. A sum that falls below zero starts again, as in a CUSUM test.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ class StackFault:
 
 @dataclass(frozen=True, eq=False)
 class DetectorState:
-    """Signatures (size, 2 u), log-likelihood ratios (2 u,) and the ticks (2 u,) over which they were summed."""
+    """Signatures (size, 2 u), log-likelihood ratios (2 u,) and the ticks (2 u,) over which they
+    were summed.
+    """
 
     signatures: Array
     gains: Array
@@ -43,7 +47,9 @@ class DetectorState:
 
 
 class StackFaultDetector:
-    """Signatures (size, 2 u) and log-likelihood ratios (2 u,) of all thrusters that may fire: first stuck off, then stuck on."""
+    """Signatures (size, 2 u) and log-likelihood ratios (2 u,) of all thrusters that may fire: first
+    stuck off, then stuck on.
+    """
 
     def __init__(self, thrusters: Sequence[tuple[int, int]], size: int, full_N: Array) -> None:
         self._thrusters, self._full_N = tuple(thrusters), full_N
@@ -60,7 +66,9 @@ class StackFaultDetector:
         return DetectorState(self._signatures.copy(), self.gains.copy(), self._ticks.copy())
 
     def load(self, state: DetectorState) -> None:
-        """Replace the state by a saved one of a detector of the same thrusters. Raises ValueError for another one."""
+        """Replace the state by a saved one of a detector of the same thrusters. Raises ValueError
+        for another one.
+        """
         if state.signatures.shape != self._signatures.shape or not (
             len(state.gains) == len(state.ticks) == len(self.gains)
         ):
@@ -91,7 +99,10 @@ class StackFaultDetector:
         best = int(np.argmax(self.gains))
         count = len(self._thrusters)
         other = np.delete(self.gains, [best % count, best % count + count])
-        if self.gains[best] < _LEAST_GAIN or self.gains[best] - other.max(initial=0.0) < _LEAST_MARGIN:
+        if (
+            self.gains[best] < _LEAST_GAIN
+            or self.gains[best] - other.max(initial=0.0) < _LEAST_MARGIN
+        ):
             return None
         chaser, thruster = self._thrusters[best % count]
         kind, ticks = "stuck_off" if best < count else "stuck_on", int(self._ticks[best])

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification in a mission: runs the filter of the stack while chasers are latched, and its fault detection."""
+"""Identification in a mission: runs the filter of the stack while chasers are latched, and its
+fault detection.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,12 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 
 from chaserdock_controller.estimation.composite_body import pose_in_target, stated_properties
 from chaserdock_controller.estimation.mass_properties import MassProperties, attach, inertia_ratios
-from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
+from chaserdock_controller.interfaces import (
+    IdentifiedStack,
+    LogEntry,
+    Observation,
+    TargetEstimation,
+)
 
 from .composite import CompositeIdentification, IdentificationParameters
 from .fault_recovery import FaultTolerantIdentification, RecoveryState
@@ -28,13 +35,17 @@ from .faults import StackFault
 _SHOCK = (0.01, 0.02)
 """One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
 _SILENT_S, _SILENT_SHARE = 1.0, 0.02
-"""Thrusters of a chaser that reports none are unknown for this long, and later up to this share of their thrust."""
+"""Thrusters of a chaser that reports none are unknown for this long, and later up to this share of
+their thrust.
+"""
 _REFINE_S, _KNOWN_RATIO, _KNOWN_M = 2.0, 0.05, 0.02
 _PULSE_S = 0.3
 _WATCH_S = 1.0
 """Time over which a pulse's effect is thought to be measured when pulses are compared."""
 _GOOD = (0.02, 0.005, 0.05)
-"""Accuracy that is worth the same of mass (share), centre (m) and inertia (share of the largest moment)."""
+"""Accuracy that is worth the same of mass (share), centre (m) and inertia (share of the largest
+moment).
+"""
 
 
 def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
@@ -48,7 +59,9 @@ def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
 
 @dataclass(frozen=True, eq=False)
 class IdentificationState:
-    """What a standby controller takes over. ``composite``: the latched chasers in the filter's order, and its state."""
+    """What a standby controller takes over. ``composite``: the latched chasers in the filter's
+    order, and its state.
+    """
 
     target: MassProperties
     failed: dict[int, tuple[int, ...]]
@@ -58,7 +71,9 @@ class IdentificationState:
 
 
 class StackIdentification:
-    """The filter of the stack that is latched now. ``target``: what is known of the target alone, kept when chasers come and go."""
+    """The filter of the stack that is latched now. ``target``: what is known of the target alone,
+    kept when chasers come and go.
+    """
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario, self._parameters = scenario, parameters_of(scenario)
@@ -72,8 +87,9 @@ class StackIdentification:
         self._events: list[LogEntry] = []
 
     def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
-        """Take a tick's odometry and pulses; return None while the target is unknown. While nothing is latched, what the estimator
-        finds of the freely tumbling target becomes the prior of the stack."""
+        """Take a tick's odometry and pulses; return None while the target is unknown. While nothing
+        is latched, what the estimator finds of the freely tumbling target becomes the prior of the
+        stack."""
         latched = estimation.latched
         if not latched:
             self._composite = None
@@ -107,7 +123,9 @@ class StackIdentification:
         )
 
     def _suspects(self, found: CompositeIdentification) -> BoolArray:
-        """Return which thrusters (u,) may be found to have failed: those that have not, of chasers that report their pulses."""
+        """Return which thrusters (u,) may be found to have failed: those that have not, of chasers
+        that report their pulses.
+        """
         return np.array(
             [
                 thruster not in self.failed.get(i, ()) and self._silent_ticks.get(i, 0) == 0
@@ -116,15 +134,17 @@ class StackIdentification:
             dtype=bool,
         )
 
-    def identified(self, observation: Observation, estimation: TargetEstimation) -> TargetEstimation:
+    def identified(
+        self, observation: Observation, estimation: TargetEstimation
+    ) -> TargetEstimation:
         """Return the estimation with the identified stack and its events."""
         stack = self.run(observation, estimation)
         events, self._events = self._events, []
         return replace(estimation, stack=stack, events=(*estimation.events, *events))
 
     def refined_target(self, observation: Observation) -> MassProperties | None:
-        """Return the target's mass properties by the motion of the stack for the estimator of its motion, now and then, once they
-        are known well enough."""
+        """Return the target's mass properties by the motion of the stack for the estimator of its
+        motion, now and then, once they are known well enough."""
         if self._composite is None or observation.tick % max(1, round(_REFINE_S / self._period_s)):
             return None
         ratios = math.sqrt(float(np.trace(inertia_ratios(self.target)[1])))
@@ -132,16 +152,24 @@ class StackIdentification:
         return self.target if ratios < _KNOWN_RATIO and centre_m < _KNOWN_M else None
 
     def save(self) -> IdentificationState:
-        """Return the state for a standby controller. What a free tumble has shown is kept in the target's mass properties."""
+        """Return the state for a standby controller. What a free tumble has shown is kept in the
+        target's mass properties.
+        """
         composite = None
         if self._composite is not None:
             composite = list(self._composite.filter.chasers), self._composite.save()
         return IdentificationState(
-            self.target, dict(self.failed), sorted(self._reporting), dict(self._silent_ticks), composite
+            self.target,
+            dict(self.failed),
+            sorted(self._reporting),
+            dict(self._silent_ticks),
+            composite,
         )
 
     def load(self, state: IdentificationState) -> None:
-        """Replace the state by a saved one of the same scenario. Raises ValueError, without a change, for another one."""
+        """Replace the state by a saved one of the same scenario. Raises ValueError, without a
+        change, for another one.
+        """
         composite = None
         if state.composite is not None:
             chasers, saved = state.composite
@@ -149,7 +177,9 @@ class StackIdentification:
             places = zip(chasers, estimate.mounts_m, estimate.mounts_wxyz, strict=True)
             still = BodyState(estimate.position_m, np.zeros(3), estimate.q_wxyz, np.zeros(3))
             composite = self._filter_of(
-                {i: MountedChaser(place, q) for i, place, q in places}, dict.fromkeys(chasers, still), 1
+                {i: MountedChaser(place, q) for i, place, q in places},
+                dict.fromkeys(chasers, still),
+                1,
             )
             composite.load(saved)
         self.target, self.failed = state.target, dict(state.failed)
@@ -199,34 +229,48 @@ class StackIdentification:
             # What was commanded before, or is fired without the controller, is not reported.
             if i not in given:
                 early = self._silent_ticks[i] * self._period_s <= _SILENT_S
-                unknown[i] = self._full_N * (self._period_s if early else _SILENT_SHARE * self._period_s)
+                unknown[i] = self._full_N * (
+                    self._period_s if early else _SILENT_SHARE * self._period_s
+                )
         touched = any(d.contact and not d.latched for d in observation.docking.values())
         composite.predict(given, self._period_s, unknown, _SHOCK if touched else None)
 
     def _add_fault(self, fault: StackFault) -> None:
-        self.failed[fault.chaser] = tuple(sorted({*self.failed.get(fault.chaser, ()), fault.thruster}))
+        self.failed[fault.chaser] = tuple(
+            sorted({*self.failed.get(fault.chaser, ()), fault.thruster})
+        )
         kind = fault.kind.replace("_", " ")
         text = f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the stack, isolated"
         self._events.append(("warning", text))
 
     def _by_information(self, found: CompositeIdentification) -> tuple[tuple[int, int], ...]:
-        """Return the thrusters by the information of a pulse on the mass properties, the best first."""
+        """Return the thrusters by the information of a pulse on the mass properties, the best
+        first.
+        """
         errors, stack = self._scenario.navigation.errors(), found.stack
         count = len(found.chasers) * _WATCH_S / self._period_s
         noise = (
-            np.repeat([errors.velocity_noise_m_s, errors.omega_noise_rad_s], 3) * math.sqrt(2.0 / count)
+            np.repeat([errors.velocity_noise_m_s, errors.omega_noise_rad_s], 3)
+            * math.sqrt(2.0 / count)
             + 1e-7
         )
         largest = float(np.linalg.eigvalsh(stack.body.inertia_kg_m2)[-1])
-        scale = np.array([_GOOD[0] * stack.body.mass_kg, *[_GOOD[1]] * 3, *[_GOOD[2] * largest] * 6])
+        scale = np.array(
+            [_GOOD[0] * stack.body.mass_kg, *[_GOOD[1]] * 3, *[_GOOD[2] * largest] * 6]
+        )
         gains = found.pulse_gains(float(self._full_N.max()) * _PULSE_S, noise, scale)
         usable = found.usable
         order = np.argsort(-gains, kind="stable")
-        return tuple(usable[k] for k in order if usable[k][1] not in self.failed.get(usable[k][0], ()))
+        return tuple(
+            usable[k] for k in order if usable[k][1] not in self.failed.get(usable[k][0], ())
+        )
 
 
 def body_state(o: Odometry) -> BodyState:
     """Return the state in an odometry message."""
     return BodyState(
-        np.array(o.position_m), np.array(o.velocity_m_s), np.array(o.q_wxyz), np.array(o.omega_rad_s)
+        np.array(o.position_m),
+        np.array(o.velocity_m_s),
+        np.array(o.q_wxyz),
+        np.array(o.omega_rad_s),
     )

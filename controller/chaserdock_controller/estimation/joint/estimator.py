@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default estimator: one error-state Kalman filter of the target, the chasers, their sensors and their disturbances.
+"""Default estimator: one error-state Kalman filter of the target, the chasers, their sensors and
+their disturbances.
 
-Mathematics: docs/estimation.md. Every tick is recorded with its inputs; a sighting that arrives late is inserted at its
-exposure, and the later ticks are processed again, so the state does not depend on the order of arrival.
+Mathematics: docs/estimation.md. Every tick is recorded with its inputs; a sighting that arrives
+late is inserted at its exposure, and the later ticks are processed again, so the state does not
+depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -70,19 +72,24 @@ from .update import SightedPose, UpdateReport, sighted_pose, start_chaser, start
 
 _IDENTITY_3 = np.eye(3)
 FAR_LOST_SHARE = 2e-3
-"""Largest standard deviation of the position of a target beyond 100 m, as a share of its distance."""
+"""Largest standard deviation of the position of a target beyond 100 m, as a share of its distance.
+"""
 _BLAS = ThreadpoolController()
-"""Products of matrices are computed by one thread, as their last bits depend on the number of threads."""
+"""Products of matrices are computed by one thread, as their last bits depend on the number of
+threads.
+"""
 
 
 @dataclass(frozen=True)
 class JointInputs:
-    """Inputs of a tick: measured odometry by chaser, and sightings, which may belong to earlier ticks.
+    """Inputs of a tick: measured odometry by chaser, and sightings, which may belong to earlier
+    ticks.
 
-    impulses (N, 6): N s and N m s, body axes, that the chasers' actuators gave in the last ``covered_s``. latched: chasers
-    whose latch holds the target. contacts: chasers with a contact since the tick before. last_commands: last
-    commands (6,), N and N m, of chasers without odometry in this tick, which fly by plans that the controller does not know.
-    outdated: newest odometry of chasers that have none of this tick, with the times of the ticks at which it was measured.
+    impulses (N, 6): N s and N m s, body axes, that the chasers' actuators gave in the last
+    ``covered_s``. latched: chasers whose latch holds the target. contacts: chasers with a contact
+    since the tick before. last_commands: last commands (6,), N and N m, of chasers without odometry
+    in this tick, which fly by plans that the controller does not know. outdated: newest odometry of
+    chasers that have none of this tick, with the times of the ticks at which it was measured.
     """
 
     time_ns: int
@@ -99,8 +106,8 @@ class JointInputs:
 class JointFilterState(HypothesisSet[JointState], frozen=True, eq=False):
     """State of the filter after the tick at ``time_ns``.
 
-    collective: ticks in a row in which most cameras were rejected. overconfident, dropped: reported channels of odometry, by
-    chaser and name.
+    collective: ticks in a row in which most cameras were rejected. overconfident, dropped: reported
+    channels of odometry, by chaser and name.
     """
 
     collective: int = 0
@@ -110,7 +117,9 @@ class JointFilterState(HypothesisSet[JointState], frozen=True, eq=False):
 
 @dataclass(kw_only=True)
 class JointTickRecord(ReplayRecord[JointFilterState]):
-    """A tick's inputs without sightings and outdated odometry, and the sightings that were exposed at it, by chaser."""
+    """A tick's inputs without sightings and outdated odometry, and the sightings that were exposed
+    at it, by chaser.
+    """
 
     inputs: JointInputs
     sightings: dict[int, Sighting] = field(default_factory=dict)
@@ -135,7 +144,9 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
 
     @property
     def shape(self) -> tuple[BodyShape, Array] | None:
-        """Return the shape of the body that the target is from now on, and its covariance (8, 8); None if it is not estimated."""
+        """Return the shape of the body that the target is from now on, and its covariance (8, 8);
+        None if it is not estimated.
+        """
         state = None if self.state is None else with_body(self.state, self.target)
         if state is None or state.shape is None:
             return None
@@ -163,7 +174,9 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         if state is None or not state.hypotheses[0].target_known:
             return no_estimate(time_ns)
         if time_ns < state.time_ns:
-            raise ValueError(f"no state for {time_ns} ns in the buffer; the oldest is {state.time_ns} ns")
+            raise ValueError(
+                f"no state for {time_ns} ns in the buffer; the oldest is {state.time_ns} ns"
+            )
         p = self._with(self.target)
         predicted = [predict_target(with_body(h, p.target), time_ns, p) for h in state.hypotheses]
         hypotheses, covariances = zip(*predicted, strict=True)
@@ -172,14 +185,18 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         return target_state(state, time_ns, hypotheses[0], covariance, lost, p.target)
 
     def relative_poses(self) -> tuple[RelativePose, ...]:
-        """Return the poses of the chasers relative to the target after the newest tick, if the target is known."""
+        """Return the poses of the chasers relative to the target after the newest tick, if the
+        target is known.
+        """
         s = self.state
         if s is None or not s.target_known:
             return ()
         return tuple(relative_poses(s, np.flatnonzero(s.alive).tolist()))
 
     def motion_covariance(self, chaser: int) -> Array | None:
-        """Return the covariance (6, 6) of a chaser's position and velocity relative to the target, WRF, if both are known."""
+        """Return the covariance (6, 6) of a chaser's position and velocity relative to the target,
+        WRF, if both are known.
+        """
         s = self.state
         if s is None or not s.target_known or not s.alive[chaser]:
             return None
@@ -205,7 +222,9 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         return p if target is p.target else dataclasses.replace(p, target=target)
 
     def _insert(self, sighting: Sighting) -> int:
-        """Add a sighting to the record of its exposure; return the record's index, or that of the newest record."""
+        """Add a sighting to the record of its exposure; return the record's index, or that of the
+        newest record.
+        """
         newest = len(self._buffer.records) - 1
         i, record = self._buffer.find(sighting.sim_time_ns)
         if record is None:
@@ -218,7 +237,9 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         return i
 
     def _insert_odometry(self, odometry: Odometry) -> int:
-        """Add odometry to the record of its tick, if that is known without it; return the record's index, or that of the newest."""
+        """Add odometry to the record of its tick, if that is known without it; return the record's
+        index, or that of the newest.
+        """
         i, record = self._buffer.find(odometry.sim_time_ns)
         if record is None or odometry.chaser in record.inputs.odometry:
             return len(self._buffer.records) - 1
@@ -229,17 +250,24 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
     def _process(
         self, before: JointFilterState | None, record: JointTickRecord
     ) -> tuple[JointFilterState, tuple[EstimatorEvent, ...]]:
-        return process_tick(before, record, self.chasers, self._mounting, self._with(record.parameters))
+        return process_tick(
+            before, record, self.chasers, self._mounting, self._with(record.parameters)
+        )
 
 
 def lost_limits(state: JointState, target: MekfParameters) -> MekfParameters:
-    """Return the parameters with the standard deviation of the target's position beyond which it is lost: of a far target at least
-    `FAR_LOST_SHARE` of its distance from the nearest chaser, as the error of a camera's mounting grows with the distance."""
+    """Return the parameters with the standard deviation of the target's position beyond which it is
+    lost: of a far target at least `FAR_LOST_SHARE` of its distance from the nearest chaser, as the
+    error of a camera's mounting grows with the distance."""
     at = state.position_m.tolist()
     places = zip(state.positions_m.tolist(), state.alive.tolist(), strict=True)
-    limit_m = FAR_LOST_SHARE * min((math.dist(place, at) for place, alive in places if alive), default=0.0)
+    limit_m = FAR_LOST_SHARE * min(
+        (math.dist(place, at) for place, alive in places if alive), default=0.0
+    )
     return (
-        target if limit_m <= target.lost_position_m else dataclasses.replace(target, lost_position_m=limit_m)
+        target
+        if limit_m <= target.lost_position_m
+        else dataclasses.replace(target, lost_position_m=limit_m)
     )
 
 
@@ -250,7 +278,9 @@ def process_tick(
     mounting: CameraMounting,
     p: JointParameters,
 ) -> tuple[JointFilterState, tuple[EstimatorEvent, ...]]:
-    """Return the state after a tick, and the events. ``before``: after the previous tick, None at the first."""
+    """Return the state after a tick, and the events. ``before``: after the previous tick, None at
+    the first.
+    """
     events: list[EstimatorEvent] = []
     old = before
     if old is None:
@@ -274,9 +304,11 @@ def process_tick(
 
 
 def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -> JointState:
-    """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured for long.
+    """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured
+    for long.
 
-    A state that contradicts all of its measurements for long cannot recover by them, as none passes its gate.
+    A state that contradicts all of its measurements for long cannot recover by them, as none passes
+    its gate.
     """
     inputs = record.inputs
     state = with_body(state, p.target)
@@ -292,7 +324,8 @@ def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -
     for i, wrench in inputs.last_commands.items():
         if state.alive[i] and i not in inputs.latched:
             state = replace(
-                state, covariance=_with_unknown_command(state.covariance, i, wrench, inputs.covered_s, p)
+                state,
+                covariance=_with_unknown_command(state.covariance, i, wrench, inputs.covered_s, p),
             )
     return replace(state, odometry_ns=newest)
 
@@ -300,7 +333,9 @@ def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -
 def _with_unknown_command(
     covariance: Array, i: int, wrench: Array, period_s: float, p: JointParameters
 ) -> Array:
-    """Return the covariance with the rates of a chaser uncertain by a command as large as ``wrench`` (6,) for a period."""
+    """Return the covariance with the rates of a chaser uncertain by a command as large as
+    ``wrench`` (6,) for a period.
+    """
     velocity = float(np.linalg.norm(wrench[:3])) * period_s / p.body.mass_kg
     rate = float(np.linalg.norm(wrench[3:])) * period_s / min(p.inertia)
     return widened(covariance, rate_variances(velocity, rate), block(i).start)
@@ -332,7 +367,9 @@ def _check_cameras(
     for i in sorted(seen):
         was, count = int(before.rejections[i, k]), int(best.rejections[i, k])
         if count == limit and was == limit - 1:
-            events.append(EstimatorEvent(now.time_ns, "warning", f"chaser {i} gated out: {limit} in a row"))
+            events.append(
+                EstimatorEvent(now.time_ns, "warning", f"chaser {i} gated out: {limit} in a row")
+            )
         elif was >= limit and count == 0:
             events.append(EstimatorEvent(now.time_ns, "info", f"chaser {i} accepted again"))
     if 2 * len(report.rejected) <= len(seen):
@@ -340,7 +377,9 @@ def _check_cameras(
     collective = now.collective + 1
     now = replace(now, collective=collective)
     if collective == p.collective_rejections:
-        return replace(now, hypotheses=tuple(with_uncertain_rates(h, p.target) for h in now.hypotheses))
+        return replace(
+            now, hypotheses=tuple(with_uncertain_rates(h, p.target) for h in now.hypotheses)
+        )
     if collective >= p.target.sustained_rejections:
         rates = rates_of(with_uncertain_rates(now.hypotheses[0], p.target))
         if p.target.motion_model == "torque_free":
@@ -353,24 +392,37 @@ def _start(
     now: JointFilterState, seen: Mapping[int, Sighting], rates: TargetRates,
     mounting: CameraMounting, p: JointParameters, action: str, events: list[EstimatorEvent],
 ) -> JointFilterState:  # fmt: skip
-    """Start the target at the sighting with which most others agree, and apply the others as updates."""
+    """Start the target at the sighting with which most others agree, and apply the others as
+    updates.
+    """
     s = now.hypotheses[0]
     with _BLAS.limit(limits=1, user_api="blas"):
         poses = {
-            i: [sighted_pose(s, i, x, len(sighting.marker_ids), mounting, p) for x in sighting.solutions]
+            i: [
+                sighted_pose(s, i, x, len(sighting.marker_ids), mounting, p)
+                for x in sighting.solutions
+            ]
             for i, sighting in seen.items()
         }
 
     def support(i: int, pose: SightedPose) -> int:
         others = (poses[k] for k in poses if k != i)
         return sum(
-            any(poses_agree(pose, x, pose.covariance + x.covariance, p.gate_sighting) for x in other)
+            any(
+                poses_agree(pose, x, pose.covariance + x.covariance, p.gate_sighting) for x in other
+            )
             for other in others
         )
 
     def rank(i: int) -> tuple[int, bool, int, float, int]:
         most = max(support(i, pose) for pose in poses[i])
-        return most, len(poses[i]) == 1, len(seen[i].marker_ids), -float(np.trace(poses[i][0].covariance)), -i
+        return (
+            most,
+            len(poses[i]) == 1,
+            len(seen[i].marker_ids),
+            -float(np.trace(poses[i][0].covariance)),
+            -i,
+        )
 
     first = max(sorted(seen), key=rank)
     supports = [support(first, pose) for pose in poses[first]]
@@ -392,7 +444,9 @@ def _reacquire(
     now: JointFilterState, seen: Mapping[int, Sighting], mounting: CameraMounting, p: JointParameters,
     events: list[EstimatorEvent],
 ) -> JointFilterState:  # fmt: skip
-    """Reinitialize the target from the status "lost", keeping its rates; unless it would be lost again."""
+    """Reinitialize the target from the status "lost", keeping its rates; unless it would be lost
+    again.
+    """
     new_events: list[EstimatorEvent] = []
     fresh = _start(now, seen, rates_of(now.hypotheses[0]), mounting, p, "reacquired", new_events)
     if all_lost(fresh, lost_limits(fresh.hypotheses[0], p.target)):
@@ -420,8 +474,14 @@ def _report_odometry(
                 events.append(EstimatorEvent(now.time_ns, "warning", text))
             elif count == 0 and key in dropped:
                 dropped.discard(key)
-                events.append(EstimatorEvent(now.time_ns, "info", f"chaser {i}: odometry {name} used again"))
-            if mean > 3.0 * p.overconfident_ratio and key not in overconfident and key not in dropped:
+                events.append(
+                    EstimatorEvent(now.time_ns, "info", f"chaser {i}: odometry {name} used again")
+                )
+            if (
+                mean > 3.0 * p.overconfident_ratio
+                and key not in overconfident
+                and key not in dropped
+            ):
                 overconfident.add(key)
                 text = f"chaser {i}: odometry {name} is overconfident: its noise is larger than stated (NIS {mean:.1f} of 3)"
                 events.append(EstimatorEvent(now.time_ns, "warning", text))
@@ -439,10 +499,14 @@ def _pose_rows(chasers: tuple[int, ...]) -> IntArray:
 
 
 def relative_poses(s: JointState, chasers: Sequence[int]) -> list[RelativePose]:
-    """Return the poses of chasers in TRF with their covariances (6, 6): position in TRF, rotation in CRF."""
+    """Return the poses of chasers in TRF with their covariances (6, 6): position in TRF, rotation
+    in CRF.
+    """
     rows = _pose_rows(tuple(chasers))
     rt, n = so3.to_matrix(s.q_wxyz), len(rows)
-    c = np.array([so3.matrix_components(*s.attitudes_wxyz[i].tolist()) for i in chasers]).reshape(n, 3, 3)
+    c = np.array([so3.matrix_components(*s.attitudes_wxyz[i].tolist()) for i in chasers]).reshape(
+        n, 3, 3
+    )
     places = [rt.T @ (s.positions_m[i] - s.position_m) for i in chasers]
     j = np.zeros((n, 6, 12))
     j[:, 0:3, 0:3], j[:, 0:3, 6:9], j[:, 3:6, 9:12] = -rt.T, rt.T, _IDENTITY_3

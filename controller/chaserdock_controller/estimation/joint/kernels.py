@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Array interface of the joint filter's compiled kernels (`native`), with the same names.
 
-A mean is one array: position, velocity, attitude and rate of the target (13), and for each chaser the same and its additive
-states (44). Of a covariance within an update only the lower triangle is valid; ``complete`` fills the other one.
+A mean is one array: position, velocity, attitude and rate of the target (13), and for each chaser
+the same and its additive states (44). Of a covariance within an update only the lower triangle is
+valid; ``complete`` fills the other one.
 """
 
 from __future__ import annotations
@@ -52,7 +53,16 @@ class _Measurement(Structure):
         ("i", c_int64),
         *(
             (name, c_void_p)
-            for name in ("lens", "axes", "camera", "odometry", "odometry_noise", "sighting", "stated", "view")
+            for name in (
+                "lens",
+                "axes",
+                "camera",
+                "odometry",
+                "odometry_noise",
+                "sighting",
+                "stated",
+                "view",
+            )
         ),
         ("white_ratio", c_double),
         ("view_ratio", c_double),
@@ -63,7 +73,16 @@ class _Innovation(Structure):
     _fields_ = [
         *(
             (name, c_void_p)
-            for name in ("residual", "jacobian", "noise", "s", "cross", "white", "correction", "values")
+            for name in (
+                "residual",
+                "jacobian",
+                "noise",
+                "s",
+                "cross",
+                "white",
+                "correction",
+                "values",
+            )
         ),
         ("stride", c_int64),
         ("size", c_int64),
@@ -73,8 +92,9 @@ class _Innovation(Structure):
 class ChaserMeasurement:
     """Measurements of chaser ``i`` of ``n``, of which one may be None.
 
-    mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting: pose (7,) in IRF, stated
-    covariance (6, 6), covariance (6, 6) in whose units the view error is, and the ratios of white noise and view error to them.
+    mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting:
+    pose (7,) in IRF, stated covariance (6, 6), covariance (6, 6) in whose units the view error is,
+    and the ratios of white noise and view error to them.
     """
 
     def __init__(
@@ -96,7 +116,9 @@ class ChaserMeasurement:
 
 
 class JointInnovation:
-    """Memory of the updates of a tick with the covariance (D, D) and a mean; see ``Innovation`` of native/update.c."""
+    """Memory of the updates of a tick with the covariance (D, D) and a mean; see ``Innovation`` of
+    native/update.c.
+    """
 
     def __init__(self, n: int, size: int) -> None:
         stride = -(-size // 8) * 8
@@ -116,13 +138,19 @@ class JointInnovation:
         self._n = c_int64(n)
 
     def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
-        """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same array or another one)."""
+        """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same
+        array or another one).
+        """
         function("innovate")(
             ctypes.byref(z.native), address(mean), address(prior), address(covariance), self._address, self._work_address
         )  # fmt: skip
 
-    def correct(self, z: ChaserMeasurement, used: NDArray[np.int64], prior: Array, mean: Array) -> bool:
-        """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their covariance is not positive."""
+    def correct(
+        self, z: ChaserMeasurement, used: NDArray[np.int64], prior: Array, mean: Array
+    ) -> bool:
+        """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their
+        covariance is not positive.
+        """
         return bool(
             function("correct", c_int64)(
                 self._n, c_int64(z.rows), address(used), c_int64(len(used)), self._address, address(prior), address(mean)
@@ -140,7 +168,9 @@ def _error_size(n: int) -> int:
 
 
 def check_size(mean: Array, covariance: Array) -> int:
-    """Return the number of chasers of a state. Raises ValueError if its covariance has another size, with or without a shape."""
+    """Return the number of chasers of a state. Raises ValueError if its covariance has another
+    size, with or without a shape.
+    """
     n, rest = divmod(mean.size - TARGET_MEAN, CHASER_MEAN)
     size = _error_size(n)
     if rest or covariance.shape not in ((size, size), (size + SHAPE, size + SHAPE)):
@@ -170,7 +200,8 @@ def predict(
     mean: Array,
     covariance: Array,
 ) -> Array:
-    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of native/covariance.c.
+    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of
+    native/covariance.c.
 
     Raises ValueError if sizes contradict each other, as in a state from a checkpoint."""
     n = check_size(mean, covariance)
@@ -181,15 +212,17 @@ def predict(
     arrays: tuple[NDArray[Any], ...] = (
         target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance, out, work,
     )  # fmt: skip
-    function("predict")(ctypes.byref(motion), c_int64(n), c_int64(len(covariance)), *map(address, arrays))
+    function("predict")(
+        ctypes.byref(motion), c_int64(n), c_int64(len(covariance)), *map(address, arrays)
+    )
     return out
 
 
 def wrench_at_origin(
     wrench: Array, centre_m: Array, omega_rad_s: Array, mass_kg: float, inertia: Array
 ) -> Array:
-    """Return the wrench (6,) that moves a body with its centre of mass at the origin as ``wrench`` moves one with it at
-    ``centre_m`` (3,); see native/motion.c."""
+    """Return the wrench (6,) that moves a body with its centre of mass at the origin as ``wrench``
+    moves one with it at ``centre_m`` (3,); see native/motion.c."""
     out = np.empty(6)
     function("wrench_at_origin")(
         address(wrench), address(centre_m), address(omega_rad_s), c_double(mass_kg), address(inertia), address(out)
@@ -205,8 +238,12 @@ def linearize(z: ChaserMeasurement, mean: Array) -> tuple[Array, Array, Array]:
     return out
 
 
-def predict_sighting(mean: Array, i: int, mounting: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Return the predicted pose (7,) of the target in IRF, and its Jacobian (6, 55) without the view's error."""
+def predict_sighting(
+    mean: Array, i: int, mounting: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    """Return the predicted pose (7,) of the target in IRF, and its Jacobian (6, 55) without the
+    view's error.
+    """
     pose, jacobian = np.empty(7), np.empty((6, _SEEN))
     function("predict_sighting")(
         address(mean), c_int64(i), *map(address, mounting), address(pose), address(jacobian)

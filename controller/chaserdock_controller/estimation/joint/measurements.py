@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement models of the joint filter: odometry, and a sighting in the frame of the camera (native/measurements.c).
+"""Measurement models of the joint filter: odometry, and a sighting in the frame of the camera
+(native/measurements.c).
 
-Residuals are to first order r = H e + n, with e the error vector of ``state`` and n white noise. With the chaser at p_i, C_i, the
-lens at l (CRF), the nominal camera axes R (IRF to CRF), E = C_i R and the camera errors delta, b, s of ``camera_calibration``, a
-target at p, R_t is seen at S^-1 exp(-delta) (E' (p - p_i - C_i l) - b) with the attitude exp(-delta) E' R_t.
+Residuals are to first order r = H e + n, with e the error vector of ``state`` and n white noise.
+With the chaser at p_i, C_i, the lens at l (CRF), the nominal camera axes R (IRF to CRF), E = C_i R
+and the camera errors delta, b, s of ``camera_calibration``, a target at p, R_t is seen at S^-1
+exp(-delta) (E' (p - p_i - C_i l) - b) with the attitude exp(-delta) E' R_t.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ _ODOMETRY_ROWS = np.arange(12)
 
 
 class CameraMounting(NamedTuple):
-    """Nominal lens position (3,) in CRF, and the axes of the camera, IRF to CRF, as matrix (3, 3) and quaternion (4,)."""
+    """Nominal lens position (3,) in CRF, and the axes of the camera, IRF to CRF, as matrix (3, 3)
+    and quaternion (4,).
+    """
 
     position_m: Array
     axes: Array
@@ -33,7 +37,9 @@ class CameraMounting(NamedTuple):
 
 
 class LinearizedMeasurement(NamedTuple):
-    """Residual (k,), its Jacobians by the errors of the target (k, 12) and of the chaser (k, CHASER), and noise (k, k)."""
+    """Residual (k,), its Jacobians by the errors of the target (k, 12) and of the chaser (k,
+    CHASER), and noise (k, k).
+    """
 
     residual: Array
     by_target: Array
@@ -57,8 +63,9 @@ def measurement(
     p: JointParameters,
     view: Array | None = None,
 ) -> kernels.ChaserMeasurement:
-    """Return what chaser ``i`` of ``chasers`` measures in a tick, for the kernels: odometry, a solution from ``markers``
-    markers, or both. ``view`` (6, 6): covariance in whose units the view error is; the stated one by default."""
+    """Return what chaser ``i`` of ``chasers`` measures in a tick, for the kernels: odometry, a
+    solution from ``markers`` markers, or both. ``view`` (6, 6): covariance in whose units the view
+    error is; the stated one by default."""
     measured = sighted = None
     if odometry is not None:
         o = odometry
@@ -68,13 +75,19 @@ def measurement(
         noise = p.sighting_noise(markers)
         pose = np.array([*solution.position_m, *solution.q_wxyz])
         stated = sighting_covariance(solution, p)
-        sighted = pose, stated, stated if view is None else view, noise.white_ratio, noise.view_ratio
+        sighted = (
+            pose,
+            stated,
+            stated if view is None else view,
+            noise.white_ratio,
+            noise.view_ratio,
+        )
     return kernels.ChaserMeasurement(chasers, i, mounting, measured, sighted)
 
 
 def linearize(state: JointState, z: kernels.ChaserMeasurement) -> LinearizedMeasurement:
-    """Return the residual of a measurement, first the sighting: position in IRF, m, rotation in TRF, rad; then odometry: position,
-    velocity, attitude, rate."""
+    """Return the residual of a measurement, first the sighting: position in IRF, m, rotation in
+    TRF, rad; then odometry: position, velocity, attitude, rate."""
     residual, jacobian, noise = kernels.linearize(z, packed(state))
     return LinearizedMeasurement(residual, jacobian[:, :TARGET], jacobian[:, TARGET:], noise)
 
@@ -102,8 +115,8 @@ def _white_noise(stated: tuple[tuple[float, ...], ...], floors: tuple[float, ...
 
 
 class PredictedSighting(NamedTuple):
-    """Predicted pose of the target in IRF: position (3,) and attitude (4,), with Jacobians as in ``LinearizedMeasurement``,
-    without the columns of ``VIEW``."""
+    """Predicted pose of the target in IRF: position (3,) and attitude (4,), with Jacobians as in
+    ``LinearizedMeasurement``, without the columns of ``VIEW``."""
 
     position_m: Array
     q_wxyz: Array

@@ -16,7 +16,9 @@ from chaserdock_protocol.scenario.navigation import NavigationErrors
 from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE, MekfParameters
 
 GATE_CHI_SQUARE_3 = 21.107513466160444
-"""0.9999 quantile of the chi-square distribution with 3 degrees of freedom (tests compare with SciPy)."""
+"""0.9999 quantile of the chi-square distribution with 3 degrees of freedom (tests compare with
+SciPy).
+"""
 
 TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-5, 1e-5)}
 
@@ -38,11 +40,13 @@ class SightingNoise(NamedTuple):
 
 SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
-# Errors of geometry and shading change only with the view, and are alike in the images of several cameras (docs/markerless.md).
+# Errors of geometry and shading change only with the view, and are alike in the images of several
+# cameras (docs/markerless.md).
 SHAPE = SightingNoise(white_ratio=1.0, view_ratio=1.6, view_time_s=30.0, units_time_s=15.0)
 # Without images, range, bearing and attitude of `[ranging]` have white errors of the stated size.
 RANGING = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
-# A bearing from an image: light, markers and the pixel grid shift the centroid as long as the view stays the same.
+# A bearing from an image: light, markers and the pixel grid shift the centroid as long as the view
+# stays the same.
 BEARING = SightingNoise(white_ratio=1.0, view_ratio=1.0, view_time_s=25.0)
 
 
@@ -129,7 +133,9 @@ class JointParameters:
     camera_turn_rad: float = field(init=False)
 
     def __post_init__(self) -> None:
-        """Derive the prior of the camera's turn: an error of the principal point acts as a turn, to first order."""
+        """Derive the prior of the camera's turn: an error of the principal point acts as a turn, to
+        first order.
+        """
         n = self.navigation
         turn = math.hypot(n.camera_turn_rad, n.camera_centre_px / self.camera.fx_px)
         object.__setattr__(self, "camera_turn_rad", turn)

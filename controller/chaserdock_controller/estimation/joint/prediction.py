@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of the target and the chasers between ticks, and the growth of the covariance (native/motion.c, covariance.c).
+"""Motion of the target and the chasers between ticks, and the growth of the covariance
+(native/motion.c, covariance.c).
 
-A chaser is a rigid body under its commanded wrench and an unknown, slowly changing disturbance (F_d, T_d), both in body axes:
-I omega' = T + T_d - c x (F + F_d) - omega x I omega, v' = C ((F + F_d) / m - omega' x c - omega x (omega x c)), where the
-origin of CRF is at -c from the centre of mass.
-In an orbit, the forces and torques of the Hill frame act as well (relative_motion.py). Its sensor errors
-are Gauss-Markov processes or constants.
+A chaser is a rigid body under its commanded wrench and an unknown, slowly changing disturbance
+(F_d, T_d), both in body axes: I omega' = T + T_d - c x (F + F_d) - omega x I omega, v' = C ((F +
+F_d) / m - omega' x c - omega x (omega x c)), where the origin of CRF is at -c from the centre of
+mass. In an orbit, the forces and torques of the Hill frame act as well (relative_motion.py). Its
+sensor errors are Gauss-Markov processes or constants.
 """
 
 from __future__ import annotations
@@ -22,7 +23,11 @@ from chaserdock_protocol.scenario.navigation import NavigationErrors
 from msgspec.structs import replace
 
 from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE
-from chaserdock_controller.estimation.motion_models import free_shape, process_noise, propagate_target
+from chaserdock_controller.estimation.motion_models import (
+    free_shape,
+    process_noise,
+    propagate_target,
+)
 
 from . import kernels
 from .kernels import CHASER_MEAN, TARGET_MEAN
@@ -59,8 +64,9 @@ def predict(
 ) -> JointState:
     """Propagate the state to ``time_ns``.
 
-    ``impulses`` (N, 6): N s and N m s, body axes, that the actuators gave since then. ``nominal_s``: the time that they
-    cover; beyond it the command is unknown. Raises ValueError for an earlier time.
+    ``impulses`` (N, 6): N s and N m s, body axes, that the actuators gave since then.
+    ``nominal_s``: the time that they cover; beyond it the command is unknown. Raises ValueError for
+    an earlier time.
     """
     dt = (time_ns - state.time_ns) * 1e-9
     if dt == 0.0:
@@ -94,7 +100,9 @@ def predict(
 
 
 def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.MotionParameters:
-    """Return the parameters of a prediction over ``dt``, of which the command is unknown for ``unknown_s``."""
+    """Return the parameters of a prediction over ``dt``, of which the command is unknown for
+    ``unknown_s``.
+    """
     n = p.navigation
     return kernels.MotionParameters(
         dt,
@@ -117,7 +125,9 @@ def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.MotionPa
 
 
 def predict_target(state: JointState, time_ns: int, p: JointParameters) -> tuple[JointState, Array]:
-    """Return the state with the target's mean at ``time_ns``, and the target's covariance (12, 12) then."""
+    """Return the state with the target's mean at ``time_ns``, and the target's covariance (12, 12)
+    then.
+    """
     dt = (time_ns - state.time_ns) * 1e-9
     if dt == 0.0:
         return state, state.covariance[:TARGET, :TARGET].copy()
@@ -135,7 +145,9 @@ def target_covariance(state: JointState) -> Array:
 
 
 def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[JointState, Array]:
-    """Return the state with the target after ``dt``, and the transition (12, 12), or (12, 20) if its shape is estimated."""
+    """Return the state with the target after ``dt``, and the transition (12, 12), or (12, 20) if
+    its shape is estimated.
+    """
     if not state.target_known:
         return state, np.eye(TARGET, TARGET if state.shape is None else TARGET + SHAPE)
     motion = (state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s)
@@ -143,14 +155,21 @@ def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[J
         (position, velocity, q, omega), f = propagate_target(*motion, dt, p.target)
     else:
         (position, velocity, q, omega), f = free_shape(motion, dt, state.shape, p.mean_motion_rad_s)
-    return replace(state, position_m=position, velocity_m_s=velocity, q_wxyz=q, omega_rad_s=omega), f
+    return replace(
+        state, position_m=position, velocity_m_s=velocity, q_wxyz=q, omega_rad_s=omega
+    ), f
 
 
 def _target_noise(dt: float, p: JointParameters, is_stack: bool = False) -> Array:
-    """Return the process noise (12, 12) of the target. ``is_stack``: disturbances of latched chasers act on it, too."""
+    """Return the process noise (12, 12) of the target. ``is_stack``: disturbances of latched
+    chasers act on it, too.
+    """
     linear, angular = p.target_noise[p.target.motion_model]
     if is_stack:
-        linear, angular = math.hypot(linear, p.stack_noise[0]), math.hypot(angular, p.stack_noise[1])
+        linear, angular = (
+            math.hypot(linear, p.stack_noise[0]),
+            math.hypot(angular, p.stack_noise[1]),
+        )
     return _process_noise(dt, linear**2, angular**2)
 
 
@@ -159,7 +178,9 @@ _process_noise = lru_cache(maxsize=16)(process_noise)
 
 
 def _couple_shape(covariance: Array, by_shape: Array) -> None:
-    """Add to a predicted covariance, in place, that the target moves by its shape; ``by_shape`` (12, 8): the transition."""
+    """Add to a predicted covariance, in place, that the target moves by its shape; ``by_shape``
+    (12, 8): the transition.
+    """
     covariance[:TARGET] += by_shape @ covariance[-SHAPE:]
     covariance[:, :TARGET] += covariance[:, -SHAPE:] @ by_shape.T
 
@@ -167,10 +188,12 @@ def _couple_shape(covariance: Array, by_shape: Array) -> None:
 def _fade_ratios(
     covariance: Array, information: Array, dt: float, state: JointState, p: JointParameters
 ) -> None:
-    """Reduce, in place, the information of past measurements on the ratios of the inertia since the shape started.
+    """Reduce, in place, the information of past measurements on the ratios of the inertia since the
+    shape started.
 
-    They were linearized at an earlier estimate, which was far from the truth at first: after the time t, what was measured at the
-    time s weighs (s / t)^``ratio_memory``. The ``information`` (5, 5) from before the measurements is kept.
+    They were linearized at an earlier estimate, which was far from the truth at first: after the
+    time t, what was measured at the time s weighs (s / t)^``ratio_memory``. The ``information`` (5,
+    5) from before the measurements is kept.
     """
     age = max((state.time_ns - state.shape_ns) * 1e-9, _YOUNG_S)
     share = p.ratio_memory * dt / (age + dt)
@@ -178,14 +201,16 @@ def _fade_ratios(
 
 
 def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) -> Array:
-    """Return the wrench (6,) that acts on chaser ``i``, as a body with its centre of mass at the origin of CRF, in addition to
-    the commanded ``wrench``."""
+    """Return the wrench (6,) that acts on chaser ``i``, as a body with its centre of mass at the
+    origin of CRF, in addition to the commanded ``wrench``."""
     total, centre_m, omega = (
         wrench + state.extra[i, :6],
         state.of(i, CENTRE).copy(),
         state.omegas_rad_s[i].copy(),
     )
-    at_origin = kernels.wrench_at_origin(total, centre_m, omega, p.body.mass_kg, np.array(p.inertia))
+    at_origin = kernels.wrench_at_origin(
+        total, centre_m, omega, p.body.mass_kg, np.array(p.inertia)
+    )
     return at_origin - wrench
 
 
@@ -201,7 +226,9 @@ def chaser_prior(p: JointParameters) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _prior_of(n: NavigationErrors, force_N: float, torque_N_m: float, centre_m: float, turn: float) -> Array:
+def _prior_of(
+    n: NavigationErrors, force_N: float, torque_N_m: float, centre_m: float, turn: float
+) -> Array:
     prior = np.zeros(EXTRA)
     for part, sigma in (
         (FORCE, force_N),

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """State of the joint filter, and the layout of its error vector.
 
-The error vector has 12 components for the target, then ``CHASER`` for each chaser. Both begin with position and velocity
-(WRF), rotation (body axes, q_true = q (x) exp(dtheta)) and angular rate (body axes). A chaser's additive states follow. The last
-``SHAPE`` components, of a torque-free target only, are those of its ``BodyShape``.
+The error vector has 12 components for the target, then ``CHASER`` for each chaser. Both begin with
+position and velocity (WRF), rotation (body axes, q_true = q (x) exp(dtheta)) and angular rate (body
+axes). A chaser's additive states follow. The last ``SHAPE`` components, of a torque-free target
+only, are those of its ``BodyShape``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,13 @@ from chaserdock_models.arrays import Array
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE, BodyShape, shape_covariance, shape_of
+from chaserdock_controller.estimation.body_shape import (
+    RATIOS,
+    SHAPE,
+    BodyShape,
+    shape_covariance,
+    shape_of,
+)
 from chaserdock_controller.estimation.parameters import BodyPrior, MekfParameters
 from chaserdock_controller.estimation.target_hypotheses import TargetHypothesis
 
@@ -32,7 +39,9 @@ MOTION = 21
 POSITION_DRIFT, ATTITUDE_DRIFT, GYRO_BIAS = slice(21, 24), slice(24, 27), slice(27, 30)
 """Errors of its odometry that do not average out: m (WRF), rad (CRF), rad/s (CRF)."""
 TURN, SHIFT, FOCAL = slice(30, 33), slice(33, 36), slice(36, 37)
-"""Errors of its camera: rotation vector and shift (IRF), relative focal length (see ``camera_calibration``)."""
+"""Errors of its camera: rotation vector and shift (IRF), relative focal length (see
+``camera_calibration``).
+"""
 VIEW = slice(37, 43)
 """Error of its sightings that persists with the view, in units of the stated sigmas."""
 CHASER = 43
@@ -45,19 +54,21 @@ CHANNELS = ("sighting", "position", "velocity", "attitude", "rate")
 
 
 class JointState(TargetHypothesis, frozen=True, eq=False, kw_only=True):
-    """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``) and of N chasers.
+    """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``)
+    and of N chasers.
 
-    positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
-    additive states. covariance (12 + CHASER N, 12 + CHASER N), or with ``shape`` ``SHAPE`` more. alive (N,): chasers whose state
-    is known. shape: of a torque-free target. prior: knowledge that it started from at ``shape_ns``, with ``ratio_information``
-    (5, 5), the (pseudo-)inverse of the covariance of its ratios.
-    odometry_ns (N,): time of the newest odometry. measured_ns (N,): time of the newest measurement that was used.
-    rejections (N, len(CHANNELS)): counts that decide which channel is used.
-    markers (N,): number of markers in the newest sighting of each chaser; 1 before the first one.
-    view_units (N, 6, 6), view_units_ns (N,): mean of the stated covariances of sightings, and the time of the newest one, where the
-    view error is in units of such a mean; 0 before, and where it is in units of the newest one.
-    nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
-    updates: ticks with sightings since the start of the target.
+    positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4).
+    extra (N, EXTRA): their additive states. covariance (12 + CHASER N, 12 + CHASER N), or with
+    ``shape`` ``SHAPE`` more. alive (N,): chasers whose state is known. shape: of a torque-free
+    target. prior: knowledge that it started from at ``shape_ns``, with ``ratio_information`` (5,
+    5), the (pseudo-)inverse of the covariance of its ratios. odometry_ns (N,): time of the newest
+    odometry. measured_ns (N,): time of the newest measurement that was used. rejections (N,
+    len(CHANNELS)): counts that decide which channel is used. markers (N,): number of markers in the
+    newest sighting of each chaser; 1 before the first one. view_units (N, 6, 6), view_units_ns
+    (N,): mean of the stated covariances of sightings, and the time of the newest one, where the
+    view error is in units of such a mean; 0 before, and where it is in units of the newest one. nis
+    (N, 4): moving average of the normalized innovation squared of the odometry's channels. updates:
+    ticks with sightings since the start of the target.
     """
 
     positions_m: Array
@@ -117,7 +128,9 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
 
 
 def with_body(state: JointState, p: MekfParameters) -> JointState:
-    """Return the state of a target that is the body of ``p`` from now on: the same, unless it was another body until now."""
+    """Return the state of a target that is the body of ``p`` from now on: the same, unless it was
+    another body until now.
+    """
     if p.motion_model != "torque_free" or state.prior == p.body_prior:
         return state
     return start_shape(state, p)
@@ -135,7 +148,9 @@ def start_shape(state: JointState, p: MekfParameters) -> JointState:
         state,
         shape=shape_of(inertia, np.array(p.centre_of_mass_trf_m)),
         prior=p.body_prior,
-        ratio_information=np.linalg.pinv(covariance[own:, own:][RATIOS, RATIOS], rcond=1e-12, hermitian=True),
+        ratio_information=np.linalg.pinv(
+            covariance[own:, own:][RATIOS, RATIOS], rcond=1e-12, hermitian=True
+        ),
         shape_ns=state.time_ns,
         covariance=covariance,
     )
@@ -153,7 +168,11 @@ def packed(state: JointState) -> Array:
     mean[6:10], mean[10:13] = state.q_wxyz, state.omega_rad_s
     each = mean[TARGET_MEAN:].reshape(-1, CHASER_MEAN)
     each[:, 0:3], each[:, 3:6] = state.positions_m, state.velocities_m_s
-    each[:, 6:10], each[:, 10:13], each[:, 13:] = state.attitudes_wxyz, state.omegas_rad_s, state.extra
+    each[:, 6:10], each[:, 10:13], each[:, 13:] = (
+        state.attitudes_wxyz,
+        state.omegas_rad_s,
+        state.extra,
+    )
     return mean
 
 
@@ -178,7 +197,9 @@ def inject(state: JointState, error: Array) -> JointState:
     """Return the state corrected by an error vector; the covariance stays."""
     end = TARGET + CHASER * state.chasers
     shape = None if state.shape is None else state.shape.corrected(error[end:])
-    return replace(state, shape=shape, **mean_fields(kernels.inject(packed(state), np.array(error))))
+    return replace(
+        state, shape=shape, **mean_fields(kernels.inject(packed(state), np.array(error)))
+    )
 
 
 def difference(a: JointState, b: JointState) -> Array:

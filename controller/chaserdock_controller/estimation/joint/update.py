@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Updates of the joint filter by a tick's odometry and sightings, with a gate for each channel. Pure functions.
+"""Updates of the joint filter by a tick's odometry and sightings, with a gate for each channel.
+Pure functions.
 
-A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
-until it has fitted as often: a jump or a constant error then changes nothing. A chaser whose estimate no measurement of
-translation, or none of rotation, has supported for ``restart_after_s`` is started again from its odometry: an estimate that
-contradicts all of them cannot recover otherwise.
-A velocity or rate that does not fit in two ticks in a row, by no more than the thrusters can cause within a tick, is followed.
-Noise that exceeds the gate in a single tick, which happens in about every flight, must not pass for a force. A sighting by shape
-that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can cause, is followed as well, unless
-most cameras disagree with the estimate.
-When most cameras are rejected together, the target has moved in an unexpected way: its rates are widened, and if that does not
-help its pose is reinitialized.
+A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop``
+rejections in a row it is dropped until it has fitted as often: a jump or a constant error then
+changes nothing. A chaser whose estimate no measurement of translation, or none of rotation, has
+supported for ``restart_after_s`` is started again from its odometry: an estimate that contradicts
+all of them cannot recover otherwise. A velocity or rate that does not fit in two ticks in a row, by
+no more than the thrusters can cause within a tick, is followed. Noise that exceeds the gate in a
+single tick, which happens in about every flight, must not pass for a force. A sighting by shape
+that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can
+cause, is followed as well, unless most cameras disagree with the estimate. When most cameras are
+rejected together, the target has moved in an unexpected way: its rates are widened, and if that
+does not help its pose is reinitialized.
 """
 
 from __future__ import annotations
@@ -88,7 +90,9 @@ class _Channel(NamedTuple):
 
 
 class _Gates(NamedTuple):
-    """Which channels are used, by number; a chaser's counts of rejections and normalized innovations; the log likelihood."""
+    """Which channels are used, by number; a chaser's counts of rejections and normalized
+    innovations; the log likelihood.
+    """
 
     fits: dict[int, bool]
     rejections: list[int]
@@ -137,7 +141,9 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
 
 @dataclass(frozen=True, eq=False)
 class SightedPose(PoseHypothesis):
-    """Pose of the target by one sighting and the chaser's estimated state; ``cross`` (6, D): covariance with the error vector."""
+    """Pose of the target by one sighting and the chaser's estimated state; ``cross`` (6, D):
+    covariance with the error vector.
+    """
 
     cross: Array
 
@@ -150,7 +156,9 @@ def sighted_pose(
     mounting: CameraMounting,
     p: JointParameters,
 ) -> SightedPose:
-    """Return the pose of the target by a solution of chaser ``i``, with the camera's errors as estimated."""
+    """Return the pose of the target by a solution of chaser ``i``, with the camera's errors as
+    estimated.
+    """
     c = so3.to_matrix(state.attitudes_wxyz[i])
     delta = state.of(i, TURN)
     q_camera = so3.multiply(state.attitudes_wxyz[i], mounting.q_wxyz)
@@ -170,7 +178,9 @@ def sighted_pose(
     return SightedPose(position, moved.q_wxyz, 0.5 * (covariance + covariance.T), cross)
 
 
-def start_target(state: JointState, pose: SightedPose, rates: TargetRates, scale: float = 1.0) -> JointState:
+def start_target(
+    state: JointState, pose: SightedPose, rates: TargetRates, scale: float = 1.0
+) -> JointState:
     """Return the state with the target at a sighted pose with ``rates``.
 
     ``scale``: factor on the covariance of the pose.
@@ -199,9 +209,11 @@ def start_target(state: JointState, pose: SightedPose, rates: TargetRates, scale
 
 
 class RunningUpdate:
-    """State during the updates of a tick, one chaser after the other; its arrays change, those of ``state`` do not.
+    """State during the updates of a tick, one chaser after the other; its arrays change, those of
+    ``state`` do not.
 
-    covariance (D, D): only the lower triangle is valid. rejections, nis, log_likelihood: as in ``JointState``.
+    covariance (D, D): only the lower triangle is valid. rejections, nis, log_likelihood: as in
+    ``JointState``.
     """
 
     def __init__(self, state: JointState) -> None:
@@ -213,12 +225,14 @@ class RunningUpdate:
         self.innovation = kernels.JointInnovation(state.chasers, len(self.covariance))
 
     def values(self, z: kernels.ChaserMeasurement) -> list[float]:
-        """Compute the innovation of a measurement; return the squared norm of each channel's residual by its innovation
-        covariance, then the determinant of the sighting's."""
+        """Compute the innovation of a measurement; return the squared norm of each channel's
+        residual by its innovation covariance, then the determinant of the sighting's."""
         self.innovation.innovate(z, self.mean, self.mean, self.covariance)
         return self.innovation.values.tolist()
 
-    def correct(self, z: kernels.ChaserMeasurement, used: NDArray[np.int64], iterations: int) -> None:
+    def correct(
+        self, z: kernels.ChaserMeasurement, used: NDArray[np.int64], iterations: int
+    ) -> None:
         """Update with the rows ``used`` of the last innovation, linearized ``iterations`` times.
 
         Raises numpy.linalg.LinAlgError for an innovation covariance that is not positive definite.
@@ -250,11 +264,13 @@ class RunningUpdate:
         )
 
 
-def with_view_units(state: JointState, sightings: Mapping[int, Sighting], p: JointParameters) -> JointState:
+def with_view_units(
+    state: JointState, sightings: Mapping[int, Sighting], p: JointParameters
+) -> JointState:
     """Return the state with the means of the stated covariances after these sightings.
 
-    A stated covariance changes from image to image with the points in use, the error that persists does not: in units of the newest
-    covariance it would seem observable by these changes.
+    A stated covariance changes from image to image with the points in use, the error that persists
+    does not: in units of the newest covariance it would seem observable by these changes.
     """
     stated = {
         i: sighting_covariance(s.solutions[0], p)
@@ -282,7 +298,9 @@ def _is_positive_definite(covariance: Array) -> bool:
 
 
 def _view_units(state: JointState, i: int, markers: int, p: JointParameters) -> Array | None:
-    """Return the covariance (6, 6) in whose units the view error of a sighting is; None for the stated one."""
+    """Return the covariance (6, 6) in whose units the view error of a sighting is; None for the
+    stated one.
+    """
     return state.view_units[i] if p.sighting_noise(markers).units_time_s else None
 
 
@@ -319,10 +337,11 @@ def update(
 
 
 def _is_supported(fits: Mapping[int, bool], contradicted: bool) -> bool:
-    """Return whether measurements support a chaser's estimate: a sighting, or odometry of translation and rotation.
+    """Return whether measurements support a chaser's estimate: a sighting, or odometry of
+    translation and rotation.
 
-    Of each, one of two channels is enough, as the other may lie; while sightings ``contradicted`` the estimate, those of the pose
-    must fit.
+    Of each, one of two channels is enough, as the other may lie; while sightings ``contradicted``
+    the estimate, those of the pose must fit.
     """
     if fits.get(SIGHTING_CHANNEL, False):
         return True
@@ -339,19 +358,28 @@ def _update_chaser(
     mounting: CameraMounting,
     p: JointParameters,
 ) -> dict[int, bool]:
-    """Update with the measurements of one chaser; return which channels were used. ``new_views``: follow errors of views that jump."""
-    chasers, markers = running.state.chasers, len(sighting.marker_ids) if sighting is not None else 0
+    """Update with the measurements of one chaser; return which channels were used. ``new_views``:
+    follow errors of views that jump.
+    """
+    chasers, markers = (
+        running.state.chasers,
+        len(sighting.marker_ids) if sighting is not None else 0,
+    )
     solution = _likeliest(running, i, sighting, mounting, p)
     if odometry is None and solution is None:
         return {}
     view = _view_units(running.state, i, markers, p)
     z = measurement(chasers, i, odometry, solution, markers, mounting, p, view)
-    channels = _channels(odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry)
+    channels = _channels(
+        odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry
+    )
     gates = _gate(running, i, channels, running.values(z), p)
     if not all(gates.fits.values()) and any(
         not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES
     ):
-        gates = _follow(running, i, z, channels, gates, _unexpected_motion(i, running, p), _ODOMETRY, p)
+        gates = _follow(
+            running, i, z, channels, gates, _unexpected_motion(i, running, p), _ODOMETRY, p
+        )
     if (
         new_views
         and view is not None
@@ -362,7 +390,9 @@ def _update_chaser(
     running.log_likelihood = gates.log_likelihood
     used = _rows(tuple(c.rows for c in channels if gates.fits[c.number]))
     if len(used):
-        nonlinear = gates.fits.get(SIGHTING_CHANNEL, False) and running.state.updates < p.iterated_updates
+        nonlinear = (
+            gates.fits.get(SIGHTING_CHANNEL, False) and running.state.updates < p.iterated_updates
+        )
         running.correct(z, used, p.iterations if nonlinear else 1)
     return gates.fits
 
@@ -377,7 +407,8 @@ def _follow(
     judged: frozenset[int],
     p: JointParameters,
 ) -> _Gates:
-    """Widen the covariance by the variances of an unexpected ``change``, if the channels ``judged`` then fit; return the gates.
+    """Widen the covariance by the variances of an unexpected ``change``, if the channels ``judged``
+    then fit; return the gates.
 
     The running innovation is afterwards that of the covariance."""
     diagonal = np.einsum("ii->i", running.covariance)
@@ -392,7 +423,9 @@ def _follow(
 
 
 def _unexpected_motion(i: int, running: RunningUpdate, p: JointParameters) -> Array:
-    """Return the variances (D,) that a force and a torque without a command add to chaser ``i`` within a tick."""
+    """Return the variances (D,) that a force and a torque without a command add to chaser ``i``
+    within a tick.
+    """
     variances, own = np.zeros(len(running.covariance)), block(i).start
     for part, sigma in (
         (VELOCITY, p.unexpected_velocity_m_s),
@@ -407,14 +440,20 @@ def _unexpected_motion(i: int, running: RunningUpdate, p: JointParameters) -> Ar
 
 
 def _new_view(i: int, running: RunningUpdate) -> Array:
-    """Return the variances (D,) that the error of the sightings of chaser ``i`` gains where it changes at once to any other one."""
+    """Return the variances (D,) that the error of the sightings of chaser ``i`` gains where it
+    changes at once to any other one.
+    """
     variances, own = np.zeros(len(running.covariance)), block(i).start
     variances[own + VIEW.start : own + VIEW.stop] = 1.0
     return variances
 
 
 def _gate(
-    running: RunningUpdate, i: int, channels: Sequence[_Channel], values: Sequence[float], p: JointParameters
+    running: RunningUpdate,
+    i: int,
+    channels: Sequence[_Channel],
+    values: Sequence[float],
+    p: JointParameters,
 ) -> _Gates:
     """Count which channels fit; ``values`` as ``RunningUpdate.values`` returns them."""
     rejections, nis, likelihood = (
@@ -478,7 +517,9 @@ def _rows(parts: tuple[range, ...]) -> NDArray[np.int64]:
 
 
 def _count(count: int, value: float, gate: float, p: JointParameters) -> tuple[int, bool]:
-    """Return the count of a channel's rejections after a squared residual ``value``, and whether the channel is used."""
+    """Return the count of a channel's rejections after a squared residual ``value``, and whether
+    the channel is used.
+    """
     limit = p.rejections_to_drop
     if not value <= gate:  # rejects NaN as well
         return min(count + 1, 2 * limit), False

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thrusts of all thrusters of a stack that stop it: exact in direction, as much as possible of the magnitude. Pure functions.
+"""Thrusts of all thrusters of a stack that stop it: exact in direction, as much as possible of the
+magnitude. Pure functions.
 
-One linear programme: maximize the common scale s <= 1 of the wrench, then minimize the sum of thrusts, subject to B f = s w and
-0 <= f <= f_max. It is solved as a strictly convex quadratic programme with the same solution (M. P. Friedlander and P. Tseng,
-SIAM J. Optim. 18, 2008), which makes the thrusts unique, by daqp, a deterministic dual active-set method.
+One linear programme: maximize the common scale s <= 1 of the wrench, then minimize the sum of
+thrusts, subject to B f = s w and 0 <= f <= f_max. It is solved as a strictly convex quadratic
+programme with the same solution (M. P. Friedlander and P. Tseng, SIAM J. Optim. 18, 2008), which
+makes the thrusts unique, by daqp, a deterministic dual active-set method.
 """
 
 from __future__ import annotations
@@ -17,12 +19,16 @@ from chaserdock_models.arrays import Array
 
 _REGULARIZATION = 1e-2
 _SCALE_FIRST = 1e3
-"""Weight of the scale over that of the thrusts. A gain in scale that costs more thrust than this is not taken (below 1e-3)."""
+"""Weight of the scale over that of the thrusts. A gain in scale that costs more thrust than this is
+not taken (below 1e-3).
+"""
 _EQUALITY = 5  # daqp's codes for an equality constraint and for success
 _SOLVED = 1
 _NOTHING = 1e-12
 _TOLERANCE = 1e-5
-"""Wrench (N, N m) that is within the tolerance of the solver: no more is given in a direction that cannot be served."""
+"""Wrench (N, N m) that is within the tolerance of the solver: no more is given in a direction that
+cannot be served.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,26 +41,33 @@ class StackAllocation:
 
 @dataclass(frozen=True)
 class MinimumTime:
-    """Shortest time (s) in which thrusters can stop a momentum while the stack does not turn, and the impulse (N s) that takes."""
+    """Shortest time (s) in which thrusters can stop a momentum while the stack does not turn, and
+    the impulse (N s) that takes.
+    """
 
     time_s: float
     impulse_N_s: float
 
 
 def units_of(wrenches: Array, limits_N: Array) -> tuple[float, float]:
-    """Return a force and a torque typical of the thrusters, which make all numbers of the programme near one."""
+    """Return a force and a torque typical of the thrusters, which make all numbers of the programme
+    near one.
+    """
     force_N = float((np.linalg.norm(wrenches[:3], axis=0) * limits_N).max(initial=0.0))
     torque_N_m = float((np.linalg.norm(wrenches[3:], axis=0) * limits_N).max(initial=0.0))
     return force_N or 1.0, torque_N_m or 1.0
 
 
 def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation:
-    """Return thrusts within ``limits_N`` (n,) that give the largest share of ``wrench`` (6,), at the least sum.
+    """Return thrusts within ``limits_N`` (n,) that give the largest share of ``wrench`` (6,), at
+    the least sum.
 
-    ``wrenches`` (6, n): those of 1 N of each thruster. Raises ValueError for numbers that are not finite, RuntimeError if the
-    solver fails.
+    ``wrenches`` (6, n): those of 1 N of each thruster. Raises ValueError for numbers that are not
+    finite, RuntimeError if the solver fails.
     """
-    if not (np.isfinite(wrenches).all() and np.isfinite(wrench).all() and np.isfinite(limits_N).all()):
+    if not (
+        np.isfinite(wrenches).all() and np.isfinite(wrench).all() and np.isfinite(limits_N).all()
+    ):
         raise ValueError("wrenches and limits must be finite")
     thrusts = np.zeros(len(limits_N))
     able = limits_N > 0.0
@@ -66,7 +79,9 @@ def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation
         return StackAllocation(thrusts, 1.0)
     if not able.any():
         return StackAllocation(thrusts, 0.0)
-    rows = np.hstack([wrenches[:, able] * limits_N[able] / units[:, None], -(asked / size)[:, None]])
+    rows = np.hstack(
+        [wrenches[:, able] * limits_N[able] / units[:, None], -(asked / size)[:, None]]
+    )
     n = rows.shape[1]
     cost = np.concatenate([limits_N[able] / limits_N[able].max(), [-_SCALE_FIRST]])
     zeros = np.zeros(6)
@@ -85,8 +100,8 @@ def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation
 def spans_all_directions(wrenches: Array, limits_N: Array) -> bool:
     """Return whether thrusts within ``limits_N`` (n,) can give force and torque in every direction.
 
-    They can if ``wrenches`` (6, n) has full rank and some thrusts, all of them positive, cancel: then they cancel what any
-    other combination has too little of.
+    They can if ``wrenches`` (6, n) has full rank and some thrusts, all of them positive, cancel:
+    then they cancel what any other combination has too little of.
     """
     able = limits_N > 0.0
     b = wrenches[:, able] * limits_N[able]
@@ -96,11 +111,17 @@ def spans_all_directions(wrenches: Array, limits_N: Array) -> bool:
         return False
     # All thrusters at a floor plus what cancels it.
     floor = -b.sum(axis=1)
-    return allocate(b, floor / max(1.0, float(np.linalg.norm(floor))) * 1e-3, np.ones(b.shape[1])).scale > 0.5
+    return (
+        allocate(
+            b, floor / max(1.0, float(np.linalg.norm(floor))) * 1e-3, np.ones(b.shape[1])
+        ).scale
+        > 0.5
+    )
 
 
 def minimum_time(wrenches: Array, momentum: Array, limits_N: Array) -> MinimumTime | None:
-    """Return the shortest time to stop ``momentum`` (6,) by constant thrusts while the stack does not turn; None if impossible.
+    """Return the shortest time to stop ``momentum`` (6,) by constant thrusts while the stack does
+    not turn; None if impossible.
 
     A linear programme: the thrusts that give the largest share of -momentum per second.
     """
@@ -116,7 +137,9 @@ def minimum_time(wrenches: Array, momentum: Array, limits_N: Array) -> MinimumTi
 
 
 def feedback(wrenches: Array, momentum: Array, limits_N: Array, time_s: float) -> StackAllocation:
-    """Return the thrusts that stop ``momentum`` (6,) in ``time_s``, or as fast as they can in this direction."""
+    """Return the thrusts that stop ``momentum`` (6,) in ``time_s``, or as fast as they can in this
+    direction.
+    """
     if not time_s > 0.0 or not math.isfinite(time_s):
         raise ValueError(f"time_s must be positive, not {time_s!r}")
     return allocate(wrenches, -momentum / time_s, limits_N)

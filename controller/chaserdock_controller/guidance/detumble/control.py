@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detumbling control: the motion of the stack from the estimates, thrusts that stop it, and why it cannot be stopped."""
+"""Detumbling control: the motion of the stack from the estimates, thrusts that stop it, and why it
+cannot be stopped.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,12 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_controller.estimation.composite_body import pose_in_target
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import TargetState
-from chaserdock_controller.interfaces import DirectCommand, IdentifiedStack, Observation, TargetEstimation
+from chaserdock_controller.interfaces import (
+    DirectCommand,
+    IdentifiedStack,
+    Observation,
+    TargetEstimation,
+)
 
 from .allocation import feedback, minimum_time, spans_all_directions
 from .planner import StackPlanner
@@ -34,17 +41,23 @@ from .stack import StackMotion, thruster_wrenches
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
 _STOPPED_SHARE = 0.4
-"""Share of the rest limits below which the stack counts as stopped: less than ``_MOVING_SHARE``, so that phases do not alternate."""
+"""Share of the rest limits below which the stack counts as stopped: less than ``_MOVING_SHARE``, so
+that phases do not alternate.
+"""
 _MOVING_SHARE = 0.5
 """Share of the rest limits above which a stopped stack moves again.
 
-Disturbances of 5 mN and 0.5 mN m on each of two chasers turn the stack faster by 0.01 degrees/s every second. Until the thrusters act,
-the true rate rises by another quarter of the limit; they fire down to ``_DEADBAND_SHARE``.
+Disturbances of 5 mN and 0.5 mN m on each of two chasers turn the stack faster by 0.01 degrees/s
+every second. Until the thrusters act, the true rate rises by another quarter of the limit; they
+fire down to ``_DEADBAND_SHARE``.
 """
 _MEAN_S = 0.5
-"""Time constant of the mean motion. In single ticks noise of `lab` odometry is half of the limits."""
+"""Time constant of the mean motion. In single ticks noise of `lab` odometry is half of the limits.
+"""
 _SLEW_SHARE = 20.0
-"""Share of the rest limits beyond which a stack that turns to its commanded attitude counts as moving."""
+"""Share of the rest limits beyond which a stack that turns to its commanded attitude counts as
+moving.
+"""
 _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
 _ATTITUDE_TIME_S = 5.0
 _PULSE_PERIOD_NS, _PULSE_NS = 600_000_000, 300_000_000
@@ -61,11 +74,13 @@ class StackTask(Enum):
 
 @dataclass(frozen=True, eq=False)
 class StackState:
-    """The stack as estimated for the time at which the commands take effect; ``chasers``: those latched, by number.
+    """The stack as estimated for the time at which the commands take effect; ``chasers``: those
+    latched, by number.
 
-    ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if estimated. ``failed``: thrusters
-    found stuck. ``informative``: see ``IdentifiedStack``. ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the odometry
-    of the chasers alone: with noise, but not late where disturbances act.
+    ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if
+    estimated. ``failed``: thrusters found stuck. ``informative``: see ``IdentifiedStack``.
+    ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the odometry of the chasers alone:
+    with noise, but not late where disturbances act.
     """
 
     body: TargetBody
@@ -86,8 +101,8 @@ class StackState:
 
 @dataclass(frozen=True, eq=False)
 class _Thrusters:
-    """Thrusters of the active ``chasers``: ``wrenches`` (6, n) of 1 N commanded and ``limits_N`` (n,); ``groups`` (n,): row of
-    the chaser."""
+    """Thrusters of the active ``chasers``: ``wrenches`` (6, n) of 1 N commanded and ``limits_N``
+    (n,); ``groups`` (n,): row of the chaser."""
 
     chasers: tuple[int, ...]
     wrenches: Array
@@ -98,7 +113,8 @@ class _Thrusters:
 class DetumbleControl:
     """Control of the stack for a scenario; no thruster fires whose plume would hit something.
 
-    A plan of least propellant, if the scenario gives it time, and feedback on the momentum, which needs no memory.
+    A plan of least propellant, if the scenario gives it time, and feedback on the momentum, which
+    needs no memory.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -115,17 +131,25 @@ class DetumbleControl:
         self._mean_rates: Array | None = None
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
-        """Return the stack's state; None while the target is unknown or no latched chaser has odometry."""
+        """Return the stack's state; None while the target is unknown or no latched chaser has
+        odometry.
+        """
         known = sorted(estimation.latched & estimation.own.keys())
         if estimation.at_effect is None or not known:
             return None
         if estimation.stack is not None:
             return self._identified_state(observation, estimation.stack, known)
-        chasers = {i: MountedChaser(*pose_in_target(estimation.target, estimation.own[i])) for i in known}
+        chasers = {
+            i: MountedChaser(*pose_in_target(estimation.target, estimation.own[i])) for i in known
+        }
         ahead = _impulse_ahead(observation, chasers, estimation.body)
         own = {i: estimation.own[i] for i in known}
-        motion = observed_motion(estimation.body, estimation.target, own, self._variances(len(known)))
-        turn = rotations.multiply(rotations.conjugate(estimation.at_effect.q_wxyz), estimation.target.q_wxyz)
+        motion = observed_motion(
+            estimation.body, estimation.target, own, self._variances(len(known))
+        )
+        turn = rotations.multiply(
+            rotations.conjugate(estimation.at_effect.q_wxyz), estimation.target.q_wxyz
+        )
         parts = [
             rotations.rotate(turn, part + ahead[k : k + 3])
             for k, part in ((0, motion.linear_N_s), (3, motion.angular_N_m_s))
@@ -141,16 +165,22 @@ class DetumbleControl:
     def _identified_state(
         self, observation: Observation, identified: IdentifiedStack, known: Sequence[int]
     ) -> StackState:
-        """Return the state by the identified mass properties and the motion that was estimated with them."""
+        """Return the state by the identified mass properties and the motion that was estimated with
+        them.
+        """
         body, motion = identified.stack.body, identified.motion
         chasers = {i: identified.chasers[i] for i in known}
         ahead = _impulse_ahead(observation, chasers, body)
-        linear = body.mass_kg * rotations.rotate_inverse(motion.q_wxyz, motion.velocity_m_s) + ahead[:3]
+        linear = (
+            body.mass_kg * rotations.rotate_inverse(motion.q_wxyz, motion.velocity_m_s) + ahead[:3]
+        )
         angular = body.inertia_kg_m2 @ motion.omega_rad_s + ahead[3:]
         latency_s = (observation.effective_ns - observation.time_ns) / 1e9
         omega = np.linalg.solve(body.inertia_kg_m2, angular - ahead[3:] / 2.0)
         turn = rotations.exp(omega * latency_s)
-        parts = StackMotion(rotations.rotate_inverse(turn, linear), rotations.rotate_inverse(turn, angular))
+        parts = StackMotion(
+            rotations.rotate_inverse(turn, linear), rotations.rotate_inverse(turn, angular)
+        )
         q = rotations.multiply(motion.q_wxyz, turn)
         factors = {i: identified.thrust_factors[i] for i in known}
         measured = _mean_omega({i: observation.odometry[i] for i in known}, motion.q_wxyz)
@@ -159,7 +189,9 @@ class DetumbleControl:
         )
 
     def _variances(self, chasers: int) -> tuple[float, float]:
-        """Return the variances per axis of velocity and rate of the stack by the odometry of so many chasers."""
+        """Return the variances per axis of velocity and rate of the stack by the odometry of so
+        many chasers.
+        """
         errors = self._scenario.navigation.errors()
         size_m = math.hypot(*self._target.size_m)
         velocity = errors.velocity_noise_m_s**2 + (errors.omega_noise_rad_s * size_m / 2.0) ** 2
@@ -211,7 +243,7 @@ class DetumbleControl:
         rows = dict(zip(active, thrusts.reshape(len(active), -1), strict=True))
         return {i: DirectCommand("detumble", self._own @ row, row) for i, row in rows.items()}
 
-    # -- tasks -----------------------------------------------------------------------------------------------
+    # -- tasks -------------------------------------------------------------------------------------
 
     def _stop(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
         if min(self.share_of_limits(state), self._mean_share_of_limits(state)) <= _DEADBAND_SHARE:
@@ -223,7 +255,9 @@ class DetumbleControl:
         return self._feedback(state.motion.momentum, thrusters)
 
     def _hold(self, state: StackState, thrusters: _Thrusters) -> Array:
-        """Return the thrusts that turn a stopped stack to the commanded attitude; none without one, or close to it."""
+        """Return the thrusts that turn a stopped stack to the commanded attitude; none without one,
+        or close to it.
+        """
         none = np.zeros(len(thrusters.limits_N))
         reference = self._slew_rate(state)
         if reference is None or self.share_of_limits(state, slewing=True) <= _DEADBAND_SHARE:
@@ -234,7 +268,9 @@ class DetumbleControl:
         return self._feedback(state.motion.momentum - wanted, thrusters)
 
     def _informative(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
-        """Return a pulse of the most informative thruster for the mass properties, of those that damp the motion."""
+        """Return a pulse of the most informative thruster for the mass properties, of those that
+        damp the motion.
+        """
         thrusts = np.zeros(len(thrusters.limits_N))
         number = now_ns // _PULSE_PERIOD_NS
         if now_ns % _PULSE_PERIOD_NS >= _PULSE_NS:
@@ -258,24 +294,28 @@ class DetumbleControl:
         return None
 
     def _feedback(self, momentum: Array, thrusters: _Thrusters) -> Array:
-        return feedback(thrusters.wrenches, momentum, thrusters.limits_N, self._settings.response_s).thrusts_N
+        return feedback(
+            thrusters.wrenches, momentum, thrusters.limits_N, self._settings.response_s
+        ).thrusts_N
 
     def _slew_rate(self, state: StackState) -> Array | None:
         """Return the rate (3,), TRF axes, towards the commanded attitude; None if there is none."""
         wanted = self._settings.attitude_wxyz
         if wanted is None:
             return None
-        turn = rotations.log(rotations.multiply(rotations.conjugate(state.q_wxyz), np.array(wanted)))
+        turn = rotations.log(
+            rotations.multiply(rotations.conjugate(state.q_wxyz), np.array(wanted))
+        )
         angle = float(np.linalg.norm(turn))
         if angle < _ATTITUDE_DEADBAND_RAD:
             return np.zeros(3)
         return turn * min(1.0 / _ATTITUDE_TIME_S, math.radians(self._settings.slew_deg_s) / angle)
 
-    # -- judgement -------------------------------------------------------------------------------------------
+    # -- judgement ---------------------------------------------------------------------------------
 
     def share_of_limits(self, state: StackState, slewing: bool = False) -> float:
-        """Return the larger of speed and angular rate of the stack, as share of the rest limits. ``slewing``: the rate counts from
-        the one that turns the stack to its commanded attitude."""
+        """Return the larger of speed and angular rate of the stack, as share of the rest limits.
+        ``slewing``: the rate counts from the one that turns the stack to its commanded attitude."""
         velocity = state.motion.linear_N_s / state.body.mass_kg
         return self._share(state, np.concatenate([velocity, state.omega_rad_s]), slewing)
 
@@ -284,10 +324,12 @@ class DetumbleControl:
         return self._mean_share_of_limits(state) < _STOPPED_SHARE
 
     def moves_again(self, state: StackState) -> bool:
-        """Return whether a stack at rest moves by its mean motion until ``state``, beside the turn to its commanded attitude, so
-        that it has to be stopped again."""
+        """Return whether a stack at rest moves by its mean motion until ``state``, beside the turn
+        to its commanded attitude, so that it has to be stopped again."""
         slews = self._slew_rate(state) is not None
-        return self._mean_share_of_limits(state, slewing=True) > (_SLEW_SHARE if slews else _MOVING_SHARE)
+        return self._mean_share_of_limits(state, slewing=True) > (
+            _SLEW_SHARE if slews else _MOVING_SHARE
+        )
 
     def _mean_share_of_limits(self, state: StackState, slewing: bool = False) -> float:
         if self._mean_rates is None:
@@ -326,7 +368,7 @@ class DetumbleControl:
             return f"stopping the stack takes {time}; detumble.timeout_s is {self._settings.timeout_s:g} s"
         return ""
 
-    # -- models ----------------------------------------------------------------------------------------------
+    # -- models ------------------------------------------------------------------------------------
 
     def problem(
         self, state: StackState, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]
@@ -337,7 +379,8 @@ class DetumbleControl:
 
     def _problem(self, state: StackState, thrusters: _Thrusters) -> StackProblem:
         momentum = [
-            rotations.rotate(state.q_wxyz, p) for p in (state.motion.linear_N_s, state.motion.angular_N_m_s)
+            rotations.rotate(state.q_wxyz, p)
+            for p in (state.motion.linear_N_s, state.motion.angular_N_m_s)
         ]
         return StackProblem(
             np.concatenate(momentum),
@@ -350,9 +393,14 @@ class DetumbleControl:
         )
 
     def _thrusters_of(
-        self, state: StackState, active: Mapping[int, MountedChaser], isolated: Mapping[int, tuple[int, ...]]
+        self,
+        state: StackState,
+        active: Mapping[int, MountedChaser],
+        isolated: Mapping[int, tuple[int, ...]],
     ) -> _Thrusters:
-        """Return the thrusters of the active chasers: the limit is zero where a plume is not free or the thruster is closed."""
+        """Return the thrusters of the active chasers: the limit is zero where a plume is not free
+        or the thruster is closed.
+        """
         latched, rows = frozenset(state.chasers), []
         for i in active:
             row = np.where(self._plume_free(latched)[i], self._full_N, 0.0)
@@ -366,7 +414,10 @@ class DetumbleControl:
 
     def _load_model(self, state: StackState, thrusters: _Thrusters) -> LoadModel:
         count = len(self._full_N)
-        own = {i: (slice(k * count, (k + 1) * count), self._own) for k, i in enumerate(thrusters.chasers)}
+        own = {
+            i: (slice(k * count, (k + 1) * count), self._own)
+            for k, i in enumerate(thrusters.chasers)
+        }
         return load_model(
             state.body,
             state.omega_rad_s,
@@ -379,11 +430,15 @@ class DetumbleControl:
         )
 
 
-def _impulse_ahead(observation: Observation, chasers: Mapping[int, MountedChaser], body: TargetBody) -> Array:
+def _impulse_ahead(
+    observation: Observation, chasers: Mapping[int, MountedChaser], body: TargetBody
+) -> Array:
     """Return the impulse (6,), TRF axes, of all that acts until the commands take effect."""
     ahead = np.zeros(6)
     for i, chaser in chasers.items():
-        impulse = sum((duration_s * wrench for duration_s, wrench in observation.ahead[i]), np.zeros(6))
+        impulse = sum(
+            (duration_s * wrench for duration_s, wrench in observation.ahead[i]), np.zeros(6)
+        )
         ahead = ahead + chaser.wrench_to_stack(impulse, body.centre_trf_m)
     return ahead
 
@@ -395,12 +450,17 @@ def _mean_omega(own: Mapping[int, Odometry], q_wxyz: Array) -> Array:
 
 
 def observed_motion(
-    body: TargetBody, target: TargetState, own: Mapping[int, Odometry], variances: tuple[float, float]
+    body: TargetBody,
+    target: TargetState,
+    own: Mapping[int, Odometry],
+    variances: tuple[float, float],
 ) -> StackMotion:
-    """Return the momentum of the stack, TRF axes, from the target's estimate and the states of latched chasers.
+    """Return the momentum of the stack, TRF axes, from the target's estimate and the states of
+    latched chasers.
 
-    The chasers measure the stack's rates without delay, the target's estimate smooths them while nothing fires; the two are
-    weighted by their covariances. ``variances`` per axis: of the chasers' mean velocity (m²/s²) and rate (rad²/s²).
+    The chasers measure the stack's rates without delay, the target's estimate smooths them while
+    nothing fires; the two are weighted by their covariances. ``variances`` per axis: of the
+    chasers' mean velocity (m²/s²) and rate (rad²/s²).
     """
     omega = _mean_omega(own, target.q_wxyz)
     omega_world = rotations.rotate(target.q_wxyz, omega)
@@ -415,7 +475,9 @@ def observed_motion(
     measured = np.concatenate([rotations.rotate_inverse(target.q_wxyz, velocity_world), omega])
     turn = rotations.to_matrix(target.q_wxyz).T
     lever = rotations.skew(body.centre_trf_m)
-    estimated = np.concatenate([turn @ target.velocity_m_s - lever @ target.omega_rad_s, target.omega_rad_s])
+    estimated = np.concatenate(
+        [turn @ target.velocity_m_s - lever @ target.omega_rad_s, target.omega_rad_s]
+    )
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3], jacobian[:3, 3:], jacobian[3:, 3:] = turn, -lever, np.eye(3)
     rows = [3, 4, 5, 9, 10, 11]

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flies a stack by a plan of least propellant, which is renewed from the estimates while it is flown.
+"""Flies a stack by a plan of least propellant, which is renewed from the estimates while it is
+flown.
 
-The programme of a plan has many local minima. Plans from several guesses are therefore improved by a few linear programmes in every
-tick, for the state that the stack will have when the next plan begins. Before the first plan the stack coasts meanwhile.
+The programme of a plan has many local minima. Plans from several guesses are therefore improved by
+a few linear programmes in every tick, for the state that the stack will have when the next plan
+begins. Before the first plan the stack coasts meanwhile.
 """
 
 from __future__ import annotations
@@ -21,16 +23,23 @@ _FEEDBACK_S = 0.6
 """The feedback takes over this long before the end of the plan."""
 _RENEWAL_PROGRAMMES = 6
 _SEARCH_S, _SEARCH_SHARE = 0.5, 0.1
-"""The stack coasts for this long, but at most for this share of the planned time, until a first plan begins."""
+"""The stack coasts for this long, but at most for this share of the planned time, until a first
+plan begins.
+"""
 _PROGRAMMES_PER_S = 90.0
 """Linear programmes that a search solves, in equal parts in every tick; one takes about 6 ms."""
 _FIRST_PROGRAMMES = 6
-"""Linear programmes after which plans from different guesses are compared. Fewer do not show which becomes the cheapest."""
+"""Linear programmes after which plans from different guesses are compared. Fewer do not show which
+becomes the cheapest.
+"""
 _FIRST_GUESSES = 5
-"""Guesses of a first plan: no thrust, and random ones. The worst minimum is 1.4 times as expensive as the best."""
+"""Guesses of a first plan: no thrust, and random ones. The worst minimum is 1.4 times as expensive
+as the best.
+"""
 _NEXT_GUESSES = 2
 _OTHER_GAIN = 0.05
-"""Share of the cost by which a plan from another guess must be cheaper to replace the present one."""
+"""Share of the cost by which a plan from another guess must be cheaper to replace the present one.
+"""
 _OTHER_UNTIL = 0.4
 """Share of the planned time that must be left for other guesses to be tried."""
 _GUESS_DENSITY = 0.15
@@ -41,8 +50,8 @@ _LONGER = 0.6
 
 @dataclass(frozen=True, eq=False)
 class ActivePlan:
-    """A plan made at ``begin_ns``, with steps of ``step_ns``, which is renewed at ``renewal_ns``; ``limits_N`` (n,): of the thrusters
-    it was made for."""
+    """A plan made at ``begin_ns``, with steps of ``step_ns``, which is renewed at ``renewal_ns``;
+    ``limits_N`` (n,): of the thrusters it was made for."""
 
     plan: StackPlan
     begin_ns: int
@@ -79,7 +88,9 @@ class PlanSearch:
     tried: int = 0
 
     def improved(self, programmes: int) -> PlanSearch:
-        """Return the search with one plan improved: each guess in turn, then the cheapest that can still be improved."""
+        """Return the search with one plan improved: each guess in turn, then the cheapest that can
+        still be improved.
+        """
         k, tried = self.tried // math.ceil(_FIRST_PROGRAMMES / programmes), self.tried + 1
         if k >= len(self.plans):
             open_plans = [k for k, plan in enumerate(self.plans) if plan.radius > 0.0]
@@ -96,9 +107,11 @@ class PlanSearch:
 
 
 class StackPlanner:
-    """Keeps the plan of the stack, if it is ``enabled`` by a time to stop it in, and searches for the next one.
+    """Keeps the plan of the stack, if it is ``enabled`` by a time to stop it in, and searches for
+    the next one.
 
-    ``active`` is None before the first plan and after the last. ``search`` is for the next renewal of the plan.
+    ``active`` is None before the first plan and after the last. ``search`` is for the next renewal
+    of the plan.
     """
 
     def __init__(self, plan_s: float | None, rate_hz: float) -> None:
@@ -132,7 +145,9 @@ class StackPlanner:
         return np.minimum(active.thrusts_at(now_ns), problem.limits_N)
 
     def _begin(self, problem: StackProblem, now_ns: int, duration_s: float) -> ActivePlan:
-        """Return a plan that coasts, and begin to search for one that stops the stack at the same time."""
+        """Return a plan that coasts, and begin to search for one that stops the stack at the same
+        time.
+        """
         step_s = self._step_ns / 1e9
         coasting = max(1, round(min(_SEARCH_S, _SEARCH_SHARE * duration_s) / step_s))
         count = max(coasting + 1, round(duration_s / step_s))
@@ -143,9 +158,11 @@ class StackPlanner:
         return active
 
     def _renew(self, problem: StackProblem, now_ns: int, last: ActivePlan) -> ActivePlan:
-        """Return a plan from the present state that ends with the ``last`` one, and begin to search for the next.
+        """Return a plan from the present state that ends with the ``last`` one, and begin to search
+        for the next.
 
-        It begins with the rest of the last plan, or with what the search has found, if that is cheaper.
+        It begins with the rest of the last plan, or with what the search has found, if that is
+        cheaper.
         """
         thrusts_N, step_s, search = last.rest(now_ns), self._step_ns / 1e9, self.search
         found = None if search is None else search.best()
@@ -154,15 +171,23 @@ class StackPlanner:
             if found.cost_N_s < (1.0 - _OTHER_GAIN) * rest.cost_N_s:
                 thrusts_N = found.thrusts_N[len(found.thrusts_N) - len(thrusts_N) :]
         plan = improve(problem, flown(problem, thrusts_N, step_s), _RENEWAL_PROGRAMMES)
-        active = ActivePlan(plan, now_ns, self._step_ns, now_ns + self._step_ns, problem.limits_N.copy())
+        active = ActivePlan(
+            plan, now_ns, self._step_ns, now_ns + self._step_ns, problem.limits_N.copy()
+        )
         goes_on = active.end_ns - active.renewal_ns > _OTHER_UNTIL * self._plan_s * 1e9
-        self.search = self._search(problem, active, _NEXT_GUESSES, with_rest=False) if goes_on else None
+        self.search = (
+            self._search(problem, active, _NEXT_GUESSES, with_rest=False) if goes_on else None
+        )
         return active
 
-    def _search(self, problem: StackProblem, active: ActivePlan, guesses: int, with_rest: bool) -> PlanSearch:
-        """Return a search for the plan that follows the active one, begun with random guesses, and its rest if ``with_rest``.
+    def _search(
+        self, problem: StackProblem, active: ActivePlan, guesses: int, with_rest: bool
+    ) -> PlanSearch:
+        """Return a search for the plan that follows the active one, begun with random guesses, and
+        its rest if ``with_rest``.
 
-        The guesses follow from the time for which they are made, so that every controller draws the same.
+        The guesses follow from the time for which they are made, so that every controller draws the
+        same.
         """
         begin_ns, step_s = active.renewal_ns, self._step_ns / 1e9
         ahead_N = active.plan.thrusts_N[: len(active.plan.thrusts_N) - len(active.rest(begin_ns))]
@@ -170,4 +195,6 @@ class StackPlanner:
         rng = np.random.default_rng([0x9A2, begin_ns])
         fires = rng.random((guesses, *rest_N.shape)) < _GUESS_DENSITY
         starts = [*([rest_N] if with_rest else []), *np.where(fires, problem.limits_N, 0.0)]
-        return PlanSearch(problem, begin_ns, tuple(flown(problem, start, step_s) for start in starts))
+        return PlanSearch(
+            problem, begin_ns, tuple(flown(problem, start, step_s) for start in starts)
+        )

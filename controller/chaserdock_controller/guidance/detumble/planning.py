@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Least-propellant plans that stop a stack within a time, while it turns. Pure functions.
 
-States: momentum P, angular momentum H about the centre of mass (WRF) and attitude q; inputs: thrusts f >= 0 of all thrusters,
-constant over each step. P' = R F, H' = R T, q' = q (0, w) / 2 with w = I^-1 R' H, and (F, T) = B f in TRF axes. The sum of all
-impulses is minimized, with an exact penalty on P and H at the end. Sequential linear programming with a trust region (S l1 LP;
-Nocedal and Wright, "Numerical Optimization", section 18.5): each programme is linearized about the flight of the last thrusts.
-Its solutions are vertices: nearly all thrusters are off or fully on, as pulses need.
+States: momentum P, angular momentum H about the centre of mass (WRF) and attitude q; inputs:
+thrusts f >= 0 of all thrusters, constant over each step. P' = R F, H' = R T, q' = q (0, w) / 2 with
+w = I^-1 R' H, and (F, T) = B f in TRF axes. The sum of all impulses is minimized, with an exact
+penalty on P and H at the end. Sequential linear programming with a trust region (S l1 LP; Nocedal
+and Wright, "Numerical Optimization", section 18.5): each programme is linearized about the flight
+of the last thrusts. Its solutions are vertices: nearly all thrusters are off or fully on, as pulses
+need.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from chaserdock_models.arrays import Array, IntArray
 from .allocation import units_of
 
 _PENALTY = 30.0
-"""Price of a remaining momentum over that of the impulse that would remove it in the thrusters' best direction."""
+"""Price of a remaining momentum over that of the impulse that would remove it in the thrusters'
+best direction.
+"""
 _LEAST_RADIUS = 0.002
 _ACCEPT = 0.05
 """Share of a predicted improvement that must be real for a step to be taken."""
@@ -29,8 +33,9 @@ _ACCEPT = 0.05
 
 @dataclass(frozen=True, eq=False)
 class StackProblem:
-    """A stack to stop. ``momentum`` (6,): P and H, WRF axes. ``wrenches`` (6, n) of 1 N of each thruster, TRF axes. ``groups``:
-    for each thruster the number of its chaser; ``at_once``: how many thrusters of a chaser may fire at the same time, or None."""
+    """A stack to stop. ``momentum`` (6,): P and H, WRF axes. ``wrenches`` (6, n) of 1 N of each
+    thruster, TRF axes. ``groups``: for each thruster the number of its chaser; ``at_once``: how
+    many thrusters of a chaser may fire at the same time, or None."""
 
     momentum: Array
     q_wxyz: Array
@@ -43,9 +48,10 @@ class StackProblem:
 
 @dataclass(frozen=True, eq=False)
 class StackPlan:
-    """``thrusts_N`` (K, n) for K steps of ``step_s``. ``remaining`` (6,): momentum at the end, WRF axes, by the plan's own model;
-    ``impulse_N_s`` of all thrusters; ``cost_N_s``: this impulse and the penalty on the remaining momentum. ``radius``: of the trust
-    region, as share of full thrust, with which the next programme begins; 0 if none improves the plan."""
+    """``thrusts_N`` (K, n) for K steps of ``step_s``. ``remaining`` (6,): momentum at the end, WRF
+    axes, by the plan's own model; ``impulse_N_s`` of all thrusters; ``cost_N_s``: this impulse and
+    the penalty on the remaining momentum. ``radius``: of the trust region, as share of full thrust,
+    with which the next programme begins; 0 if none improves the plan."""
 
     thrusts_N: Array
     step_s: float
@@ -64,8 +70,8 @@ class StackPlan:
 
 @dataclass(frozen=True, eq=False)
 class _Flight:
-    """``end`` (6,): momentum at the end, and ``attitude`` there; at the middle of every step rotation, rate and angular momentum
-    (TRF axes)."""
+    """``end`` (6,): momentum at the end, and ``attitude`` there; at the middle of every step
+    rotation, rate and angular momentum (TRF axes)."""
 
     end: Array
     attitude: Array
@@ -84,7 +90,9 @@ def plan_stop(problem: StackProblem, guess_N: Array, step_s: float, iterations: 
 
 
 def flown(problem: StackProblem, thrusts_N: Array, step_s: float) -> StackPlan:
-    """Return the plan that fires these thrusts (K, n) within the limits. Raises ValueError as ``plan_stop``."""
+    """Return the plan that fires these thrusts (K, n) within the limits. Raises ValueError as
+    ``plan_stop``.
+    """
     if not (step_s > 0.0 and math.isfinite(step_s)):
         raise ValueError(f"step_s must be positive, not {step_s!r}")
     if not (np.isfinite(problem.momentum).all() and np.isfinite(problem.wrenches).all()):
@@ -151,13 +159,15 @@ def predicted(problem: StackProblem, thrusts_N: Array, step_s: float) -> StackPr
 
 
 def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: IntArray) -> Array:
-    """Return the matrix (6, K a) of the momentum at the end by the thrusts of the thrusters ``able`` at every step."""
+    """Return the matrix (6, K a) of the momentum at the end by the thrusts of the thrusters
+    ``able`` at every step.
+    """
     inverse = np.linalg.inv(problem.inertia_kg_m2)
     own = problem.wrenches[:, able]
     count, half = len(flight.rates), step_s / 2.0
     rows = np.empty((count, 6, len(able)))
-    # Of the momentum at the end: by that at the begin of a step it is the same, by the attitude (TRF axes) ``by_turn`` and, through
-    # the rate, by the angular momentum ``by_spin``.
+    # Of the momentum at the end: by that at the begin of a step it is the same, by the attitude
+    # (TRF axes) ``by_turn`` and, through the rate, by the angular momentum ``by_spin``.
     by_turn, by_spin = np.zeros((6, 3)), np.zeros((6, 3))
     for k in range(count - 1, -1, -1):
         r, omega, h = flight.rotations[k], flight.rates[k], flight.momenta[k]
@@ -201,8 +211,12 @@ def _linear_step(
     price: Array,
     radius: float,
 ) -> tuple[Array, float]:
-    """Return the change of the thrusts (K, n) that the linear programme gives, and the merit that it predicts."""
-    from scipy.optimize import linprog  # as slow to import as the controller, and needed for plans only
+    """Return the change of the thrusts (K, n) that the linear programme gives, and the merit that
+    it predicts.
+    """
+    from scipy.optimize import (
+        linprog,
+    )  # as slow to import as the controller, and needed for plans only
 
     count, a = len(thrusts_N), len(able)
     jacobian = sensitivity(problem, flight, step_s, able)
@@ -235,7 +249,9 @@ def _linear_step(
 
 
 def _sequencing(problem: StackProblem, able: IntArray, count: int) -> tuple[Any, Array | None]:
-    """Return the rows (sparse) that let at most ``at_once`` thrusters of a chaser fire in a step; None without a limit."""
+    """Return the rows (sparse) that let at most ``at_once`` thrusters of a chaser fire in a step;
+    None without a limit.
+    """
     if problem.at_once is None:
         return None, None
     from scipy.sparse import csr_array, eye_array, hstack, kron

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads that latched chasers exert on their ports, and which thrusters may fire together so that no load exceeds its limit.
+"""Loads that latched chasers exert on their ports, and which thrusters may fire together so that no
+load exceeds its limit.
 
-Scaling the thrusts does not lower the peaks, because every pulse is fully on; only firing one after the other does. Pure functions.
+Scaling the thrusts does not lower the peaks, because every pulse is fully on; only firing one after
+the other does. Pure functions.
 """
 
 from __future__ import annotations
@@ -36,8 +38,9 @@ _DIRECTIONS = _directions(200)
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """Loads at P ports: ``constant`` (P, 6) plus ``by_thrust`` (P, 6, n) times the thrusts; force and torque about the tip, TRF axes.
-    ``limits`` (P, 2): of their magnitudes, infinite without one."""
+    """Loads at P ports: ``constant`` (P, 6) plus ``by_thrust`` (P, 6, n) times the thrusts; force
+    and torque about the tip, TRF axes. ``limits`` (P, 2): of their magnitudes, infinite without
+    one."""
 
     constant: Array
     by_thrust: Array
@@ -56,8 +59,9 @@ def load_model(
 ) -> LoadModel:
     """Return the loads at the ports of ``chasers``.
 
-    ``wrenches`` (6, n) of 1 N of every thruster about the stack's centre of mass, TRF axes; ``own``: which of them are a chaser's,
-    and their wrenches about its centre in its axes. ``tips_m``: points of the ports (TRF); ``limits``: force and torque.
+    ``wrenches`` (6, n) of 1 N of every thruster about the stack's centre of mass, TRF axes;
+    ``own``: which of them are a chaser's, and their wrenches about its centre in its axes.
+    ``tips_m``: points of the ports (TRF); ``limits``: force and torque.
     """
     inverse = np.linalg.inv(body.inertia_kg_m2)
     free = -inverse @ rotations.cross(omega_rad_s, body.inertia_kg_m2 @ omega_rad_s)
@@ -85,13 +89,16 @@ def load_model(
 
 
 def fire_in_turn(model: LoadModel, wanted: Array, full_N: Array) -> Array:
-    """Return which thrusters (n,) of those ``wanted`` (n,) may fire together, the most wanted first, as a mask.
+    """Return which thrusters (n,) of those ``wanted`` (n,) may fire together, the most wanted
+    first, as a mask.
 
-    Nor does any part of them exceed a limit: their pulses differ in width, and the rest of a load that others have borne remains.
+    Nor does any part of them exceed a limit: their pulses differ in width, and the rest of a load
+    that others have borne remains.
     """
     chosen = np.zeros(len(wanted), dtype=bool)
     ports = len(model.constant)
-    # The largest component of the loads along each direction, over all parts of the chosen thrusters.
+    # The largest component of the loads along each direction, over all parts of the chosen
+    # thrusters.
     along = model.constant.reshape(ports, 2, 3) @ _DIRECTIONS.T
     more = np.einsum("pckn,dk->pcdn", model.by_thrust.reshape(ports, 2, 3, -1), _DIRECTIONS)
     for k in np.argsort(-wanted, kind="stable"):

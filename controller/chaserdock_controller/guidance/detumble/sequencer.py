@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fires the thrusters of a stack one after the other where together they would exceed the load limits of a port."""
+"""Fires the thrusters of a stack one after the other where together they would exceed the load
+limits of a port.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +14,27 @@ from .port_loads import LoadModel, fire_in_turn
 _KEPT = 0.7
 """Share of what a thruster could not give in a carrier period that it may still give later."""
 _WIDEST = 0.94
-"""Longest pulse as a share of its carrier period: a pulse that scatters must not last into the next one, when others fire."""
+"""Longest pulse as a share of its carrier period: a pulse that scatters must not last into the next
+one, when others fire.
+"""
 
 
 class Sequencer:
-    """Chooses which thrusters fire in every carrier period of the modulation; the impulse of the others waits.
+    """Chooses which thrusters fire in every carrier period of the modulation; the impulse of the
+    others waits.
 
-    The modulation gives what was commanded and not yet given in later periods, when others fire. Therefore the command changes only
-    in ticks in which a period begins, and what it amounts to until the next such tick fits into the pulses of these periods.
+    The modulation gives what was commanded and not yet given in later periods, when others fire.
+    Therefore the command changes only in ticks in which a period begins, and what it amounts to
+    until the next such tick fits into the pulses of these periods.
 
     ``limits``: force and torque by chaser, infinite without a limit; ``tips_m``: the ports (TRF).
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
         ports = scenario.docking.ports
-        self.limits = {p.chaser: (p.force_limit_N or np.inf, p.torque_limit_N_m or np.inf) for p in ports}
+        self.limits = {
+            p.chaser: (p.force_limit_N or np.inf, p.torque_limit_N_m or np.inf) for p in ports
+        }
         self.tips_m = {p.chaser: np.array(p.position_m) for p in ports}
         self.limited = any(np.isfinite(limit).any() for limit in self.limits.values())
         self._timing = scenario.timing
@@ -39,13 +47,17 @@ class Sequencer:
         self._pending_N_s, self._thrusts_N = np.zeros(0), np.zeros(0)
 
     def in_turn(self, model: LoadModel, wanted_N: Array, limits_N: Array, tick: int) -> Array:
-        """Return thrusts (n,) that keep the limits, of those wanted; the choice changes only when a carrier period begins."""
+        """Return thrusts (n,) that keep the limits, of those wanted; the choice changes only when a
+        carrier period begins.
+        """
         if len(self._pending_N_s) != len(wanted_N):
             self._pending_N_s = np.zeros(len(wanted_N))
             self._thrusts_N = np.zeros(len(wanted_N))
         periods, span_s = self._span(tick)
         if periods:
-            most = limits_N * min(span_s, _WIDEST * periods * self._period_steps / self._timing.physics_hz)
+            most = limits_N * min(
+                span_s, _WIDEST * periods * self._period_steps / self._timing.physics_hz
+            )
             pending = np.minimum(_KEPT * self._pending_N_s + wanted_N * span_s, 2.0 * most)
             pending[wanted_N <= 0.0] = 0.0
             chosen = fire_in_turn(model, pending, limits_N)
@@ -54,8 +66,8 @@ class Sequencer:
         return np.minimum(self._thrusts_N, limits_N)
 
     def _span(self, tick: int) -> tuple[int, float]:
-        """Return how many carrier periods begin while a tick's command acts, and the time until that of the next tick in which one
-        begins; none and zero if none begins."""
+        """Return how many carrier periods begin while a tick's command acts, and the time until
+        that of the next tick in which one begins; none and zero if none begins."""
         begun = self._begun(tick)
         periods, last = self._begun(tick + 1) - begun, tick + 1
         if not periods:

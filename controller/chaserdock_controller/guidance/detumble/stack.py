@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stack of a target and the chasers latched to it: its momentum, and the wrenches of all thrusters. Pure functions.
+"""The stack of a target and the chasers latched to it: its momentum, and the wrenches of all
+thrusters. Pure functions.
 
 Wrenches are force and torque about the centre of mass of the stack, in TRF axes.
 """
@@ -20,7 +21,9 @@ from chaserdock_controller.estimation.target_body import TargetBody
 
 @dataclass(frozen=True, eq=False)
 class StackMotion:
-    """Momentum of the stack, TRF axes: linear (3,), N s, and angular (3,) about its centre of mass, N m s."""
+    """Momentum of the stack, TRF axes: linear (3,), N s, and angular (3,) about its centre of mass,
+    N m s.
+    """
 
     linear_N_s: Array
     angular_N_m_s: Array
@@ -36,15 +39,25 @@ class StackMotion:
         return float(np.linalg.norm(self.linear_N_s)) / body.mass_kg, float(np.linalg.norm(omega))
 
 
-def stack_motion(body: TargetBody, velocity_m_s: Array, q_wxyz: Array, omega_rad_s: Array) -> StackMotion:
-    """Return the momentum of a stack with velocity (3,) of TRF's origin in WRF, attitude (4,) and rate (3,) in TRF."""
-    own = rotations.rotate_inverse(q_wxyz, velocity_m_s) + rotations.cross(omega_rad_s, body.centre_trf_m)
+def stack_motion(
+    body: TargetBody, velocity_m_s: Array, q_wxyz: Array, omega_rad_s: Array
+) -> StackMotion:
+    """Return the momentum of a stack with velocity (3,) of TRF's origin in WRF, attitude (4,) and
+    rate (3,) in TRF.
+    """
+    own = rotations.rotate_inverse(q_wxyz, velocity_m_s) + rotations.cross(
+        omega_rad_s, body.centre_trf_m
+    )
     return StackMotion(body.mass_kg * own, body.inertia_kg_m2 @ omega_rad_s)
 
 
 def thruster_wrenches(
     body: TargetBody, chasers: Mapping[int, MountedChaser], thrusters: Sequence[ThrusterMount]
 ) -> Array:
-    """Return the wrenches (6, N n) of 1 N of each of the ``n`` thrusters of every chaser, in the order of the mapping."""
+    """Return the wrenches (6, N n) of 1 N of each of the ``n`` thrusters of every chaser, in the
+    order of the mapping.
+    """
     own = wrench_matrix(thrusters)
-    return np.concatenate([c.wrench_to_stack(own, body.centre_trf_m) for c in chasers.values()], axis=1)
+    return np.concatenate(
+        [c.wrench_to_stack(own, body.centre_trf_m) for c in chasers.values()], axis=1
+    )

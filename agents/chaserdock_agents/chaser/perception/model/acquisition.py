@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the target's pose in an image without a prior.
 
-Silhouettes of the tracker mesh from attitudes spread over all rotations, normalized to one size, are compared with the image's
-region of the target; the best are compared by how well some light explains their grey levels, and refined by the tracker.
-That region stands out by its brightness or, in front of the Earth, by its sharp edges.
+Silhouettes of the tracker mesh from attitudes spread over all rotations, normalized to one size,
+are compared with the image's region of the target; the best are compared by how well some light
+explains their grey levels, and refined by the tracker. That region stands out by its brightness or,
+in front of the Earth, by its sharp edges.
 """
 
 from __future__ import annotations
@@ -31,28 +32,35 @@ _TEMPLATES, _SIDE_PX = 3000, 40
 _SPREAD_PX = 8.0
 """Root mean square distance of a normalized silhouette's pixels from their centre."""
 _DISTANCES_RADII, _NEAR_RADII = (6.0, 2.2), 3.6
-"""Distances of the templates, far and near ones, in radii of the target: perspective changes near silhouettes; distance at which the
-near ones begin."""
+"""Distances of the templates, far and near ones, in radii of the target: perspective changes near
+silhouettes; distance at which the near ones begin."""
 _BY_SILHOUETTE, _BY_LIGHT, _FULL = 250, 24, 6
 _TEMPLATE_POINTS, _TEMPLATE_SUNS, _BY_LIGHT_WEIGHT = 100, 100, 0.1
 _APPEARANCE_LEVEL = 1
 _SHARP_PER_PX = (1.5, 4.0)
-"""Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over bright parts of the Earth."""
+"""Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over bright
+parts of the Earth.
+"""
 MIN_APPEARANCE = 0.85
-"""Gate of an acquisition: a smaller correlation of the synthetic view with the image rejects a pose."""
+"""Gate of an acquisition: a smaller correlation of the synthetic view with the image rejects a
+pose.
+"""
 _CUT_SHIFTS, _CUT_SIZES = (0.3, 0.6), (1.0, 1.2, 1.4, 1.6)
-"""Assumed places of a silhouette that leaves the image: shifts of its centre towards one of those sides, in rms radii of what is
-visible, and ratios of its rms radius to that."""
+"""Assumed places of a silhouette that leaves the image: shifts of its centre towards one of those
+sides, in rms radii of what is visible, and ratios of its rms radius to that."""
 _SAME_REGION = 0.8
 """Common share of two regions of which only one is searched."""
 _MIN_AREA_PX, _MIN_CONTRAST = 60, 5.0
 _AMBIGUOUS_SCORE, _DISTINCT_RAD = 0.04, math.radians(8.0)
 _WORSE_START = 0.2
-"""Once a pose has been found, coarse poses with a score lower than its own by this much are not refined."""
+"""Once a pose has been found, coarse poses with a score lower than its own by this much are not
+refined.
+"""
 _RATED_AT_ONCE, _FITTED_AT_ONCE, _REGION_POINTS = 25, 9, 10_000
 _REGION_MS, _SILHOUETTES_MS, _RATE_MS, _APPEARANCE_MS = 10.0, 20.0, 10.0, 10.0
-"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes at
-``_FITTED_AT_ONCE`` places, to rate suns for ``_RATED_AT_ONCE`` of them, to compare a synthetic view with the image."""
+"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes
+at ``_FITTED_AT_ONCE`` places, to rate suns for ``_RATED_AT_ONCE`` of them, to compare a synthetic
+view with the image."""
 
 Found = tuple[Alignment, Lighting]
 """A pose that passes the gate, and its light."""
@@ -60,8 +68,9 @@ Found = tuple[Alignment, Lighting]
 
 @dataclass(frozen=True)
 class _Templates:
-    """n normalized views: ``rotations`` (n, 3, 3); ``masks`` (n, pixels) float32; ``owners`` (n, pixels) triangles or -1; of each
-    silhouette: ``spread`` (n,) rms radius and ``centre`` (n, 2), in units of the tangent of the angle at the distance."""
+    """n normalized views: ``rotations`` (n, 3, 3); ``masks`` (n, pixels) float32; ``owners`` (n,
+    pixels) triangles or -1; of each silhouette: ``spread`` (n,) rms radius and ``centre`` (n, 2),
+    in units of the tangent of the angle at the distance."""
 
     rotations: Array
     masks: NDArray[np.float32]
@@ -73,8 +82,9 @@ class _Templates:
 
 @dataclass(frozen=True)
 class _SilhouetteFit:
-    """A region compared with n templates: its assumed centre ``middle`` (2,) and rms radius ``spread``, tangents of angles;
-    ``mask`` and ``grey`` (pixels,) on the grid of the templates; ``overlap`` (n,): common share of both silhouettes, 0 to 1."""
+    """A region compared with n templates: its assumed centre ``middle`` (2,) and rms radius
+    ``spread``, tangents of angles; ``mask`` and ``grey`` (pixels,) on the grid of the templates;
+    ``overlap`` (n,): common share of both silhouettes, 0 to 1."""
 
     middle: Array
     spread: float
@@ -84,7 +94,9 @@ class _SilhouetteFit:
 
 
 def spread_rotations(n: int) -> Array:
-    """Return ``n`` quaternions (n, 4) spread evenly over all rotations: super-Fibonacci spirals (M. Alexa, CVPR 2022)."""
+    """Return ``n`` quaternions (n, 4) spread evenly over all rotations: super-Fibonacci spirals (M.
+    Alexa, CVPR 2022).
+    """
     s = np.arange(n) + 0.5
     r, big = np.sqrt(s / n), np.sqrt(1.0 - s / n)
     a, b = 2.0 * math.pi * s / math.sqrt(2.0), 2.0 * math.pi * s / 1.533751168755204288118041
@@ -92,7 +104,9 @@ def spread_rotations(n: int) -> Array:
 
 
 class Acquisition:
-    """Searches for one target in the images of one camera. The templates are rendered when they are first needed."""
+    """Searches for one target in the images of one camera. The templates are rendered when they are
+    first needed.
+    """
 
     def __init__(self, camera: Camera, mesh: TrackerMesh) -> None:
         self._camera, self._mesh = camera, mesh
@@ -106,11 +120,13 @@ class Acquisition:
     def prepare(self) -> None:
         """Render the templates, if that has not been done; takes about two seconds."""
         if not self._templates:
-            self._templates = tuple(_make_templates(self._mesh, radii) for radii in _DISTANCES_RADII)
+            self._templates = tuple(
+                _make_templates(self._mesh, radii) for radii in _DISTANCES_RADII
+            )
 
     def find(self, image: NDArray[np.uint8]) -> tuple[Found, ...]:
-        """Return the alignments that pass the gate, and their light, best first; several if they explain the image about equally
-        well."""
+        """Return the alignments that pass the gate, and their light, best first; several if they
+        explain the image about equally well."""
         return result_of(self.search(Pyramid(image, self._camera)))
 
     def search(self, pyramid: Pyramid) -> Steps[tuple[Found, ...]]:
@@ -137,7 +153,9 @@ class Acquisition:
             found = yield from self._search_in(pyramid, region)
         return found
 
-    def _search_in(self, pyramid: Pyramid, region: NDArray[np.uint8] | None) -> Steps[tuple[Found, ...]]:
+    def _search_in(
+        self, pyramid: Pyramid, region: NDArray[np.uint8] | None
+    ) -> Steps[tuple[Found, ...]]:
         """Do what `search` does, for a target that covers ``region`` (h, w)."""
         if region is None:
             return ()
@@ -228,7 +246,9 @@ class Acquisition:
     def _places(
         self, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
     ) -> list[tuple[Array, float]]:
-        """Return the centre and the rms radius of the silhouette that a region shows: several for one that leaves the image."""
+        """Return the centre and the rms radius of the silhouette that a region shows: several for
+        one that leaves the image.
+        """
         if not _touches_border(region):
             return [(middle, spread)]
         centres = [middle]
@@ -240,7 +260,9 @@ class Acquisition:
     def _fits(
         self, t: _Templates, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, places: list[tuple[Array, float]]
     ) -> list[_SilhouetteFit]:  # fmt: skip
-        """Compare a region with the silhouettes, inside the image, for each centre and rms radius in ``places``."""
+        """Compare a region with the silhouettes, inside the image, for each centre and rms radius
+        in ``places``.
+        """
         seen = [self._normalized(pyramid, region, towards, *place) for place in places]
         masks = np.array([mask for mask, _, _ in seen])
         # One product, as reading the templates takes the most time.
@@ -249,13 +271,22 @@ class Acquisition:
         overlaps = common / np.maximum(inside + masks.sum(axis=1, keepdims=True) - common, 1.0)
         return [
             _SilhouetteFit(middle, spread, mask, grey, overlap)
-            for (middle, spread), (mask, grey, _), overlap in zip(places, seen, overlaps, strict=True)
+            for (middle, spread), (mask, grey, _), overlap in zip(
+                places, seen, overlaps, strict=True
+            )
         ]
 
     def _normalized(
-        self, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
+        self,
+        pyramid: Pyramid,
+        region: NDArray[np.uint8],
+        towards: Array,
+        middle: Array,
+        spread: float,
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.float32]]:
-        """Return the region's mask, the image, and a mask of what is inside the image, each (pixels,) on the grid of the templates."""
+        """Return the region's mask, the image, and a mask of what is inside the image, each
+        (pixels,) on the grid of the templates.
+        """
         step = spread / _SPREAD_PX
         axis = (np.arange(_SIDE_PX) - (_SIDE_PX - 1) / 2.0) * step
         u, v = np.meshgrid(axis + middle[0], axis + middle[1])
@@ -267,7 +298,9 @@ class Acquisition:
         at = (px + 0.5) * scale - 0.5
         grid = pyramid.level(level)
         grey = cv2.remap(grid, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        soft = cv2.resize(255 * region, (grid.shape[1], grid.shape[0]), interpolation=cv2.INTER_AREA)
+        soft = cv2.resize(
+            255 * region, (grid.shape[1], grid.shape[0]), interpolation=cv2.INTER_AREA
+        )
         mask = cv2.remap(soft, at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 127
         last = np.array([region.shape[1] - 1, region.shape[0] - 1])
         visible = ((px >= 0.0) & (px <= last)).all(axis=-1)
@@ -284,22 +317,30 @@ class Acquisition:
         if len(inside) < 30:
             return math.inf
         owners, nowhere = t.owners[i][inside], np.zeros((len(inside), 3))
-        points = points_on(self._mesh, owners, nowhere, -t.rotations[i][2], fit.grey[inside], t.rotations[i])
+        points = points_on(
+            self._mesh, owners, nowhere, -t.rotations[i][2], fit.grey[inside], t.rotations[i]
+        )
         return float(rate_suns(points, self._suns)[:, 0].min()) * _BY_LIGHT_WEIGHT + 2.0 * (
             1.0 - fit.overlap[i]
         )
 
 
 def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
-    """Return the mask (h, w) of what is brighter than the background, in one connected region; None without any."""
+    """Return the mask (h, w) of what is brighter than the background, in one connected region; None
+    without any.
+    """
     level = float(np.median(image)) + _MIN_CONTRAST
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
-    bright = cv2.morphologyEx((smooth > level).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    bright = cv2.morphologyEx(
+        (smooth > level).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
+    )
     return _largest_region(bright)
 
 
 def _border_sides(region: NDArray[np.uint8]) -> list[tuple[float, float]]:
-    """Return the directions, right and down, of the sides of the image that a mask (h, w) reaches, and of corners between two."""
+    """Return the directions, right and down, of the sides of the image that a mask (h, w) reaches,
+    and of corners between two.
+    """
     edges = (region[:, 0], region[:, -1], region[0], region[-1])
     sides = ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
     reached = [side for side, edge in zip(sides, edges, strict=True) if edge.any()]
@@ -329,7 +370,8 @@ def _largest_region(mask: NDArray[Any]) -> NDArray[np.uint8] | None:
 
 
 def _sharp_region(image: NDArray[np.float32], slope: float) -> NDArray[np.uint8] | None:
-    """Return the mask (h, w) of the largest region within edges of at least ``slope`` grey levels per pixel; None without any.
+    """Return the mask (h, w) of the largest region within edges of at least ``slope`` grey levels
+    per pixel; None without any.
 
     The Earth has no sharp edges but its limb, which is a thin line.
     """
@@ -339,17 +381,23 @@ def _sharp_region(image: NDArray[np.float32], slope: float) -> NDArray[np.uint8]
         cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125),
     )
     edges = (cv2.magnitude(gx, gy) > slope).astype(np.uint8)
-    closed = cv2.morphologyEx(edges, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11)))
+    closed = cv2.morphologyEx(
+        edges, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11))
+    )
     outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     filled = np.zeros_like(edges)
     cv2.drawContours(filled, outlines, -1, 1, cv2.FILLED)
-    opened = cv2.morphologyEx(filled, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+    opened = cv2.morphologyEx(
+        filled, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    )
     # Edges are found up to a pixel outside.
     return _largest_region(cv2.erode(opened, np.ones((3, 3), np.uint8)))
 
 
 def _look_at(ray: Array) -> Array:
-    """Return the rotation (3, 3) from IRF to axes whose z points along ``ray``, by the smallest turn."""
+    """Return the rotation (3, 3) from IRF to axes whose z points along ``ray``, by the smallest
+    turn.
+    """
     z = ray / np.linalg.norm(ray)
     axis = np.cross(z, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
@@ -363,11 +411,17 @@ def _make_templates(mesh: TrackerMesh, radii: float) -> _Templates:
     light = Lighting(np.array([0.0, 0.0, -1.0]), shadows=False)
     masks = np.zeros((_TEMPLATES, _SIDE_PX**2), dtype=np.float32)
     owners = np.full((_TEMPLATES, _SIDE_PX**2), -1, dtype=np.int16)
-    turns, spread, centre = np.empty((_TEMPLATES, 3, 3)), np.empty(_TEMPLATES), np.empty((_TEMPLATES, 2))
+    turns, spread, centre = (
+        np.empty((_TEMPLATES, 3, 3)),
+        np.empty(_TEMPLATES),
+        np.empty((_TEMPLATES, 2)),
+    )
     middle, whole = (_SIDE_PX - 1) / 2.0, 0.45 * _SIDE_PX * math.sqrt(radii**2 - 1.0)
     for i, q in enumerate(quaternions):
         pose = PoseInCamera(np.array([0.0, 0.0, distance]), rotations.to_matrix(q))
-        view = render(mesh, pose, PixelWindow(_SIDE_PX, _SIDE_PX, (whole, whole, middle, middle)), light)
+        view = render(
+            mesh, pose, PixelWindow(_SIDE_PX, _SIDE_PX, (whole, whole, middle, middle)), light
+        )
         y, x = np.nonzero(view.coverage > 0.5)
         flat = np.column_stack([x - middle, y - middle]) / whole
         centre[i] = flat.mean(axis=0)

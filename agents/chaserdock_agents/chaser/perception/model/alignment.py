@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Align a synthetic view of the tracker mesh with an image: pose, covariance and the share of inliers.
+"""Align a synthetic view of the tracker mesh with an image: pose, covariance and the share of
+inliers.
 
-Control points are gradient maxima of the synthetic view; their profiles are found in the image by signed correlation and give
-the pose by robust least squares (native/align.c).
+Control points are gradient maxima of the synthetic view; their profiles are found in the image by
+signed correlation and give the pose by robust least squares (native/align.c).
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 _PROFILE, _PER_CELL_MOST = 9, 4
 _CELL_PX, _PER_CELL = 8, 2
 _LEAST_GRADIENT = (0.5, 1.5)
-"""Least gradient of control points, grey levels per pixel, in light from everywhere and in estimated light. In a dim image, noise
-hides weaker edges, which would count as outliers."""
+"""Least gradient of control points, grey levels per pixel, in light from everywhere and in
+estimated light. In a dim image, noise hides weaker edges, which would count as outliers."""
 _MARGIN_PX = 14
 """Border of a window around the target: reach of the search and half a profile."""
 _MIN_CORRELATION = 0.6
@@ -39,21 +40,26 @@ INLIER_PX = 1.5
 _DISPLACED_INLIER_PX, _REFINED_REACH_PX = 5.0, 3
 MIN_POINTS = 24
 NEAR_PX = 1300.0
-"""Diameter of the target in the image, in pixels of level 0, beyond which it shows texture that the mesh does not have."""
+"""Diameter of the target in the image, in pixels of level 0, beyond which it shows texture that the
+mesh does not have.
+"""
 _BESIDE_PX = 3.0
 """Distance from an edge at which the surfaces beside it are looked up."""
 _CORRELATED_POINTS, _INDEPENDENT_MOST = 5.5, 60.0
-"""Number of neighbouring control points that err together, so that their information counts once; and largest number of points
-that count: shading and facets that the mesh does not have do not become more accurate with more pixels."""
+"""Number of neighbouring control points that err together, so that their information counts once;
+and largest number of points that count: shading and facets that the mesh does not have do not
+become more accurate with more pixels."""
 _INDEPENDENT_DIM, _BEHIND_Z = 25.0, 0.3
-"""The same on a side in the shade, or with the sun behind the target, where it brightens rims, which move together; and least z in IRF
-of the direction of such a sun."""
+"""The same on a side in the shade, or with the sun behind the target, where it brightens rims,
+which move together; and least z in IRF of the direction of such a sun."""
 _SPREAD_PX = {0: 0.6, 1: 0.45, -1: 1.2}
 """Standard deviation, in pixels of a level, of the point spread that the synthetic view gets."""
 
 
 class Pyramid:
-    """Levels of one image (h, w), uint8: level k has 2**-k as many pixels along each axis; made when first used."""
+    """Levels of one image (h, w), uint8: level k has 2**-k as many pixels along each axis; made
+    when first used.
+    """
 
     def __init__(self, image: NDArray[np.uint8], camera: Camera) -> None:
         self.camera = camera
@@ -79,14 +85,20 @@ class Pyramid:
     def lens(self, k: int) -> tuple[float, float, float, float]:
         """Return fx, fy, cx, cy of level ``k``."""
         c, scale = self.camera, 0.5**k
-        return c.fx_px * scale, c.fy_px * scale, (c.cx_px + 0.5) * scale - 0.5, (c.cy_px + 0.5) * scale - 0.5
+        return (
+            c.fx_px * scale,
+            c.fy_px * scale,
+            (c.cx_px + 0.5) * scale - 0.5,
+            (c.cy_px + 0.5) * scale - 0.5,
+        )
 
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """n control points of a rendering: ``points_m`` (n, 3) and ``ahead_m`` (n, 3), a pixel further along the gradient, in TRF;
-    ``profiles`` (n, 9), grey levels; ``owners`` (n,): triangles; ``level``; ``pose`` of the rendering; ``displaced_m`` (k, n, 3):
-    displacements by the modes of the mesh; ``border_m`` (n,): standard deviation of where each is seen; ``independent``: largest
+    """n control points of a rendering: ``points_m`` (n, 3) and ``ahead_m`` (n, 3), a pixel further
+    along the gradient, in TRF; ``profiles`` (n, 9), grey levels; ``owners`` (n,): triangles;
+    ``level``; ``pose`` of the rendering; ``displaced_m`` (k, n, 3): displacements by the modes of
+    the mesh; ``border_m`` (n,): standard deviation of where each is seen; ``independent``: largest
     number of them that count as independent."""
 
     points_m: Array
@@ -102,9 +114,10 @@ class ControlPoints:
 
 @dataclass(frozen=True)
 class Alignment:
-    """An aligned pose: ``inlier_share`` of the points in the image, ``correlation``: mean of the points in the image, -1 to 1;
-    ``rms_px``: of the inliers, pixels of level 0; ``covariance`` (6, 6): as in `TargetPose`; ``modes`` (k,): estimated errors of
-    the geometry in standard deviations; ``geometry``: what the image alone tells about them."""
+    """An aligned pose: ``inlier_share`` of the points in the image, ``correlation``: mean of the
+    points in the image, -1 to 1; ``rms_px``: of the inliers, pixels of level 0; ``covariance`` (6,
+    6): as in `TargetPose`; ``modes`` (k,): estimated errors of the geometry in standard deviations;
+    ``geometry``: what the image alone tells about them."""
 
     pose: PoseInCamera
     inlier_share: float
@@ -129,7 +142,9 @@ def diameter_px(camera: Camera, mesh: TrackerMesh, pose: PoseInCamera) -> float:
 def window_of(
     pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera
 ) -> tuple[PixelWindow, int, int] | None:
-    """Return the window of level ``k`` that the target can touch, and its first column and row; None if it is out of view."""
+    """Return the window of level ``k`` that the target can touch, and its first column and row;
+    None if it is out of view.
+    """
     at = mesh.vertices_m @ pose.rotation.T + pose.position
     at = at[at[:, 2] > 0.05]
     if not len(at):
@@ -138,8 +153,14 @@ def window_of(
     scale = 0.5**k
     height, width = int(pyramid.camera.height_px * scale), int(pyramid.camera.width_px * scale)
     u, v = fx * at[:, 0] / at[:, 2] + cx, fy * at[:, 1] / at[:, 2] + cy
-    left, right = max(0, math.floor(u.min()) - _MARGIN_PX), min(width, math.ceil(u.max()) + _MARGIN_PX)
-    top, bottom = max(0, math.floor(v.min()) - _MARGIN_PX), min(height, math.ceil(v.max()) + _MARGIN_PX)
+    left, right = (
+        max(0, math.floor(u.min()) - _MARGIN_PX),
+        min(width, math.ceil(u.max()) + _MARGIN_PX),
+    )
+    top, bottom = (
+        max(0, math.floor(v.min()) - _MARGIN_PX),
+        min(height, math.ceil(v.max()) + _MARGIN_PX),
+    )
     if right - left < 3 * _PROFILE or bottom - top < 3 * _PROFILE:
         return None
     return PixelWindow(bottom - top, right - left, (fx, fy, cx - left, cy - top)), left, top
@@ -206,10 +227,13 @@ def _on_textured(
     ahead: Array,
     near: bool,
 ) -> NDArray[np.bool_]:
-    """Return which points (n,) are edges between surfaces with the same pattern: the lines of a grid of solar cells beside such an
-    edge or, on a ``near`` target, wrinkles of foil, on which shadows bend, move it to either side."""
+    """Return which points (n,) are edges between surfaces with the same pattern: the lines of a
+    grid of solar cells beside such an edge or, on a ``near`` target, wrinkles of foil, on which
+    shadows bend, move it to either side."""
     # From farther away, shadows on foil help more than their bends hurt.
-    patterns = mesh.patterns if near else np.where(mesh.patterns == WRINKLES, NO_PATTERN, mesh.patterns)
+    patterns = (
+        mesh.patterns if near else np.where(mesh.patterns == WRINKLES, NO_PATTERN, mesh.patterns)
+    )
     if not patterns.any():
         return np.zeros(len(points), dtype=bool)
     fx, fy, cx, cy = window.lens
@@ -225,7 +249,9 @@ def _on_textured(
     return (beside[0] == beside[1]) & (beside[0] != NO_PATTERN)
 
 
-def image_window(pyramid: Pyramid, k: int, window: PixelWindow, left: int, top: int) -> NDArray[np.float32]:
+def image_window(
+    pyramid: Pyramid, k: int, window: PixelWindow, left: int, top: int
+) -> NDArray[np.float32]:
     """Return the image of level ``k`` on the grid of a window of ideal pixels."""
     image = pyramid.level(k)
     if not pyramid.camera.distortion:
@@ -244,14 +270,20 @@ def image_window(pyramid: Pyramid, k: int, window: PixelWindow, left: int, top: 
         (window.width, window.height),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
     )
-    return np.asarray(cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR), dtype=np.float32)
+    return np.asarray(
+        cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR), dtype=np.float32
+    )
 
 
-def in_grey_levels(view: SyntheticView, patch: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-    """Return a synthetic view (h, w) in grey levels of the image, with the image's background behind it, and its gain.
+def in_grey_levels(
+    view: SyntheticView, patch: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], float]:
+    """Return a synthetic view (h, w) in grey levels of the image, with the image's background
+    behind it, and its gain.
 
-    ``patch`` (h, w): the image. The gain is the ratio of the means within the target. The background is a local mean of the image
-    outside of the target and a border, so that it follows the Earth without taking over edges of the target.
+    ``patch`` (h, w): the image. The gain is the ratio of the means within the target. The
+    background is a local mean of the image outside of the target and a border, so that it follows
+    the Earth without taking over edges of the target.
     """
     inside = view.coverage > 0.99
     mean = float(view.grey[inside].mean()) if inside.any() else 0.0
@@ -268,7 +300,9 @@ def in_grey_levels(view: SyntheticView, patch: NDArray[np.float32]) -> tuple[NDA
         use = np.minimum(share / 0.05, 1.0) * missing
         background += use * local / np.maximum(share, 1e-6)
         missing -= use
-    background = cv2.resize(background, (patch.shape[1], patch.shape[0]), interpolation=cv2.INTER_LINEAR)
+    background = cv2.resize(
+        background, (patch.shape[1], patch.shape[0]), interpolation=cv2.INTER_LINEAR
+    )
     return np.asarray(gain * view.grey + (1.0 - view.coverage) * background, dtype=np.float32), gain
 
 
@@ -280,10 +314,11 @@ def align(
     modes: Array | None = None,
     iterations: int = 6,
 ) -> Alignment | None:
-    """Align control points with an image, searching ``reach_px`` of their level around ``prior``; None if that fails.
+    """Align control points with an image, searching ``reach_px`` of their level around ``prior``;
+    None if that fails.
 
-    ``modes`` (k,): errors of the geometry as far as they are known. They are estimated with the pose: points that they displace by
-    more than the width of an edge would be outliers otherwise.
+    ``modes`` (k,): errors of the geometry as far as they are known. They are estimated with the
+    pose: points that they displace by more than the width of an edge would be outliers otherwise.
     """
     k = len(points.displaced_m)
     known = np.zeros(k) if modes is None or len(modes) != k else modes
@@ -300,8 +335,8 @@ def align(
 
 @dataclass(frozen=True)
 class _Matches:
-    """Result of align_points (native/align.c) for n points: ``pose``, ``inside``: number of points in the image; ``residual`` (n,),
-    ``weight`` (n,), ``correlation`` (n,), ``rows`` (n, 6)."""
+    """Result of align_points (native/align.c) for n points: ``pose``, ``inside``: number of points
+    in the image; ``residual`` (n,), ``weight`` (n,), ``correlation`` (n,), ``rows`` (n, 6)."""
 
     pose: PoseInCamera
     inside: int
@@ -314,7 +349,9 @@ class _Matches:
 def _match(
     pyramid: Pyramid, points: ControlPoints, modes: Array, prior: PoseInCamera, reach_px: int, iterations: int, inlier_px: float
 ) -> _Matches | None:  # fmt: skip
-    """Match the profiles of control points, displaced by ``modes``, and fit the pose; None for too few matches."""
+    """Match the profiles of control points, displaced by ``modes``, and fit the pose; None for too
+    few matches.
+    """
     image = pyramid.level(points.level)
     n = len(points.points_m)
     distortion = (*pyramid.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
@@ -334,12 +371,17 @@ def _match(
     return _Matches(aligned, int(inside), residual, weight, correlation, rows)
 
 
-def _alignment(pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Matches) -> Alignment | None:
-    """Estimate pose and errors of the geometry together from matches; None for a pose that is not observable."""
+def _alignment(
+    pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Matches
+) -> Alignment | None:
+    """Estimate pose and errors of the geometry together from matches; None for a pose that is not
+    observable.
+    """
     used = found.weight > 0.0
     residual, weight, moved = found.residual[used], found.weight[used], found.rows[used, 3:]
     pose = found.pose
-    # A rotation phi in camera axes is R dtheta; a displacement in TRF moves a point as that of the position in IRF axes.
+    # A rotation phi in camera axes is R dtheta; a displacement in TRF moves a point as that of the
+    # position in IRF axes.
     jacobian = np.concatenate([moved, found.rows[used, :3] @ pose.rotation], axis=1)
     shifts = np.einsum("ni,kni->nk", moved @ pose.rotation, points.displaced_m[:, used])
     solved = _solve(_Fit(residual, weight, jacobian, shifts, points.independent), modes)
@@ -358,9 +400,9 @@ def _alignment(pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Ma
 
 @dataclass(frozen=True)
 class _Fit:
-    """Linearized fit of m used control points at a pose: ``residual`` (m,) pixels, ``weight`` (m,), ``jacobian`` (m, 6): of the
-    residual by position (IRF) and rotation (TRF); ``shifts`` (m, k): of each point, pixels, by the k modes of the geometry;
-    ``independent``: as in `ControlPoints`."""
+    """Linearized fit of m used control points at a pose: ``residual`` (m,) pixels, ``weight`` (m,),
+    ``jacobian`` (m, 6): of the residual by position (IRF) and rotation (TRF); ``shifts`` (m, k): of
+    each point, pixels, by the k modes of the geometry; ``independent``: as in `ControlPoints`."""
 
     residual: Array
     weight: Array
@@ -370,11 +412,12 @@ class _Fit:
 
 
 def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] | None:
-    """Return the step (6 + k,) of pose and modes, the covariance (6, 6) of the pose, and the information about the modes; None for
-    a pose that is not observable.
+    """Return the step (6 + k,) of pose and modes, the covariance (6, 6) of the pose, and the
+    information about the modes; None for a pose that is not observable.
 
-    The errors of the geometry have their standard deviations, 1, as prior knowledge around 0; ``modes`` (k,) is where the fit is
-    linearized. Control points near to each other err together, which divides their information.
+    The errors of the geometry have their standard deviations, 1, as prior knowledge around 0;
+    ``modes`` (k,) is where the fit is linearized. Control points near to each other err together,
+    which divides their information.
     """
     rows = np.concatenate([fit.jacobian, fit.shifts], axis=1)
     chi_square = float(fit.residual**2 @ fit.weight) / max(len(fit.residual) - 6, 1)
@@ -395,8 +438,9 @@ def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] 
 
 
 def _without_pose(information: Array, right: Array, modes: Array) -> GeometryInformation:
-    """Return the information about the modes (k,) of a fit (6 + k, 6 + k) that is linearized at ``modes``, its Schur complement, and
-    how the position depends on them, as a displacement from where the fit is linearized."""
+    """Return the information about the modes (k,) of a fit (6 + k, 6 + k) that is linearized at
+    ``modes``, its Schur complement, and how the position depends on them, as a displacement from
+    where the fit is linearized."""
     of_pose = np.asarray(np.linalg.pinv(information[:6, :6], hermitian=True), dtype=float)
     gain = information[6:, :6] @ of_pose
     matrix = information[6:, 6:] - gain @ information[:6, 6:]

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimated errors of the geometry: correct the tracker mesh by them, and state what an image tells about them."""
+"""Estimated errors of the geometry: correct the tracker mesh by them, and state what an image tells
+about them.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ class GeometryCorrection:
 
     @cached_property
     def factor(self) -> Array:
-        """Lower Cholesky factor (k, k) of the covariance: its columns are the modes of the corrected mesh."""
+        """Lower Cholesky factor (k, k) of the covariance: its columns are the modes of the
+        corrected mesh.
+        """
         return np.asarray(np.linalg.cholesky(self.covariance), dtype=float)
 
     def is_of(self, mean: Array) -> bool:
@@ -34,9 +38,11 @@ class GeometryCorrection:
         return mesh.corrected(self.mean, self.covariance)
 
     def of_uncorrected(self, found: GeometryInformation) -> GeometryInformation:
-        """Return information about the errors of the corrected mesh as information about those of the mesh before.
+        """Return information about the errors of the corrected mesh as information about those of
+        the mesh before.
 
-        With e = mean + C x for errors x of the corrected mesh, information L about x is C^-T L C^-1 about e.
+        With e = mean + C x for errors x of the corrected mesh, information L about x is C^-T L C^-1
+        about e.
         """
         back = np.linalg.inv(self.factor)
         by_errors = found.position_by_errors @ back

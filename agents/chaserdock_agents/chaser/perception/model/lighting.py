@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimate the light on the target from the image, so that sun, eclipse and lamp need no ephemeris.
 
-Each of several hundred directions of the sun is rated by how well its light explains the grey levels of points on the target,
-with cast shadows and highlights (native/light.c). The best one is refined between its neighbours.
+Each of several hundred directions of the sun is rated by how well its light explains the grey
+levels of points on the target, with cast shadows and highlights (native/light.c). The best one is
+refined between its neighbours.
 """
 
 from __future__ import annotations
@@ -35,21 +36,26 @@ _NEIGHBOURS_RAD, _FINE_TEXELS = (0.12, 0.05), 96
 _COMPARED, _DISTINCT_RAD = 8, 0.35
 """Number of directions that are compared by synthetic views, and their least distance."""
 _LIKELY = 0.08
-"""Increase of the mean squared residual, as a share of its least, at which a direction weighs 1/e in the mean of the likely ones."""
+"""Increase of the mean squared residual, as a share of its least, at which a direction weighs 1/e
+in the mean of the likely ones.
+"""
 
 _EVEN_RESIDUAL, _CLEARLY = 0.15, 0.95
-"""Mean squared residual, in standard deviations, below which light from everywhere explains the points: of 40 sunlit views the least
-was 0.45, of views without sun on what is visible the most 0.17. Ratio of residuals below which a sun explains a view better."""
+"""Mean squared residual, in standard deviations, below which light from everywhere explains the
+points: of 40 sunlit views the least was 0.45, of views without sun on what is visible the most
+0.17. Ratio of residuals below which a sun explains a view better."""
 _LEAST_BEHIND, _LEAST_IN_FRONT = -0.1, -0.9
-"""Directions of which synthetic views are compared have a z in IRF above the one, behind the target, or below the other, as of a
-lamp beside the lens."""
+"""Directions of which synthetic views are compared have a z in IRF above the one, behind the
+target, or below the other, as of a lamp beside the lens."""
 _COMPARED_FINELY = 3
 """Number of these that are compared at a finer level."""
 
 
 @dataclass(frozen=True)
 class LitPoints:
-    """n points as native/light.c takes them, ``rows`` (n, 14), seen at the attitude ``rotation`` (3, 3), TRF to IRF."""
+    """n points as native/light.c takes them, ``rows`` (n, 14), seen at the attitude ``rotation``
+    (3, 3), TRF to IRF.
+    """
 
     rows: Array
     rotation: Array
@@ -63,10 +69,12 @@ def light_steps(
     previous: Lighting | None = None,
     by_view: bool = False,
 ) -> Steps[Lighting | None]:
-    """Return, in steps, the light, in grey levels, that the image shows on a target at ``pose``; None if too little of it is in view.
+    """Return, in steps, the light, in grey levels, that the image shows on a target at ``pose``;
+    None if too little of it is in view.
 
-    With ``previous``, only directions near that light are tried. With ``by_view``, a synthetic view in each of several likely
-    lights decides: on few textured faces, directions far apart explain the points about equally well, but not the shadows' edges.
+    With ``previous``, only directions near that light are tried. With ``by_view``, a synthetic view
+    in each of several likely lights decides: on few textured faces, directions far apart explain
+    the points about equally well, but not the shadows' edges.
     """
     yield LIGHT_MS
     points = lit_points(pyramid, mesh, pose, level)
@@ -83,15 +91,17 @@ def light_steps(
     found = fit_light(mesh, points, previous)
     if previous is None or not previous.weak:
         return found
-    # A sun that explains points in the shade a little better than light from everywhere can be one of noise.
+    # A sun that explains points in the shade a little better than light from everywhere can be one
+    # of noise.
     yield 2.0 * compared_ms(area_px(pyramid, level, mesh, pose))
     lights = [light for light in (found, previous) if light is not None]
     return max(lights, key=lambda light: appearance(pyramid, mesh, pose, level, light))
 
 
 def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:
-    """Return light from everywhere if that alone explains the points within their noise and texture, as of a target that shows
-    its shaded side: a sun that explains them better would be one of noise, and cast shadows that are not there."""
+    """Return light from everywhere if that alone explains the points within their noise and
+    texture, as of a target that shows its shaded side: a sun that explains them better would be one
+    of noise, and cast shadows that are not there."""
     rows = points.rows.copy()
     rows[:, 3:6] = 0.0  # without normals, the sun has no effect
     anywhere = ShadowMaps(np.eye(3)[:1], np.zeros((1, 12)), np.zeros((1, 0, 0), np.float32))
@@ -102,11 +112,13 @@ def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:
 def _view_steps(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, even: Lighting, previous: Lighting | None
 ) -> Steps[Lighting]:  # fmt: skip
-    """Return, in steps, the light of a target whose points ``even`` explains, light from everywhere: on a side in the shade a sun
-    behind the target brightens no more than rims, which are no points.
+    """Return, in steps, the light of a target whose points ``even`` explains, light from
+    everywhere: on a side in the shade a sun behind the target brightens no more than rims, which
+    are no points.
 
-    Synthetic views in several directions of the sun, near that of ``previous`` if it has one, are compared with the image; the
-    levels follow by least squares. Returns ``even`` if no sun explains the image clearly better.
+    Synthetic views in several directions of the sun, near that of ``previous`` if it has one, are
+    compared with the image; the levels follow by least squares. Returns ``even`` if no sun explains
+    the image clearly better.
     """
     near = previous.to_sun_irf if previous is not None else None
     if near is None:
@@ -135,8 +147,9 @@ def _view_steps(
 
 @dataclass(frozen=True)
 class _ComparedView:
-    """A view of a target at ``pose`` and the image there: n pixels of it without the background, ``grey`` (n,), and of the view in
-    light from everywhere, ``ambient`` (n,); ``pixels`` (h, w): which these are; ``residual``: mean square without a sun."""
+    """A view of a target at ``pose`` and the image there: n pixels of it without the background,
+    ``grey`` (n,), and of the view in light from everywhere, ``ambient`` (n,); ``pixels`` (h, w):
+    which these are; ``residual``: mean square without a sun."""
 
     mesh: TrackerMesh
     pose: PoseInCamera
@@ -147,7 +160,9 @@ class _ComparedView:
     residual: float
 
     @classmethod
-    def at(cls, pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> _ComparedView | None:
+    def at(
+        cls, pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int
+    ) -> _ComparedView | None:
         """Return the view at a level; None if the target is out of view."""
         found = window_of(pyramid, level, mesh, pose)
         if found is None:
@@ -157,31 +172,42 @@ class _ComparedView:
         view = render(mesh, pose, window, Lighting(None, 0.0, 1.0))
         drawn, gain = in_grey_levels(view, patch)
         pixels = cv2.dilate(view.coverage, np.ones((5, 5))) > 0.0
-        grey, ambient = smooth(patch - (drawn - gain * view.grey))[pixels], smooth(view.grey)[pixels]
+        grey, ambient = (
+            smooth(patch - (drawn - gain * view.grey))[pixels],
+            smooth(view.grey)[pixels],
+        )
         level_of = float(ambient @ grey) / max(float(ambient @ ambient), 1e-9)
         residual = float(np.mean((grey - level_of * ambient) ** 2))
         return cls(mesh, pose, window, pixels, grey, ambient, residual)
 
     def rate(self, to_sun: Array) -> tuple[float, float, float]:
-        """Return the mean squared residual with a sun in the direction (3,), IRF, the ambient and the direct level."""
+        """Return the mean squared residual with a sun in the direction (3,), IRF, the ambient and
+        the direct level.
+        """
         return self._fit(render(self.mesh, self.pose, self.window, Lighting(to_sun, 1.0, 0.0)).grey)
 
     def _fit(self, sunlit: NDArray[Any]) -> tuple[float, float, float]:
-        """Return the mean squared residual with the view (h, w) in sunlight of level 1, the ambient and the direct level."""
+        """Return the mean squared residual with the view (h, w) in sunlight of level 1, the ambient
+        and the direct level.
+        """
         columns = np.column_stack([self.ambient, smooth(sunlit)[self.pixels]])
         levels = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), columns.T @ self.grey)
         ambient, direct = np.maximum(levels, 0.0).tolist()
         return float(np.mean((self.grey - columns @ (ambient, direct)) ** 2)), ambient, direct
 
     def likely_suns(self) -> Array:
-        """Return the directions (n, 3), IRF, of the few suns that explain the image best, best first.
+        """Return the directions (n, 3), IRF, of the few suns that explain the image best, best
+        first.
 
-        The view is drawn once: in each direction only light and shadow of its samples are computed, two by two in a pixel.
+        The view is drawn once: in each direction only light and shadow of its samples are computed,
+        two by two in a pixel.
         """
         h, w = self.window.height, self.window.width
         fx, fy, cx, cy = self.window.lens
         fine = PixelWindow(2 * h, 2 * w, (2.0 * fx, 2.0 * fy, 2.0 * cx + 0.5, 2.0 * cy + 0.5))
-        view = render(self.mesh, self.pose, fine, Lighting(None, 0.0, 1.0, shadows=False), samples=1)
+        view = render(
+            self.mesh, self.pose, fine, Lighting(None, 0.0, 1.0, shadows=False), samples=1
+        )
         samples = np.flatnonzero(view.owner.ravel() >= 0)
         points = _points_in(self.mesh, self.pose, fine, view, samples)
         maps = self.mesh.few_suns
@@ -195,12 +221,16 @@ class _ComparedView:
 
 
 def smooth(grey: NDArray[Any]) -> Array:
-    """Return a view or image (h, w) without noise, as equally smooth as others, so that the lens' point spread does not count."""
+    """Return a view or image (h, w) without noise, as equally smooth as others, so that the lens'
+    point spread does not count.
+    """
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=float)
 
 
 def likely_lights(mesh: TrackerMesh, points: LitPoints) -> list[Lighting]:
-    """Return the light of the best directions that are at least ``_DISTINCT_RAD`` apart, likely ones first."""
+    """Return the light of the best directions that are at least ``_DISTINCT_RAD`` apart, likely
+    ones first.
+    """
     rated, towards = rate_suns(points, mesh.suns), mesh.suns.to_sun_trf
     chosen: list[int] = []
     for k in np.argsort(rated[:, 0]).tolist():
@@ -208,13 +238,18 @@ def likely_lights(mesh: TrackerMesh, points: LitPoints) -> list[Lighting]:
             towards[k] @ towards[other] < math.cos(_DISTINCT_RAD) for other in chosen
         ):
             chosen.append(k)
-    return [Lighting(points.rotation @ towards[k], float(rated[k, 2]), float(rated[k, 1])) for k in chosen]
+    return [
+        Lighting(points.rotation @ towards[k], float(rated[k, 2]), float(rated[k, 1]))
+        for k in chosen
+    ]
 
 
 def lit_points(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, most: int = _MOST_POINTS
 ) -> LitPoints | None:
-    """Return at most ``most`` points of the target with their grey levels, away from edges; None if there are too few."""
+    """Return at most ``most`` points of the target with their grey levels, away from edges; None if
+    there are too few.
+    """
     found = window_of(pyramid, level, mesh, pose)
     if found is None:
         return None
@@ -238,21 +273,30 @@ def _points_in(
     mesh: TrackerMesh, pose: PoseInCamera, window: PixelWindow, view: SyntheticView, pixels: NDArray[np.int64],
     grey: Array | float = 0.0,
 ) -> LitPoints:  # fmt: skip
-    """Return the points that n pixels (n,) of a view show, with their grey levels ``grey`` in the image."""
+    """Return the points that n pixels (n,) of a view show, with their grey levels ``grey`` in the
+    image.
+    """
     row, column = np.divmod(pixels, window.width)
     fx, fy, cx, cy = window.lens
     rays = np.column_stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(pixels))])
     at = rays / view.nearest.ravel()[pixels, None]
     to_camera = -(at / np.linalg.norm(at, axis=1, keepdims=True)) @ pose.rotation
     return points_on(
-        mesh, view.owner.ravel()[pixels], (at - pose.position) @ pose.rotation, to_camera, grey, pose.rotation
+        mesh,
+        view.owner.ravel()[pixels],
+        (at - pose.position) @ pose.rotation,
+        to_camera,
+        grey,
+        pose.rotation,
     )
 
 
 def points_on(
     mesh: TrackerMesh, owners: NDArray[np.integer], at_trf: Array, to_camera_trf: Array, grey: Array | float, rotation: Array
 ) -> LitPoints:  # fmt: skip
-    """Return n points on the triangles ``owners`` (n,), with grey levels (n,), at (n, 3), seen in directions (n, 3), all in TRF."""
+    """Return n points on the triangles ``owners`` (n,), with grey levels (n,), at (n, 3), seen in
+    directions (n, 3), all in TRF.
+    """
     rows = np.empty((len(owners), 14))
     rows[:, 0:3], rows[:, 3:6], rows[:, 6:9] = at_trf, mesh.mean_normals[owners], to_camera_trf
     rows[:, 9:12] = mesh.contiguous[3][owners]
@@ -262,7 +306,9 @@ def points_on(
 
 
 def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
-    """Return, for each of k directions of the sun, (k, 3): mean squared residual (robust), ambient and direct level."""
+    """Return, for each of k directions of the sun, (k, 3): mean squared residual (robust), ambient
+    and direct level.
+    """
     k, n = len(maps.to_sun_trf), len(points.rows)
     out, work = np.empty((k, 3)), np.empty(2 * n)
     function("rate_suns")(
@@ -273,7 +319,9 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
 
 
 def direct_light(points: LitPoints, maps: ShadowMaps, k: int) -> NDArray[np.float32]:
-    """Return the light (n,) that each of n points reflects of a sun of level 1 in the direction ``k`` of ``maps``."""
+    """Return the light (n,) that each of n points reflects of a sun of level 1 in the direction
+    ``k`` of ``maps``.
+    """
     out = np.empty(len(points.rows), np.float32)
     function("direct_light")(
         address(points.rows), c_int64(len(out)), (c_double * 3)(*maps.to_sun_trf[k]), (c_double * 12)(*maps.settings[k]),
@@ -282,7 +330,9 @@ def direct_light(points: LitPoints, maps: ShadowMaps, k: int) -> NDArray[np.floa
     return out
 
 
-def fit_light(mesh: TrackerMesh, points: LitPoints, previous: Lighting | None = None) -> Lighting | None:
+def fit_light(
+    mesh: TrackerMesh, points: LitPoints, previous: Lighting | None = None
+) -> Lighting | None:
     """Return the light that explains the points best; None for a dark image."""
     if previous is not None and previous.to_sun_irf is not None and not previous.weak:
         best = points.rotation.T @ previous.to_sun_irf
@@ -314,11 +364,17 @@ def _around(direction: Array, angle_rad: float) -> Array:
     across /= np.linalg.norm(across)
     turns = np.arange(8) * np.pi / 4.0
     ring = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(direction, across)
-    return np.concatenate([direction[None], np.cos(angle_rad) * direction + np.sin(angle_rad) * ring])
+    return np.concatenate(
+        [direction[None], np.cos(angle_rad) * direction + np.sin(angle_rad) * ring]
+    )
 
 
-def appearance(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, light: Lighting) -> float:
-    """Return the correlation, -1 to 1, of a synthetic view with the image, on the target and a border of two pixels."""
+def appearance(
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, light: Lighting
+) -> float:
+    """Return the correlation, -1 to 1, of a synthetic view with the image, on the target and a
+    border of two pixels.
+    """
     found = window_of(pyramid, level, mesh, pose)
     if found is None:
         return -1.0
@@ -328,7 +384,9 @@ def appearance(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: i
     synthetic, _ = in_grey_levels(view, patch)
     compared = cv2.dilate(view.coverage, np.ones((5, 5))) > 0.0
     # Equally smooth, so that noise and the lens' point spread do not count.
-    a, b = (cv2.GaussianBlur(grey, (0, 0), 1.0)[compared].astype(float) for grey in (synthetic, patch))
+    a, b = (
+        cv2.GaussianBlur(grey, (0, 0), 1.0)[compared].astype(float) for grey in (synthetic, patch)
+    )
     a, b = a - a.mean(), b - b.mean()
     power = float(a @ a) * float(b @ b)
     return float(a @ b) / float(np.sqrt(power)) if power > 0.0 else -1.0

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from ..native import function
 
 _CREASE_COSINE = 0.8
-"""Normals are smoothed over edges of a smaller angle, 37 degrees: facets of a cylinder, not the edges of a box."""
+"""Normals are smoothed over edges of a smaller angle, 37 degrees: facets of a cylinder, not the
+edges of a box.
+"""
 
 MAX_TRIANGLES = 200_000
 
@@ -29,12 +31,14 @@ SCALE_SIGMA = 0.003
 """Standard deviation of the scale of a target's known shape."""
 
 _PLAIN_TEXTURE, _FOIL_TEXTURE = 0.1, 0.3
-"""Relative standard deviation of grey levels by texture that the mesh does not have: of plain surfaces, and of wrinkled foil."""
+"""Relative standard deviation of grey levels by texture that the mesh does not have: of plain
+surfaces, and of wrinkled foil.
+"""
 _FOIL_SLOPE = 0.35
 """Standard deviation of the slopes of wrinkled foil, which widen its highlights."""
 _CELLS_BORDER_M = 0.0002
-"""Standard deviation of where points of the border of solar cells are seen, beside what all have in common (mode ``rim``): the known
-mesh does not have the grid."""
+"""Standard deviation of where points of the border of solar cells are seen, beside what all have in
+common (mode ``rim``): the known mesh does not have the grid."""
 NO_PATTERN, CELLS, WRINKLES = 0, 1, 2
 """Patterns of a surface that the known mesh does not have."""
 _SUNS, _SUN_TEXELS = 400, 64
@@ -47,7 +51,9 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True)
 class ShadowMaps:
-    """Depth maps (k, size, size) of a mesh towards k directions (k, 3), unit vectors in TRF; ``settings`` (k, 12): native/mesh.c."""
+    """Depth maps (k, size, size) of a mesh towards k directions (k, 3), unit vectors in TRF;
+    ``settings`` (k, 12): native/mesh.c.
+    """
 
     to_sun_trf: Array
     settings: Array
@@ -63,7 +69,9 @@ def spread_directions(n: int) -> Array:
 
 
 def _surface(material: Material) -> tuple[float, float, float, float]:
-    """Return reflectance, gloss, exponent and texture of a material. Wrinkles widen the highlights of foil and weaken them."""
+    """Return reflectance, gloss, exponent and texture of a material. Wrinkles widen the highlights
+    of foil and weaken them.
+    """
     if material.texture != "insulation":
         return material.diffuse, material.specular, material.shininess, _PLAIN_TEXTURE
     # A lobe of exponent m has a variance of about 1 / m.
@@ -76,12 +84,13 @@ def _surface(material: Material) -> tuple[float, float, float, float]:
 class TrackerMesh:
     """A closed triangle mesh with one material per triangle.
 
-    ``vertices_m`` (n, 3) in TRF; ``triangles`` (m, 3) int64, counter-clockwise seen from outside; ``reflectance`` (m,), 0 to 1.
-    ``modes_m`` (k, n, 3): displacement of the vertices by one standard deviation of each of k independent errors of the
-    geometry, such as the angle of a panel. ``gloss`` (m, 2): specular reflectance and Blinn's exponent, empty for dull surfaces;
-    ``texture`` (m,): relative standard deviation of the grey levels by texture, empty for that of plain surfaces;
-    ``border_m`` (m,): standard deviation of where the borders of a surface are seen, empty for none.
-    Raises MeshError for arrays that are not such a mesh.
+    ``vertices_m`` (n, 3) in TRF; ``triangles`` (m, 3) int64, counter-clockwise seen from outside;
+    ``reflectance`` (m,), 0 to 1. ``modes_m`` (k, n, 3): displacement of the vertices by one
+    standard deviation of each of k independent errors of the geometry, such as the angle of a
+    panel. ``gloss`` (m, 2): specular reflectance and Blinn's exponent, empty for dull surfaces;
+    ``texture`` (m,): relative standard deviation of the grey levels by texture, empty for that of
+    plain surfaces; ``border_m`` (m,): standard deviation of where the borders of a surface are
+    seen, empty for none. Raises MeshError for arrays that are not such a mesh.
     """
 
     vertices_m: Array
@@ -95,34 +104,53 @@ class TrackerMesh:
     def __post_init__(self) -> None:
         vertices, triangles, reflectance = self.vertices_m, self.triangles, self.reflectance
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.all(np.isfinite(vertices)):
-            raise MeshError(f"vertices must be finite numbers of shape (n, 3), not {vertices.shape}")
-        if triangles.ndim != 2 or triangles.shape[1:] != (3,) or not 4 <= len(triangles) <= MAX_TRIANGLES:
+            raise MeshError(
+                f"vertices must be finite numbers of shape (n, 3), not {vertices.shape}"
+            )
+        if (
+            triangles.ndim != 2
+            or triangles.shape[1:] != (3,)
+            or not 4 <= len(triangles) <= MAX_TRIANGLES
+        ):
             raise MeshError(
                 f"a tracker mesh has 4 to {MAX_TRIANGLES} triangles of shape (m, 3), not {triangles.shape}; simplify the mesh"
             )
         if triangles.min() < 0 or triangles.max() >= len(vertices):
             raise MeshError(f"triangles must index the {len(vertices)} vertices")
-        if reflectance.shape != (len(triangles),) or not np.all((reflectance >= 0.0) & (reflectance <= 1.0)):
+        if reflectance.shape != (len(triangles),) or not np.all(
+            (reflectance >= 0.0) & (reflectance <= 1.0)
+        ):
             raise MeshError(f"reflectance must be {len(triangles)} numbers from 0 to 1")
         for name, values, shape in (
             ("gloss", self.gloss, (len(triangles), 2)),
             ("texture", self.texture, (len(triangles),)),
             ("border_m", self.border_m, (len(triangles),)),
         ):
-            if len(values) and not (values.shape == shape and np.all((values >= 0.0) & (values < 1000.0))):
+            if len(values) and not (
+                values.shape == shape and np.all((values >= 0.0) & (values < 1000.0))
+            ):
                 raise MeshError(f"{name} must be numbers from 0 to 1000 of shape {shape}")
         if len(self.modes_m) and self.modes_m.shape[1:] != vertices.shape:
-            raise MeshError(f"modes must have shape (k, {len(vertices)}, 3), not {self.modes_m.shape}")
+            raise MeshError(
+                f"modes must have shape (k, {len(vertices)}, 3), not {self.modes_m.shape}"
+            )
 
     @classmethod
     def of_boxes(cls, boxes: Sequence[Box], scale_sigma: float = SCALE_SIGMA) -> TrackerMesh:
-        """Return the mesh of cuboids in TRF, eight vertices each; its mode is an error of the scale, if not 0."""
+        """Return the mesh of cuboids in TRF, eight vertices each; its mode is an error of the
+        scale, if not 0.
+        """
         vertices = np.concatenate(
-            [rotations.rotate(np.array(b.q_wxyz), cuboid_corners(b.size_m)) + b.position_m for b in boxes]
+            [
+                rotations.rotate(np.array(b.q_wxyz), cuboid_corners(b.size_m)) + b.position_m
+                for b in boxes
+            ]
         )
         triangles = np.concatenate([BOX_TRIANGLES + 8 * i for i in range(len(boxes))])
         shade = np.repeat([b.shade for b in boxes], len(BOX_TRIANGLES))
-        modes = np.array([scale_sigma * vertices] if scale_sigma > 0.0 else []).reshape(-1, len(vertices), 3)
+        modes = np.array([scale_sigma * vertices] if scale_sigma > 0.0 else []).reshape(
+            -1, len(vertices), 3
+        )
         return cls(vertices, triangles, shade, modes)
 
     @classmethod
@@ -133,7 +161,9 @@ class TrackerMesh:
             [p.triangles + first for p, first in zip(mesh.parts, counts[:-1], strict=True)]
         )
         surfaces = np.repeat(
-            [_surface(p.material) for p in mesh.parts], [len(p.triangles) for p in mesh.parts], axis=0
+            [_surface(p.material) for p in mesh.parts],
+            [len(p.triangles) for p in mesh.parts],
+            axis=0,
         )
 
         known = np.concatenate([part.vertices_m for part in mesh.parts])
@@ -143,13 +173,21 @@ class TrackerMesh:
             [len(p.triangles) for p in mesh.parts],
         )
         return cls(
-            known, triangles.astype(np.int64), surfaces[:, 0], modes, surfaces[:, 1:3], surfaces[:, 3], border
+            known,
+            triangles.astype(np.int64),
+            surfaces[:, 0],
+            modes,
+            surfaces[:, 1:3],
+            surfaces[:, 3],
+            border,
         )
 
     def corrected(self, mean: Array, covariance: Array) -> TrackerMesh:
-        """Return the mesh after its modes have been estimated: ``mean`` (k,) and ``covariance`` (k, k), standard deviations of now.
+        """Return the mesh after its modes have been estimated: ``mean`` (k,) and ``covariance`` (k,
+        k), standard deviations of now.
 
-        Its modes are the columns of the lower Cholesky factor of the covariance. The coarse shadow maps are kept.
+        Its modes are the columns of the lower Cholesky factor of the covariance. The coarse shadow
+        maps are kept.
         """
         factor = np.linalg.cholesky(covariance)
         new = replace(
@@ -162,7 +200,9 @@ class TrackerMesh:
 
     @cached_property
     def contiguous(self) -> tuple[Array, NDArray[np.int64], Array, Array]:
-        """Vertices, triangles, corner normals (m, 3, 3) and surfaces (m, 3): reflectance, gloss, exponent; as kernels take them."""
+        """Vertices, triangles, corner normals (m, 3, 3) and surfaces (m, 3): reflectance, gloss,
+        exponent; as kernels take them.
+        """
         gloss = self.gloss if len(self.gloss) else np.zeros((len(self.triangles), 2))
         return (
             np.array(self.vertices_m, dtype=float, order="C"),
@@ -177,13 +217,17 @@ class TrackerMesh:
         return self.texture if len(self.texture) else np.full(len(self.triangles), _PLAIN_TEXTURE)
 
     def border_of(self, owners: NDArray[np.int64]) -> Array:
-        """Return the standard deviation (n,), m, of where the borders of the triangles ``owners`` (n,) are seen."""
+        """Return the standard deviation (n,), m, of where the borders of the triangles ``owners``
+        (n,) are seen.
+        """
         return self.border_m[owners] if len(self.border_m) else np.zeros(len(owners))
 
     @cached_property
     def patterns(self) -> NDArray[np.int64]:
         """Pattern (m,) of the surface of each triangle: none, solar cells, or wrinkles."""
-        cells = self.border_m > 0.0 if len(self.border_m) else np.zeros(len(self.triangles), dtype=bool)
+        cells = (
+            self.border_m > 0.0 if len(self.border_m) else np.zeros(len(self.triangles), dtype=bool)
+        )
         wrinkled = self.texture_share >= _FOIL_TEXTURE
         return np.where(cells, CELLS, np.where(wrinkled, WRINKLES, NO_PATTERN))
 
@@ -204,14 +248,18 @@ class TrackerMesh:
         return self.shadow_maps(spread_directions(_FEW_SUNS), _FEW_SUN_TEXELS)
 
     def shadow_maps(self, to_sun_trf: Array, texels: int) -> ShadowMaps:
-        """Return a shadow map of ``texels`` squared for each of k unit vectors (k, 3) to the sun in TRF."""
+        """Return a shadow map of ``texels`` squared for each of k unit vectors (k, 3) to the sun in
+        TRF.
+        """
         k = len(to_sun_trf)
         axis = np.eye(3)[np.argmin(np.abs(to_sun_trf), axis=1)]
         right = np.cross(axis, to_sun_trf)
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         per_m = 0.49 * texels / self.radius_m
         settings = np.empty((k, 12))
-        settings[:, :9] = np.stack([right, np.cross(to_sun_trf, right), to_sun_trf], axis=1).reshape(k, 9)
+        settings[:, :9] = np.stack(
+            [right, np.cross(to_sun_trf, right), to_sun_trf], axis=1
+        ).reshape(k, 9)
         settings[:, 9:] = per_m, texels, 1.5 / per_m
         depths = np.empty((k, texels, texels), np.float32)
         vertices, triangles, _, _ = self.contiguous
@@ -227,7 +275,9 @@ class TrackerMesh:
         return float(np.linalg.norm(self.vertices_m, axis=1).max())
 
     def mode_displacements(self, owners: NDArray[np.int64], points_m: Array) -> Array:
-        """Return the displacements (k, n, 3) by each mode of points (n, 3) on the triangles ``owners`` (n,)."""
+        """Return the displacements (k, n, 3) by each mode of points (n, 3) on the triangles
+        ``owners`` (n,).
+        """
         if not len(self.modes_m):
             return np.zeros((0, len(points_m), 3))
         corners = self.triangles[owners]
@@ -259,5 +309,7 @@ class TrackerMesh:
         total = np.zeros((len(corner_place), 3))
         np.add.at(total, corner[smooth], facing[other[smooth]])
         length = np.linalg.norm(total, axis=1, keepdims=True)
-        normals = np.where(length > 1e-30, total / np.maximum(length, 1e-30), np.repeat(unit, 3, axis=0))
+        normals = np.where(
+            length > 1e-30, total / np.maximum(length, 1e-30), np.repeat(unit, 3, axis=0)
+        )
         return np.ascontiguousarray(normals.reshape(-1, 3, 3))

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Perception `model`: acquire and track a target by its shape, and return to acquisition when the gate rejects it."""
+"""Perception `model`: acquire and track a target by its shape, and return to acquisition when the
+gate rejects it.
+"""
 
 from __future__ import annotations
 
@@ -39,24 +41,32 @@ _KEY_EVERY = 8
 _KEY_TURN_RAD = 0.04
 """Points of a view are not reused when the target has turned by more since."""
 _STOPGAP_TURN_RAD = 0.08
-"""Where the gate rejects a new view, as in changing weak light, the points of the one before are reused up to this turn."""
+"""Where the gate rejects a new view, as in changing weak light, the points of the one before are
+reused up to this turn.
+"""
 _LOST_AFTER = 3
 """Number of images in a row without a valid pose after which a track ends."""
 _PER_IMAGE_MS = 30.0
-"""Expected CPU time per image, beyond which work is continued at the next one; a first step may take longer."""
+"""Expected CPU time per image, beyond which work is continued at the next one; a first step may
+take longer.
+"""
 _POINTS_MS = 6.0
 _MOST_WAITING = 120
-"""Number of images that wait until an acquisition has ended; beyond, it is given up for one of the newest image."""
+"""Number of images that wait until an acquisition has ended; beyond, it is given up for one of the
+newest image.
+"""
 _MOST_WAITING_PREDICTED, _MOST_FAILED = 30, 15
-"""The same where a pose is predicted; number of images in a row in which a start from it fails before an acquisition is tried."""
+"""The same where a pose is predicted; number of images in a row in which a start from it fails
+before an acquisition is tried.
+"""
 _WORSE = 0.1
 """An ambiguous pose is dropped when its score falls this far below the best one's."""
 
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """One hypothesis: last alignment and light, the pose before it, and the numbers of images since its view and since it was
-    valid."""
+    """One hypothesis: last alignment and light, the pose before it, and the numbers of images since
+    its view and since it was valid."""
 
     last: Alignment
     light: Lighting
@@ -65,7 +75,9 @@ class PoseTrack:
     missed: int = 0
 
     def predicted(self) -> PoseInCamera:
-        """Return the pose in the next image at a constant rate per image; the last pose after a miss."""
+        """Return the pose in the next image at a constant rate per image; the last pose after a
+        miss.
+        """
         now = self.last.pose
         if self.before is None or self.missed:
             return now
@@ -76,21 +88,25 @@ class PoseTrack:
 
 @dataclass(frozen=True)
 class _WaitingImage:
-    """An image (h, w) and the pose that others predict in it, position (3,) and rotation (4,), if any."""
+    """An image (h, w) and the pose that others predict in it, position (3,) and rotation (4,), if
+    any.
+    """
 
     image: NDArray[np.uint8]
     predicted: tuple[ArrayLike, ArrayLike] | None
 
 
 class ModelPerception:
-    """Estimates the pose of the target from its shape. Stateful: equal sequences of images give equal results.
+    """Estimates the pose of the target from its shape. Stateful: equal sequences of images give
+    equal results.
 
-    Work that takes longer than the time of an image is spread over several: an acquisition, or starts around a lost pose. Until it
-    ends, images wait and give no solution; then the target is tracked through them, several at each new image, up to the newest one.
-    Without a track, a pose that others predict is tried first; an acquisition follows when that has failed for about a second.
-    One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be shared. With ``single_images``, which
-    do not follow each other, an acquisition ends in the image in which it begins. ``solutions`` are ambiguous poses, the best
-    first, and without markers.
+    Work that takes longer than the time of an image is spread over several: an acquisition, or
+    starts around a lost pose. Until it ends, images wait and give no solution; then the target is
+    tracked through them, several at each new image, up to the newest one. Without a track, a pose
+    that others predict is tried first; an acquisition follows when that has failed for about a
+    second. One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be
+    shared. With ``single_images``, which do not follow each other, an acquisition ends in the image
+    in which it begins. ``solutions`` are ambiguous poses, the best first, and without markers.
     """
 
     def __init__(
@@ -112,17 +128,25 @@ class ModelPerception:
         self._correction: GeometryCorrection | None = None
 
     def prepare(self) -> None:
-        """Compute what depends on the mesh alone; takes one to two seconds, which the first image would take otherwise."""
+        """Compute what depends on the mesh alone; takes one to two seconds, which the first image
+        would take otherwise.
+        """
         self._acquisition.prepare()
         _ = self.mesh.suns, self.mesh.few_suns
 
     def correct_geometry(self, mean: Array, covariance: Array) -> None:
-        """Correct the mesh by its estimated errors (k,) with covariance (k, k), in its standard deviations; tracks go on.
+        """Correct the mesh by its estimated errors (k,) with covariance (k, k), in its standard
+        deviations; tracks go on.
 
-        Raises ValueError for another number of errors than the mesh has, or a covariance that is not positive definite.
+        Raises ValueError for another number of errors than the mesh has, or a covariance that is
+        not positive definite.
         """
         k = len(self._uncorrected.modes_m)
-        if mean.shape != (k,) or covariance.shape != (k, k) or not np.linalg.eigvalsh(covariance)[0] > 0.0:
+        if (
+            mean.shape != (k,)
+            or covariance.shape != (k, k)
+            or not np.linalg.eigvalsh(covariance)[0] > 0.0
+        ):
             raise ValueError(f"the mesh has {k} errors; {len(mean)} or their covariance do not fit")
         if self._correction is not None and self._correction.is_of(mean):
             return
@@ -131,7 +155,8 @@ class ModelPerception:
         if self._tracks:
             self._work = None  # begins again, with this mesh
         self._tracks = tuple(
-            replace(t, last=replace(t.last, modes=np.zeros(k)), age=_KEY_EVERY) for t in self._tracks
+            replace(t, last=replace(t.last, modes=np.zeros(k)), age=_KEY_EVERY)
+            for t in self._tracks
         )
 
     def reset(self) -> None:
@@ -144,13 +169,18 @@ class ModelPerception:
     ) -> PerceptionResult:
         """Estimate the target's pose in a grey image (h, w), uint8.
 
-        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; used as a start while there is no track.
+        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; used as
+        a start while there is no track.
 
         Raises ValueError for an image of another shape or type than the camera's.
         """
         shape = (self.camera.height_px, self.camera.width_px)
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
-            got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            got = (
+                f"{image.dtype} {image.shape}"
+                if isinstance(image, np.ndarray)
+                else type(image).__name__
+            )
             raise ValueError(f"expected a uint8 image of {shape}, got {got}")
         if len(self._waiting) >= (
             _MOST_WAITING if self._tracks or predicted is None else _MOST_WAITING_PREDICTED
@@ -164,11 +194,13 @@ class ModelPerception:
         valid = [_target_pose(t.last) for t in tracks if t.missed == 0]
         geometry = self._geometry() if tracks else None
         no_ids, no_corners = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
-        return PerceptionResult(tuple(valid), no_ids, no_corners, (), geometry, acquiring=bool(self._waiting))
+        return PerceptionResult(
+            tuple(valid), no_ids, no_corners, (), geometry, acquiring=bool(self._waiting)
+        )
 
     def _geometry(self) -> GeometryInformation | None:
-        """Return what the image tells about the errors of the mesh before corrections, if there is one track; without information
-        for any pose if its view is not new."""
+        """Return what the image tells about the errors of the mesh before corrections, if there is
+        one track; without information for any pose if its view is not new."""
         if len(self._tracks) != 1 or self._tracks[0].missed:
             return None
         found = self._tracks[0].last.geometry
@@ -213,19 +245,26 @@ class ModelPerception:
         lost_after = _LOST_AFTER if waiting.predicted is None else 1
         self._tracks = _distinct([t for t in updated if t.missed < lost_after])
 
-    def _start(self, pyramid: Pyramid, position: ArrayLike, q: ArrayLike) -> Steps[tuple[PoseTrack, ...]]:
+    def _start(
+        self, pyramid: Pyramid, position: ArrayLike, q: ArrayLike
+    ) -> Steps[tuple[PoseTrack, ...]]:
         """Return the track that begins near a predicted pose, if the gate accepts one."""
-        prior = PoseInCamera(np.array(position, dtype=float), rotations.to_matrix(np.array(q, dtype=float)))
+        prior = PoseInCamera(
+            np.array(position, dtype=float), rotations.to_matrix(np.array(q, dtype=float))
+        )
         found = yield from prior_steps(pyramid, self.mesh, prior)
         return (PoseTrack(*found),) if found is not None and is_valid(found[0]) else ()
 
 
 def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[PoseTrack]:
-    """Return a track after the next image: with the points of its view while they hold, else by a new view, else with the old
-    points once more, else from a rough prior; before it is lost, from several starts."""
+    """Return a track after the next image: with the points of its view while they hold, else by a
+    new view, else with the old points once more, else from a rough prior; before it is lost, from
+    several starts."""
     prior, modes = track.predicted(), track.last.modes
     missed = replace(track, missed=track.missed + 1)
-    fresh = track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
+    fresh = (
+        track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
+    )
     # The light of a new view is estimated in the image before, which leaves more time for the view.
     view_is_next = track.age + 2 == _KEY_EVERY
     if fresh and not track.missed:
@@ -255,20 +294,26 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
         return PoseTrack(*refined)
     if missed.missed < _LOST_AFTER:
         return missed
-    found = yield from start_steps(pyramid, mesh, starts_around(prior), refined[1] if refined else light)
+    found = yield from start_steps(
+        pyramid, mesh, starts_around(prior), refined[1] if refined else light
+    )
     return PoseTrack(found, light) if is_valid(found) else missed
 
 
 def _light_near(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting
 ) -> Steps[Lighting | None]:
-    """Return, in steps, the light on a target at ``pose`` near a previous one; None if too little of the target is in view."""
+    """Return, in steps, the light on a target at ``pose`` near a previous one; None if too little
+    of the target is in view.
+    """
     levels = levels_of(pyramid, mesh, pose)
     return (yield from light_steps(pyramid, mesh, pose, levels[0], light)) if levels else None
 
 
 def _distinct(tracks: list[PoseTrack]) -> tuple[PoseTrack, ...]:
-    """Return the tracks, best first, without those that have become equal to a better one or much worse than the best."""
+    """Return the tracks, best first, without those that have become equal to a better one or much
+    worse than the best.
+    """
     kept: list[PoseTrack] = []
     for track in sorted(tracks, key=lambda t: (t.missed > 0, -t.last.score)):
         if kept and (track.missed or track.last.score < kept[0].last.score - _WORSE):

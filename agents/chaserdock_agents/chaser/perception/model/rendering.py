@@ -23,9 +23,10 @@ _NO_SHADOW = np.zeros(1, dtype=np.float32)
 class Lighting:
     """Light on the target, up to an unknown common factor.
 
-    ``to_sun_irf`` (3,): unit vector to the sun in IRF; None: the only directed light is the lamp at the lens. ``direct`` and
-    ``ambient``: shares of the directed light and of light from all directions. ``shadows``: whether the target casts
-    shadows on itself. ``weak``: a sun that lights little of what is visible.
+    ``to_sun_irf`` (3,): unit vector to the sun in IRF; None: the only directed light is the lamp at
+    the lens. ``direct`` and ``ambient``: shares of the directed light and of light from all
+    directions. ``shadows``: whether the target casts shadows on itself. ``weak``: a sun that lights
+    little of what is visible.
     """
 
     to_sun_irf: Array | None
@@ -37,7 +38,9 @@ class Lighting:
 
 @dataclass(frozen=True)
 class PixelWindow:
-    """A rectangle of the grid of ideal pixels of an image level: pinhole (fx, fy, cx, cy) relative to its first pixel."""
+    """A rectangle of the grid of ideal pixels of an image level: pinhole (fx, fy, cx, cy) relative
+    to its first pixel.
+    """
 
     height: int
     width: int
@@ -46,8 +49,9 @@ class PixelWindow:
 
 @dataclass(frozen=True)
 class SyntheticView:
-    """A rendering, each array (h, w): ``grey``, reflectance times light, times ``coverage``, the share that the target covers;
-    ``nearest``: inverse depth, 1/m, 0 for none; ``owner``: triangle or -1."""
+    """A rendering, each array (h, w): ``grey``, reflectance times light, times ``coverage``, the
+    share that the target covers; ``nearest``: inverse depth, 1/m, 0 for none; ``owner``: triangle
+    or -1."""
 
     grey: NDArray[np.float32]
     coverage: NDArray[np.float32]
@@ -84,7 +88,10 @@ def render(
         if light.shadows:
             maps = mesh.shadow_maps((pose.rotation.T @ light.to_sun_irf)[None], _SHADOW_TEXELS)
             shadow_settings, depth = tuple(maps.settings[0].tolist()), maps.depths
-    facing, work = np.empty((len(triangles), 3)), np.empty(3 * samples * samples * h * w, np.float32)
+    facing, work = (
+        np.empty((len(triangles), 3)),
+        np.empty(3 * samples * samples * h * w, np.float32),
+    )
     function("render_mesh")(
         (c_double * 4)(*window.lens), c_int64(h), c_int64(w), c_int64(samples), address(at),
         address(vertices), address(triangles), address(normals), address(surfaces), c_int64(len(triangles)),

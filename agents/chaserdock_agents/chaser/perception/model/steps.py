@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that is spread over several images: generators that state the expected CPU time of each step before they take it."""
+"""Work that is spread over several images: generators that state the expected CPU time of each step
+before they take it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from typing import TypeVar
 T = TypeVar("T")
 
 Steps = Generator[float, None, T]
-"""Yields the expected CPU time of the next step, ms, and returns a result. The time decides only how work is spread."""
+"""Yields the expected CPU time of the next step, ms, and returns a result. The time decides only
+how work is spread.
+"""
 
 LIGHT_MS = 5.0
 """Time to estimate the light by points."""
@@ -31,10 +35,14 @@ def result_of(steps: Steps[T]) -> T:
 
 
 def level_ms(area_px: float) -> float:
-    """Return the time to render a level on a window of ``area_px`` pixels and to align its control points."""
+    """Return the time to render a level on a window of ``area_px`` pixels and to align its control
+    points.
+    """
     return _LEVEL_MS + _MS_PER_PX * area_px
 
 
 def compared_ms(area_px: float) -> float:
-    """Return the time to render a view on a window of ``area_px`` pixels and to compare it with the image."""
+    """Return the time to render a view on a window of ``area_px`` pixels and to compare it with the
+    image.
+    """
     return _COMPARED_MS + _COMPARED_MS_PER_PX * area_px

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Track a pose from a prior: coarse to fine alignment, validity gate, several starts. Pure functions."""
+"""Track a pose from a prior: coarse to fine alignment, validity gate, several starts. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -33,36 +35,49 @@ MIN_INLIER_SHARE = 0.66
 MIN_SCORE = 0.56
 """Gate: a smaller product of inlier share and mean correlation rejects a pose."""
 MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
-"""Gate: a larger standard deviation in any direction, of position as a share of the range, rejects a pose."""
+"""Gate: a larger standard deviation in any direction, of position as a share of the range, rejects
+a pose.
+"""
 _FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 600_000, 12_000, 24_000
 _LARGEST_PX = (NEAR_PX, 740.0)
-"""Largest diameter of the target at the finest level, in pixels of it: if that is the image's own, or a coarser one. Nearer targets
-are aligned at a coarser level: they show texture that the mesh does not have at the size of profiles, and a whole image of them
-takes the most time."""
+"""Largest diameter of the target at the finest level, in pixels of it: if that is the image's own,
+or a coarser one. Nearer targets are aligned at a coarser level: they show texture that the mesh
+does not have at the size of profiles, and a whole image of them takes the most time."""
 _FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
 _START_SHARE, _START_RAD = 0.02, math.radians(3.0)
 _SETTLED_SHARE, _SETTLED_RAD, _MOST_REPEATED = 0.85, math.radians(0.5), 3
-"""A pose from a rough prior is settled within this turn from the view that it comes from; light and view are repeated until it is,
-at most three times, and once for a smaller share of inliers. One that still turns is rejected."""
+"""A pose from a rough prior is settled within this turn from the view that it comes from; light and
+view are repeated until it is, at most three times, and once for a smaller share of inliers. One
+that still turns is rejected."""
 _EVEN_LIGHT = Lighting(None, 0.0, 1.0, shadows=False)
 """Light from everywhere."""
 
 
 def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
-    """Return whether an alignment passes the gate: enough inliers, well correlated, and a pose that is observable."""
-    if alignment is None or alignment.inlier_share < MIN_INLIER_SHARE or alignment.score < MIN_SCORE:
+    """Return whether an alignment passes the gate: enough inliers, well correlated, and a pose that
+    is observable.
+    """
+    if (
+        alignment is None
+        or alignment.inlier_share < MIN_INLIER_SHARE
+        or alignment.score < MIN_SCORE
+    ):
         return False
     position_m = math.sqrt(float(np.linalg.eigvalsh(alignment.covariance[:3, :3])[-1]))
     attitude_rad = math.sqrt(float(np.linalg.eigvalsh(alignment.covariance[3:, 3:])[-1]))
     range_m = float(np.linalg.norm(alignment.pose.position))
-    return position_m <= MAX_POSITION_SIGMA_SHARE * range_m and attitude_rad <= MAX_ATTITUDE_SIGMA_RAD
+    return (
+        position_m <= MAX_POSITION_SIGMA_SHARE * range_m and attitude_rad <= MAX_ATTITUDE_SIGMA_RAD
+    )
 
 
 def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[int, ...]:
-    """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is out of view.
+    """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is
+    out of view.
 
-    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded time, and at most ``_LARGEST_PX``
-    wide, of which it may show a part; small targets are upsampled twice.
+    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded
+    time, and at most ``_LARGEST_PX`` wide, of which it may show a part; small targets are upsampled
+    twice.
     """
     found = window_of(pyramid, 0, mesh, pose)
     if found is None:
@@ -87,7 +102,9 @@ def pose_steps(
     first_reach_px: int = _FIRST_REACH_PX,
     modes: Array | None = None,
 ) -> Steps[Alignment | None]:
-    """Align the mesh with an image from ``prior``, one level in each step; None without an alignment at the last level."""
+    """Align the mesh with an image from ``prior``, one level in each step; None without an
+    alignment at the last level.
+    """
     pose, alignment = prior, None
     for number, k in enumerate(levels):
         yield view_ms(pyramid, mesh, pose, k)
@@ -95,7 +112,9 @@ def pose_steps(
         alignment = (
             None
             if points is None
-            else align(pyramid, points, pose, first_reach_px if number == 0 else _NEXT_REACH_PX, modes)
+            else align(
+                pyramid, points, pose, first_reach_px if number == 0 else _NEXT_REACH_PX, modes
+            )
         )
         if alignment is not None:
             pose, modes = alignment.pose, alignment.modes
@@ -105,7 +124,9 @@ def pose_steps(
 def refine_from_prior(
     pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
 ) -> tuple[Alignment, Lighting] | None:
-    """Return the pose near ``prior`` and the light, neither of which needs to be known well; None without an alignment."""
+    """Return the pose near ``prior`` and the light, neither of which needs to be known well; None
+    without an alignment.
+    """
     return result_of(prior_steps(pyramid, mesh, prior, modes))
 
 
@@ -114,8 +135,9 @@ def prior_steps(
 ) -> Steps[tuple[Alignment, Lighting] | None]:
     """Do what `refine_from_prior` does, in steps; None also for a pose that does not settle.
 
-    Starts from light from everywhere, for a prior that may be far off. If that explains the image badly, as where sunlight only
-    grazes the target, starts from the light at the prior as well, and returns the better one.
+    Starts from light from everywhere, for a prior that may be far off. If that explains the image
+    badly, as where sunlight only grazes the target, starts from the light at the prior as well, and
+    returns the better one.
     """
     found = yield from rough_prior_steps(pyramid, mesh, prior, modes)
     levels = levels_of(pyramid, mesh, prior)
@@ -131,10 +153,11 @@ def prior_steps(
 def rough_prior_steps(
     pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
 ) -> Steps[tuple[Alignment, Lighting] | None]:
-    """Return pose and light, starting from light from everywhere; None also for a pose that does not settle.
+    """Return pose and light, starting from light from everywhere; None also for a pose that does
+    not settle.
 
-    The outline and the borders of materials give a coarse pose; from it follows the light, which improves the coarse pose, which
-    improves the light.
+    The outline and the borders of materials give a coarse pose; from it follows the light, which
+    improves the coarse pose, which improves the light.
     """
     levels = levels_of(pyramid, mesh, prior)
     if not levels:
@@ -153,16 +176,22 @@ def rough_prior_steps(
 def _settling_steps(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting, levels: tuple[int, ...], modes: Array | None
 ) -> Steps[tuple[Alignment, Lighting] | None]:  # fmt: skip
-    """Align the two finest levels, and improve light and pose again until the pose settles; None if it does not."""
+    """Align the two finest levels, and improve light and pose again until the pose settles; None if
+    it does not.
+    """
     fine = yield from pose_steps(pyramid, mesh, pose, light, levels[-2:], _NEXT_REACH_PX, modes)
     for number in range(_MOST_REPEATED):
         if fine is None or _is_settled(fine, 0.0 if number else _SETTLED_SHARE):
             break
-        # The light of a coarse pose that is wrong by degrees is wrong as well, and leaves the fine one between the two.
+        # The light of a coarse pose that is wrong by degrees is wrong as well, and leaves the fine
+        # one between the two.
         light = (yield from light_steps(pyramid, mesh, fine.pose, levels[0], by_view=True)) or light
-        fine = yield from pose_steps(pyramid, mesh, fine.pose, light, levels[-2:], _NEXT_REACH_PX, fine.modes)
+        fine = yield from pose_steps(
+            pyramid, mesh, fine.pose, light, levels[-2:], _NEXT_REACH_PX, fine.modes
+        )
         if fine is not None and not _is_settled(fine):
-            # Of few points the coarser level turns a pose away by more than that, and the finest one back.
+            # Of few points the coarser level turns a pose away by more than that, and the finest
+            # one back.
             fine = yield from pose_steps(
                 pyramid, mesh, fine.pose, light, levels[-1:], _NEXT_REACH_PX, fine.modes
             )
@@ -170,7 +199,9 @@ def _settling_steps(
 
 
 def _is_settled(alignment: Alignment, least_share: float = 0.0) -> bool:
-    """Return whether a pose hardly turned from that of its view, and at least ``least_share`` of the points agree with it."""
+    """Return whether a pose hardly turned from that of its view, and at least ``least_share`` of
+    the points agree with it.
+    """
     turned_rad = turn_between(alignment.pose, alignment.points.pose)
     return alignment.inlier_share >= least_share and turned_rad <= _SETTLED_RAD
 
@@ -183,7 +214,9 @@ def track_points(
 
 
 def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
-    """Return twelve poses around ``prior``: turned by 3 degrees about each axis, moved by 2 % of the range along each."""
+    """Return twelve poses around ``prior``: turned by 3 degrees about each axis, moved by 2 % of
+    the range along each.
+    """
     starts, step_m = [], _START_SHARE * float(np.linalg.norm(prior.position))
     for axis, sign in itertools.product(range(3), (1.0, -1.0)):
         unit = sign * np.eye(3)[axis]
@@ -196,7 +229,9 @@ def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
 def start_steps(
     pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
 ) -> Steps[Alignment | None]:
-    """Return the best alignment from several starts, in steps: all at the coarsest level, the best three at all levels."""
+    """Return the best alignment from several starts, in steps: all at the coarsest level, the best
+    three at all levels.
+    """
     coarse: list[Alignment] = []
     for start in starts:
         levels = levels_of(pyramid, mesh, start)
@@ -225,6 +260,8 @@ def turn_between(a: PoseInCamera, b: PoseInCamera) -> float:
 
 
 def pose_error(estimate: PoseInCamera, truth: PoseInCamera) -> Array:
-    """Return the error (6,) of a pose in the coordinates of its covariance: position in IRF, rotation in TRF axes."""
+    """Return the error (6,) of a pose in the coordinates of its covariance: position in IRF,
+    rotation in TRF axes.
+    """
     turn = rotations.log(rotations.from_matrix(estimate.rotation.T @ truth.rotation))
     return np.concatenate([truth.position - estimate.position, turn])

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
-from chaserdock_controller.estimation.joint.estimator import JointInputs
-from chaserdock_controller.estimation.joint.parameters import SightingNoise
-from chaserdock_controller.estimation.parameters import MekfParameters
+from chaserdock_controller.estimation.joint.parameters import SightingNoise, TargetParameters
+from chaserdock_controller.estimation.types import EstimatorInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
@@ -50,7 +49,8 @@ class SyntheticFlight:
 
     The chasers follow the reference exactly by a wrench computed from it, plus a command noise;
     ``disturbance`` acts on them. ``view_error``: ratio of the part of a sighting's error that is
-    constant.
+    constant. ``texts``: events of the estimator that it feeds.
+    ``turns``: rotations (4,) of the attitudes that the chasers hold.
     """
 
     def __init__(
@@ -90,16 +90,18 @@ class SyntheticFlight:
                 )
             )
         self.impulses = np.zeros((chasers, 6))
+        self.texts: list[str] = []
+        self.turns = [rotations.IDENTITY] * chasers
 
     @property
     def time_ns(self) -> int:
         return round(self.tick * PERIOD_S * 1e9)
 
-    def inputs(self) -> JointInputs:
+    def inputs(self) -> EstimatorInputs:
         """Return the measurements now."""
         odometry = {i: self._odometry(i) for i in range(self.n)}
         sightings = tuple(self._sighting(i) for i in range(self.n))
-        return JointInputs(self.time_ns, odometry, sightings, self.impulses.copy(), PERIOD_S)
+        return EstimatorInputs(self.time_ns, odometry, sightings, self.impulses.copy(), PERIOD_S)
 
     def step(self) -> None:
         """Move everything to the next tick under a feedback that holds the chasers at their places."""
@@ -146,7 +148,7 @@ class SyntheticFlight:
 
     def _turn(self, i: int) -> Array:
         t, s = self.target, self.chasers[i].state
-        wanted = rotations.multiply(t[6:10], self._place(i)[1])
+        wanted = rotations.multiply(t[6:10], rotations.multiply(self._place(i)[1], self.turns[i]))
         error = rotations.log(rotations.multiply(rotations.conjugate(s[6:10]), wanted))
         rate = rotations.rotate_inverse(self._place(i)[1], t[10:13])
         inertia = np.array(self.body.inertia)
@@ -225,7 +227,7 @@ def parameters(scenario: Scenario, errors: NavigationErrors, **more: object) -> 
     """
     options = {"single_marker": WHITE, "floor_sighting_m": 0.0, "floor_sighting_rad": 0.0, **more}
     return JointParameters(
-        MekfParameters(), scenario.chaser, scenario.camera_model(), errors, **options
+        TargetParameters(), scenario.chaser, scenario.camera_model(), errors, **options
     )  # type: ignore[arg-type]
 
 

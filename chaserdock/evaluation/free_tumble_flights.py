@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 from chaserdock_controller.estimation.composite_body import stated_properties
-from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
-from chaserdock_controller.estimation.joint.estimator import JointInputs
+from chaserdock_controller.estimation.joint import JointEstimator, JointParameters, parameters_of
 from chaserdock_controller.estimation.mass_properties import (
     inertia_ratios,
     properties_of,
     with_shape,
 )
-from chaserdock_controller.parameters import estimator_of
+from chaserdock_controller.estimation.types import EstimatorInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
@@ -121,10 +120,8 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     camera, sensor, estimator = (
         RenderedImages(scenario),
         OdometrySensor(scenario),
-        estimator_of(flight),
+        JointEstimator(parameters_of(flight), len(flight.chasers)),
     )
-    if not isinstance(estimator, JointEstimator):
-        raise ValueError('needs estimator.name = "joint"')
     chasers, before, nees = range(len(scenario.chasers)), None, []
     drawn = scenario.perception.name == "statistical"
     views = [ViewErrors(estimator.parameters, scenario.seed, i) for i in chasers]
@@ -145,7 +142,7 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
             image_s = period_s * timing.ticks_per_image
             sightings = tuple(views[s.chaser].added_to(s, image_s) for s in sightings)
         estimator.update(
-            JointInputs(
+            EstimatorInputs(
                 time_ns=now_ns,
                 odometry={i: odometry_of(sensor, i, own[i], tick, now_ns) for i in chasers},
                 sightings=sightings,

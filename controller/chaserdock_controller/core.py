@@ -8,7 +8,7 @@ from collections.abc import Callable
 from chaserdock_protocol.messages import TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 
-from .estimation.joint import JointEstimator
+from .estimation.estimators import make_estimator
 from .estimation.stage import EstimationStage
 from .estimation.types import Estimator
 from .guidance.stage import GuidanceStage
@@ -17,7 +17,7 @@ from .interfaces import TickInputs, TickOutputs
 from .nmpc.stage import PlanningStage
 from .output.message_builders import target_message
 from .output.stage import OutputStage
-from .parameters import estimator_of, nmpc_parameters
+from .parameters import nmpc_parameters
 
 
 class ControllerCore:
@@ -33,12 +33,13 @@ class ControllerCore:
         self,
         scenario: FlightScenario,
         now_s: Callable[[], float],
-        estimator: Estimator | JointEstimator | None = None,
+        estimator: Estimator | None = None,
         realtime: bool = False,
     ) -> None:
         self.scenario = scenario
         self.ingest = IngestStage(scenario)
-        self.estimation = EstimationStage(scenario, estimator or estimator_of(scenario))
+        estimator = estimator or make_estimator(scenario.estimator.name, scenario)
+        self.estimation = EstimationStage(scenario, estimator)
         self.guidance = GuidanceStage(scenario)
         self.planning = PlanningStage(scenario, nmpc_parameters(scenario), now_s, realtime)
         self.output = OutputStage(scenario)
@@ -64,6 +65,6 @@ class ControllerCore:
         return self.estimation.consistency.doubtful
 
     @property
-    def estimator(self) -> Estimator | JointEstimator:
+    def estimator(self) -> Estimator:
         """Return the target estimator."""
         return self.estimation.estimator

@@ -11,10 +11,15 @@ from typing import Any, cast
 
 import msgspec
 import numpy as np
-import pytest
 from chaserdock_controller.estimation.identification.stage import StackIdentification
 from chaserdock_controller.estimation.stage import EstimationStage
-from chaserdock_controller.estimation.types import Measurement
+from chaserdock_controller.estimation.types import (
+    Estimate,
+    Estimator,
+    EstimatorInputs,
+    TargetState,
+    no_estimate,
+)
 from chaserdock_controller.interfaces import TargetEstimation
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import Odometry
@@ -26,38 +31,37 @@ SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 ZERO = (0.0, 0.0, 0.0)
 
 
-class Recorded:
-    """An estimator that keeps the measurements of each tick."""
+class Recorded(Estimator):
+    """An estimator that keeps the odometry of each tick."""
 
     def __init__(self) -> None:
-        self.ticks: list[list[Measurement]] = []
+        self.ticks: list[tuple[set[int], set[int]]] = []
 
-    def update(self, measurements: list[Measurement], now_ns: int) -> Any:
-        self.ticks.append(measurements)
-        raise StopIteration
+    def update(self, inputs: EstimatorInputs) -> Estimate:
+        self.ticks.append((set(inputs.odometry), set(inputs.outdated)))
+        return Estimate(no_estimate(inputs.time_ns))
+
+    def estimate_at(self, time_ns: int) -> TargetState:
+        return no_estimate(time_ns)
 
 
-def test_estimators_of_the_target_alone_take_measured_odometry_only() -> None:
-    """A sighting whose odometry is lost becomes a measurement when that odometry arrives, not
-    before.
-    """
+def test_estimators_get_measured_odometry_only() -> None:
+    """What is extrapolated is none; odometry that arrives late is handed over with its own time."""
     flight = SyntheticFlight(scenario(), navigation("lab"), 2, 1)
     recorded = Recorded()
-    stage = EstimationStage(scenario(), cast(Any, recorded))
+    stage = EstimationStage(scenario(), recorded)
     first = flight.inputs()
     flight.step()
     second = flight.inputs()
     moved = msgspec.structs.replace(second.odometry[1], position_m=(9.0, 9.0, 9.0))
-    late = second.sightings[1]
     for observation in (
         observation_of(
             second.time_ns, {**second.odometry, 1: moved}, second.sightings, {1: first.odometry[1]}
         ),
-        observation_of(second.time_ns + 1, {}, (late,), {1: second.odometry[1]}),
+        observation_of(second.time_ns + 1, {}, (), {1: second.odometry[1]}),
     ):
-        with pytest.raises(StopIteration):
-            stage.run(observation)
-    assert [[m.chaser for m in tick] for tick in recorded.ticks] == [[0], [1]]
+        stage.run(observation)
+    assert recorded.ticks == [({0}, {1}), (set(), {1})]
 
 
 def test_identification_of_the_stack_takes_measured_odometry_only() -> None:

@@ -85,7 +85,7 @@ def test_monitor_needs_the_joint_estimator() -> None:
     with pytest.raises(
         ScenarioError, match=r"limits.passive_safety: needs the covariance of estimator.name"
     ):
-        mission({"passive_safety": "monitor"}, estimator={"name": "mekf"})
+        mission({"passive_safety": "monitor"}, estimator={"name": "paper"})
 
 
 def test_chaser_counts_once_it_was_safe_for_a_while_and_then_has_to_abort_when_it_is_not_for_a_second() -> (

@@ -15,10 +15,7 @@ from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import AppliedImpulse
 
-from .body_shape import BodyShape
-from .joint import JointEstimator
 from .mass_properties import MassProperties, attach, covariance_by_chasers, prior_of, with_shape
-from .parameters import Matrix9
 from .target_body import TargetBody
 from .types import Estimator, Shock, TargetState
 
@@ -49,11 +46,6 @@ def stated_properties(scenario: FlightScenario) -> MassProperties:
     )
 
 
-def rows_of(covariance: Array) -> Matrix9:
-    """Return a covariance as ``MekfParameters.body_covariance``."""
-    return tuple(tuple(row) for row in covariance.tolist())
-
-
 def centre_in_target(target: TargetState, odometry: Odometry) -> Array:
     """Return a chaser's estimated centre (3,) in TRF."""
     return rotations.rotate_inverse(
@@ -71,7 +63,7 @@ class CompositeBody:
     """Chasers whose latch holds the target (``latched``), and the body that they form with it
     (``body``), by what is known of the target alone at the last change of a latch."""
 
-    def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self._scenario = scenario
         self._estimator = estimator
         self._target_alone = stated_properties(scenario)
@@ -99,7 +91,7 @@ class CompositeBody:
             self._estimator.disturb(_TOUCH)
         else:
             for i in sorted(latched & odometry.keys()):
-                self._push(odometry[i], impulses[i], now_ns)
+                self._push(self._estimator.without_drift(odometry[i]), impulses[i], now_ns)
         self._changed |= changed
         self.latched = latched
 
@@ -129,7 +121,7 @@ class CompositeBody:
         """Return the mass properties of the target alone: while nothing is latched, with the shape
         that its motion shows.
         """
-        estimated = self._estimated_shape() if not self.latched else None
+        estimated = self._estimator.shape if not self.latched else None
         return (
             self._target_alone if estimated is None else with_shape(self._target_alone, *estimated)
         )
@@ -137,7 +129,7 @@ class CompositeBody:
     @property
     def moving(self) -> TargetBody:
         """Return the body that moves with the target, with the shape that its motion shows."""
-        estimated = self._estimated_shape()
+        estimated = self._estimator.shape
         if estimated is None:
             return self.body
         shape, _ = estimated
@@ -146,9 +138,6 @@ class CompositeBody:
             float(np.trace(self.body.inertia_kg_m2)) * shape.inertia,
             shape.centre_m,
         )
-
-    def _estimated_shape(self) -> tuple[BodyShape, Array] | None:
-        return self._estimator.shape if isinstance(self._estimator, JointEstimator) else None
 
     def refine_target(self, target: MassProperties) -> None:
         """Replace the target's mass properties by identified ones, from the next update on."""
@@ -169,15 +158,8 @@ class CompositeBody:
         }
         stack = attach(self._target_alone, mounted, chaser)
         self.body = stack.body
-        rows = self.body.inertia_kg_m2.tolist()
-        centre = self.body.centre_trf_m.tolist()
-        inertia = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
-        if isinstance(self._estimator, JointEstimator):
-            alone = self._target_alone.body
-            covariance = stack.covariance + covariance_by_chasers(
-                alone, mounted, chaser, _CHASER_MASS_SHARE, _CHASER_CENTRE_M
-            )
-            self._estimator.change_body(inertia, tuple(centre), rows_of(covariance[1:, 1:]))
-        else:
-            self._estimator.change_body(inertia, tuple(centre))
+        covariance = stack.covariance + covariance_by_chasers(
+            self._target_alone.body, mounted, chaser, _CHASER_MASS_SHARE, _CHASER_CENTRE_M
+        )
+        self._estimator.change_body(self.body, covariance[1:, 1:])
         self._changed = False

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import msgspec
@@ -28,14 +28,8 @@ from chaserdock_controller.interfaces import (
 
 from .composite_body import CompositeBody
 from .identification.stage import StackIdentification
-from .joint import JointEstimator
-from .joint.estimator import JointInputs
-from .joint.prediction import disturbance
-from .joint.state import POSITION_DRIFT, JointState
-from .measurements import SightingConverter
-from .mekf import Mekf
 from .target_shape import ShapeEstimation, shape_parameters
-from .types import Estimator, TargetState
+from .types import CameraError, ChaserMotion, Estimator, EstimatorInputs, TargetState
 
 _NO_DISTURBANCE = np.zeros(6)
 
@@ -43,16 +37,15 @@ _NO_DISTURBANCE = np.zeros(6)
 class EstimationStage:
     """The estimator, with the body that the target forms with latched chasers."""
 
-    def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self.estimator = estimator
         self.composite = CompositeBody(scenario, estimator)
         self.consistency = SensorConsistency()
         self._body, self._period_s = scenario.chaser, 1.0 / scenario.time.rate_hz
-        orbit = scenario.orbit
+        self._count, orbit = len(scenario.chasers), scenario.orbit
         self._passive_safety = scenario.limits.passive_safety != "off"
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self._camera = scenario.camera_model()
-        self._converter = SightingConverter(self._camera)
         parameters = shape_parameters(scenario)
         self.shape = ShapeEstimation(scenario, parameters) if parameters else None
         enabled = scenario.detumble.identification.enabled
@@ -75,36 +68,38 @@ class EstimationStage:
         return estimation
 
     def _estimate(self, observation: Observation) -> TargetEstimation:
-        o, now_ns, estimator = observation, observation.time_ns, self.estimator
-        before = self.composite.latched
-        own = _without_drift(estimator, o.odometry)
-        self.composite.disturb(o.docking, own, o.impulses, now_ns)
-        if isinstance(estimator, JointEstimator):
-            target = estimator.update(self._joint_inputs(o, estimator.chasers, before))
-            own = _estimated(estimator.state, o.odometry)
-        else:
-            target = self._target_only(o, estimator)
+        o, before = observation, self.composite.latched
+        self.composite.disturb(o.docking, o.odometry, o.impulses, o.time_ns)
+        found = self.estimator.update(self._inputs(o, before))
+        target, motions = found.target, {m.chaser: m for m in found.chasers}
+        own = {i: _estimated(odometry, motions.get(i)) for i, odometry in o.odometry.items()}
         known = target.status in ("tracking", "predicting")
         if known:
             self.composite.update_body(target, own)
-        disturbances = self._disturbances(o, own)
+        disturbances = self._disturbances(own, motions)
         visible_to = frozenset(s.chaser for s in o.sightings if s.solutions)
-        events: list[LogEntry] = [(e.level, e.text) for e in estimator.drain_events()]
+        events: list[LogEntry] = [(e.level, e.text) for e in found.events]
         accepted, rejected = sorted(visible_to - set(target.rejected)), sorted(target.rejected)
         events += self.consistency.update(o.time_s, accepted, rejected, o.interrupted)
         return TargetEstimation(
             target=target,
-            at_effect=estimator.estimate_at(o.effective_ns) if known else None,
+            at_effect=self.estimator.estimate_at(o.effective_ns) if known else None,
             own=own,
             own_at_effect={
                 i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own
             },
             disturbances=disturbances,
-            motion_covariances=self._motion_covariances(own) if known else {},
-            relative=estimator.relative_poses() if isinstance(estimator, JointEstimator) else (),
+            motion_covariances={
+                i: m.motion_covariance
+                for i, m in motions.items()
+                if known and self._passive_safety and i in own and m.motion_covariance is not None
+            },
+            relative=tuple(m.relative for m in found.chasers if m.relative is not None),
             visible_to=visible_to,
             doubtful=self.consistency.doubtful,
-            cameras=camera_calibrations(estimator, self._camera),
+            cameras=camera_calibrations(
+                [m.camera for m in found.chasers if m.camera is not None], self._camera
+            ),
             latched=self.composite.latched,
             body=self.composite.moving,
             events=tuple(events),
@@ -115,11 +110,7 @@ class EstimationStage:
         """Return what the motion of the target shows of its mass properties while no chaser is
         latched to it.
         """
-        if (
-            self.composite.latched
-            or not isinstance(self.estimator, JointEstimator)
-            or self.estimator.shape is None
-        ):
+        if self.composite.latched or self.estimator.shape is None:
             return None
         motion = BodyState(
             target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s
@@ -127,20 +118,13 @@ class EstimationStage:
         found = self.composite.target
         return IdentifiedStack(found, found, {}, motion, {}, {}, tuple)
 
-    def _target_only(self, o: Observation, estimator: Estimator) -> TargetState:
-        """Update an estimator that takes odometry as exact."""
-        self._converter.add_odometry((*o.measured.values(), *o.outdated.values()), o.time_ns)
-        return estimator.update(self._converter.measurements(o.sightings), o.time_ns)
-
-    def _joint_inputs(
-        self, o: Observation, chasers: int, latched_before: frozenset[int]
-    ) -> JointInputs:
-        impulses = np.zeros((chasers, 6))
+    def _inputs(self, o: Observation, latched_before: frozenset[int]) -> EstimatorInputs:
+        impulses = np.zeros((self._count, 6))
         for i, applied in o.impulses.items():
             impulses[i] = applied.impulse
         touched = {i for i, s in o.docking.items() if s.contact and not s.latched}
         latched = self.composite.latched
-        return JointInputs(
+        return EstimatorInputs(
             time_ns=o.time_ns,
             odometry=o.measured,
             sightings=o.sightings,
@@ -152,76 +136,41 @@ class EstimationStage:
             contacts=frozenset(touched | (latched ^ latched_before)),
         )
 
-    def _disturbances(self, o: Observation, own: Mapping[int, Odometry]) -> dict[int, Array]:
+    def _disturbances(
+        self, own: Mapping[int, Odometry], motions: Mapping[int, ChaserMotion]
+    ) -> dict[int, Array]:
         """Return the wrench of the orbit on each chaser, with the estimated disturbance; none on a
         latched one, whose motion is the target's."""
-        estimator, found = self.estimator, dict.fromkeys(own, _NO_DISTURBANCE)
+        found = dict.fromkeys(own, _NO_DISTURBANCE)
         if self._mean_motion_rad_s:
             found |= {i: self._orbital_wrench(own[i]) for i in own.keys() - self.composite.latched}
-        if not isinstance(estimator, JointEstimator) or estimator.state is None:
-            return found
-        for i in own.keys() - self.composite.latched:
-            impulse = o.impulses[i].impulse if i in o.impulses else np.zeros(6)
-            estimated = disturbance(
-                estimator.state, i, impulse / self._period_s, estimator.parameters
-            )
+        for i in own.keys() & motions.keys() - self.composite.latched:
+            estimated = motions[i].disturbance
             found[i] = found[i] + estimated if self._mean_motion_rad_s else estimated
         return found
-
-    def _motion_covariances(self, own: Mapping[int, Odometry]) -> dict[int, Array]:
-        if not self._passive_safety or not isinstance(self.estimator, JointEstimator):
-            return {}
-        found = {i: self.estimator.motion_covariance(i) for i in own}
-        return {i: covariance for i, covariance in found.items() if covariance is not None}
 
     def _orbital_wrench(self, o: Odometry) -> Array:
         state = np.array([*o.position_m, *o.velocity_m_s, *o.q_wxyz, *o.omega_rad_s])
         return cw_wrench(self._mean_motion_rad_s, state, self._body.mass_kg, self._body.inertia)
 
 
-def _without_drift(
-    estimator: Estimator | JointEstimator, odometry: Mapping[int, Odometry]
-) -> Mapping[int, Odometry]:
-    """Return odometry without the estimated drift of its position."""
-    state = estimator.state if isinstance(estimator, JointEstimator) else None
-    if state is None:
+def _estimated(odometry: Odometry, motion: ChaserMotion | None) -> Odometry:
+    """Return a chaser's estimated state in place of its odometry, where it is known."""
+    if motion is None:
         return odometry
-    return {
-        i: msgspec.structs.replace(
-            o, position_m=vector(np.array(o.position_m) - state.of(i, POSITION_DRIFT))
-        )
-        for i, o in odometry.items()
-    }
-
-
-def _estimated(state: JointState | None, odometry: Mapping[int, Odometry]) -> dict[int, Odometry]:
-    """Return the estimated states of the chasers that have odometry, in place of it, where they are
-    known.
-    """
-    assert state is not None
-    return {
-        i: msgspec.structs.replace(
-            o,
-            position_m=vector(state.positions_m[i]),
-            velocity_m_s=vector(state.velocities_m_s[i]),
-            q_wxyz=vector(state.attitudes_wxyz[i]),
-            omega_rad_s=vector(state.omegas_rad_s[i]),
-        )
-        if state.alive[i]
-        else o
-        for i, o in odometry.items()
-    }
+    return msgspec.structs.replace(
+        odometry,
+        position_m=vector(motion.position_m),
+        velocity_m_s=vector(motion.velocity_m_s),
+        q_wxyz=vector(motion.q_wxyz),
+        omega_rad_s=vector(motion.omega_rad_s),
+    )
 
 
 def camera_calibrations(
-    estimator: Estimator | JointEstimator, camera: Camera
+    errors: Sequence[CameraError], camera: Camera
 ) -> tuple[CameraCalibration, ...]:
-    """Return the estimated errors of the cameras used so far, in CRF axes; ``camera``: the nominal
-    calibration.
-    """
-    if not isinstance(estimator, Mekf | JointEstimator):
-        return ()
-    errors = estimator.cameras()
+    """Return the estimated errors of the cameras in CRF axes; ``camera``: the nominal calibration."""
     if not errors:
         return ()
     axes = rotations.to_matrix(camera.q_crf_irf_wxyz)

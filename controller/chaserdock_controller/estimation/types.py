@@ -1,56 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs and outputs of target state estimation. Arrays are float64; SI units and radians."""
+"""The interface of estimators: what they get in a tick, and what they return. Arrays are float64;
+SI units and radians.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from chaserdock_models.arrays import Array, Matrix3
-from chaserdock_protocol.messages import Level
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Level, Odometry, Sighting
+
+from .body_shape import BodyShape
+from .target_body import TargetBody
 
 
-@dataclass(frozen=True, eq=False)
-class PoseHypothesis:
-    """One possible pose of the target.
+@dataclass(frozen=True)
+class EstimatorInputs:
+    """Inputs of a tick: measured odometry by chaser, and sightings, which may belong to earlier
+    ticks.
 
-    position_m: (3,) origin of TRF in WRF, m.
-    q_wxyz: (4,) unit quaternion, TRF to WRF.
-    covariance: (6, 6), order (position in WRF axes, m; dtheta in TRF axes, rad) with
-        q_true = q (x) exp(dtheta).
+    impulses (N, 6): N s and N m s, body axes, that the chasers' actuators gave in the last
+    ``covered_s``. latched: chasers whose latch holds the target. contacts: chasers with a contact
+    since the tick before. last_commands: last commands (6,), N and N m, of chasers without odometry
+    in this tick, which fly by plans that the controller does not know. outdated: newest odometry of
+    chasers that have none of this tick, with the times of the ticks at which it was measured.
     """
 
-    position_m: Array
-    q_wxyz: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class CameraPose:
-    """Nominal pose of a camera at an exposure: optical centre (3,) in WRF and rotation (4,) IRF to
-    WRF.
-    """
-
-    position_m: Array
-    q_wxyz: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """Measurement of one chaser in one exposure.
-
-    time_ns: simulated time of the exposure. markers: number of markers used.
-    hypotheses: one pose, two for the planar ambiguity of a single marker (the likelier first), none
-        if the target is not visible. camera: its nominal pose.
-    """
-
-    chaser: int
     time_ns: int
-    hypotheses: tuple[PoseHypothesis, ...]
-    markers: int
-    camera: CameraPose
+    odometry: Mapping[int, Odometry]
+    sightings: tuple[Sighting, ...]
+    impulses: Array
+    covered_s: float
+    latched: frozenset[int] = frozenset()
+    contacts: frozenset[int] = frozenset()
+    last_commands: Mapping[int, Array] = field(default_factory=dict)
+    outdated: Mapping[int, Odometry] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,30 +116,77 @@ class EstimatorEvent(NamedTuple):
     text: str
 
 
+@dataclass(frozen=True, eq=False)
+class ChaserMotion:
+    """Estimated motion of a chaser, and of its camera.
+
+    position_m, velocity_m_s (3,): WRF. q_wxyz (4,): CRF to WRF. omega_rad_s (3,): CRF. disturbance
+    (6,): force and torque on it besides the commanded ones, body axes; zero on a latched chaser,
+    whose motion is the target's. relative, motion_covariance: while the target is known; the latter
+    (6, 6) of position and velocity relative to it, WRF. camera: once its errors are estimated.
+    """
+
+    chaser: int
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+    disturbance: Array
+    relative: RelativePose | None
+    motion_covariance: Array | None
+    camera: CameraError | None
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Result of a tick. ``chasers``: those whose motion the estimator estimates, in order."""
+
+    target: TargetState
+    chasers: tuple[ChaserMotion, ...] = ()
+    events: tuple[EstimatorEvent, ...] = ()
+
+
 class Estimator(Protocol):
-    """Interface of estimators; ``mekf.Mekf`` documents the members."""
+    """Estimates the target's motion, called once a tick with all inputs.
+
+    Only ``update`` and ``estimate_at`` are required; a class that inherits from this one gets the
+    others for a method without a model of the target's body or of the chasers.
+    """
+
+    def update(self, inputs: EstimatorInputs) -> Estimate:
+        """Process a tick and return the estimates at its time. Ticks come in order."""
+        ...
+
+    def estimate_at(self, time_ns: int) -> TargetState:
+        """Return the target's estimate for a time from the newest tick on; changes no state."""
+        ...
 
     @property
-    def accepted(self) -> int: ...
+    def shape(self) -> tuple[BodyShape, Array] | None:
+        """Return the shape of the body that the target is from now on, as its motion shows it, and
+        its covariance (8, 8); None if it is not estimated.
+        """
+        return None
 
     @property
-    def gated(self) -> int: ...
+    def reinitialisations(self) -> int:
+        """Return how often the target was started again, for statistics."""
+        return 0
 
-    @property
-    def late_dropped(self) -> int: ...
+    def without_drift(self, odometry: Odometry) -> Odometry:
+        """Return odometry without the drift of its position that is estimated up to now."""
+        return odometry
 
-    @property
-    def reinitialisations(self) -> int: ...
+    def disturb(self, shock: Shock) -> None:
+        """Take note that the target's rates change suddenly, after the newest tick."""
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState: ...
+    def change_body(self, body: TargetBody, covariance: Array) -> None:
+        """Take another body for the target from the newest tick on: it was latched or released, or
+        is known better.
 
-    def estimate_at(self, time_ns: int) -> TargetState: ...
-
-    def disturb(self, shock: Shock) -> None: ...
-
-    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None: ...
-
-    def drain_events(self) -> list[EstimatorEvent]: ...
+        covariance (9, 9): of its centre of mass (m) and of the elements xx, yy, zz, xy, xz, yz of
+        its inertia (kg m²). Raises ValueError for an inertia that no rigid body has.
+        """
 
 
 NO_ESTIMATE_VARIANCE = 1e6
@@ -171,44 +205,3 @@ def no_estimate(time_ns: int) -> TargetState:
         0,
         (),
     )
-
-
-def is_usable(measurement: Measurement) -> bool:
-    """Check camera pose and hypotheses: shapes, finite numbers, unit quaternions (to 1e-3), and
-    symmetric positive definite covariances."""
-    camera = measurement.camera
-    if (
-        camera.position_m.shape != (3,)
-        or camera.q_wxyz.shape != (4,)
-        or not np.isfinite(camera.position_m).all()
-    ):
-        return False
-    if not abs(float(camera.q_wxyz @ camera.q_wxyz) - 1.0) < 1e-3:
-        return False
-    for h in measurement.hypotheses:
-        if h.position_m.shape != (3,) or h.q_wxyz.shape != (4,) or h.covariance.shape != (6, 6):
-            return False
-        if not (np.isfinite(h.position_m).all() and np.isfinite(h.covariance).all()):
-            return False
-        # This form rejects NaN as well.
-        if not abs(float(h.q_wxyz @ h.q_wxyz) - 1.0) < 1e-3:
-            return False
-        scale = float(np.abs(h.covariance).max())
-        if float(np.abs(h.covariance - h.covariance.T).max()) > 1e-6 * scale:
-            return False
-        try:
-            np.linalg.cholesky(h.covariance)
-        except np.linalg.LinAlgError:
-            return False
-    return True
-
-
-def content_key(m: Measurement) -> tuple[int, int, int, int, bytes]:
-    """Return a sort key (time, chaser, content) that makes results independent of the order of
-    arrival.
-    """
-    content = m.camera.position_m.tobytes() + m.camera.q_wxyz.tobytes()
-    content += b"".join(
-        h.position_m.tobytes() + h.q_wxyz.tobytes() + h.covariance.tobytes() for h in m.hypotheses
-    )
-    return m.time_ns, m.chaser, len(m.hypotheses), m.markers, content

@@ -50,11 +50,9 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
     """Check that a chaser can fly the calibration manoeuvre."""
     if phase is not Phase.HOLD or not at_rest:
         return f"in phase {phase}; hold first"
-    if (
-        scenario.estimator.name not in ("joint", "mekf")
-        or not scenario.navigation.errors().uncertain_mounting
-    ):
-        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = joint or mekf)"
+    uncertain = scenario.navigation.errors().uncertain_mounting
+    if scenario.estimator.name != "joint" or not uncertain:
+        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = joint)"
     return ""
 
 

@@ -11,25 +11,19 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, TypeVar
 
-import msgspec
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from msgspec import Struct
 
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.estimation import Mekf
-from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
-from chaserdock_controller.estimation.filter_update import FilterState
 from chaserdock_controller.estimation.identification.stage import IdentificationState
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.joint.estimator import JointFilterState, JointTickRecord
+from chaserdock_controller.estimation.joint.parameters import TargetParameters
+from chaserdock_controller.estimation.joint.replay import ReplayBuffer
 from chaserdock_controller.estimation.mass_properties import MassProperties
-from chaserdock_controller.estimation.mekf import Exposure
-from chaserdock_controller.estimation.parameters import MekfParameters
-from chaserdock_controller.estimation.replay import ReplayBuffer
+from chaserdock_controller.estimation.paper import PaperEstimator, PaperParameters, View
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.target_shape import ShapeFilter
-from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.docking import DockingObservation
@@ -51,10 +45,6 @@ class CheckpointError(ValueError):
 
 class CoreState(Struct, forbid_unknown_fields=True):
     inspecting: frozenset[int]
-
-
-class SightingState(Struct, forbid_unknown_fields=True):
-    _odometry: dict[tuple[int, int], Odometry]
 
 
 class PlanningState(Struct, forbid_unknown_fields=True):
@@ -153,43 +143,32 @@ class ConsistencyState(Struct, forbid_unknown_fields=True):
     _since_s: dict[int, tuple[bool, float]]
 
 
-class MekfState(Struct, forbid_unknown_fields=True, tag=True):
-    target: MekfParameters
-    late_dropped: int
-    early_dropped: int
-    invalid: int
-    duplicates: int
-    _before: list[tuple[int, MekfParameters]]
-    _buffer: ReplayBuffer[Exposure, FilterState]
-    _was_lost: bool
-
-
 class JointEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
-    target: MekfParameters
-    late_dropped: int
-    duplicates: int
-    _buffer: ReplayBuffer[JointTickRecord, JointFilterState]
+    target: TargetParameters
+    _buffer: ReplayBuffer
     _was_lost: bool
 
 
-class PaperState(Struct, forbid_unknown_fields=True, tag=True):
+class PaperEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
     parameters: PaperParameters
-    accepted: int
-    gated: int
-    late_dropped: int
-    early_dropped: int
-    invalid: int
-    reinitialisations: int
-    _latest: dict[int, Measurement]
+    _odometry: dict[tuple[int, int], Odometry]
+    _latest: dict[int, View]
     _poses: list[tuple[Array, Array]]
     _rates: list[tuple[Array, Array]]
     _mean: tuple[int, Array, Array] | None
     _newest_ns: int | None
+    _removed_in_a_row: int
+    _reinitialisations: int
     _seen: int
     _rejected: tuple[int, ...]
-    _removed_in_a_row: int
-    _events: list[EstimatorEvent]
     _was_lost: bool
+
+
+_ESTIMATORS: dict[type, type[JointEstimatorState | PaperEstimatorState]] = {
+    JointEstimator: JointEstimatorState,
+    PaperEstimator: PaperEstimatorState,
+}
+"""What is copied of an estimator. Of those of installed packages, nothing is."""
 
 
 class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
@@ -198,7 +177,6 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     solver, inputs by chaser."""
 
     core: CoreState
-    sightings: SightingState
     planning: PlanningState
     plan_monitor: PlanMonitorState
     output: OutputState
@@ -218,7 +196,7 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     consistency: ConsistencyState
     identification: IdentificationState | None
     shape: ShapeState | None
-    estimator: JointEstimatorState | MekfState | PaperState | None
+    estimator: JointEstimatorState | PaperEstimatorState | None
     plans: dict[int, Array]
 
 
@@ -235,7 +213,6 @@ class Checkpoint:
         core = self._core
         parts: dict[str, tuple[Any, type[Struct]]] = {
             "core": (core, CoreState),
-            "sightings": (vars(core.estimation)["_converter"], SightingState),
             "planning": (core.planning, PlanningState),
             "plan_monitor": (core.planning.monitor, PlanMonitorState),
             "output": (core.output, OutputState),
@@ -262,13 +239,14 @@ class Checkpoint:
         parts: dict[str, Any] = {"shape": None}
         parts |= {name: _read(*part) for name, part in self._parts().items()}
         frame, identification = self._warm_starts(), self._core.estimation.identification
+        estimator, kind = self._core.estimator, _ESTIMATORS.get(type(self._core.estimator))
         try:
             return encode(
                 ControllerCheckpoint(
                     **parts,
                     timeline_left=len(vars(self._core.guidance.machine)["_timeline"]),
                     identification=None if identification is None else identification.save(),
-                    estimator=_estimator_state(self._core.estimator),
+                    estimator=None if kind is None else _read(estimator, kind),
                     plans=dict(frame.plans) if frame is not None else {},
                 )
             )
@@ -298,9 +276,8 @@ class Checkpoint:
         vars(self._core.guidance.machine)["_timeline"] = timeline[
             len(timeline) - state.timeline_left :
         ]
-        if state.estimator is not None and type(state.estimator) is _estimator_kind(
-            self._core.estimator
-        ):
+        kind = _ESTIMATORS.get(type(self._core.estimator))
+        if state.estimator is not None and type(state.estimator) is kind:
             _write(self._core.estimator, state.estimator)
         frame = self._warm_starts()
         if frame is not None:
@@ -323,7 +300,16 @@ class Checkpoint:
 
 def _read(owner: Any, kind: type[PartT]) -> PartT:
     values = vars(owner)
-    return kind(**{name: values[name] for name in kind.__struct_fields__})
+    return kind(**{name: _data(values[name]) for name in kind.__struct_fields__})
+
+
+def _data(value: Any) -> Any:
+    match value:
+        case deque():
+            return list(value)
+        case ReplayBuffer():
+            return value.with_newest_only()
+    return value
 
 
 def _write(owner: Any, state: Struct) -> None:
@@ -336,22 +322,3 @@ def _write(owner: Any, state: Struct) -> None:
             setattr(owner, name, deque(value, current.maxlen))
         else:
             setattr(owner, name, value)
-
-
-EstimatorState = JointEstimatorState | MekfState | PaperState
-
-
-def _estimator_kind(estimator: Any) -> type[EstimatorState] | None:
-    kinds = {JointEstimator: JointEstimatorState, Mekf: MekfState, PaperEstimator: PaperState}
-    return kinds.get(type(estimator))
-
-
-def _estimator_state(estimator: Any) -> EstimatorState | None:
-    kind = _estimator_kind(estimator)
-    if kind is None:
-        return None
-    state = _read(estimator, kind)
-    if isinstance(state, PaperState):
-        state._poses, state._rates = list(state._poses), list(state._rates)
-        return state
-    return msgspec.structs.replace(state, _buffer=state._buffer.with_newest_only())

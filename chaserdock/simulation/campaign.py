@@ -32,8 +32,9 @@ from .checks.estimates import (
     MOST_MEAN_NEES,
     CovarianceConsistency,
 )
+from .flight import SimulationResult, fly_case
 from .shrinking import shrink
-from .swarm import Case, SimulationResult, draw_case, fly_case
+from .swarm import Case, draw_case
 
 _NOT_DOCKED = "ends in phase "
 """Begin of the text on a chaser that should have docked, or should be safe."""

@@ -27,8 +27,10 @@ from chaserdock.simulation.campaign import (
     write_case,
 )
 from chaserdock.simulation.checks import flight_checks
-from chaserdock.simulation.checks.check import Check, reads
-from chaserdock.simulation.swarm import draw_case, fly_case
+from chaserdock.simulation.checks.check import Check
+from chaserdock.simulation.checks.reader import reads
+from chaserdock.simulation.flight import fly_case
+from chaserdock.simulation.swarm import draw_case
 
 SHORT = """
 extends = "single"

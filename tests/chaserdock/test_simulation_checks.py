@@ -57,6 +57,7 @@ from chaserdock.simulation.checks.estimates import MOST_MEAN_NEES
 from chaserdock.simulation.checks.flight_checks import CHECKS, FlightChecks
 from chaserdock.simulation.checks.messages import covariance_defect, defects_of
 from chaserdock.simulation.checks.processes import BoundedQueues, queue_limit
+from chaserdock.simulation.flight import SimulationResult
 from chaserdock.simulation.mission import SimulatedFlight
 from chaserdock.simulation.network import EPOCH_NS, Traffic
 from chaserdock.simulation.shrinking import shrink
@@ -64,7 +65,6 @@ from chaserdock.simulation.swarm import (
     KINDS,
     LATCH_KINDS,
     Case,
-    SimulationResult,
     draw_case,
     draw_fault,
 )

@@ -17,8 +17,9 @@ from chaserdock_protocol.messages import BodyTruth, DrawnBody, Tick, WorldTruth
 from chaserdock.analysis.criteria import nearest_allowed_m
 
 from .causes import DEVICES_SETTLE_S, IN_LATE_NETWORK, SETTLING_S, STOPPING_S
-from .check import Check, reads
+from .check import Check
 from .flight_view import FlightView, FreeStep, inertia_of
+from .reader import reads
 
 KEEP_OUT_SLACK_M = 0.02
 """Distance (m) by which a chaser may enter a keep-out zone, the errors of its estimate. Chosen."""

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every check of a simulated flight has: its text, its state, and the messages it reads."""
+"""What every check of a simulated flight has: its texts, its state, and what it finds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import ClassVar
 
-if TYPE_CHECKING:
-    from ..mission import SimulatedFlight
-    from .flight_view import FlightView
-
-Method = TypeVar("Method", bound=Callable[..., None])
+from ..mission import SimulatedFlight
+from .flight_view import FlightView
+from .reader import MessageReader
 
 
 @dataclass(frozen=True)
@@ -26,28 +24,8 @@ class Violation:
         return f"{self.invariant} at {self.time_s:.2f} s: {self.text}"
 
 
-def reads(kind: type) -> Callable[[Method], Method]:
-    """Mark the method of a ``Reader`` that is called with each message of a type."""
-
-    def mark(method: Method) -> Method:
-        method.__dict__["_reads"] = kind
-        return method
-
-    return mark
-
-
-class Reader:
-    """Reads messages of some types as they are published, by methods marked with ``reads``."""
-
-    def readers(self) -> Iterator[tuple[type, Callable[[Any], None]]]:
-        """Yield each type of message that is read, and the method to call with one."""
-        for name, method in vars(type(self)).items():
-            if kind := getattr(method, "_reads", None):
-                yield kind, getattr(self, name)
-
-
 @dataclass
-class Check(Reader):
+class Check(MessageReader):
     """An invariant of a flight. Its docstring states what holds, in one sentence.
 
     ``name``: what violations are called. ``exceptions``: when it is not judged. ``view``: the

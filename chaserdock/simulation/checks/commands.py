@@ -13,7 +13,8 @@ from chaserdock_protocol.leases import commander_of
 from chaserdock_protocol.messages import ActuatorCommand, Plan, Tick, WrenchCommand
 
 from .causes import FOLLOWING_S, IN_LATE_NETWORK
-from .check import Check, reads
+from .check import Check
+from .reader import reads
 
 KNOWN_AFTER_S = 0.1
 """Time (s), in addition to the latency, after which a tick is known to a chaser that is not frozen.

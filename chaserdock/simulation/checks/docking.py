@@ -19,9 +19,10 @@ from chaserdock_protocol.scenario.faults import LATCH_FAULTS
 
 from ..mission import SimulatedFlight
 from .causes import SETTLING_S, STOPPING_S, lasting
-from .check import Check, reads
+from .check import Check
 from .estimates import ACCURACY_M, DRIFT_SIGMAS
 from .flight_view import FlightView
+from .reader import reads
 
 RETREAT_SLACK_M = 0.15
 """Distance (m) by which the reference of a retreat may come nearer to the target at first: one that

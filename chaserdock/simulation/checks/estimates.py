@@ -25,7 +25,8 @@ from chaserdock.analysis.pose_errors import (
 
 from ..mission import SimulatedFlight
 from .causes import keeps_commands
-from .check import Check, reads
+from .check import Check
+from .reader import reads
 
 ACCURACY_M = 0.01
 """Largest error (m) of the target's position beside drift, while two honest chasers see it. Chosen.

@@ -33,7 +33,7 @@ from chaserdock_world.orbit import TargetOrbit
 
 from ..network import EPOCH_NS
 from .causes import STOPPING_S, Causes
-from .check import Reader, reads
+from .reader import MessageReader, reads
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class FreeStep:
 
 
 @dataclass
-class FlightView(Reader):
+class FlightView(MessageReader):
     """A flight as its messages show it. Checks read it; ``FlightChecks`` updates it, once for each
     message and before the checks see that.
 

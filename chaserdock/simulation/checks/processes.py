@@ -17,8 +17,9 @@ from mcap.reader import make_reader
 
 from ..mission import SimulatedFlight
 from .causes import IN_LATE_NETWORK
-from .check import Check, reads
+from .check import Check
 from .flight_view import lost_by
+from .reader import reads
 
 QUEUE_LIMIT = 400
 """Most messages that may wait for a reader which nothing holds up. Chosen; 7 ticks of four

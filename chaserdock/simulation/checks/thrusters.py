@@ -11,7 +11,8 @@ from chaserdock_protocol.messages import ThrusterReport
 
 from .bodies import ARM_M
 from .causes import DEVICES_SETTLE_S, IN_LATE_NETWORK
-from .check import Check, reads
+from .check import Check
+from .reader import reads
 
 FLOOR_N_S = 0.01
 """Impulse (N s) by which expected and true impulse may differ. Chosen; as one pulse of 10 ms of

@@ -29,10 +29,7 @@ from collections.abc import Callable, Iterable
 
 from chaserdock_protocol.scenario import Scenario
 from common import Figures, make_parser, run_parts
-
-from chaserdock.evaluation.flight_record import FlightRecord, record_flight
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
-from chaserdock.evaluation.transfers import (
+from flights.transfers import (
     CLUTTER,
     DENSE_CLUTTER,
     avoidance,
@@ -41,6 +38,9 @@ from chaserdock.evaluation.transfers import (
     load_shipped,
     swap,
 )
+
+from chaserdock.evaluation.flight_record import FlightRecord, record_flight
+from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
 
 NOISE_M, NOISE_RAD = 0.002, math.radians(0.1)
 STEADY_FROM_S = 40.0

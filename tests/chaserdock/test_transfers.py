@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 from chaserdock_models import rotations
+from flights.transfers import SYMMETRIC_EVERY, avoidance, fly_transfer, swap
 
 from chaserdock.evaluation.perception import measurement_model
-from chaserdock.evaluation.transfers import SYMMETRIC_EVERY, avoidance, fly_transfer, swap
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -20,12 +20,12 @@ from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CommandReply, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, ScenarioError
+from flights.detumble_flights import StackMission, moving_with, stack_scenario
+from flights.transfers import load_shipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.detumble_flights import StackMission, moving_with, stack_scenario
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.transfers import load_shipped
 
 SETTLED_S = 2.0
 

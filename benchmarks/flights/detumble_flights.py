@@ -36,9 +36,10 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
-from .in_process import InProcessMission, TickRecord
+from chaserdock.evaluation.in_process import InProcessMission, TickRecord
+from chaserdock.evaluation.perception import PerceptionModel
+
 from .latched_stack import attach_plants, body_of_plant, with_port_error
-from .perception import PerceptionModel
 from .transfers import load_shipped
 
 COMMAND_AT_S = 5.0

@@ -20,8 +20,8 @@ from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.rendering.cameras import States
 from numpy.typing import ArrayLike
 
-from .in_process import InProcessMission
-from .perception import PerceptionModel
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import PerceptionModel
 
 SYMMETRIC_EVERY = 4
 SMALL = {"width_px": 640, "height_px": 360}

@@ -10,8 +10,8 @@ keep-out (benchmarks/flights/abort_study.py).
 from __future__ import annotations
 
 from common import make_parser, print_figures, write_json
+from flights import load_shipped
 from flights.abort_study import study
-from flights.transfers import load_shipped
 
 
 def main() -> None:

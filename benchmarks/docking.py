@@ -45,8 +45,9 @@ from flights.docking_flights import (
     dock,
     docking_scenario,
 )
+from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
+from chaserdock.evaluation.perception import PerceptionModel, RenderedImages
 
 PerceptionOf = Callable[[Scenario], PerceptionModel]
 KINDS = ("stuck_on", "stuck_off")

@@ -16,7 +16,7 @@ from typing import ParamSpec, TypeVar
 
 from chaserdock_protocol.scenario import Scenario
 from common import Figures, make_parser, print_figures, write_json
-from flights.transfers import load_shipped
+from flights import load_shipped
 
 from chaserdock.evaluation.in_process import InProcessMission
 from chaserdock.evaluation.perception import RenderedImages

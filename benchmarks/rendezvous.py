@@ -17,8 +17,8 @@ import math
 import time
 
 from common import Figures, make_parser, print_figures, write_json
+from flights import load_shipped
 from flights.rendezvous import last_leg, leg, rendezvous
-from flights.transfers import load_shipped
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages

@@ -27,7 +27,7 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import true_camera
 from common import Figures, make_parser, run_parts, use_one_thread
-from flights.transfers import load_shipped
+from flights import load_shipped
 from markerless_missions import QUICK, SCENARIOS
 
 from chaserdock.analysis.pose_errors import pose_error

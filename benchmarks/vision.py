@@ -42,7 +42,7 @@ from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from common import Figures, make_parser, percentiles, run_parts
-from flights.transfers import load_shipped
+from flights import load_shipped
 from numpy.typing import NDArray
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error

@@ -21,7 +21,7 @@ from chaserdock_world.physics.simulation import TARGET, Physics
 from chaserdock.evaluation.in_process import InProcessMission
 from chaserdock.evaluation.perception import PerceptionModel
 
-from .transfers import load_shipped
+from . import load_shipped
 
 APPROACH_AT_S = 4.0
 LIMIT_S = 96.0

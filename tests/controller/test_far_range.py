@@ -16,8 +16,8 @@ from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.pose_image import WIDTH_PX, encode_pose
 from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario, parse_scenario
+from flights import load_shipped
 from flights.abort_study import study
-from flights.transfers import load_shipped
 
 
 def scenario(**changes: Any) -> Scenario:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flights import load_shipped
 from flights.rendezvous import last_leg, rendezvous
-from flights.transfers import load_shipped
 
 from chaserdock.evaluation.in_process import InProcessMission
 from chaserdock.evaluation.perception import RenderedImages

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of the bridge to ROS 2: ``python benchmarks/ros2.py [--quick] [--json FILE] [--only PART
-...]``.
+"""Cost of the bridge to ROS 2, in its steps, and what remains per message of ROS 2 beside
+serialization.
 
-Parts: ``cost`` (wall time for each message of the mission, in the bridge's steps, and what remains
-per message of ROS 2 beside serialization). The messages are those of a golden log; a reader in
-another session takes what is sent. Serialization is CDR and, of an image, the decoding of JPEG.
-``large_image``: the same for 0.9 MB. ``--quick``: fewer repetitions.
+The messages are those of a golden log; a reader in another session takes what is sent.
+Serialization is CDR and, of an image, the decoding of JPEG.
 """
 
 from __future__ import annotations
@@ -23,12 +21,17 @@ from chaserdock_agents.ros2.types import TYPES
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.transport.zenoh_network import PlainSession
-from common import ROOT, Figures, make_parser, run_parts
+from common import ROOT, Figures, Group, Options
 
 from chaserdock.launch.launcher import free_port
 from chaserdock.logs import open_log
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
+
+
+def repetitions_of(options: Options) -> int:
+    """Return how often each step is timed."""
+    return 100 if options.quick else 1000
 
 
 def median_us(call: Callable[[], Any], repetitions: int) -> float:
@@ -41,8 +44,9 @@ def median_us(call: Callable[[], Any], repetitions: int) -> float:
     return 1e6 * statistics.median(times)
 
 
-def cost(repetitions: int) -> Figures:
-    """Return the cost of each step, for one message of each topic of the mission."""
+def cost(options: Options) -> Figures:
+    """Time each step of the bridge for one message of each topic of the mission."""
+    repetitions = repetitions_of(options)
     log = open_log(GOLDEN)
     converter = Converter(log.scenario)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -104,8 +108,9 @@ def cost(repetitions: int) -> Figures:
     return {**figures, "worst_beside_serialization_ms_per_message": worst / 1000.0}
 
 
-def large_image(repetitions: int) -> Figures:
-    """Return the cost of the steps for an image of the default camera's size, not compressed."""
+def large_image(options: Options) -> Figures:
+    """Time the steps for an image of the default camera's size, 0.9 MB, not compressed."""
+    repetitions = repetitions_of(options)
     endpoint, kind, topic = (
         f"tcp/127.0.0.1:{free_port()}",
         "sensor_msgs/msg/Image",
@@ -137,14 +142,4 @@ def large_image(repetitions: int) -> Figures:
     return figures
 
 
-def main() -> None:
-    options = make_parser(__doc__, ("cost", "large_image")).parse_args()
-    repetitions = 100 if options.quick else 1000
-    run_parts(
-        options,
-        {"cost": lambda: cost(repetitions), "large_image": lambda: large_image(repetitions)},
-    )
-
-
-if __name__ == "__main__":
-    main()
+GROUP = Group({"ros2": cost, "ros2-image": large_image})

@@ -1,14 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The physics engines against each other: ``python benchmarks/engines.py [--only PART ...]
-[--quick] [--json FILE]``.
-
-Parts: ``free``, ``thrusters``, ``capture`` and ``stack`` (open loop, 30 s, ``--quick`` 5 s; the
-cases of ``flights.engine_comparison``) print the largest differences of any body and
-port, the change of momentum on each engine where no load acts, and the time per physics step.
-``missions`` flies ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s) and
-``four-chaser-capture`` (75 s) as ``chaserdock simulate`` does, on each engine with the perception
-``statistical``, and prints their success and, in closed loop, the largest differences of any body.
-``--seeds N``: number of seeds of each mission.
+"""The physics engines against each other: the cases of ``flights.engine_comparison`` in open loop, and
+whole missions in closed loop.
 """
 
 from __future__ import annotations
@@ -16,12 +8,13 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_protocol.shipped_scenarios import shipped_scenario
-from common import Figures, make_parser, print_figures, run_parts
+from common import Figures, Group, Options, described, seeds_of
 from flights.engine_comparison import CASES, ENGINES, difference, fly_case
 
 from chaserdock.analysis.flight import Track, load_flight
@@ -33,11 +26,15 @@ MISSIONS = {
     "docking-contact": ("duration_s=50.0",),
     "four-chaser-capture": ("duration_s=75.0",),
 }
+QUICK = ("duration_s=10.0", "settling_s=5.0", "steady_until_s=10.0", "timeline=[]", "success={}")
 WITHOUT_LOADS = ("free", "capture")
 
 
-def case(name: str, duration_s: float) -> Figures:
-    """Return the differences of both engines in one case."""
+def compare(name: str, options: Options) -> Figures:
+    """Return the largest differences of any body and port in a case, the change of momentum on each
+    engine where no load acts, and the processor time of a physics step.
+    """
+    duration_s = 5.0 if options.quick else 30.0
     flights = {engine: fly_case(CASES[name](0), engine, duration_s) for engine in ENGINES}
     apart = difference(*flights.values())
     figures = {
@@ -54,14 +51,17 @@ def case(name: str, duration_s: float) -> Figures:
     return figures
 
 
-def missions(seeds: int) -> Figures:
-    """Return how many missions succeed on each engine, and the largest differences of any body
-    between the engines.
+def missions(options: Options) -> Figures:
+    """Fly ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s) and ``four-chaser-capture`` (75
+    s) as ``simulate`` does on each engine, with statistical perception: successes, and the largest
+    differences of any body. ``--quick``: the first of them for 10 s.
     """
+    flown = {"four-chaser-docking": QUICK} if options.quick else MISSIONS
+    seeds = seeds_of(options, 1, 1)
     figures: Figures = {}
-    for name, overrides in MISSIONS.items():
+    for name, overrides in flown.items():
         successes, apart_m, apart_deg = dict.fromkeys(ENGINES, 0), 0.0, 0.0
-        for seed in range(seeds):
+        for seed in seeds:
             flights = {}
             for engine in ENGINES:
                 flights[engine], failures = fly_mission(name, engine, seed, overrides)
@@ -72,9 +72,10 @@ def missions(seeds: int) -> Figures:
                 )
             distance_m, angle_deg = tracks_apart(*flights.values())
             apart_m, apart_deg = max(apart_m, distance_m), max(apart_deg, angle_deg)
-        figures |= {f"{name}_{engine}_success_share": n / seeds for engine, n in successes.items()}
+        figures |= {
+            f"{name}_{engine}_success_share": n / len(seeds) for engine, n in successes.items()
+        }
         figures |= {f"{name}_position_m": apart_m, f"{name}_attitude_deg": apart_deg}
-        print_figures({key: value for key, value in figures.items() if key.startswith(name)})
     return figures
 
 
@@ -109,15 +110,13 @@ def tracks_apart(a: Mapping[str, Track], b: Mapping[str, Track]) -> tuple[float,
     return distance_m, math.degrees(angle_rad)
 
 
-def main() -> None:
-    """Run the parts."""
-    parser = make_parser(__doc__, (*CASES, "missions"))
-    parser.add_argument("--seeds", type=int, default=1, help="seeds of each mission")
-    options = parser.parse_args()
-    duration_s = 5.0 if options.quick else 30.0
-    parts = {name: lambda name=name: case(name, duration_s) for name in CASES}
-    run_parts(options, {**parts, "missions": lambda: missions(options.seeds)})
-
-
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {
+        **{
+            name: described(partial(compare, name), f"Compare: {case.__doc__}")
+            for name, case in CASES.items()
+        },
+        "missions": missions,
+    },
+    ("flights", "first"),
+)

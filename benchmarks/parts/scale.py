@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of a tick with 1 to 16 chasers, by part: ``python benchmarks/scale.py [--quick] [--json
-FILE]``.
+"""Cost of a tick with 1 to 16 chasers, by part: the first N of ``sixteen-chasers``.
 
-The first N chasers of ``sixteen-chasers``. In one process (``chaserdock.evaluation.in_process``)
-each part is timed by the thread's processor time, medians over ticks: render, physics, perceive,
-fuse, solve, guide (references, prediction, messages). Then ``chaserdock run`` flies the same
-mission in lock-step: wall time per tick, and processor time of its processes. ``record`` is the
-recorder's; ``transport`` is what world, chasers and controller use beyond the parts: encoding,
-Zenoh, decoding and waiting. ``--quick``: 1, 2 and 4 chasers. ``--chasers`` (repeatable) chooses;
-``--parts-only`` omits the lock-step missions.
+In one process (``chaserdock.evaluation.in_process``) each part is timed by the thread's processor
+time, medians over ticks: render, physics, perceive, fuse, solve, guide (references, prediction,
+messages). Then ``chaserdock run`` flies the same mission in lock-step: wall time per tick, and
+processor time of its processes. ``record`` is the recorder's; ``transport`` is what world, chasers
+and controller use beyond the parts: encoding, Zenoh, decoding and waiting.
 """
 
 from __future__ import annotations
@@ -16,6 +13,7 @@ from __future__ import annotations
 import subprocess
 import tempfile
 import time
+from argparse import ArgumentParser
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
@@ -27,7 +25,7 @@ import psutil
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.rendering.cameras import Cameras
-from common import ROOT, Figures, chaserdock_command, make_parser, write_json
+from common import ROOT, Figures, Group, Options, chaserdock_command
 
 from chaserdock.evaluation import perception
 from chaserdock.evaluation.in_process import InProcessMission
@@ -114,7 +112,7 @@ def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
 
 
 def fly(n: int, duration_s: float) -> dict[str, float]:
-    """Run the mission with ``n`` chasers; return wall time and processor time of each command, s
+    """Measure the mission with ``n`` chasers; return wall time and processor time of each command, s
     per tick.
 
     Raise SystemExit if it fails.
@@ -166,33 +164,54 @@ def measure(n: int, ticks: int, duration_s: float | None) -> dict[str, float]:
     return out
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("--chasers", type=int, action="append", choices=range(1, 17), metavar="N")
-    parser.add_argument("--ticks", type=int, default=60, help="ticks timed in one process")
-    parser.add_argument(
-        "--seconds", type=float, default=12.0, help="simulated time of the lock-step missions"
-    )
-    parser.add_argument("--parts-only", action="store_true", help="no lock-step missions")
-    options = parser.parse_args()
+def scale(options: Options, in_lockstep: bool) -> Figures:
+    """Measure a tick for several numbers of chasers, and the ratio of sixteen to four."""
     sizes = options.chasers or ([1, 2, 4] if options.quick else [1, 2, 4, 8, 16])
-    duration_s = None if options.parts_only else options.seconds
-    names = (*PARTS, *(("sum",) if duration_s is None else ("transport", "record", "cpu", "wall")))
-    legend = "; cpu: all processes; wall: in lock-step, on this machine"
-    print("ms per tick" + ("" if duration_s is None else legend))
+    duration_s = options.seconds if in_lockstep else None
+    names = (*PARTS, *(("transport", "record", "cpu", "wall") if in_lockstep else ("sum",)))
+    print("ms per tick; cpu: all processes; wall: in lock-step, on this machine")
     print(f"{'N':>3}" + "".join(f"{name:>11}" for name in names))
-    result: Figures = {}
+    figures: Figures = {}
     for n in sizes:
         row = measure(n, options.ticks, duration_s)
         print(f"{n:3d}" + "".join(f"{1e3 * row[name]:11.2f}" for name in names), flush=True)
-        result |= {f"n{n}_{name}_s_per_tick": row[name] for name in names}
-    for name in names:
-        if {4, 16} <= set(sizes):
-            ratio = result[f"n16_{name}_s_per_tick"] / result[f"n4_{name}_s_per_tick"]
-            result[f"{name}_16_over_4"] = ratio
-            print(f"{name}: 16 chasers over 4: {ratio:.2f}")
-    write_json(options.json, result)
+        figures |= {f"n{n}_{name}_s_per_tick": row[name] for name in names}
+    if {4, 16} <= set(sizes):
+        figures |= {
+            f"{name}_16_over_4": figures[f"n16_{name}_s_per_tick"]
+            / figures[f"n4_{name}_s_per_tick"]
+            for name in names
+        }
+    return figures
 
 
-if __name__ == "__main__":
-    main()
+def whole(options: Options) -> Figures:
+    """Measure a tick with 1 to 16 chasers by part, and missions in lock-step."""
+    return scale(options, in_lockstep=True)
+
+
+def parts_only(options: Options) -> Figures:
+    """Measure the same without the missions in lock-step."""
+    return scale(options, in_lockstep=False)
+
+
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--chasers",
+        type=int,
+        nargs="+",
+        choices=range(1, 17),
+        metavar="N",
+        help="numbers of chasers of scale",
+    )
+    parser.add_argument("--ticks", type=int, default=60, help="ticks that scale times")
+    parser.add_argument(
+        "--seconds", type=float, default=12.0, help="simulated time of the missions of scale"
+    )
+
+
+GROUP = Group(
+    {"scale": whole, "scale-parts": parts_only},
+    add_options=add_options,
+    on_request=("scale-parts",),
+)

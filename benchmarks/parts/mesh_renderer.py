@@ -1,31 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The renderer of meshes: ``python benchmarks/rendering.py [--views N] [--only PART] [--quick]
-[--json FILE]``.
+"""The renderer of meshes: processor time, and its images against those of the ray tracer Embree.
 
-Parts:
-
-- ``time``: CPU time of one image of 960 x 540 pixels of each shipped satellite at 1 and 3 m, random
-  attitudes and suns, one thread; the least of four runs of each view.
-- ``accuracy``: against images of Embree, 480 x 270 pixels with 36 rays each: mean grey-level error
-  inside surfaces, and the displacement of silhouettes and shadow edges by blocks of 12 pixels.
-  Textures are left out.
+Time: of one image of 960 x 540 pixels of each shipped satellite at 1 and 3 m, random attitudes and
+suns, one thread; the least of four runs of each view. Accuracy: 480 x 270 pixels with 36 rays each:
+mean grey-level error inside surfaces, and the displacement of silhouettes and shadow edges by
+blocks of 12 pixels; without textures.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 
 import numpy as np
-from common import ROOT, Figures, make_parser, percentiles, run_parts
-
-sys.path.insert(0, str(ROOT / "tests"))
-
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.satellites import satellite
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
+from common import Figures, Group, Options, percentiles
 from embree_images import compare
 from markerless_cases import random_view
 
@@ -34,8 +26,9 @@ RANGES_M = (1.0, 3.0)
 RUNS = 4
 
 
-def measure_time(views: int) -> Figures:
-    """Return the CPU time of an image by satellite and range."""
+def measure_time(options: Options) -> Figures:
+    """Time images of meshes by satellite and range."""
+    views = views_of(options)
     camera, figures = Camera.from_hfov(960, 540, np.deg2rad(60.0)), {}
     for name in SATELLITES:
         renderer = MeshRenderer(camera, satellite(name), None, Effects().point_spread_px)
@@ -57,8 +50,9 @@ def measure_time(views: int) -> Figures:
     return figures
 
 
-def measure_accuracy(views: int) -> Figures:
-    """Return the errors against the ray tracer over all satellites and ranges."""
+def measure_accuracy(options: Options) -> Figures:
+    """Compare grey levels, silhouettes and shadow edges with those of the ray tracer Embree."""
+    views = max(1, views_of(options) // 4)
     camera, rng = Camera.from_hfov(480, 270, np.deg2rad(60.0)), np.random.default_rng(3)
     greys, silhouettes, shadows = [], [], []
     for _ in range(views):
@@ -83,22 +77,9 @@ def measure_accuracy(views: int) -> Figures:
     }
 
 
-def main() -> None:
-    """Run the parts."""
-    parser = make_parser(__doc__, ("time", "accuracy"))
-    parser.add_argument(
-        "--views", type=int, help="views by satellite and range (default 20; 2 with --quick)"
-    )
-    options = parser.parse_args()
-    views = options.views or (2 if options.quick else 20)
-    run_parts(
-        options,
-        {
-            "time": lambda: measure_time(views),
-            "accuracy": lambda: measure_accuracy(max(1, views // 4)),
-        },
-    )
+def views_of(options: Options) -> int:
+    """Return the number of views by satellite and range."""
+    return options.views or (2 if options.quick else 20)
 
 
-if __name__ == "__main__":
-    main()
+GROUP = Group({"mesh-time": measure_time, "mesh-accuracy": measure_accuracy})

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observability of camera calibration errors in flight: ``python benchmarks/observability.py
-[--json FILE]``.
+"""Observability of camera calibration errors in flight.
 
 Stacks the Jacobians of all poses measured in a minute with respect to the target's state (12) and
 the errors of each camera (rotation of the mounting: 3; or rotation, position and focal length: 7).
-Rows are divided by the sigma of a measurement, columns multiplied by the prior sigma. Figures: the
-number of unobservable directions, and the posterior sigma of the mounting rotation (prior: 0.3
-degrees). In synchronized flight the chasers stay 1 m from the target and rotate with it; in the
-calibration manoeuvre chaser 0 also turns about its line of sight. ``--quick`` changes nothing.
+Rows are divided by the sigma of a measurement, columns multiplied by the prior sigma. In
+synchronized flight the chasers stay 1 m from the target and rotate with it; in the calibration
+manoeuvre chaser 0 also turns about its line of sight.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_t
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ
-from common import Figures, make_parser, print_figures, write_json
+from common import Figures, Group, Options
 
 RATES = {"still": np.zeros(3), "tumbling": np.array([0.015, 0.045, 0.03])}
 IMAGE_HZ, DURATION_S = 5.0, 60.0
@@ -64,8 +62,10 @@ def jacobian(chasers: int, omega: Array, errors: int, manoeuvre: bool) -> Array:
     return np.concatenate(rows) * np.concatenate([TARGET_SIGMA, *[CAMERA_SIGMA[:errors]] * chasers])
 
 
-def main() -> None:
-    options = make_parser(__doc__).parse_args()
+def observability(_: Options) -> Figures:
+    """Compute the unobservable directions of camera errors, and the posterior sigma of a mounting's
+    rotation (prior: 0.3 degrees).
+    """
     figures: Figures = {}
     for errors, chasers, rate, manoeuvre in itertools.product(
         (3, ERRORS), (1, 2, 3, 4), RATES, (False, True)
@@ -80,9 +80,7 @@ def main() -> None:
         figures[f"{key}_unobservable"] = int((values <= 1e-9 * values[0]).sum())
         figures[f"{key}_worst_rotation_sigma_rad"] = float(sigmas_rad[-1])
         figures[f"{key}_best_rotation_sigma_rad"] = float(sigmas_rad[0])
-    print_figures(figures)
-    write_json(options.json, figures)
+    return figures
 
 
-if __name__ == "__main__":
-    main()
+GROUP = Group({"observability": observability})

@@ -1,12 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster performance: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART
-...]``.
-
-Parts: ``allocation`` (random wrenches), ``pulses`` (delivered against commanded impulse),
-``tracking`` (measurements without noise, the paper's rates), ``failures`` (every thruster of
-tetra12 stuck on, and stuck off, not reported, at 30 s), ``healthy`` (false alarms). Missions fly in
-one process with a measurement model in place of images. ``--quick``: fewer and shorter.
-"""
+"""Thruster performance. Missions fly in one process with a measurement model in place of images."""
 
 from __future__ import annotations
 
@@ -24,7 +17,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import Valves
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_protocol.scenario.thrusters import thrusts_max
-from common import Figures, make_parser, run_parts
+from common import Figures, Group, Options
 from flights.measured_poses import measurement_model
 
 from chaserdock.evaluation.flight_record import FlightRecord, record_flight
@@ -69,7 +62,7 @@ def fly(s: Scenario) -> FlightRecord:
     return record_flight(s, measurement_model(s, 0))
 
 
-def allocation(quick: bool) -> Figures:
+def allocation(options: Options) -> Figures:
     """Measure accuracy and time of the allocation of random feasible wrenches, up to full thrust."""
     out: Figures = {}
     for body in ("tetra12", "slider"):
@@ -77,7 +70,7 @@ def allocation(quick: bool) -> Figures:
         b = scenario(1.0, body).chaser
         allocator, full = allocator_of(b), thrusts_max(b.thrusters)
         worst, over, inexact, took = 0.0, 0.0, 0, []
-        for _ in range(1000 if quick else 10_000):
+        for _ in range(1000 if options.quick else 10_000):
             wrench = allocator.matrix @ (full * rng.uniform(0.0, 1.0, len(full)))
             begin = time.perf_counter()
             got = allocator.allocate(wrench, full)
@@ -95,7 +88,7 @@ def allocation(quick: bool) -> Figures:
     return out
 
 
-def pulses(quick: bool) -> Figures:
+def pulses(options: Options) -> Figures:
     """Measure the largest difference of delivered and commanded impulse over a second of random
     thrusts, in minimum pulses.
 
@@ -108,7 +101,7 @@ def pulses(quick: bool) -> Figures:
         b, timing, rng = s.chaser, s.timing, np.random.default_rng(2)
         full = thrusts_max(b.thrusters)
         modulator, valves = Modulator(b.thrusters, b.modulation, timing), Valves(b.thrusters)
-        ticks, level = (20 if quick else 200) * rate_hz, full
+        ticks, level = (20 if options.quick else 200) * rate_hz, full
         commanded = [np.zeros(len(full))]
         for tick in range(ticks):
             # The cube makes small thrusts frequent; steps come every second.
@@ -158,17 +151,17 @@ class CommandedImpulse:
         return self.until(ends_ns) - self.until(begins) - 1e3 * first
 
 
-def tracking(quick: bool) -> Figures:
+def tracking(options: Options) -> Figures:
     """Measure steady errors and impulse with thrusters, beside ideal actuation."""
     out: Figures = {}
-    duration_s = 40.0 if quick else 120.0
+    duration_s = 40.0 if options.quick else 120.0
     for body in ("tetra12", "slider"):
         ideal = fly(scenario(duration_s, body, chaser={"actuation": "ideal"}))
         out[f"tracking_{body}_ideal_position_rms_m"] = ideal.rms(20.0)[0]
         out[f"tracking_{body}_ideal_absolute_impulse_N_s"] = float(ideal.absolute_impulse_N_s[0])
         rates: list[tuple[str, int, dict[str, Any]]] = [(f"{hz}_hz", hz, {}) for hz in (15, 10, 30)]
         rates += [(name, 15, chaser) for name, chaser in VARIANTS.items()]
-        for variant, rate_hz, chaser in rates[:1] if quick else rates:
+        for variant, rate_hz, chaser in rates[:1] if options.quick else rates:
             record = fly(scenario(duration_s, body, rate_hz, chaser=chaser))
             position, angle = record.rms(20.0)
             name = f"tracking_{body}_{variant}"
@@ -193,12 +186,12 @@ def _isolated_s(record: FlightRecord, thruster: int) -> float:
     return times[0] if times else math.inf
 
 
-def failures(quick: bool) -> Figures:
+def failures(options: Options) -> Figures:
     """Let every thruster fail at 30 s, not reported: time to isolation, wrongly isolated thrusters,
     errors afterwards.
     """
     out: Figures = {}
-    thrusters = (0, 5, 10) if quick else range(12)
+    thrusters = (0, 5, 10) if options.quick else range(12)
     for kind in ("stuck_on", "stuck_off"):
         delays, wrong, peaks, final = [], 0, [], []
         for thruster in thrusters:
@@ -230,11 +223,11 @@ def failures(quick: bool) -> Figures:
     return out
 
 
-def healthy(quick: bool) -> Figures:
+def healthy(options: Options) -> Figures:
     """Count false alarms without failures: random starts, up to three times the paper's rates,
     noisy measurements, both bodies.
     """
-    alarms, flights = 0, 4 if quick else 20
+    alarms, flights = 0, 4 if options.quick else 20
     for seed in range(flights):
         rng = np.random.default_rng(100 + seed)
         times = rng.uniform(0.0, 3.0)
@@ -246,7 +239,7 @@ def healthy(quick: bool) -> Figures:
         target = {
             key: _randomly_rotated(rng, np.array(v) * times) for key, v in PAPER_RATES.items()
         }
-        s = scenario(40.0 if quick else 60.0, ("tetra12", "slider")[seed % 2], (15, 10, 30)[seed % 3], start=start,
+        s = scenario(40.0 if options.quick else 60.0, ("tetra12", "slider")[seed % 2], (15, 10, 30)[seed % 3], start=start,
                      target=target)  # fmt: skip
         record = record_flight(s, measurement_model(s, seed, 0.002, math.radians(0.1)))
         alarms += len(record.thruster_events)
@@ -259,21 +252,12 @@ def _randomly_rotated(rng: np.random.Generator, vector: Array) -> list[float]:
     return rotations.rotate(rotations.normalize(rng.normal(size=4)), vector).tolist()
 
 
-PARTS = {
-    "allocation": allocation,
-    "pulses": pulses,
-    "tracking": tracking,
-    "failures": failures,
-    "healthy": healthy,
-}
-
-
-def main() -> None:
-    options = make_parser(__doc__, PARTS).parse_args()
-    run_parts(
-        options, {name: lambda part=part: part(options.quick) for name, part in PARTS.items()}
-    )
-
-
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {
+        "thrusters-allocation": allocation,
+        "thrusters-pulses": pulses,
+        "thrusters-tracking": tracking,
+        "thrusters-failures": failures,
+        "thrusters-healthy": healthy,
+    }
+)

@@ -1,62 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Perception by shape: ``python benchmarks/markerless.py [--views N] [--ranges M ...] [--only PART]
-[--results FILE] [--quick] [--json FILE]``.
+"""Perception by shape in single images and sequences of ``geo_servicer``.
 
-Images of ``geo_servicer``, 960 x 540 pixels, 60 degrees, by the world's renderer of meshes, with
-cast shadows, specular reflection, insulation texture, point spread and noise. The tracker has its
-own renderer and estimates the light. Attitudes and suns in front of the target are random. Parts:
+960 x 540 pixels, 60 degrees, by the world's renderer of meshes, with cast shadows, specular
+reflection, insulation texture, point spread and noise. The tracker has its own renderer and
+estimates the light. Attitudes and suns in front of the target are random. Single images are tracked
+from a prior 1 % of the range and 1.5 degrees off. The exact mesh, or one as known: simplified to 1
+mm, with panels wrong by 0.5 degrees and a scale wrong by 0.3 % (standard deviations, drawn for each
+view; the truth stays the same).
 
-- ``exact`` and ``knowledge``: tracking from a prior 1 % of the range and 1.5 degrees off, at 1, 3
-  and 10 m, with the exact mesh, and with one that is simplified to 1 mm, with panels wrong by 0.5
-  degrees and a scale wrong by 0.3 % (standard deviations, drawn for each view; the truth stays the
-  same);
-- ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are
-  averaged by their covariances;
-- ``triangulated``: as ``knowledge``, after one image of each of four cameras around the target at 1
-  to 1.6 m, whose distances odometry of grade `lab` measures, which tells the scale;
-- ``independent`` and ``independent-knowledge``: as ``exact`` and ``knowledge``, with images by the
-  ray tracer Embree, without texture;
-- ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun
-  behind the target; views in which the target is darker than 5 grey levels are left out, here and
-  with the lamp;
-- ``backlit-flight`` and ``lamp-flight``: the views of ``backlit`` and ``lamp`` as in flight, each
-  the last of 30 images of a target that turns;
-- ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp,
-  that of `harsh-light`, and at 1 to 3 m of a target that moves by four pixels during the exposure;
-  the pose is that in the middle of it;
-- ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m:
-  gross errors, and those that pass the gate;
-- ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the
-  Earth, and in front of space by one of two cameras that see the target at right angles;
-- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated by the controller's
-  filter from 36 views from all around at 1 to 1.6 m, by two cameras on opposite sides whose
-  distance odometry of grade `lab` measures; twelve views of each of ``views / 12`` drawn meshes;
-- ``sequence`` and ``closing``: a tumbling target, followed at 15 Hz from its acquisition on, at 3 m
-  and from 1.4 to 0.55 m;
-- ``shaded``: CPU time per image on the shaded side of tumbling targets at 0.8 to 2.2 m, from poses
-  that others expect, the least of three repetitions, as other programs on the machine prolong it.
-
-Gross: an error above 2 degrees or 2 % of range that passes the gate. Times are CPU times of this
-process. ``--results FILE`` appends every view to FILE (JSON lines) and does not repeat views that
-are in it.
+Gross: an error above 2 degrees or 2 % of range that passes the gate. Views in which the target is
+darker than 5 grey levels are left out. Times are CPU times of this process.
 """
 
 from __future__ import annotations
 
 import itertools
-import sys
 import time
 import zlib
-from collections.abc import Callable
+from argparse import ArgumentParser
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
-from common import ROOT, Figures, append_line, make_parser, read_lines, run_parts, use_one_thread
-
-sys.path.insert(0, str(ROOT / "tests"))
-
 from chaserdock_agents.chaser.perception.model import tracking
 from chaserdock_agents.chaser.perception.model.acquisition import Acquisition
 from chaserdock_agents.chaser.perception.model.alignment import Alignment, Pyramid
@@ -77,6 +45,7 @@ from chaserdock_protocol.scenario.navigation import NavigationSection
 from chaserdock_world.rendering.background import SPACE_LEVEL, Earth, Light
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
+from common import Figures, Group, Options, Results, described
 from markerless_cases import backlit_view, perturbed, random_view
 from numpy.typing import NDArray
 
@@ -184,16 +153,10 @@ class Cells:
         """Return the rows of a cell; ``view`` makes that of a number with a generator of its own,
         or that of the cell ``like``.
         """
-        known = {
-            line["number"]: line["row"] for line in read_lines(self.path) if line["cell"] == cell
-        }
-        for number in range(views):
-            if number not in known:
-                known[number] = view(
-                    np.random.default_rng([zlib.crc32((like or cell).encode()), number]), number
-                )
-                append_line(self.path, {"cell": cell, "number": number, "row": known[number]})
-        return [known[number] for number in range(views)]
+        stream = zlib.crc32((like or cell).encode())
+        return Results(self.path, {"cell": cell}, ViewRow).of(
+            range(views), lambda number: view(np.random.default_rng([stream, number]), number)
+        )
 
 
 def inspect(views: int) -> Figures:
@@ -667,16 +630,16 @@ def follow(key: str, images: int, first_m: float, closing_m: float) -> Figures:
     }
 
 
-def shaded() -> Figures:
+def shaded(images: int) -> Figures:
     """Start from expected poses, and follow, on the shaded side of targets that turn at 4
-    degrees/s; 40 images of each.
+    degrees/s; so many images of each.
     """
     scene, least_s, seen = SatelliteImages(), [], 0
     for number, (range_m, sun) in enumerate(_SHADED):
         rng = np.random.default_rng(number)
         pose, _ = random_view(rng, range_m, CAMERA)
         views = []
-        for k in range(_SHADED_IMAGES):
+        for k in range(images):
             moved = PoseInCamera(
                 pose.position, rotations.to_matrix(rotations.exp(k * TURN)) @ pose.rotation
             )
@@ -723,83 +686,141 @@ def _quantiles(key: str, errors: Array) -> Figures:
     return out
 
 
-def main() -> None:
-    parts = (
-        "exact",
-        "knowledge",
-        "crossed",
-        "triangulated",
-        "inspect",
-        "independent",
-        "independent-knowledge",
-        "behind",
-        "backlit",
-        "backlit-flight",
-        "lamp",
-        "lamp-flight",
-        "blur",
-        "gate",
-        "acquisition",
-        "earth",
-        "pair",
-        "sequence",
-        "closing",
-        "shaded",
+def at_ranges(
+    cell: Callable[[Cells, float, int], Figures],
+    cells: Cells,
+    ranges_m: Sequence[float],
+    views: int,
+) -> Figures:
+    """Return the figures of a cell at several ranges."""
+    figures = Figures()
+    for range_m in ranges_m:
+        figures |= cell(cells, range_m, views)
+    return figures
+
+
+AT_RANGES: dict[str, tuple[Callable[[Cells, float, int], Figures], str]] = {
+    "exact": (
+        lambda cells, range_m, views: track_cell(cells, "exact", range_m, views),
+        "Track single images at 1, 3 and 10 m with the exact mesh.",
+    ),
+    "knowledge": (
+        lambda cells, range_m, views: track_cell(cells, "knowledge", range_m, views),
+        "Track the same with a mesh as known.",
+    ),
+    "crossed": (crossed, "Track the same by two cameras at right angles, poses averaged."),
+    "triangulated": (
+        triangulated,
+        "Track the same after one image of each of four cameras around the target at 1 to 1.6 m, "
+        "whose distances odometry of grade lab measures, which tells the scale.",
+    ),
+    "independent": (
+        lambda cells, range_m, views: independent(cells, "independent", range_m, views),
+        "Track images by the ray tracer Embree, without texture, with the exact mesh.",
+    ),
+    "independent-knowledge": (
+        lambda cells, range_m, views: independent(cells, "independent-knowledge", range_m, views),
+        "Track the same with a mesh as known.",
+    ),
+}
+VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
+    "inspect": (
+        lambda _, views: inspect(views),
+        "Track at 1 m after the geometry has been estimated by the controller's filter from 36 views "
+        "at 1 to 1.6 m, by two cameras on opposite sides: twelve views of each drawn mesh.",
+    ),
+    "behind": (behind, "Track at 1 to 3 m in front of the Earth."),
+    "backlit": (backlit, "Track at 1 to 3 m with the sun behind the target."),
+    "backlit-flight": (
+        lambda cells, views: in_flight(
+            cells, "backlit", views, lambda rng: backlit_view(rng, CAMERA)
+        ),
+        "Track the views of backlit as in flight, each the last of 30 images of a turning target.",
+    ),
+    "lamp": (lamp, "Track at 1 to 2 m in eclipse, by the light of the camera's lamp."),
+    "lamp-flight": (
+        lambda cells, views: in_flight(cells, "lamp", views, lamp_view),
+        "Track the views of lamp as in flight.",
+    ),
+    "blur": (
+        blur,
+        "Track at 1 to 3 m a target that moves by four pixels during the exposure; the pose is that "
+        "in the middle of it.",
+    ),
+    "gate": (
+        gate,
+        "Track from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and "
+        "those that pass the gate.",
+    ),
+    "acquisition": (
+        lambda cells, views: acquire(cells, "acquisition", views),
+        "Find the target without a prior at 1 to 3 m, in front of space.",
+    ),
+    "earth": (
+        lambda cells, views: acquire(cells, "earth", views),
+        "Find it in front of the Earth.",
+    ),
+    "pair": (
+        lambda cells, views: acquire(cells, "pair", views),
+        "Find it by one of two cameras at right angles.",
+    ),
+    "sequence": (
+        lambda _, views: follow("sequence", views, 3.0, 0.0),
+        "Follow a tumbling target at 15 Hz from its acquisition on, at 3 m.",
+    ),
+    "closing": (
+        lambda _, views: follow("closing", min(views, 100), 1.4, 0.0085),
+        "Follow it from 1.4 to 0.55 m.",
+    ),
+    "shaded": (
+        lambda _, views: shaded(min(views, _SHADED_IMAGES)),
+        "Time images of the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that others "
+        "expect: the least of three repetitions, as other programs on the machine prolong it.",
+    ),
+}
+
+
+def views_of(options: Options) -> int:
+    """Return the number of views of a cell."""
+    return options.views or (3 if options.quick else 300)
+
+
+def run_at_ranges(name: str, options: Options) -> Figures:
+    """Measure a cell at the ranges of the options."""
+    cells = Cells(options.results)
+    return at_ranges(AT_RANGES[name][0], cells, options.ranges, views_of(options))
+
+
+def run_views(name: str, options: Options) -> Figures:
+    """Measure a cell."""
+    return VIEWS[name][0](Cells(options.results), views_of(options))
+
+
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--views", type=int, metavar="N", help="of mesh and shape: views of a cell (20 and 300)"
     )
-    parser = make_parser(__doc__, parts)
-    parser.add_argument("--views", type=int, help="views per cell (default 300, with --quick 20)")
     parser.add_argument(
         "--ranges",
         type=float,
         nargs="+",
         default=RANGES_M,
         metavar="M",
-        help="ranges of the tracking cells",
+        help="of shape: ranges of the cells at several ranges",
     )
-    parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="append views; those in it are not repeated"
-    )
-    options = parser.parse_args()
-    use_one_thread()
-    views = options.views or (20 if options.quick else 300)
-    cells = Cells(options.results)
 
-    def at_ranges(cell: Callable[[float], Figures]) -> Figures:
-        figures = Figures()
-        for range_m in options.ranges:
-            figures |= cell(range_m)
-        return figures
 
-    run_parts(
-        options,
-        {
-            "exact": lambda: at_ranges(lambda m: track_cell(cells, "exact", m, views)),
-            "knowledge": lambda: at_ranges(lambda m: track_cell(cells, "knowledge", m, views)),
-            "crossed": lambda: at_ranges(lambda m: crossed(cells, m, views)),
-            "triangulated": lambda: at_ranges(lambda m: triangulated(cells, m, views)),
-            "inspect": lambda: inspect(views),
-            "independent": lambda: at_ranges(lambda m: independent(cells, "independent", m, views)),
-            "independent-knowledge": lambda: at_ranges(
-                lambda m: independent(cells, "independent-knowledge", m, views)
-            ),
-            "behind": lambda: behind(cells, views),
-            "backlit": lambda: backlit(cells, views),
-            "backlit-flight": lambda: in_flight(
-                cells, "backlit", views, lambda rng: backlit_view(rng, CAMERA)
-            ),
-            "lamp": lambda: lamp(cells, views),
-            "lamp-flight": lambda: in_flight(cells, "lamp", views, lamp_view),
-            "blur": lambda: blur(cells, views),
-            "gate": lambda: gate(cells, views),
-            "acquisition": lambda: acquire(cells, "acquisition", views),
-            "earth": lambda: acquire(cells, "earth", views),
-            "pair": lambda: acquire(cells, "pair", views),
-            "sequence": lambda: follow("sequence", views, 3.0, 0.0),
-            "closing": lambda: follow("closing", 100, 1.4, 0.0085),
-            "shaded": shaded,
+GROUP = Group(
+    {
+        **{
+            f"shape-{name}": described(partial(run_at_ranges, name), text)
+            for name, (_, text) in AT_RANGES.items()
         },
-    )
-
-
-if __name__ == "__main__":
-    main()
+        **{
+            f"shape-{name}": described(partial(run_views, name), text)
+            for name, (_, text) in VIEWS.items()
+        },
+    },
+    ("results",),
+    add_options,
+)

@@ -1,22 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy, range and speed of perception, and both renderers: ``python benchmarks/vision.py
-[--quick] [--json FILE] [--only PART ...]``.
+"""Accuracy, range and speed of perception by markers, and both renderers.
 
-Parts: ``rendering`` (time and corner errors of the renderers), ``speed`` (image to pose), ``reach``
-(share of detected views by distance), ``near`` (the body fills the image), ``metre`` (a lit and a
-shadowed face at 1 m), ``accuracy`` (random views of both targets with all effects at default
-strength, by the default perception and by the paper's), ``far`` (the servicer at 5 to 7.5 m: views
-without a pose, errors, and NEES over the stated covariance; ``--strip PX``: fit borders that end at
-neighbours beside a part of a side as strips below this width, 1.5 by default), ``bearing`` (the
-servicer at 7 to 200 m, by bearing and range). Gross error: more than 10 degrees or 10 cm (for an
-ambiguous view: of the solution nearer to the truth).
+Gross error: more than 10 degrees or 10 cm (for an ambiguous view: of the solution nearer to the
+truth).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from argparse import ArgumentParser
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -41,7 +36,7 @@ from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
-from common import Figures, make_parser, percentiles, run_parts
+from common import Figures, Group, Options, described, percentiles
 from flights import load_shipped
 from numpy.typing import NDArray
 
@@ -451,31 +446,41 @@ def bearing(count: int) -> Figures:
     return out
 
 
-def main() -> None:
-    counts = {
-        "rendering": (rendering, 200, 20),
-        "speed": (speed, 200, 30),
-        "reach": (reach, 100, 10),
-        "near": (near_views, 600, 60),
-        "metre": (at_one_metre, 1000, 100),
-        "accuracy": (accuracy, 10_000, 150),
-        "far": (far, 80, 8),
-        "bearing": (bearing, 80, 8),
-    }
-    parser = make_parser(__doc__, counts)
-    parser.add_argument("--strip", type=float, metavar="PX", help="of far: width in pixels")
-    options = parser.parse_args()
+COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
+    "rendering": (rendering, 200, 20),
+    "speed": (speed, 200, 30),
+    "reach": (reach, 100, 4),
+    "near": (near_views, 600, 30),
+    "metre": (at_one_metre, 1000, 30),
+    "accuracy": (accuracy, 10_000, 60),
+    "far": (far, 80, 4),
+    "bearing": (bearing, 80, 8),
+}
+"""Number of views of each part, and number with ``--quick``."""
+
+
+def measure(name: str, options: Options) -> Figures:
+    """Measure a part."""
     if options.strip is not None:
         SETTINGS.partial_px = options.strip
-    cv2.setNumThreads(1)
-    run_parts(
-        options,
-        {
-            name: lambda part=part, count=quick if options.quick else full: part(count)
-            for name, (part, full, quick) in counts.items()
-        },
+    part, full, quick = COUNTS[name]
+    return part(quick if options.quick else full)
+
+
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--strip",
+        type=float,
+        metavar="PX",
+        help="of markers-far: fit borders that end at neighbours beside a part of a side as strips "
+        "below this width (1.5)",
     )
 
 
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {
+        f"markers-{name}": described(partial(measure, name), part.__doc__ or "")
+        for name, (part, _, _) in COUNTS.items()
+    },
+    add_options=add_options,
+)

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Take-over by the standby controller: ``python benchmarks/standby.py [--flights 5] [--only PART
-...] [--quick] [--json FILE]``.
+"""Take-over by the standby controller: ``fault-drill`` in real time, all processes as clients of a
+router.
 
-Flies ``fault-drill`` in real time, all processes as clients of a router. During the final approach
-the commanding controller is killed (``kill``: SIGKILL), stopped for 3 s (``freeze``: SIGSTOP,
-SIGCONT), or cut off from the router for 3 s in both directions without closing a connection
-(``partition``). ``takeover``: wall time from the fault to the sending of the standby's first
-command. ``two_commanding``: commands of an older term that a chaser executed after one of a newer
-term. ``identity``: pairs of lock-step flights, one with the controller killed, whose bodies must
-move identically. Measures wall time: run nothing else beside it.
+During the final approach the commanding controller is killed (``kill``: SIGKILL), stopped for 3 s
+(``freeze``: SIGSTOP, SIGCONT), or cut off from the router for 3 s in both directions without
+closing a connection (``partition``). ``takeover``: wall time from the fault to the sending of the
+standby's first command. ``two_commanding``: commands of an older term that a chaser executed after
+one of a newer term.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import ActuatorCommand, MissionEnd, Tick, WrenchCommand
 from chaserdock_protocol.recording.log import read_log
 from chaserdock_protocol.transport import Link, Node, RawSample
-from common import ROOT, Figures, make_parser, run_parts, start_mission
+from common import ROOT, Figures, Group, Options, described, start_mission
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summarize
@@ -271,21 +270,26 @@ def is_identical(at_s: float) -> bool:
     return all(np.array_equal(truths[0][body], truths[1][body]) for body in truths[0])
 
 
-def identity(pairs: int) -> Figures:
-    """Compare pairs of lock-step flights."""
+def identity(options: Options) -> Figures:
+    """Compare pairs of lock-step flights, one with the controller killed: bodies move identically."""
+    pairs = 1 if options.quick else 2
     draw = random.Random("identity")
     same = [is_identical(round(draw.uniform(EARLIEST_S, LATEST_S), 1)) for _ in range(pairs)]
     return {"identity_pairs": pairs, "identity_different": same.count(False)}
 
 
-def main() -> None:
-    parser = make_parser(__doc__, (*FAULTS, "identity"))
-    parser.add_argument("--flights", type=int, default=5, help="flights with each fault")
-    options = parser.parse_args()
-    flights = 1 if options.quick else options.flights
-    faults = {name: lambda name=name: takeovers(name, flights) for name in FAULTS}
-    run_parts(options, {**faults, "identity": lambda: identity(1 if options.quick else 2)})
+def measure(fault: str, options: Options) -> Figures:
+    """Return the figures of five take-overs (``--quick``: one)."""
+    return takeovers(fault, 1 if options.quick else options.flights or 5)
 
 
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {
+        **{
+            f"standby-{name}": described(partial(measure, name), fault.__doc__ or "")
+            for name, fault in FAULTS.items()
+        },
+        "standby-identity": identity,
+    },
+    ("flights",),
+)

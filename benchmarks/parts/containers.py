@@ -1,31 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Failures of containers: ``python benchmarks/containers.py [--quick] [--json FILE] [--only FAULT
-...]``.
+"""Failures of containers: a mission by compose.yaml for each fault, with access control, each in its
+own project. Needs Docker.
 
-Builds the image and flies a mission by compose.yaml for each fault, with access control, each in
-its own project. Figures: wall time until every process is expected again, simulated time without
-one, and whether the mission was a success. Faults: ``crash`` of a chaser (Docker restarts it),
-``kill`` of a chaser (``docker kill``; ``docker start`` after 2 s), ``pause`` of a chaser for 5 s,
-``disconnect`` of a chaser from the network for 5 s, restart of the ``router``, crash of the
-``controller``. ``--quick``: 120 s of two chasers with small images (a shorter mission may end
-before a container is back).
+Figures: wall time until every process is expected again, simulated time without one, and whether
+the mission was a success.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 
 from chaserdock_protocol.recording.log import read_log
-from common import ROOT, Figures, make_parser, run_parts
-
-sys.path.insert(0, str(ROOT / "tests"))
-
+from common import ROOT, Figures, Group, Options, described
 from compose_project import Project, compose_command, docker
 
 SMALL = "camera.width_px=640 camera.height_px=480 settling_s=10.0"
@@ -67,22 +60,34 @@ def disconnect(project: Project, container: str) -> None:
     docker("network", "connect", project.network(), container)
 
 
-FAULTS: dict[str, tuple[str, Callable[[Project, str], object]]] = {
-    "none": ("chaser-1", lambda project, container: None),
-    "crash": ("chaser-1", lambda project, container: crash(container)),
-    "kill": ("chaser-1", kill),
-    "pause": ("chaser-1", pause),
-    "disconnect": ("chaser-1", disconnect),
-    "router": ("router", lambda project, container: docker("restart", "-t", "2", container)),
-    "controller": ("controller", lambda project, container: crash(container)),
+FAULTS: dict[str, tuple[str, Callable[[Project, str], object], str]] = {
+    "none": ("chaser-1", lambda project, container: None, "Fly without a fault."),
+    "crash": (
+        "chaser-1",
+        lambda project, container: crash(container),
+        "Kill the process of a chaser; Docker restarts its container.",
+    ),
+    "kill": ("chaser-1", kill, "Kill the container of a chaser, and start it after 2 s."),
+    "pause": ("chaser-1", pause, "Pause the container of a chaser for 5 s."),
+    "disconnect": ("chaser-1", disconnect, "Disconnect a chaser from the network for 5 s."),
+    "router": (
+        "router",
+        lambda project, container: docker("restart", "-t", "2", container),
+        "Restart the router.",
+    ),
+    "controller": (
+        "controller",
+        lambda project, container: crash(container),
+        "Kill the process of the controller; Docker restarts its container.",
+    ),
 }
-"""Service and cause of each fault."""
+"""Service, cause and description of each fault."""
 
 
 def fly(fault: str, scenario: str, overrides: str) -> Figures:
     """Return the figures of a flight with a fault."""
     project = Project(scenario, overrides)
-    service, cause = FAULTS[fault]
+    service, cause, _ = FAULTS[fault]
     try:
         begin_s = time.monotonic()
         up = project.compose("up", "-d", "--no-build")
@@ -126,18 +131,29 @@ def figures(fault: str, log: Path, fault_ns: int, status: int, took_s: float) ->
     }
 
 
-def main() -> None:
-    options = make_parser(__doc__, FAULTS).parse_args()
+@cache
+def build_image() -> None:
+    """Build the image. Raises SystemExit if it cannot be built."""
     (ROOT / "runs").mkdir(exist_ok=True)
     built = subprocess.run([*compose_command(), "build", "router"], cwd=ROOT, check=False)
     if built.returncode != 0:
         raise SystemExit("the image cannot be built")
-    scenario = "two-chaser-tracking" if options.quick else "four-chaser-docking"
-    overrides = f"duration_s=120.0 {SMALL} {TOLERANT}" if options.quick else TOLERANT
-    run_parts(
-        options, {fault: lambda fault=fault: fly(fault, scenario, overrides) for fault in FAULTS}
-    )
 
 
-if __name__ == "__main__":
-    main()
+def measure(fault: str, options: Options) -> Figures:
+    """Fly with a fault, if there is Docker."""
+    if shutil.which("docker") is None:
+        print("  not measured: Docker is not installed")
+        return {}
+    build_image()
+    if options.quick:
+        return fly(fault, "two-chaser-tracking", f"duration_s=120.0 {SMALL} {TOLERANT}")
+    return fly(fault, "four-chaser-docking", TOLERANT)
+
+
+GROUP = Group(
+    {
+        f"containers-{name}": described(partial(measure, name), text)
+        for name, (_, _, text) in FAULTS.items()
+    }
+)

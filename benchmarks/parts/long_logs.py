@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and memory of the commands that read a log: ``python benchmarks/long_logs.py LOG [--hours
-10] [--quick] [--json FILE]``.
+"""Time and memory of the commands that read a log, on one flight and on many hours.
 
-Runs each command on the given log and on a log of many hours. The long log repeats the given one
-with continued ticks and times, without images (ten hours of them would be hundreds of gigabytes).
-LOG is a run's folder or log, for example of ``chaserdock run four-chaser-docking``.
+The long log repeats the flown one with continued ticks and times, without images (ten hours of them
+would be hundreds of gigabytes).
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ import os
 import sys
 import tempfile
 import time
+from argparse import ArgumentParser
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -21,7 +20,7 @@ import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd, encoding_of
 from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
-from common import Figures, chaserdock_command, make_parser, print_figures, write_json
+from common import Figures, Group, Options, chaserdock_command, run_chaserdock
 
 _TIMES = ("sim_time_ns", "effective_time_ns", "expires_ns")
 
@@ -65,7 +64,7 @@ def repeat(log: Path, out: Path, hours: float) -> int:
 
 
 def cost_of(*arguments: str | Path) -> tuple[float, float]:
-    """Run ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise
+    """Measure ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise
     SystemExit if it fails.
     """
     begin_s = time.perf_counter()
@@ -93,33 +92,43 @@ def costs(log: Path, label: str) -> Figures:
             "log_tracks": ("log", "tracks", log, "--out", out / "tracks"),
         }.items():
             wall_s, peak_bytes = cost_of(*arguments)
-            part = {
+            figures |= {
                 f"{label}_{command}_wall_s": wall_s,
                 f"{label}_{command}_peak_bytes": peak_bytes,
             }
-            print_figures(part)
-            figures |= part
     return figures
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("log", type=Path, metavar="LOG", help="a run's folder or log")
-    parser.add_argument("--hours", type=float, default=10.0, help="length of the long log")
-    options = parser.parse_args()
-    figures = costs(options.log, "given")
+QUICK = ("duration_s=10.0", "settling_s=5.0", "steady_until_s=10.0", "timeline=[]", "success={}")
+
+
+def logs(options: Options) -> Figures:
+    """Measure each command that reads a log on ``--log`` (default: a flight of the main mission), and
+    on a log of ten hours (``--quick``: 0.2) made of it by repetition.
+    """
     with tempfile.TemporaryDirectory(prefix="long-log-") as folder:
-        long = Path(folder) / "long.mcap"
+        log, long = options.log, Path(folder) / "long.mcap"
+        if log is None:
+            log = Path(folder) / "run"
+            changes = [word for o in QUICK if options.quick for word in ("--set", o)]
+            run_chaserdock("run", "four-chaser-docking", "--out", log, "-q", *changes)
+        figures = costs(log, "given")
         # In a process of its own: Linux reports for a child at least the largest resident set that
         # its parent had when it started the child, and a writer keeps the index of all its chunks.
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            messages = pool.submit(
-                repeat, options.log, long, 0.2 if options.quick else options.hours
-            ).result()
+            hours = 0.2 if options.quick else options.log_h
+            messages = pool.submit(repeat, log, long, hours).result()
         figures |= {"long_messages": messages, "long_size_bytes": long.stat().st_size}
-        figures |= costs(long, "long")
-    write_json(options.json, figures)
+        return figures | costs(long, "long")
 
 
-if __name__ == "__main__":
-    main()
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--log", type=Path, help="of logs: a run's folder or log; default: a new run"
+    )
+    parser.add_argument(
+        "--log-h", type=float, default=10.0, metavar="H", help="length of the long log"
+    )
+
+
+GROUP = Group({"logs": logs}, add_options=add_options)

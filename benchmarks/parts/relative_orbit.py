@@ -1,13 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: ``python
-benchmarks/relative_orbit.py [--json FILE]``.
-
-Two spacecraft 100 m apart fly one orbit under two-body gravity, and with J2. ``--basilisk PYTHON``:
-an interpreter with the package ``bsk``, which flies them in Basilisk; it needs an environment of
-its own, as its releases demand older versions of matplotlib and pillow than chaserdock is locked
-to: ``python -m venv bsk && bsk/bin/pip install bsk``. Without it the recorded results are compared;
-``--write`` records them (tests/models/basilisk_relative_orbit.json). ``--quick``: a third of the
-cases.
+"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: two spacecraft 100 m apart fly one
+orbit under two-body gravity, and with J2.
 """
 
 from __future__ import annotations
@@ -16,6 +9,7 @@ import json
 import math
 import subprocess
 import tempfile
+from argparse import ArgumentParser
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -32,9 +26,9 @@ from chaserdock_models.orbit import (
     to_eci,
 )
 from chaserdock_models.relative_motion import cw_transition, propagate_relative
-from common import Figures, make_parser, print_figures, write_json
+from common import ROOT, Figures, Group, Options
 
-REFERENCE = Path(__file__).parents[1] / "tests" / "models" / "basilisk_relative_orbit.json"
+REFERENCE = ROOT / "tests" / "models" / "basilisk_relative_orbit.json"
 
 ORBITS = {
     "circular": (OrbitalElements(EARTH_RADIUS_M + 4e5, 0.0, 0.9), 0.0),
@@ -145,33 +139,38 @@ def fly_in_basilisk(python: str, folder: Path) -> list[dict[str, Any]]:
     return flown
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("--basilisk", metavar="PYTHON", help="interpreter with the package bsk")
-    parser.add_argument(
-        "--write", action="store_true", help="record Basilisk's results for the tests"
-    )
-    arguments = parser.parse_args()
-    if arguments.basilisk:
+def orbit(options: Options) -> Figures:
+    """Compare one orbit of two spacecraft at 100 m with Basilisk (recorded, or flown by
+    ``--basilisk``), and Clohessy-Wiltshire with it. ``--quick``: a third of the cases.
+    """
+    if options.basilisk:
         with tempfile.TemporaryDirectory() as folder:
-            flown = fly_in_basilisk(arguments.basilisk, Path(folder))
-        if arguments.write:
+            flown = fly_in_basilisk(options.basilisk, Path(folder))
+        if options.write:
             REFERENCE.write_text(json.dumps({"cases": flown}, indent=1) + "\n")
     else:
         flown = json.loads(REFERENCE.read_text())["cases"]
     figures: Figures = {}
-    for case in flown[:: 3 if arguments.quick else 1]:
+    for case in flown[:: 3 if options.quick else 1]:
         elements = OrbitalElements(**case["elements"])
         start = (case["position_m"], case["velocity_m_s"])
         position, _ = propagate_relative(state_of(elements), *start, case["duration_s"], case["j2"])
         figures[f"{case['name']}_to_basilisk_m"] = math.dist(position, case["end_position_m"])
-        linear = cw_transition(elements.mean_motion_rad_s, case["duration_s"]) @ np.concatenate(
-            start
-        )
+        transition = cw_transition(elements.mean_motion_rad_s, case["duration_s"])
+        linear = transition @ np.concatenate(start)
         figures[f"{case['name']}_cw_error_m"] = math.dist(linear[:3], case["end_position_m"])
-    print_figures(figures)
-    write_json(arguments.json, figures)
+    return figures
 
 
-if __name__ == "__main__":
-    main()
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--basilisk",
+        metavar="PYTHON",
+        help="of orbit: interpreter of an environment of its own, in which bsk is installed",
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="record Basilisk's results for the tests"
+    )
+
+
+GROUP = Group({"orbit": orbit}, add_options=add_options)

@@ -1,38 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Missions with perception by shape: ``python benchmarks/markerless_missions.py [--only PART]
-[--flights N] [--first SEED] [--set KEY=VALUE] [--results FILE] [--quick] [--json FILE]``.
+"""Missions with perception by shape, complete, in one process, with rendered images.
 
-Complete missions in one process (``chaserdock.evaluation.in_process``), with rendered images. The
-seed draws the errors of the target's geometry, of sensors and of images.
+The seed draws the errors of the target's geometry, of sensors and of images. A flight's line states
+how it ended; the figures are the worst over flights, and times are CPU times of this process by
+part.
 
-- ``docking``: ``markerless-docking`` to its end;
-- ``capture``: ``markerless-capture`` until the docking is verified, or to its end;
-- ``inspection``: ``markerless-inspection`` to its end; trackers correct their mesh by the
-  controller's estimate.
-
-A flight's line states how it ended; the figures are the worst over flights, and times are CPU times
-of this process by part. ``--results FILE`` appends every flight to FILE (JSON lines) and does not
-repeat flights that are in it. ``--quick``: one flight of 30 s, which cannot dock.
+Each sighting is compared with the true pose of the target in the true camera, of position and
+rotation apart: ``sighting_*_nees``, the squared error over the stated covariance (3 expected); and
+``sighting_*_correlation_*`` of the errors of one chaser at several lags, and of two chasers at one
+tick (``cameras``): mean products of errors, as ratios to their mean square. Errors are whitened by
+the stated covariance in the axes of TRF, and their mean is not subtracted.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
-from chaserdock_protocol.messages import GeometryEstimate, Image, Sighting
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import GeometryEstimate, Image, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
-from common import Figures, append_line, commit, make_parser, read_lines, run_parts, use_one_thread
+from chaserdock_world.sensors.errors import true_camera
+from common import Figures, Group, Options, Results, described, seeds_of
 from flights import load_shipped
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
@@ -44,8 +45,11 @@ SCENARIOS = {
     "capture": "markerless-capture",
     "inspection": "markerless-inspection",
 }
-QUICK = ("duration_s=30.0", "steady_until_s=30.0", "timeline=[]")
+QUICK = ("duration_s=20.0", "settling_s=10.0", "steady_until_s=20.0", "timeline=[]")
 PROGRESS_S = 5.0
+LAGS_S = (0.0, 1.0, 5.0, 20.0)
+"""Lags of the correlations; 0 stands for the next image."""
+KINDS = {"position": slice(0, 3), "rotation": slice(3, 6)}
 STEADY_RAD = math.radians(0.3)
 
 
@@ -59,6 +63,7 @@ class MarkerlessOutcome(msgspec.Struct, frozen=True):
     the first, by chaser. ``*_ms``: CPU time per tick by part; ``image_*_ms``: of the perception,
     per image. ``touch_m``, ``touch_deg``: at the latch. ``geometry_views``: views of an inspection;
     ``geometry_nees``: normalized squared error of its estimate per parameter, 1 expected.
+    ``sightings``: figures of their errors.
     """
 
     seed: int
@@ -89,19 +94,45 @@ class MarkerlessOutcome(msgspec.Struct, frozen=True):
     geometry_nees: float | None = None
     touch_m: float | None = None
     touch_deg: float | None = None
+    sightings: dict[str, float] = msgspec.field(default_factory=dict)
     retreats: list[str] = msgspec.field(default_factory=list)
 
 
-class TimedImages(RenderedImages):
-    """Rendered images and the perceptions of the chasers, with the CPU times of both."""
+def whitened_error(true_position_m: Array, true_q: Array, solution: PoseSolution) -> Array:
+    """Return the error (6,) of a solution over its stated covariance, in the axes of TRF; true pose
+    in IRF.
+    """
+    q = np.array(solution.q_wxyz)
+    error = pose_error(true_position_m, true_q, np.array(solution.position_m), q)
+    axes = np.eye(6)
+    axes[:3, :3] = rotations.to_matrix(q).T
+    covariance = axes @ np.reshape(solution.covariance, (6, 6)) @ axes.T
+    error = axes @ error
+    return np.concatenate(
+        [np.linalg.solve(np.linalg.cholesky(covariance[k, k]), error[k]) for k in KINDS.values()],
+        dtype=np.float64,
+    )
+
+
+class JudgedImages(RenderedImages):
+    """Rendered images and the perceptions of the chasers, with the CPU times of both, and the
+    whitened errors (6,) of all images by chaser, NaN without a pose.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario)
+        self._true_cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
+        self._truth: dict[int, tuple[Array, Array]] = {}
+        self.errors: list[list[Array]] = [[] for _ in scenario.chasers]
         self.render_s: list[float] = []
         self.perception_s: list[float] = []
         self.seen: list[list[bool]] = [[] for _ in scenario.chasers]
 
     def image(self, chaser: int, tick: int, time_ns: int, states: States) -> Image:
+        own, target = states[f"chaser/{chaser}"], states[TARGET]
+        eye, attitude = self._true_cameras[chaser].irf_pose_in_world(own.position_m, own.q_wxyz)
+        q = rotations.multiply(rotations.conjugate(attitude), target.q_wxyz)
+        self._truth[chaser] = rotations.rotate_inverse(attitude, target.position_m - eye), q
         begin_s = time.process_time()
         image = super().image(chaser, tick, time_ns, states)
         self.render_s.append(time.process_time() - begin_s)
@@ -112,7 +143,40 @@ class TimedImages(RenderedImages):
         sighting = super().see(chaser, image)
         self.perception_s.append(time.process_time() - begin_s)
         self.seen[chaser].append(sighting.status == "seen")
+        single = len(sighting.solutions) == 1
+        self.errors[chaser].append(
+            whitened_error(*self._truth[chaser], sighting.solutions[0])
+            if single
+            else np.full(6, math.nan)
+        )
         return sighting
+
+
+def correlation(a: Array, b: Array) -> float:
+    """Return the correlation of errors (images, 3) without subtracting their means; of images in
+    which both are known.
+    """
+    both = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
+    a, b = a[both], b[both]
+    return float(np.sum(a * b) / math.sqrt(np.sum(a * a) * np.sum(b * b)))
+
+
+def sighting_figures(errors: Array, images_per_s: float) -> Figures:
+    """Return the figures of the errors (chasers, images, 6) of one flight."""
+    figures: Figures = {}
+    for kind, part in KINDS.items():
+        of_kind = errors[:, :, part]
+        squares = np.sum(of_kind**2, axis=2)
+        figures[f"{kind}_nees"] = float(np.nanmean(squares))
+        for lag_s in LAGS_S:
+            lag = max(1, round(lag_s * images_per_s))
+            values = [correlation(e[:-lag], e[lag:]) for e in of_kind]
+            figures[f"{kind}_correlation_{f'{lag_s:g}_s' if lag_s else 'next'}"] = float(
+                np.mean(values)
+            )
+        pairs = [correlation(*pair) for pair in itertools.combinations(of_kind, 2)]
+        figures[f"{kind}_correlation_cameras"] = float(np.mean(pairs))
+    return figures
 
 
 class TimedMission(InProcessMission):
@@ -161,7 +225,7 @@ def estimate_error(record: TickRecord) -> EstimateError | None:
 
 def fly(seed: int, scenario: Scenario) -> MarkerlessOutcome:
     """Fly one mission."""
-    images = TimedImages(scenario)
+    images = JudgedImages(scenario)
     capture, wanted = scenario.docking.kind == "capture", scenario.success.latched
     rows, errors, next_s = [], [], PROGRESS_S
     begin_s = time.process_time()
@@ -183,7 +247,7 @@ def fly(seed: int, scenario: Scenario) -> MarkerlessOutcome:
 def print_progress(
     seed: int,
     record: TickRecord,
-    images: TimedImages,
+    images: JudgedImages,
     error: EstimateError | None,
     phases: list[str],
 ) -> None:
@@ -213,7 +277,7 @@ def longest_gap(seen: list[bool]) -> int:
 def outcome(
     seed: int,
     flight: TimedMission,
-    images: TimedImages,
+    images: JudgedImages,
     errors: list[list[tuple[float, float]]],
     rows: list[EstimateError | None],
     total_s: float,
@@ -265,6 +329,7 @@ def outcome(
         tick_ms=1e3 * total_s / ticks,
         touch_m=None if touch is None else touch.lateral_m,
         touch_deg=None if touch is None else math.degrees(touch.angle_rad),
+        sightings=sighting_figures(np.array(images.errors), 1.0 / image_s),
         retreats=retreats,
         geometry_views=0 if flight.geometry is None else flight.geometry.views,
         geometry_nees=None if flight.geometry is None else geometry_nees(scenario, flight.geometry),
@@ -287,7 +352,7 @@ def geometry_nees(scenario: Scenario, estimate: GeometryEstimate) -> float:
 def line_of(o: MarkerlessOutcome) -> str:
     """Return one line for people."""
     text = (
-        f"{o.seed}: {o.cause} at {o.time_s:.1f} s; steady {1e3 * o.steady_position_m:.2f} mm "
+        f"{o.cause} at {o.time_s:.1f} s; steady {1e3 * o.steady_position_m:.2f} mm "
         f"{math.degrees(o.steady_orientation_rad):.3f} deg; estimate {1e3 * o.estimate_rms_m:.2f} mm "
         f"{math.degrees(o.estimate_rms_rad):.3f} deg, NEES {o.nees:.1f} "
         f"(position {o.nees_position:.1f}, rotation {o.nees_rotation:.1f}); {o.tick_ms:.0f} ms a tick"
@@ -301,22 +366,15 @@ def line_of(o: MarkerlessOutcome) -> str:
     return text + "".join(f"; retreat: {reason}" for reason in o.retreats)
 
 
-def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | None) -> Figures:
-    """Fly the seeds of a part that are not in ``results``, and return the figures of all."""
-    outcomes = []
-    key = {"part": part, "changes": list(changes)}
-    known = {
-        line["outcome"]["seed"]: msgspec.convert(line["outcome"], MarkerlessOutcome)
-        for line in read_lines(results)
-        if {k: line[k] for k in key} == key
-    }
-    for seed in seeds:
-        if seed not in known:
-            known[seed] = fly(seed, load_shipped(SCENARIOS[part], f"seed={seed}", *changes))
-            row = {**key, "commit": commit(), "outcome": msgspec.to_builtins(known[seed])}
-            append_line(results, row)
-        outcomes.append(known[seed])
-        print(f"  {line_of(known[seed])}", flush=True)
+def fly_part(part: str, options: Options) -> Figures:
+    """Fly five seeds of a mission (``--quick``: one, 20 s, which cannot dock)."""
+    changes = (*options.set, *(QUICK if options.quick else ()))
+    results = Results(options.results, {"flight": part, "set": list(changes)}, MarkerlessOutcome)
+    outcomes = results.of(
+        seeds_of(options, 5, 1),
+        lambda seed: fly(seed, load_shipped(SCENARIOS[part], f"seed={seed}", *changes)),
+        line_of,
+    )
 
     def worst(of: Callable[[MarkerlessOutcome], float]) -> float:
         return max(map(of, outcomes))
@@ -345,32 +403,19 @@ def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | 
         f"{part}_perception_s_per_tick": 1e-3 * float(np.mean([o.perception_ms for o in outcomes])),
         f"{part}_controller_s_per_tick": 1e-3 * float(np.mean([o.controller_ms for o in outcomes])),
         f"{part}_s_per_tick": 1e-3 * float(np.mean([o.tick_ms for o in outcomes])),
+        **{
+            f"{part}_sighting_{name}": float(np.mean([o.sightings[name] for o in outcomes]))
+            for name in outcomes[0].sightings
+        },
     }
 
 
-def main() -> None:
-    parser = make_parser(__doc__, SCENARIOS)
-    parser.add_argument("--flights", type=int, default=5, help="number of seeds")
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override"
-    )
-    parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="append flights; those in it are kept"
-    )
-    options = parser.parse_args()
-    use_one_thread()
-    flights = 1 if options.quick else options.flights
-    seeds, changes = range(options.first, options.first + flights), tuple(options.set)
-    changes += QUICK if options.quick else ()
-    run_parts(
-        options,
-        {
-            part: (lambda part=part: fly_part(part, seeds, changes, options.results))
-            for part in SCENARIOS
-        },
-    )
-
-
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {
+        f"flight-{name}": described(
+            partial(fly_part, name), f"Fly {scenario}: outcome, accuracy, errors of sightings."
+        )
+        for name, scenario in SCENARIOS.items()
+    },
+    ("flights", "first", "set", "results"),
+)

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--only PART ...] [--flights 1]
-[--seconds 5] [--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
+"""Real time: ``four-chaser-docking`` with ticks and images at 30 Hz, 640 x 480, in separate processes
+on this machine.
 
-Flies ``four-chaser-docking`` in real time with ticks and images at 30 Hz, 640 x 480, all processes
-on this machine. ``image_to_command``: from the sending of an image to the sending of the actuator
-command of that tick, by the senders' time stamps; the images of a tick are sent together, as by
-cameras that expose at once. ``tick_to_command``: the same from the sending of the tick, before the
-images are rendered.
+``image_to_command``: from the sending of an image to the sending of the actuator command of that
+tick, by the senders' time stamps; the images of a tick are sent together, as by cameras that expose
+at once. ``tick_to_command``: the same from the sending of the tick, before the images are rendered.
 
 Each part is a flight in which one process is disturbed: the recorder, or a viewer with one client.
-Windows of ``--seconds`` alternate between ``undisturbed``, ``frozen`` (SIGSTOP) and ``slow`` (runs
+Windows of ``--window-s`` alternate between ``undisturbed``, ``frozen`` (SIGSTOP) and ``slow`` (runs
 a tenth of the time), so that other load on the machine affects all conditions. ``lost``: ticks of a
 chaser without a command of the controller; ``late``: commands later than 33 ms; ``p99_ratio``: 99th
-percentile relative to the undisturbed windows. Processor time is a share of one core. Measures wall
-time: run nothing else beside it. Prints medians over ``--flights``.
+percentile relative to the undisturbed windows. Processor time is a share of one core.
 """
 
 from __future__ import annotations
@@ -25,6 +22,7 @@ import tempfile
 import threading
 import time
 import uuid
+from argparse import ArgumentParser
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,7 +35,7 @@ import websockets
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.transport import Node, RawSample
-from common import ROOT, Figures, make_parser, percentiles, print_figures, run_parts, start_mission
+from common import ROOT, Figures, Group, Options, percentiles, start_mission
 from websockets.asyncio.client import connect
 
 from chaserdock.launch.launcher import Fleet, free_port, open_hub
@@ -50,7 +48,6 @@ SETTLE_S = 6.0
 PAUSE_S = 1.0
 """Between windows: a stopped process catches up."""
 LATE_S = 0.033
-PARTS = ("recorder", "viewer")
 LEASE_MS = 60_000  # as under `chaserdock run`
 OVERRIDES = (
     f"time.rate_hz={RATE_HZ}",
@@ -256,29 +253,30 @@ def cpu_s(fleet: Fleet) -> dict[str, float]:
     return {name: t.user + t.system for name, t in times.items()}
 
 
-def main() -> None:
-    parser = make_parser(__doc__, PARTS)
-    parser.add_argument("--flights", type=int, default=1, help="flights of each part")
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a window")
-    parser.add_argument("--rounds", type=int, default=3, help="rounds of four windows in a flight")
-    parser.add_argument(
-        "--keep", type=Path, metavar="DIR", help="keep logs and the output of the processes"
-    )
-    options = parser.parse_args()
-    flights, rounds = (1, 1) if options.quick else (options.flights, options.rounds)
-
-    def medians(part: str) -> Figures:
-        flown: list[Figures] = []
-        for number in range(flights):
-            keep = options.keep and options.keep / f"{part}-{number}"
-            flown.append(fly(part, options.seconds, rounds, keep))
-            if flights > 1:
-                print(f"{part}, flight {number}:")
-                print_figures(flown[-1])
-        return {name: float(np.median([f[name] for f in flown])) for name in flown[0]}
-
-    run_parts(options, {part: lambda part=part: medians(part) for part in PARTS})
+def measure(process: str, options: Options) -> Figures:
+    """Return medians over the flights in which a process is disturbed."""
+    flights, rounds = (1, 1) if options.quick else (options.flights or 1, options.rounds)
+    flown = []
+    for number in range(flights):
+        keep = options.keep and options.keep / f"{process}-{number}"
+        flown.append(fly(process, options.window_s, rounds, keep))
+    return {name: float(np.median([f[name] for f in flown])) for name in flown[0]}
 
 
-if __name__ == "__main__":
-    main()
+def recorder(options: Options) -> Figures:
+    """Time commands while the recorder is undisturbed, frozen, slow."""
+    return measure("recorder", options)
+
+
+def viewer(options: Options) -> Figures:
+    """Time commands while a viewer with one client is undisturbed, frozen, slow."""
+    return measure("viewer", options)
+
+
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument("--window-s", type=float, default=5.0, help="of realtime: one condition")
+    parser.add_argument("--rounds", type=int, default=3, help="of realtime: four windows each")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="of realtime: keep logs, outputs")
+
+
+GROUP = Group({"realtime-recorder": recorder, "realtime-viewer": viewer}, ("flights",), add_options)

@@ -1,28 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory growth over a long mission: ``python benchmarks/endurance.py [--hours 24] [--quick]
-[--json FILE]``.
+"""Memory growth over a long mission: ``endurance`` in lock-step as separate processes.
 
-Flies the scenario ``endurance`` in lock-step as separate processes. The recorder rotates its log
-every simulated hour; finished parts are deleted. The resident set of each process is sampled twice
-a simulated hour, at least twelve times. Growth: median of the last three samples relative to that
-of the first three. Status 1 if a process grows by more than 5 % or the flight is incomplete.
-``--quick``: two hours.
+The recorder rotates its log every simulated hour; finished parts are deleted. The resident set of
+each process is sampled twice a simulated hour, at least twelve times. Growth: median of the last
+three samples relative to that of the first three.
 """
 
 from __future__ import annotations
 
 import statistics
-import sys
 import tempfile
 import time
 import uuid
+from argparse import ArgumentParser
 from pathlib import Path
 
 import psutil
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd, Tick
 from chaserdock_protocol.transport import Node
-from common import ROOT, Figures, make_parser, print_figures, start_mission, write_json
+from common import ROOT, BenchmarkFailed, Figures, Group, Options, start_mission
 
 from chaserdock.launch.launcher import Fleet, open_hub
 
@@ -67,11 +64,9 @@ def sample(fleet: Fleet, hub: Node, folder: Path, period_s: float) -> tuple[Samp
     return samples, False
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("--hours", type=float, default=24.0, help="simulated time")
-    options = parser.parse_args()
-    duration_s = 3600.0 * (2.0 if options.quick else options.hours)
+def endurance(options: Options) -> Figures:
+    """Fly 24 simulated hours (``--quick``: two): memory growth of each process, at most 5 %."""
+    duration_s = 3600.0 * (2.0 if options.quick else options.endurance_h)
     namespace = f"endurance-{uuid.uuid4().hex[:8]}"
     with tempfile.TemporaryDirectory() as name:
         folder, fleet = Path(name), Fleet()
@@ -87,24 +82,27 @@ def main() -> None:
         finally:
             fleet.end()
             hub.close()
-    print(*failures, sep="\n", end="\n" if failures else "")
-    growth = {
-        n: statistics.median(v[-3:]) / statistics.median(v[:3]) - 1.0
-        for n, v in samples.items()
-        if v
-    }
     figures: Figures = {"simulated_s": duration_s, "complete": complete}
-    for name, share in growth.items():
-        key, values = name.replace("/", "_"), samples[name]
-        figures |= {
-            f"{key}_first_bytes": values[0],
-            f"{key}_last_bytes": values[-1],
-            f"{key}_growth": share,
-        }
-    print_figures(figures)
-    write_json(options.json, figures)
-    sys.exit(0 if complete and max(growth.values()) <= LARGEST_GROWTH else 1)
+    growth = {}
+    for name, values in samples.items():
+        if values:
+            key = name.replace("/", "_")
+            growth[name] = statistics.median(values[-3:]) / statistics.median(values[:3]) - 1.0
+            figures |= {
+                f"{key}_first_bytes": values[0],
+                f"{key}_last_bytes": values[-1],
+                f"{key}_growth": growth[name],
+            }
+    if not complete or max(growth.values()) > LARGEST_GROWTH:
+        grown = [name for name, share in growth.items() if share > LARGEST_GROWTH]
+        raise BenchmarkFailed(f"grown: {grown}; ended: {failures or complete}", figures)
+    return figures
 
 
-if __name__ == "__main__":
-    main()
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--endurance-h", type=float, default=24.0, metavar="H", help="simulated time of endurance"
+    )
+
+
+GROUP = Group({"endurance": endurance}, add_options=add_options, on_request=("endurance",))

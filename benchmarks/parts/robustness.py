@@ -1,29 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default estimator against the paper's under sensor errors: ``python benchmarks/robustness.py
-[--only PART ...] [--quick]``.
-
-Parts: ``grades`` (rendered images; the grades of ``[navigation]`` and ``harsh-light``, also after
-``calibrate``, with plant mismatch unless ``--nominal``), ``sources`` (statistical sightings; each
-error source alone, from 0 to 10 times its figure in the grade ``lab``), ``failures`` (``lab`` with
-plant mismatch and the statistical perception; no sight for 20 s, and odometry of one chaser that
-jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a tenth of its sigma of position).
+"""The default estimator against the paper's under sensor errors, in closed loop.
 
 Figures of ``grades`` and ``sources`` are RMS over all chasers in the steady state (from 32 s on in
-``grades``, 15 s after the end of a calibration; from 20 s on in ``sources``), mean over the seeds,
-in closed loop: the error of each chaser's pose relative to the target, ``estimate``, and of its
-distance from the reference on the true target, ``tracking``; ``nees`` of the relative pose (6
-expected); ``worst_nees`` of a flight; share of gated sightings. The paper's estimator takes
-odometry as exact; its relative pose is that of odometry and target estimate. ``--figure FILE``
-draws the curves of ``sources``.
+``grades``, 15 s after the end of a calibration; from 20 s on in ``sources``), mean over the seeds:
+the error of each chaser's pose relative to the target, ``estimate``, and of its distance from the
+reference on the true target, ``tracking``; ``nees`` of the relative pose (6 expected);
+``worst_nees`` of a flight; share of gated sightings. The paper's estimator takes odometry as exact;
+its relative pose is that of odometry and target estimate.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
+from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -37,7 +28,7 @@ from chaserdock_protocol.messages import Odometry, Sighting
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.navigation import GRADES
 from chaserdock_world.rendering.cameras import States
-from common import ROOT, Figures, make_parser, print_figures, run_parts
+from common import ROOT, Figures, Group, Options, Results, map_jobs, print_figures, seeds_of
 from flights.measured_poses import measurement_model
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
@@ -147,16 +138,13 @@ def fly(flight: Flight) -> Array:
 
 
 def fly_all(flights: Sequence[Flight], jobs: int) -> Figures:
-    """Fly missions in processes; return the mean figures of each label, and print them as they
-    come.
-    """
+    """Return the mean figures of each label, and print them as they come."""
     figures: Figures = {}
-    with ProcessPoolExecutor(jobs) as pool:
-        results = zip(flights, pool.map(fly, flights), strict=True)
-        for label, group in itertools.groupby(results, key=lambda pair: pair[0].label):
-            part = mean_figures(label, [row for _, row in group])
-            print_figures(part)
-            figures |= part
+    results = zip(flights, map_jobs(fly, flights, jobs), strict=True)
+    for label, group in itertools.groupby(results, key=lambda pair: pair[0].label):
+        part = mean_figures(label, [row for _, row in group])
+        print_figures(part)
+        figures |= part
     return figures
 
 
@@ -176,15 +164,18 @@ def mean_figures(label: str, flights: Sequence[Array]) -> Figures:
     return {f"{label}_{unit}": v for unit, v in values.items() if not math.isnan(v)}
 
 
-def grades(options: argparse.Namespace) -> Figures:
-    """Fly one and four chasers under every grade, and two in harsh light, with rendered images."""
-    seeds, settled_s, duration_s = (2, 20.0, 30.0) if options.quick else (options.seeds, 32.0, 44.0)
+def grades(options: Options) -> Figures:
+    """Fly one and four chasers under every grade of ``[navigation]``, also after a calibration, and
+    two in harsh light, with rendered images and plant mismatch.
+    """
+    settled_s, duration_s = (20.0, 30.0) if options.quick else (32.0, 44.0)
+    seeds = seeds_of(options, 20, 1)
     truth = [] if options.nominal else ['truth.preset="mismatch"']
     flights = []
     for estimator in options.estimators:
         for name, number in (("single", 1), ("four-chaser-docking", 4)):
             for grade in GRADES:
-                for seed in range(seeds):
+                for seed in seeds:
                     overrides = (f'navigation.grade="{grade}"', *truth)
                     scenario = scenario_of(name, estimator, seed, duration_s, *overrides)
                     flights.append(
@@ -195,22 +186,24 @@ def grades(options: argparse.Namespace) -> Figures:
             calibrate = (
                 f'timeline=[{{at_s=20.0,command="calibrate",chasers={list(range(number))}}}]'
             )
-            for seed in range(seeds):
+            for seed in seeds:
                 overrides = ('navigation.grade="orbit"', *truth, calibrate)
                 scenario = scenario_of(name, estimator, seed, CALIBRATED_S + 12.0, *overrides)
                 flights.append(
                     Flight(f"orbit_calibrated_{number}_{estimator}", scenario, CALIBRATED_S, True)
                 )
-        for seed in range(seeds):
+        for seed in seeds:
             overrides = ('navigation.grade="lab"', *truth)
             scenario = scenario_of("harsh-light", estimator, seed, duration_s, *overrides)
             flights.append(Flight(f"harsh_light_lab_2_{estimator}", scenario, settled_s, True))
     return fly_all([f for f in flights if f.label.startswith(tuple(options.rows))], options.jobs)
 
 
-def sources(options: argparse.Namespace) -> Figures:
-    """Fly four chasers with one error source at a time, in multiples of the grade ``lab``."""
-    seeds, duration_s = (1, 30.0) if options.quick else (options.seeds, 40.0)
+def sources(options: Options) -> Figures:
+    """Fly four chasers with statistical sightings and one error source at a time, from 0 to 10
+    times its figure in the grade ``lab``.
+    """
+    seeds, duration_s = seeds_of(options, 20, 1), 30.0 if options.quick else 40.0
     factors = (0.0, 1.0, 10.0) if options.quick else FACTORS
     flights = []
     for source, keys in SOURCES.items():
@@ -218,7 +211,7 @@ def sources(options: argparse.Namespace) -> Figures:
             values = [f"navigation.{key}={factor * GRADES['lab'][key]}" for key in keys]
             for estimator in options.estimators:
                 overrides = ('navigation.grade="exact"', *values)
-                for seed in range(seeds):
+                for seed in seeds:
                     scenario = scenario_of(
                         "four-chaser-docking", estimator, seed, duration_s, *overrides
                     )
@@ -309,7 +302,7 @@ class FailureMission(InProcessMission):
         return self._change(odometry) if self._change is not None and failed else odometry
 
 
-def fly_failure(failure: str, seed: int) -> Array:
+def fly_failure(failure: str, seed: int) -> list[float]:
     """Return RMS tracking error (m) of the failed chaser before and after the failure, the largest
     tracking error of all chasers after it (m), and the time until a warning names the failed
     odometry (s)."""
@@ -340,66 +333,48 @@ def fly_failure(failure: str, seed: int) -> Array:
             and text.startswith(f"chaser {FAILED_CHASER}: odometry")
         ]
     reported_s = min(reports, default=math.nan)
-    return np.array([math.sqrt(np.mean(before)), math.sqrt(np.mean(after)), largest, reported_s])
+    return [math.sqrt(np.mean(before)), math.sqrt(np.mean(after)), largest, reported_s]
 
 
-def failures(options: argparse.Namespace) -> Figures:
-    """Fly four chasers without sight, and with failures of one chaser's odometry."""
+def failures(options: Options) -> Figures:
+    """Fly four chasers under ``lab`` with plant mismatch and statistical perception: no sight for 20
+    s, and odometry of one chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a
+    tenth of its sigma of position.
+    """
     figures: Figures = {}
-    kinds = ("blind", *ODOMETRY_FAILURES)
-    seeds = 1 if options.quick else options.seeds
-    with ProcessPoolExecutor(options.jobs) as pool:
-        for kind in kinds:
-            rows = np.array(list(pool.map(partial(fly_failure, kind), range(seeds))))
-            part = {
-                f"{kind}_tracking_before_m": float(np.mean(rows[:, 0])),
-                f"{kind}_tracking_after_m": float(np.mean(rows[:, 1])),
-                f"{kind}_largest_tracking_m": float(np.max(rows[:, 2])),
-            }
-            if kind != "blind":
-                part[f"{kind}_reported_max_s"] = float(np.max(rows[:, 3]))
-            print_figures(part)
-            figures |= part
+    for kind in ("blind", *ODOMETRY_FAILURES):
+        results = Results(options.results, {"failure": kind}, list[float])
+        flown = results.of(seeds_of(options, 20, 1), partial(fly_failure, kind), jobs=options.jobs)
+        rows = np.array(flown)
+        figures |= {
+            f"{kind}_tracking_before_m": float(np.mean(rows[:, 0])),
+            f"{kind}_tracking_after_m": float(np.mean(rows[:, 1])),
+            f"{kind}_largest_tracking_m": float(np.max(rows[:, 2])),
+        }
+        if kind != "blind":
+            figures[f"{kind}_reported_max_s"] = float(np.max(rows[:, 3]))
     return figures
 
 
-PARTS = {"grades": grades, "sources": sources, "failures": failures}
-
-
-def main() -> None:
-    """Run the parts."""
-    parser = make_parser(__doc__, PARTS)
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument("--nominal", action="store_true", help="of grades: no plant mismatch")
     parser.add_argument(
-        "--seeds",
-        type=int,
-        default=20,
-        metavar="N",
-        help="flights per row (default: 20)",
-    )
-    parser.add_argument("--nominal", action="store_true", help="without plant mismatch in grades")
-    parser.add_argument(
-        "--estimators",
-        nargs="+",
-        choices=ESTIMATORS,
-        default=ESTIMATORS,
-        help="estimators (default: both)",
+        "--estimators", nargs="+", choices=ESTIMATORS, default=ESTIMATORS, help="default: both"
     )
     parser.add_argument(
         "--rows",
         nargs="+",
         default=("",),
         metavar="TEXT",
-        help="of grades, rows whose name begins so, such as orbit_calibrated_4 (default: all)",
+        help="of grades: rows whose name begins so, such as orbit_calibrated_4",
     )
     parser.add_argument(
-        "--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)"
+        "--figure", type=Path, metavar="FILE", help="of sources: draw the curves (SVG, PNG)"
     )
-    parser.add_argument(
-        "--figure", type=Path, metavar="FILE", help="draw the curves of sources (SVG, PNG)"
-    )
-    options = parser.parse_args()
-    run_parts(options, {name: partial(part, options) for name, part in PARTS.items()})
 
 
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {"grades": grades, "sources": sources, "failures": failures},
+    ("flights", "first", "jobs", "results"),
+    add_options,
+)

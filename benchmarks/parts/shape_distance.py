@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distance of a chaser's shape from cuboids: our kernel and the library coal: ``python
-benchmarks/shapes.py [--quick] [--json FILE]``.
+"""Distance of a chaser's shape from cuboids: our kernel and the library coal, which the product does
+not need (``pip install coal``).
 
 Random poses of a chaser (body and probe) about random cuboids. Time per pair of a chaser and a
 cuboid: of the planner's kernel (gap along one direction, with its gradient) in a plan's check, and
 of ``coal.distance`` between boxes, and between convex hulls of 8 and of 42 points, called from
-Python as a planner in Python would. The gap is at most the distance: how much less is printed. Only
-ours without ``coal`` (``pip install coal``), which the product does not need.
+Python as a planner in Python would.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.shape_distance import box_table, chaser_boxes, distance_from_cuboids, moved
 from chaserdock_models.targets import Box
-from common import Figures, make_parser, print_figures, write_json
+from common import Figures, Group, Options
 from flights import load_shipped
 
 CUBOIDS = 8
@@ -162,8 +161,8 @@ def distance_of(coal: Any, one: Any, at: Any, other: Any, there: Any) -> float:
     return float(coal.distance(one, at, other, there, coal.DistanceRequest(), result))
 
 
-def main() -> None:
-    options = make_parser(__doc__).parse_args()
+def shapes(options: Options) -> Figures:
+    """Time our distance of shapes and coal's, and print how much less than the distance ours is."""
     rng, scenario = np.random.default_rng(24), load_shipped("single")
     params = nmpc_parameters(scenario)
     repeats = 5 if options.quick else 50
@@ -178,9 +177,7 @@ def main() -> None:
         print("coal is not installed: only our kernel is measured")
     else:
         figures |= coal_figures(coal, table, states, repeats)
-    print_figures(figures)
-    write_json(options.json, figures)
+    return figures
 
 
-if __name__ == "__main__":
-    main()
+GROUP = Group({"shapes": shapes})

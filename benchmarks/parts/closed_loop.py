@@ -1,34 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controller performance in closed loop: ``python benchmarks/closed_loop.py [--only PART ...]
-[--quick] [--json FILE]``.
+"""The controller in closed loop: complete missions in one process.
 
-Complete missions in one process (``chaserdock.evaluation.in_process``). Parts:
-
-- ``avoidance``: 20 seeded variations of ``collision-avoidance`` with images of 640 x 360
-  (``--full-images``: the scenario's own, with four times as many pixels), every fourth exactly
-  symmetric;
-- ``swap``: 20 variations of ``swap``, target measured with noise of 2 mm and 0.1 degrees; seed 0 is
-  exactly head-on;
-- ``clutter``, ``clutter-dense``: sixteen chasers at random places fly to random places, all at
-  once, in 100 seeds; exact knowledge;
-- ``swap-images``: the first ``--images`` of them with rendered images;
-- ``tracking``: the paper's tumble with perfect knowledge, with and without feed-forward, with 5 %
-  actuator gain error;
-- ``tracking-images``: the same with rendered images: servicer, two chasers on the paper's target,
-  stronger actuators;
-
-``--first`` and ``--flights`` choose seeds (20 by default, of ``clutter`` 100); ``--quick`` flies
-two variations and shorter runs. Distances are true, at every tick, between centres and, in clutter,
-between shapes.
+Distances are true, at every tick, between centres and, in clutter, between shapes.
 """
 
 from __future__ import annotations
 
 import math
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterable
 
 from chaserdock_protocol.scenario import Scenario
-from common import Figures, make_parser, run_parts
+from common import Figures, Group, Options, seeds_of
 from flights import load_shipped
 from flights.measured_poses import measurement_model
 from flights.transfers import CLUTTER, DENSE_CLUTTER, avoidance, clutter, fly_transfer, swap
@@ -94,11 +77,11 @@ def add_errors(out: Figures, name: str, errors: tuple[float, float]) -> None:
     out[f"{name}_position_rms_m"], out[f"{name}_orientation_rms_rad"] = errors
 
 
-def tracking(duration_s: float) -> Figures:
+def tracking(options: Options) -> Figures:
     """Measure steady errors at the paper's tumble with perfect knowledge, starting 0.85 m behind
-    the reference.
+    the reference: with and without feed-forward, with actuators 5 % off.
     """
-    out: Figures = {}
+    duration_s, out = 60.0 if options.quick else 120.0, Figures()
     for name, overrides, gain in (
         ("feed_forward", (), 1.0),
         ("u_ref_0", ("controller.feed_forward=false",), 1.0),
@@ -110,9 +93,11 @@ def tracking(duration_s: float) -> Figures:
     return out
 
 
-def tracking_with_images(duration_s: float) -> Figures:
-    """Measure steady errors at the paper's tumble with images; the worst chaser of each flight."""
-    out: Figures = {}
+def tracking_with_images(options: Options) -> Figures:
+    """Measure steady errors at the paper's tumble with images, of the worst chaser: servicer, two
+    chasers on the paper's target, stronger actuators.
+    """
+    duration_s, out = 60.0 if options.quick else 80.0, Figures()
     length = f"duration_s={duration_s}"
     servicer = load_shipped("single", "target.model='servicer'", length)
     for name, scenario, gain in (
@@ -125,59 +110,73 @@ def tracking_with_images(duration_s: float) -> Figures:
     return out
 
 
-PARTS = (
-    "avoidance",
-    "swap",
-    "clutter",
-    "clutter-dense",
-    "swap-images",
-    "tracking",
-    "tracking-images",
-)
 _CLUTTER_STAY_S = 3.0
 """A flight in clutter ends once all chasers are at their goals for this long."""
 
 
-def main() -> None:
-    parser = make_parser(__doc__, PARTS)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--flights", type=int, help="number of seeds")
-    parser.add_argument("--images", type=int, default=2, help="number of seeds of swap with images")
+def fly_avoidance(options: Options) -> Figures:
+    """Fly 20 variations of ``collision-avoidance`` with images of 640 x 360, every fourth exactly
+    symmetric.
+    """
+    return variations(
+        "avoidance",
+        seeds_of(options, 20, 2),
+        lambda seed: avoidance(seed, options.full_images),
+        RenderedImages,
+    )
+
+
+def fly_swap(options: Options) -> Figures:
+    """Fly 20 variations of ``swap``, the target measured with noise of 2 mm and 0.1 degrees; seed 0
+    is exactly head-on.
+    """
+    return variations("swap", seeds_of(options, 20, 2), swap, noisy)
+
+
+def fly_swap_images(options: Options) -> Figures:
+    """Fly the first two of them with rendered images."""
+    return variations("swap-images", seeds_of(options, 2, 1), swap, RenderedImages)
+
+
+def in_clutter(name: str, places_m: tuple[float, float, float], options: Options) -> Figures:
+    """Fly chasers from random places to random places."""
+    return variations(
+        name,
+        seeds_of(options, 100, 1),
+        lambda seed: clutter(seed, 4 if options.quick else 16, places_m),
+        lambda _: None,
+        _CLUTTER_STAY_S,
+    )
+
+
+def fly_clutter(options: Options) -> Figures:
+    """Fly sixteen chasers (``--quick``: four) at random places to random places, all at once, with
+    exact knowledge: 100 seeds.
+    """
+    return in_clutter("clutter", CLUTTER, options)
+
+
+def fly_dense_clutter(options: Options) -> Figures:
+    """Fly the same at places that are nearer together."""
+    return in_clutter("clutter-dense", DENSE_CLUTTER, options)
+
+
+def add_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--full-images", action="store_true", help="avoidance with the scenario's image size"
     )
-    options = parser.parse_args()
-    duration_s = 60.0 if options.quick else 120.0
-
-    def seeds_of(default: int) -> range:
-        flights = 2 if options.quick else options.flights or default
-        return range(options.first, options.first + flights)
-
-    def in_clutter(name: str, places_m: tuple[float, float, float]) -> Figures:
-        return variations(
-            name,
-            seeds_of(100),
-            lambda seed: clutter(seed, places_m=places_m),
-            lambda _: None,
-            _CLUTTER_STAY_S,
-        )
-
-    seeds = seeds_of(20)
-    parts = {
-        "avoidance": lambda: variations(
-            "avoidance", seeds, lambda seed: avoidance(seed, options.full_images), RenderedImages
-        ),
-        "clutter": lambda: in_clutter("clutter", CLUTTER),
-        "clutter-dense": lambda: in_clutter("clutter-dense", DENSE_CLUTTER),
-        "swap": lambda: variations("swap", seeds, swap, noisy),
-        "swap-images": lambda: variations(
-            "swap-images", seeds[: options.images], swap, RenderedImages
-        ),
-        "tracking": lambda: tracking(duration_s),
-        "tracking-images": lambda: tracking_with_images(min(duration_s, 80.0)),
-    }
-    run_parts(options, parts)
 
 
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {
+        "avoidance": fly_avoidance,
+        "swap": fly_swap,
+        "swap-images": fly_swap_images,
+        "clutter": fly_clutter,
+        "clutter-dense": fly_dense_clutter,
+        "tracking": tracking,
+        "tracking-images": tracking_with_images,
+    },
+    ("flights", "first"),
+    add_options,
+)

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a solve with ``[orbit]`` over that without: ``python benchmarks/orbit_solve.py
-[--scenario low-orbit] [--ticks 600]``.
-
-Two missions in one process, equal but for ``[orbit]``, with statistical perception, tick by tick in
-turn. Prints the medians of the solver's and of the whole controller's processor time, and their
-ratios. ``--safety enforce``: passive safety in the first of them.
+"""Time of a solve with ``[orbit]`` over that without: two missions in one process, equal but for
+``[orbit]``, with statistical perception, tick by tick in turn.
 """
 
 from __future__ import annotations
 
 import time
+from argparse import ArgumentParser
 from collections.abc import Callable
 from statistics import median
 from typing import ParamSpec, TypeVar
 
 from chaserdock_protocol.scenario import Scenario
-from common import Figures, make_parser, print_figures, write_json
+from common import Figures, Group, Options
 from flights import load_shipped
 
 from chaserdock.evaluation.in_process import InProcessMission
@@ -52,19 +49,15 @@ def timed(function: Callable[P, T], durations_s: list[float]) -> Callable[P, T]:
     return measured
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("--scenario", default="low-orbit", help="shipped scenario with [orbit]")
-    parser.add_argument("--ticks", type=int, default=600, help="number of ticks")
-    parser.add_argument("--safety", default="off", choices=("off", "monitor", "enforce"))
-    options = parser.parse_args()
+def orbit(options: Options) -> Figures:
+    """Time solver and controller with ``[orbit]`` over those without, 600 ticks (``--quick``: 60)."""
     overrides = ("perception.name='statistical'", "timeline=[]", "duration_s=1000.0")
     in_orbit = load_shipped(
         options.scenario, *overrides, f"limits.passive_safety='{options.safety}'"
     )
     free = load_shipped(options.scenario, *overrides, "limits.passive_safety='off'")
     pair = [TimedFlight(in_orbit), TimedFlight(free.model_copy(update={"orbit": None}))]
-    for _ in range(60 if options.quick else options.ticks):
+    for _ in range(60 if options.quick else options.orbit_ticks):
         for flight in pair:
             flight.mission.step()
     figures: Figures = {"ticks": len(pair[0].tick_s)}
@@ -77,9 +70,18 @@ def main() -> None:
             f"free_{name}_s": free_s,
             f"ratio_{name}": orbit_s / free_s,
         }
-    print_figures(figures)
-    write_json(options.json, figures)
+    return figures
 
 
-if __name__ == "__main__":
-    main()
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument("--scenario", default="low-orbit", help="of orbit: one with [orbit]")
+    parser.add_argument("--orbit-ticks", type=int, default=600, metavar="N")
+    parser.add_argument(
+        "--safety",
+        default="off",
+        choices=("off", "monitor", "enforce"),
+        help="of orbit: passive safety",
+    )
+
+
+GROUP = Group({"orbit": orbit}, add_options=add_options)

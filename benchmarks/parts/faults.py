@@ -1,35 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults during a shortened docking: ``python benchmarks/faults.py [--runs N] [--quick]
-[--json FILE]``.
+"""Random faults during a shortened docking: ``fault-drill`` as separate processes with one fault, of
+which kind, process, time and severity are drawn from the number of the run.
 
-Each run flies the scenario ``fault-drill`` as separate processes with one fault; kind, process,
-time and severity are drawn from the number of the run. Outcomes: ``docked``; ``safe`` (not docked,
-and the log states why); ``no reason named``; ``collision``; ``stalled``. Results are appended to
-``--out`` (JSON lines); runs that it contains are not repeated. ``--quick``: one run of each kind.
-Status 1 if a run is neither docked nor safe, or its log is incomplete.
+Outcomes: ``docked``; ``safe`` (not docked, and the log states why); ``no reason named``;
+``collision``; ``stalled``.
 """
 
 from __future__ import annotations
 
 import random
 import subprocess
-import sys
 import tempfile
 import time
+from argparse import ArgumentParser
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from common import (
     ROOT,
+    BenchmarkFailed,
     Figures,
-    append_line,
+    Group,
+    Options,
+    Results,
     chaserdock_command,
-    make_parser,
-    print_figures,
-    read_lines,
-    write_json,
+    seeds_of,
 )
 
 from chaserdock.analysis.flight import load_flight
@@ -129,14 +126,6 @@ def evaluate(
     )
 
 
-def read_results(path: Path, mode: str) -> dict[int, FaultResult]:
-    """Return earlier results by number; a result whose fault is no longer that of its number is
-    ignored.
-    """
-    results = [FaultResult(**row) for row in read_lines(path)]
-    return {r.number: r for r in results if r.mode == mode and r.fault == fault_of(r.number)}
-
-
 def table(results: list[FaultResult]) -> str:
     """Return the outcomes by kind of fault as a table."""
     outcomes = sorted({r.outcome for r in results}, key=lambda o: (o not in GOOD, o))
@@ -152,27 +141,13 @@ def table(results: list[FaultResult]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0, help="number of the first run")
-    parser.add_argument("--mode", choices=["lockstep", "realtime"], default="lockstep")
-    parser.add_argument("--out", type=Path, default=ROOT / "runs" / "faults.jsonl")
-    options = parser.parse_args()
-    numbers = range(options.first, options.first + (len(KINDS) if options.quick else options.runs))
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    results = read_results(options.out, options.mode)
-    for number in numbers:
-        if number in results:
-            continue
-        result = results[number] = fly(number, options.mode)
-        append_line(options.out, asdict(result))
-        log = "" if result.log_complete else ", log incomplete"
-        print(
-            f"{number:4} {toml_value(result.fault)}: {result.outcome}{log}: {result.reason} ({result.wall_s:.0f} s)",
-            flush=True,
-        )
-    flown = [results[n] for n in numbers]
+def faults(options: Options) -> Figures:
+    """Fly 200 random faults (``--quick``: one of each kind); every run must dock or be safe, with a
+    complete log.
+    """
+    numbers = seeds_of(options, 200, len(KINDS))
+    results = Results(options.results, {"faults": options.mode}, FaultResult)
+    flown = results.of(numbers, lambda number: fly(number, options.mode), line_of)
     print(table(flown))
     bad = [r for r in flown if r.outcome not in GOOD or not r.log_complete]
     outcomes = Counter(r.outcome for r in flown)
@@ -184,10 +159,21 @@ def main() -> None:
         "nearest_chasers_m": min(r.nearest_chasers_m for r in flown),
         "nearest_target_m": min(r.nearest_target_m for r in flown),
     }
-    print_figures(figures)
-    write_json(options.json, figures)
-    sys.exit(1 if bad else 0)
+    if bad:
+        raise BenchmarkFailed(f"neither docked nor safe, or no complete log: {bad}", figures)
+    return figures
 
 
-if __name__ == "__main__":
-    main()
+def line_of(result: FaultResult) -> str:
+    """Return one line for people."""
+    log = "" if result.log_complete else ", log incomplete"
+    return f"{toml_value(result.fault)}: {result.outcome}{log}: {result.reason} ({result.wall_s:.0f} s)"
+
+
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--mode", choices=("lockstep", "realtime"), default="lockstep", help="of faults"
+    )
+
+
+GROUP = Group({"faults": faults}, ("flights", "first", "results"), add_options)

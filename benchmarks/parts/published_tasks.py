@@ -1,20 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published rendezvous and docking tasks by their own criteria: ``python
-benchmarks/published_tasks.py [--quick] [--only PART]``.
-
-``afrl``: three deputies dock from 100 to 150 m under the speed limit, 1,000 episodes. ``arch``: the
-spacecraft rendezvous of ARCH-COMP, 10^5 samples of its initial set without an abort (SRNA01) and
-with one at a random time within 240 minutes (SRA08). Both by laws of their own. ``afrl-scenario``,
-``arch-scenario``: the shipped scenarios, flown as ``chaserdock simulate`` does, whole, with random
-starts (``--first``, ``--flights``), and judged by their own criteria.
+"""Published rendezvous and docking tasks by their own criteria: AFRL's docking of three deputies, and
+the spacecraft rendezvous of ARCH-COMP.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
+from functools import partial
 
-from common import Figures, make_parser, run_parts
+from common import Figures, Group, Options, described, seeds_of
 from flights.published_tasks import (
     AfrlOutcome,
     ArchOutcome,
@@ -26,7 +20,10 @@ from flights.published_tasks import (
 )
 
 
-def afrl(options: argparse.Namespace) -> Figures:
+def afrl(options: Options) -> Figures:
+    """Dock three deputies from 100 to 150 m under the speed limit by a law of its own, 1,000
+    episodes.
+    """
     found: AfrlOutcome = afrl_docking(100 if options.quick else 1000, seed=0)
     return {
         "afrl_episodes": found.episodes,
@@ -41,7 +38,10 @@ def afrl(options: argparse.Namespace) -> Figures:
     }
 
 
-def arch(options: argparse.Namespace) -> Figures:
+def arch(options: Options) -> Figures:
+    """Fly 10^5 samples of ARCH-COMP's initial set without an abort (SRNA01) and with one at a random
+    time within 240 minutes (SRA08), by the task's controller.
+    """
     samples, figures = 1000 if options.quick else 100_000, {}
     for name, abort_min in (("srna01", (1e9, 1e9)), ("sra08", (0.0, 240.0))):
         found: ArchOutcome = arch_comp(samples, 0, abort_min)
@@ -56,13 +56,11 @@ def arch(options: argparse.Namespace) -> Figures:
     return figures
 
 
-def scenario(
-    name: str, draw: Callable[[int], tuple[str, ...]], options: argparse.Namespace
-) -> Figures:
+def scenario(name: str, draw: Callable[[int], tuple[str, ...]], options: Options) -> Figures:
     """Fly a shipped scenario with the starts of each seed; return how many flights meet all
     criteria, and the least margins.
     """
-    flights = range(options.first, options.first + (1 if options.quick else options.flights))
+    flights = seeds_of(options, 5, 1)
     passed, least = 0, {"speed_margin_m_s": 1e9, "abort_clear_m": 1e9}
     latest_s, cone_rad, apart_m = 0.0, 0.0, 1e9
     for seed in flights:
@@ -92,19 +90,18 @@ def scenario(
     }
 
 
-def main() -> None:
-    parser = make_parser(__doc__, ("afrl", "arch", "afrl-scenario", "arch-scenario"))
-    parser.add_argument("--first", type=int, default=0, help="first seed of the scenarios")
-    parser.add_argument("--flights", type=int, default=5, help="flights of each scenario")
-    options = parser.parse_args()
-    parts = {
-        "afrl": lambda: afrl(options),
-        "arch": lambda: arch(options),
-        "afrl-scenario": lambda: scenario("afrl-docking", afrl_starts, options),
-        "arch-scenario": lambda: scenario("arch-comp-rendezvous", arch_start, options),
-    }
-    run_parts(options, parts)
-
-
-if __name__ == "__main__":
-    main()
+GROUP = Group(
+    {
+        "afrl": afrl,
+        "arch": arch,
+        "afrl-scenario": described(
+            partial(scenario, "afrl-docking", afrl_starts),
+            "Fly afrl-docking whole, as simulate does, with random starts of five seeds.",
+        ),
+        "arch-scenario": described(
+            partial(scenario, "arch-comp-rendezvous", arch_start),
+            "Fly arch-comp-rendezvous so, every second seed with an abort.",
+        ),
+    },
+    ("flights", "first"),
+)

@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A log read by independent programs: ``python benchmarks/external_tools.py LOG [--tools DIR]
-[--image PNG] [--json FILE]``.
-
-Installs evo, pymcap-cli, mcap and rerun into a separate virtual environment (``--tools``: kept
-there, otherwise temporary) and checks:
+"""A log read by independent programs, which are installed into a virtual environment of their own.
 
 - evo_ape on the tracks of ``chaserdock log tracks``: root mean square errors within 1 % of ours;
 - pymcap-cli doctor: no error;
 - the reader of the mcap package: every channel has a schema, every message is readable;
 - rerun: draws the log without a window and saves the image to ``--image``. Without a graphics card
   it needs Mesa's Vulkan driver (Debian: mesa-vulkan-drivers).
-
-Status 1 if a check fails. ``--quick`` changes nothing.
 """
 
 from __future__ import annotations
@@ -20,19 +14,21 @@ import json
 import os
 import re
 import subprocess
-import sys
 import tempfile
 import venv
 import zipfile
+from argparse import ArgumentParser
 from pathlib import Path
 
 import cv2
 import numpy as np
-from common import Figures, make_parser, print_figures, write_json
+from chaserdock_protocol.shipped_scenarios import find_scenario
+from common import BenchmarkFailed, Figures, Group, Options
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import estimate_errors
 from chaserdock.logs.tracks import write_tracks
+from chaserdock.simulation.mission import simulate
 
 PACKAGES = ("evo", "pymcap-cli", "mcap", "mcap-ros2-support-fast", "rerun-sdk")
 TOLERANCE = 0.01
@@ -55,7 +51,7 @@ CheckedFigures = tuple[Figures, bool]
 
 
 def call(*command: str | Path, **environment: str) -> str:
-    """Run a program and return its output. Raise RuntimeError if it fails."""
+    """Measure a program and return its output. Raise RuntimeError if it fails."""
     done = subprocess.run(
         [str(c) for c in command],
         env=os.environ | environment,
@@ -142,19 +138,12 @@ def rerun(programs: Path, log: Path, image: Path) -> CheckedFigures:
     return {"rerun_grey_levels": levels}, levels > LEAST_GREY_LEVELS
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("log", type=Path, metavar="LOG", help="mission.mcap")
-    parser.add_argument(
-        "--tools", type=Path, metavar="DIR", help="virtual environment of the tools, kept"
-    )
-    parser.add_argument("--image", type=Path, metavar="PNG", default=Path("rerun.png"))
-    options = parser.parse_args()
-    log: Path = options.log.resolve()
-    result: Figures = {}
-    passed = True
+def tools(options: Options) -> Figures:
+    """Read ``--log`` (default: a new flight) by evo, pymcap-cli, mcap's own reader and rerun."""
+    result, failed = Figures(), []
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
+        log = options.log.resolve() if options.log else flown_log(work)
         programs = install_tools((options.tools or work / "tools").resolve())
         for tool, check in {
             "evo": lambda: evo(programs, log, work / "tracks"),
@@ -165,16 +154,26 @@ def main() -> None:
             try:
                 figures, good = check()
             except (RuntimeError, subprocess.TimeoutExpired) as error:
-                print(f"{tool}: FAILED: {error}", flush=True)
-                passed = False
+                failed.append(f"{tool}: {error}")
                 continue
-            print(f"{tool}: {'passed' if good else 'FAILED'}", flush=True)
-            print_figures(figures)
             result |= figures
-            passed &= good
-    write_json(options.json, result)
-    sys.exit(0 if passed else 1)
+            if not good:
+                failed.append(f"{tool}: not as it should be: {figures}")
+    if failed:
+        raise BenchmarkFailed("\n".join(failed), result)
+    return result
 
 
-if __name__ == "__main__":
-    main()
+def flown_log(folder: Path) -> Path:
+    """Return the log of a short flight with images."""
+    simulate(find_scenario("single"), folder / "run", ("duration_s=12.0", "settling_s=5.0"))
+    return folder / "run" / "mission.mcap"
+
+
+def add_options(parser: ArgumentParser) -> None:
+    parser.add_argument("--log", type=Path, help="of tools: mission.mcap")
+    parser.add_argument("--tools", type=Path, metavar="DIR", help="environment of the tools, kept")
+    parser.add_argument("--image", type=Path, metavar="PNG", default=Path("rerun.png"))
+
+
+GROUP = Group({"tools": tools}, add_options=add_options, on_request=("tools",))

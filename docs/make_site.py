@@ -17,7 +17,6 @@ import base64
 import json
 import posixpath
 import re
-import runpy
 import shutil
 import subprocess
 import sys
@@ -181,7 +180,9 @@ def configuration(stage: Path) -> str:
 
 def version() -> str:
     """Return the version that the pages describe."""
-    return runpy.run_path(str(ROOT / "release" / "version.py"))["version"]()
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "version"
+    ]
 
 
 def build_releases(out: Path) -> list[str]:

@@ -20,10 +20,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock.analysis.flight import RecordedFlight, load_flight
-from chaserdock.analysis.plots import FAINT, GRID, INK, LIMIT, SERIES, colour, styled
-from chaserdock.analysis.pose_errors import pose_error
-from chaserdock.analysis.summary import tracking_errors
 from chaserdock_models import rotations
 from chaserdock_models.thruster_bodies import BODIES
 from chaserdock_protocol.scenario import load_scenario
@@ -31,6 +27,11 @@ from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.rendering.cameras import Cameras
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Polygon
+
+from chaserdock.analysis.flight import RecordedFlight, load_flight
+from chaserdock.analysis.plots import FAINT, GRID, INK, LIMIT, SERIES, colour, styled
+from chaserdock.analysis.pose_errors import pose_error
+from chaserdock.analysis.summary import tracking_errors
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -146,7 +147,9 @@ def processes() -> None:
             "controller": Box(3.4, 1, "controller\nestimation, NMPC"),
             "standby": Box(4.9, 1, "standby"),
             "operator": Box(3.4, 2, "operator, ROS 2", "person"),
-            "recorder": Box(1.7, 0, "recorder (mission.mcap) and viewer: every message", "file", 4.2),
+            "recorder": Box(
+                1.7, 0, "recorder (mission.mcap) and viewer: every message", "file", 4.2
+            ),
         },
         [
             ("world", "chaser", "image, odometry", -0.2),
@@ -378,7 +381,7 @@ def frames() -> None:
     """World, chaser, target and image frame."""
     with styled("frames"):
         figure = Figure(figsize=(7.0, 3.6), layout="none")
-        axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", computed_zorder=False)
+        axes: Any = figure.add_axes((-0.2, -0.8, 1.4, 2.6), projection="3d", computed_zorder=False)
         q_target = rotations.exp([0.2, -0.25, 0.5])
         q_chaser = rotations.exp([0.0, 0.0, 0.15])
         camera = rotations.exp([0.0, 0.0, 0.15])
@@ -401,7 +404,7 @@ def frames() -> None:
         axes.plot(*np.stack([np.zeros(3), target]).T, color=GRID)
         axes.text(*(target / 2 - [0, 0, 0.18]), "p_tar, q_tar", fontsize=9, color=FAINT)
         axes.set(xlim=(-0.1, 3.4), ylim=(-0.6, 1.4), zlim=(-0.1, 1.7))
-        axes.set_box_aspect((3.5, 2.0, 1.8), zoom=1.25)
+        axes.set_box_aspect((3.5, 2.0, 1.8), zoom=0.78)
         axes.view_init(elev=20, azim=-62)
         axes.axis("off")
         save(figure, "frames")
@@ -461,7 +464,7 @@ def controller() -> None:
                     color=SERIES[2],
                     alpha=0.18,
                     label="corridors of 0 and 3" if i == 0 else None,
-                )  # fmt: skip
+                )
             )
         for i in f.flown:
             own = f.truth[f"chaser/{i}"]
@@ -643,11 +646,11 @@ def targets() -> None:
     """Shipped targets as the camera sees them."""
     tiles = []
     for model in ("servicer", "geo_servicer", "cubesat_12u"):
-        sets = [f"target.model='{model}'", "camera.sun_direction=[-0.6, -0.5, 0.6]"]
+        sets = [f"target.model='{model}'", "camera.sun_direction=[-0.8, -0.3, 0.5]"]
         if model != "servicer":
             sets.append("perception.name='model'")
         scenario = load_scenario(ROOT / "scenarios" / "single.toml", tuple(sets))
-        distance = {"servicer": 0.75, "geo_servicer": 1.6, "cubesat_12u": 0.85}[model]
+        distance = {"servicer": 1.0, "geo_servicer": 1.7, "cubesat_12u": 1.0}[model]
         q = rotations.exp([0.25, 0.35, 0.45])
         states = {TARGET: BodyState(np.array([distance, 0.0, 0.0]), np.zeros(3), q, np.zeros(3))}
         still = np.zeros(3)
@@ -739,7 +742,8 @@ def first_flight() -> None:
 
 def log_info() -> None:
     flight("docking-contact")
-    text = chaserdock("log", "info", str(logs / "docking-contact" / "run"))
+    log = str(logs / "docking-contact" / "run")
+    text = chaserdock("log", "info", log).replace(log, "runs/capture")
     terminal("status", "chaserdock log info runs/capture", text.splitlines()[:16])
 
 

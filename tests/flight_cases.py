@@ -12,7 +12,7 @@ from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.chaser_machine import ChaserMachine
 from chaserdock_controller.guidance.chaser_state import ChaserTick, CommandResult, TrackingErrors
 from chaserdock_controller.guidance.docking import DockingObservation
-from chaserdock_controller.guidance.fleet import Fleet
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_controller.guidance.trajectories import Motion
@@ -54,7 +54,7 @@ TARGET_AT_REST = TargetState(
 )
 
 
-def fleet_of(scenario: FlightScenario, acquired_s: float | None = None) -> Fleet:
+def fleet_of(scenario: FlightScenario, acquired_s: float | None = None) -> ChaserFleet:
     """Return the chasers of a scenario; they hold if the target is ``acquired_s``."""
     fleet = GuidanceStage(scenario).fleet
     if acquired_s is not None:
@@ -64,7 +64,7 @@ def fleet_of(scenario: FlightScenario, acquired_s: float | None = None) -> Fleet
     return fleet
 
 
-def order(fleet: Fleet, command: OperatorCommand, now_s: float) -> CommandResult:
+def order(fleet: ChaserFleet, command: OperatorCommand, now_s: float) -> CommandResult:
     """Give one command in a tick."""
     return fleet.apply([command], now_s)[0]
 
@@ -86,7 +86,7 @@ def step(
     chaser.step(here, TrackingErrors(error_m, error_rad))
 
 
-def drain(fleet: Fleet) -> list[tuple[int, str, str]]:
+def drain(fleet: ChaserFleet) -> list[tuple[int, str, str]]:
     """Return the phase changes since the last call: chaser, phase, detail."""
     changes = [(c.chaser, c.phase, c.detail) for c in fleet.changes]
     fleet.drain_events()

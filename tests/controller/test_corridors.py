@@ -17,7 +17,7 @@ from chaserdock_controller.guidance.approach_cone import (
     cone_of,
     corridor_rows,
 )
-from chaserdock_controller.guidance.fleet import Fleet
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
@@ -99,7 +99,7 @@ def test_every_way_into_a_port_lies_in_its_cone() -> None:
             assert min(cone.room_m(centre + aside), cone.room_m(centre - aside)) > 0.0
 
 
-def approaching(**changes: Any) -> Fleet:
+def approaching(**changes: Any) -> ChaserFleet:
     guidance = fleet_of(scenario(**NEAR | changes), acquired_s=0.0)
     assert order(guidance, OperatorCommand(command="approach", chaser=0), 1.0).accepted
     return guidance

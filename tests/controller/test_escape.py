@@ -14,7 +14,7 @@ import pytest
 from chaserdock_controller.estimation.target_body import TargetPath
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.escape import EscapePlanner, RelativeState
-from chaserdock_controller.guidance.fleet import Fleet
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.reference import seen_from
 from chaserdock_controller.guidance.trajectories import Escape, move_to, stay
@@ -158,7 +158,7 @@ def test_final_corridor_is_exempt() -> None:
     assert move.duration_s == pytest.approx(1.875 * 27.0 / 0.2, rel=1e-6)
 
 
-def holding(**changes: Any) -> Fleet:
+def holding(**changes: Any) -> ChaserFleet:
     machine = fleet_of(flight_scenario(scenario(**changes)), acquired_s=0.0)
     place = np.array([0.0, -30.0, 0.0])
     machine.chasers[0].position_m = place

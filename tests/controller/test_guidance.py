@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.activities.approach import docked_offset_m
-from chaserdock_controller.guidance.fleet import Fleet
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import (
     TRANSITIONS,
     Phase,
@@ -34,20 +34,20 @@ def operator(
     return OperatorCommand(command=command, chaser=chaser, offset_m=offset)
 
 
-def holding(**changes: Any) -> Fleet:
+def holding(**changes: Any) -> ChaserFleet:
     guidance = fleet_of(scenario(**changes), acquired_s=1.0)
     return guidance
 
 
-def acquire(guidance: Fleet, now_s: float) -> None:
+def acquire(guidance: ChaserFleet, now_s: float) -> None:
     guidance.follow_target(now_s, [known(now_s)] * 2, seen=True, settled=False)
 
 
-def reference(guidance: Fleet, i: int, t: float) -> Array:
+def reference(guidance: ChaserFleet, i: int, t: float) -> Array:
     return at(guidance.chasers[i].state.move, t)[0]
 
 
-def phases(guidance: Fleet) -> list[str]:
+def phases(guidance: ChaserFleet) -> list[str]:
     return [c.phase for c in guidance.chasers]
 
 
@@ -241,7 +241,7 @@ def test_an_approach_does_not_go_through_the_target() -> None:
     assert not order(guidance, operator("approach"), end).accepted
 
 
-def lose(guidance: Fleet, now_s: float) -> None:
+def lose(guidance: ChaserFleet, now_s: float) -> None:
     for chaser in guidance.chasers:
         chaser.lose_target(now_s)
 

@@ -17,7 +17,7 @@ from chaserdock_controller.estimation.target_shape import (
     ShapeFilter,
     view_cell,
 )
-from chaserdock_controller.guidance.fleet import Fleet
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import circuit
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
@@ -32,11 +32,11 @@ from harness import ROOT
 SECTION = {"distance_m": 1.1, "speed_m_s": 0.1, "axis": [1.0, 2.0, 2.0]}
 
 
-def machine(**changes: Any) -> Fleet:
+def machine(**changes: Any) -> ChaserFleet:
     return fleet_of(scenario(inspection=SECTION, **changes), acquired_s=0.0)
 
 
-def command(guidance: Fleet, now_s: float, *chasers: int) -> list[Any]:
+def command(guidance: ChaserFleet, now_s: float, *chasers: int) -> list[Any]:
     commands = [OperatorCommand(command="inspect", chaser=i) for i in chasers]
     return guidance.apply(commands, now_s)
 

@@ -22,7 +22,7 @@ from chaserdock_controller.estimation import (
 from chaserdock_controller.estimation.camera_calibration import predict_measurement
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.chaser_state import ChaserTick
-from chaserdock_controller.guidance.fleet import Fleet
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.guidance.pointing import (
     CALIBRATION_S,
@@ -217,7 +217,7 @@ def test_calibration_manoeuvre_starts_and_ends_at_rest_with_target_in_view() -> 
 
 
 def test_calibrate_is_rejected_without_target_without_bias_states_and_outside_hold() -> None:
-    def reply(guidance: Fleet, now_s: float) -> str:
+    def reply(guidance: ChaserFleet, now_s: float) -> str:
         return order(guidance, OperatorCommand(command="calibrate", chaser=0), now_s).reason
 
     exact = fleet_of(scenario())

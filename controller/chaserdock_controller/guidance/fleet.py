@@ -22,7 +22,7 @@ from .phases import ATTACHED, Phase, Trigger
 from .thruster_commands import THRUSTER_COMMANDS
 
 
-class Fleet:
+class ChaserFleet:
     """All ``chasers``, by number. ``changes``: their phase changes in this tick, in order;
     ``notes``: what else is to be logged in it.
     """

@@ -32,7 +32,7 @@ from .chaser_machine import ChaserMachine
 from .chaser_state import ChaserTick, TrackingErrors
 from .docking import DockingObservation
 from .escape import RelativeState
-from .fleet import Fleet
+from .fleet import ChaserFleet
 from .horizon import ReferenceBuilder
 from .phases import Phase
 
@@ -42,7 +42,7 @@ class GuidanceStage:
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
-        self.fleet = Fleet(scenario)
+        self.fleet = ChaserFleet(scenario)
         self.stack = Stack(self.fleet)
         self.references = ReferenceBuilder(scenario)
         activities = activities_of(self.fleet, self.stack)

@@ -78,7 +78,7 @@ class ThrusterCommandState(Struct, forbid_unknown_fields=True):
     _last_commands: dict[int, tuple[float, OperatorCommand]]
 
 
-class ChaserState(Struct, forbid_unknown_fields=True):
+class ChaserMachineState(Struct, forbid_unknown_fields=True):
     state: ChaserGuidance
     position_m: Array | None
     seen: DockingObservation | None
@@ -96,7 +96,7 @@ class ThrusterReportState(Struct, forbid_unknown_fields=True):
     _reports: dict[int, ThrusterReport]
 
 
-class StackState(Struct, forbid_unknown_fields=True):
+class WaitingState(Struct, forbid_unknown_fields=True):
     waits: bool
 
 
@@ -195,11 +195,11 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     planning: PlanningState
     plan_monitor: PlanMonitorState
     output: OutputState
-    chasers: list[tuple[ChaserState, ThrusterCommandState]]
+    chasers: list[tuple[ChaserMachineState, ThrusterCommandState]]
     fleet: FleetState
     timeline_left: int
     thruster_reports: ThrusterReportState
-    stack: StackState
+    stack: WaitingState
     stack_control: StackControlState
     stack_plan: StackPlanState
     sequencer: SequencerState
@@ -233,7 +233,7 @@ class Checkpoint:
             "output": (core.output, OutputState),
             "fleet": (core.guidance.fleet, FleetState),
             "thruster_reports": (core.ingest.thrusters, ThrusterReportState),
-            "stack": (core.guidance.stack, StackState),
+            "stack": (core.guidance.stack, WaitingState),
             "stack_control": (core.guidance.stack.control, StackControlState),
             "stack_plan": (core.guidance.stack.control.planner, StackPlanState),
             "sequencer": (core.guidance.stack.control.sequencer, SequencerState),
@@ -257,7 +257,7 @@ class Checkpoint:
                 ControllerCheckpoint(
                     **parts,
                     chasers=[
-                        (_read(c, ChaserState), _read(c.thrusters, ThrusterCommandState))
+                        (_read(c, ChaserMachineState), _read(c.thrusters, ThrusterCommandState))
                         for c in self._core.guidance.chasers
                     ],
                     timeline_left=len(vars(self._core.guidance.fleet)["_timeline"]),

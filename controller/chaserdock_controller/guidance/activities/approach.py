@@ -23,7 +23,7 @@ def docked_offset_m(chaser: ChaserMachine) -> Array:
     return chaser.nominal_m / np.linalg.norm(chaser.nominal_m) * distance_m
 
 
-class Approach(Activity):
+class ApproachActivity(Activity):
     phases = (Phase.APPROACH, Phase.DOCKED)
     commands = ("approach",)
     by_capture = False

@@ -11,16 +11,16 @@ from chaserdock_protocol.messages import CameraCalibration, OperatorCommand
 from .. import command_validation as validation
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
-from ..fleet import Fleet
+from ..fleet import ChaserFleet
 from ..phases import Phase, Trigger
 from ..pointing import CALIBRATION_S
 
 
-class Calibrate(Activity):
+class CalibrateActivity(Activity):
     phases = (Phase.CALIBRATE,)
     commands = ("calibrate",)
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: ChaserFleet) -> None:
         self._notes = fleet.notes
 
     def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:

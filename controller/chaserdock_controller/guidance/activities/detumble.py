@@ -14,7 +14,7 @@ from .. import command_validation as validation
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import ChaserTick, TrackingErrors
 from ..detumble.control import DetumbleControl, StackState, StackTask
-from ..fleet import Fleet
+from ..fleet import ChaserFleet
 from ..parameters import GUIDANCE
 from ..phases import DETUMBLING, Phase, Trigger
 from .docking import check_latch
@@ -29,7 +29,7 @@ class Stack:
     name cannot stop the stack; ``waits``: it coasts while a chaser backs out.
     """
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: ChaserFleet) -> None:
         self._fleet = fleet
         self.control = DetumbleControl(fleet.scenario)
         self.thrusts: Mapping[int, DirectCommand] = {}
@@ -47,7 +47,7 @@ class Stack:
         ``commands``.
         """
         self._state = None
-        if self._in(*Detumble.phases) or any(c.command in _COMMANDS for c in commands):
+        if self._in(*DetumbleActivity.phases) or any(c.command in _COMMANDS for c in commands):
             self._state = self.with_trusted(self.control.state(observation, estimation))
         named = {c.chaser for c in commands if c.command == "detumble"}
         able = {c.number for c in self._fleet.chasers if c.number in named and c.may_detumble()}
@@ -141,7 +141,7 @@ class Stack:
 
     def _report_waiting(self) -> None:
         """Log when the stack begins to wait for chasers that back out, or goes on."""
-        leaving = self._leaving() if self._in(*Detumble.phases) else []
+        leaving = self._leaving() if self._in(*DetumbleActivity.phases) else []
         if self.waits == bool(leaving):
             return
         self.waits = bool(leaving)
@@ -151,7 +151,7 @@ class Stack:
         self._fleet.notes.append(("info", text))
 
 
-class Detumble(Activity):
+class DetumbleActivity(Activity):
     phases = (Phase.IDENTIFY, *DETUMBLING)
     commands = _COMMANDS
 

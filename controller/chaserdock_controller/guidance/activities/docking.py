@@ -15,14 +15,14 @@ from chaserdock_controller.interfaces import DirectCommand
 from ..chaser_machine import Activity, ChaserMachine, pull
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
 from ..docking import Dock, DockingObservation
-from ..fleet import Fleet
+from ..fleet import ChaserFleet
 from ..parameters import GUIDANCE
 from ..phases import CORRIDOR, Phase, Trigger
 from ..trajectories import Glide, glide, stay, stop
 from .hold import rest
 
 
-class Docking(Activity):
+class DockingActivity(Activity):
     phases = (
         Phase.WAIT,
         Phase.ALIGN,
@@ -35,7 +35,7 @@ class Docking(Activity):
     commands = ("approach",)
     by_capture = True
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: ChaserFleet) -> None:
         self._fleet = fleet
 
     def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:

@@ -18,7 +18,7 @@ def rest(chaser: ChaserMachine, now_s: float) -> Move:
     return stop(chaser.motion(now_s), now_s)
 
 
-class Hold(Activity):
+class HoldActivity(Activity):
     phases = (Phase.ACQUIRE, Phase.HOLD)
     commands = ("hold",)
 

@@ -11,16 +11,16 @@ from chaserdock_protocol.messages import OperatorCommand
 from .. import command_validation as validation
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
-from ..fleet import Fleet
+from ..fleet import ChaserFleet
 from ..phases import Phase, Trigger
 from ..trajectories import Circuit, circuit
 
 
-class Inspect(Activity):
+class InspectActivity(Activity):
     phases = (Phase.INSPECT,)
     commands = ("inspect",)
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: ChaserFleet) -> None:
         self._fleet = fleet
 
     def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:

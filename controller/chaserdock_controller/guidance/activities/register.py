@@ -4,28 +4,28 @@
 from __future__ import annotations
 
 from ..chaser_machine import Activity
-from ..fleet import Fleet
-from .approach import Approach
-from .calibrate import Calibrate
-from .detumble import Detumble, Stack
-from .docking import Docking
-from .goto import Goto
-from .hold import Hold
-from .inspect import Inspect
-from .retreat import Retreat
-from .search import Search
+from ..fleet import ChaserFleet
+from .approach import ApproachActivity
+from .calibrate import CalibrateActivity
+from .detumble import DetumbleActivity, Stack
+from .docking import DockingActivity
+from .goto import GotoActivity
+from .hold import HoldActivity
+from .inspect import InspectActivity
+from .retreat import RetreatActivity
+from .search import SearchActivity
 
 
-def activities_of(fleet: Fleet, stack: Stack) -> tuple[Activity, ...]:
+def activities_of(fleet: ChaserFleet, stack: Stack) -> tuple[Activity, ...]:
     """Return the activities that the chasers of a fleet have in common."""
     return (
-        Hold(),
-        Search(fleet.scenario),
-        Goto(fleet),
-        Approach(),
-        Docking(fleet),
-        Retreat(fleet),
-        Inspect(fleet),
-        Calibrate(fleet),
-        Detumble(stack),
+        HoldActivity(),
+        SearchActivity(fleet.scenario),
+        GotoActivity(fleet),
+        ApproachActivity(),
+        DockingActivity(fleet),
+        RetreatActivity(fleet),
+        InspectActivity(fleet),
+        CalibrateActivity(fleet),
+        DetumbleActivity(stack),
     )

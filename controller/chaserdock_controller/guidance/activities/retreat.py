@@ -7,17 +7,17 @@ from dataclasses import replace
 
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, NextMove, TrackingErrors
-from ..fleet import Fleet
+from ..fleet import ChaserFleet
 from ..parameters import GUIDANCE
 from ..phases import ATTACHED, Phase, Trigger
 from ..trajectories import Escape, Move, move_to, stay
 
 
-class Retreat(Activity):
+class RetreatActivity(Activity):
     phases = (Phase.RETREAT, Phase.ABORT)
     commands = ("retreat", "abort")
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: ChaserFleet) -> None:
         self._moves = fleet.moves
 
     def _speed_m_s(self, phase: Phase) -> float:

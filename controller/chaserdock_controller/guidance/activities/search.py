@@ -20,7 +20,7 @@ from ..pointing import SearchProgress, facing, search_wrench, turning_wrench
 _SETTLED_M_S, _SETTLED_RAD_S = 0.01, 0.02
 
 
-class Search(Activity):
+class SearchActivity(Activity):
     phases = (Phase.SEARCHING,)
 
     def __init__(self, scenario: FlightScenario) -> None:

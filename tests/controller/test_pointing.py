@@ -117,7 +117,7 @@ def test_paused_search_goes_on_where_it_stopped() -> None:
     command = None
     for k in range(61):
         now = ChaserTick(k / 15, _odometry(0, k, x), target, acquiring=k <= 30)
-        command = chaser.direct_command(now)
+        command = chaser.directive(now, None).direct
     assert command is not None
     expected = search_wrench(_odometry(0, 60, x), s.chaser, s.camera_model(), q, 2.0)
     np.testing.assert_array_equal(command.wrench, expected)

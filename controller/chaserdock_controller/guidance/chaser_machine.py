@@ -15,7 +15,13 @@ from chaserdock_models.arrays import Array, length
 from chaserdock_protocol.messages import Latch, OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock_controller.interfaces import DirectCommand
+from chaserdock_controller.interfaces import (
+    DirectCommand,
+    Directive,
+    Observation,
+    ReferencePose,
+    TargetEstimation,
+)
 from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from . import command_validation as validation
@@ -34,6 +40,7 @@ from .parameters import GUIDANCE
 from .phases import (
     APPROACHING,
     ATTACHED,
+    BACKING_OUT,
     Phase,
     Trigger,
     next_phase,
@@ -43,7 +50,6 @@ from .phases import (
 from .thruster_commands import ThrusterCommands
 from .trajectories import Escape, Motion, stay
 
-_BACKING_OUT = (Phase.RETREAT, Phase.ABORT)
 _FAILURES = (
     Trigger.PLANNING_FAILED,
     Trigger.DETUMBLE_FAILED,
@@ -89,6 +95,17 @@ class Activity:
         its port only coasts.
         """
         return pull(0.0) if chaser.is_attached(known) else None
+
+    def observe(
+        self,
+        commands: Sequence[OperatorCommand],
+        observation: Observation,
+        estimation: TargetEstimation,
+    ) -> None:
+        """Take what its chasers need together, before the ``commands`` of a tick are obeyed."""
+
+    def conclude(self, observation: Observation) -> None:
+        """Do what its chasers do together, after each was stepped."""
 
 
 def pull(force_N: float) -> DirectCommand:
@@ -243,11 +260,21 @@ class ChaserMachine:
         self.position_m, self.seen = known.offset_m, known.port
         self._activities[self.phase].step(self, known, errors)
 
-    def direct_command(self, known: ChaserTick) -> DirectCommand | None:
-        """Return the command of a chaser that is not flown by the NMPC in this tick, or None."""
-        if known.invalid:
-            return DirectCommand("coast", np.zeros(6))
-        return None if known.own is None else self._activities[self.phase].command(self, known)
+    def directive(self, known: ChaserTick, reference: ReferencePose | None) -> Directive:
+        """Return what the chaser is to do after this tick. One with invalid odometry coasts."""
+        direct = DirectCommand("coast", np.zeros(6)) if known.invalid else None
+        if known.own is not None:
+            direct = self._activities[self.phase].command(self, known)
+        return Directive(
+            phase=self.phase,
+            phase_time_s=known.now_s - self.state.since_s,
+            latch=self.latch(),
+            free=self.is_free(),
+            isolated=self.thrusters.closed(known.stuck_thrusters),
+            trusted=tuple(sorted(self.thrusters.trusted)),
+            reference=reference,
+            direct=direct,
+        )
 
     def motion(self, now_s: float) -> Motion:
         """Return the motion in TRF: in place of an abort's, which is in WRF, rest at the estimated
@@ -264,16 +291,11 @@ class ChaserMachine:
         """Return whether the chaser is latched and is to stay, or cannot leave; its actuators are
         off but for the latch test.
         """
-        return known.latched and (self.phase not in _BACKING_OUT or self.state.stuck)
+        return known.latched and (self.phase not in BACKING_OUT or self.state.stuck)
 
     def is_free(self) -> bool:
         """Return whether the docking sensor reports neither contact nor a closed latch."""
         return self.seen is None or not (self.seen.contact or self.seen.latched)
-
-    def is_leaving(self) -> bool:
-        """Return whether the chaser backs out of its corridor."""
-        leaves = self.phase in _BACKING_OUT and not self.state.stuck
-        return leaves and self.is_free() and self.in_corridor()
 
     def in_corridor(self) -> bool:
         """Return whether the chaser is in its corridor or at its port, by its phase or its
@@ -335,8 +357,3 @@ class ChaserMachine:
         if self.dock is None:
             return "keep"
         return "arm" if self.phase in (Phase.FINAL, Phase.CONTACT, *ATTACHED) else "release"
-
-    def isolated(self, known: ChaserTick) -> tuple[int, ...]:
-        """Return the thrusters that an operator or the motion of the stack has isolated."""
-        found = self.thrusters.untrusted(known.stuck_thrusters)
-        return tuple(sorted({*self.thrusters.isolated, *found}))

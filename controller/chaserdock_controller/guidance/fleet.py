@@ -148,25 +148,3 @@ class ChaserFleet:
             if corridors_apart(chaser.dock, other.dock) < docking.clearance_m:
                 return f"chaser {other.number} is in the way"
         return f"{active} are docking already" if active >= docking.at_once else ""
-
-    # -- passive safety ----------------------------------------------------------------------------
-
-    def follow_safety(self, known: Sequence[ChaserTick], renew: bool) -> dict[int, float]:
-        """Let chasers abort whose plans are unsafe; return the margins in sigmas of the best aborts
-        where passive safety is enforced, by chaser, computed again if they are to be renewed.
-        """
-        for chaser, tick in zip(self.chasers, known, strict=True):
-            chaser.follow_safety(tick)
-        margins: dict[int, float] = {}
-        for chaser, tick in zip(self.chasers, known, strict=True):
-            if (
-                self.moves.escapes is None
-                or chaser.relative is None
-                or not chaser.enforces_safety()
-            ):
-                chaser.abort_margin = None
-                continue
-            if renew or chaser.abort_margin is None:
-                chaser.abort_margin = self.moves.escapes.escape(chaser.relative, tick.now_s)[1]
-            margins[chaser.number] = chaser.abort_margin
-        return margins

@@ -7,7 +7,8 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import FlightScenario
 
-from .escape import EscapePlanner, RelativeState
+from .chaser_machine import ChaserMachine
+from .escape import EscapePlanner
 from .parameters import GUIDANCE
 from .trajectories import Motion, move_to
 
@@ -26,26 +27,17 @@ class MovePlanner:
         if scenario.limits.passive_safety == "enforce":
             self.escapes = EscapePlanner(scenario, self.abort_m_s)
 
-    def move(
-        self,
-        start: Motion,
-        goal_m: Array,
-        now_s: float,
-        speed_m_s: float,
-        known: RelativeState | None,
-    ) -> Motion:
+    def move(self, chaser: ChaserMachine, goal_m: Array, now_s: float, speed_m_s: float) -> Motion:
         """Return the move to a goal (3,), TRF, at most at a speed; if passive safety is enforced,
-        as slow as it needs from the ``known`` state.
+        as slow as it needs.
         """
-        return self._safe(start, goal_m, now_s, speed_m_s, known) or move_to(
-            start, goal_m, now_s, speed_m_s
+        return self._safe(chaser, goal_m, now_s, speed_m_s) or move_to(
+            chaser.motion(now_s), goal_m, now_s, speed_m_s
         )
 
-    def why_not_safe(
-        self, start: Motion, goal_m: Array, now_s: float, known: RelativeState | None
-    ) -> str:
+    def why_not_safe(self, chaser: ChaserMachine, goal_m: Array, now_s: float) -> str:
         """Return why no move to a goal (3,), TRF, is passively safe, or an empty string."""
-        if self._safe(start, goal_m, now_s, self.goto_m_s, known) is not None:
+        if self._safe(chaser, goal_m, now_s, self.goto_m_s) is not None:
             return ""
         return (
             "no speed makes the move passively safe: the coast after a loss of thrust comes within "
@@ -53,18 +45,14 @@ class MovePlanner:
         )
 
     def _safe(
-        self,
-        start: Motion,
-        goal_m: Array,
-        now_s: float,
-        speed_m_s: float,
-        known: RelativeState | None,
+        self, chaser: ChaserMachine, goal_m: Array, now_s: float, speed_m_s: float
     ) -> Motion | None:
+        start = chaser.motion(now_s)
         speed_m_s = self._closing_speed(start, goal_m, now_s, speed_m_s)
         if self.escapes is None:
             return move_to(start, goal_m, now_s, speed_m_s)
         return self.escapes.limited(
-            known, lambda speed: move_to(start, goal_m, now_s, speed), speed_m_s, now_s
+            chaser.relative, lambda speed: move_to(start, goal_m, now_s, speed), speed_m_s, now_s
         )
 
     def _closing_speed(self, start: Motion, goal_m: Array, now_s: float, speed_m_s: float) -> float:

@@ -16,7 +16,6 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_controller.estimation.composite_body import centre_in_target, pose_in_target
 from chaserdock_controller.estimation.identification.stage import body_state
 from chaserdock_controller.interfaces import (
-    Directive,
     GuidanceResult,
     HorizonReference,
     Observation,
@@ -25,7 +24,6 @@ from chaserdock_controller.interfaces import (
     TargetEstimation,
 )
 
-from .activities.detumble import Stack
 from .activities.register import activities_of
 from .activities.search import is_settled
 from .chaser_machine import ChaserMachine
@@ -38,16 +36,15 @@ from .phases import Phase
 
 
 class GuidanceStage:
-    """The chasers as a fleet, and the stack that latched ones form with the target."""
+    """The chasers as a fleet, and their activities."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
         self.fleet = ChaserFleet(scenario)
-        self.stack = Stack(self.fleet)
-        self.references = ReferenceBuilder(scenario)
-        activities = activities_of(self.fleet, self.stack)
+        self.activities = activities_of(self.fleet)
         for chaser in self.fleet.chasers:
-            chaser.take_up(activities)
+            chaser.take_up(self.activities)
+        self.references = ReferenceBuilder(scenario)
 
     @property
     def chasers(self) -> tuple[ChaserMachine, ...]:
@@ -73,7 +70,8 @@ class GuidanceStage:
             chaser.follow_planning(tick)
 
         commands = (*fleet.due_commands(now_s), *observation.commands)
-        self.stack.observe(commands, observation, estimation)
+        for activity in self.activities:
+            activity.observe(commands, observation, estimation)
         replies = self._reply(commands, observation)
 
         references: list[ReferencePose | None] = [None] * len(known)
@@ -82,16 +80,18 @@ class GuidanceStage:
                 None if tick.own is None else self._step(chaser, tick, tick.own)
                 for chaser, tick in zip(fleet.chasers, known, strict=True)
             ]
-        renew = observation.tick % self._scenario.time.rate_hz == 0
-        abort_margins = fleet.follow_safety(known, renew)
-        self.stack.step(observation)
+        for chaser, tick in zip(fleet.chasers, known, strict=True):
+            chaser.follow_safety(tick)
+        for activity in self.activities:
+            activity.conclude(observation)
 
         horizon = self._horizon(known, estimation)
         directives = {
-            chaser.number: _directive(chaser, tick, reference)
+            chaser.number: chaser.directive(tick, reference)
             for chaser, tick, reference in zip(fleet.chasers, known, references, strict=True)
         }
-        return GuidanceResult(directives, horizon, replies, fleet.drain_events(), abort_margins)
+        margins = {c.number: c.abort_margin for c in fleet.chasers if c.abort_margin is not None}
+        return GuidanceResult(directives, horizon, replies, fleet.drain_events(), margins)
 
     def _known(
         self, observation: Observation, estimation: TargetEstimation, history: PlanningHistory
@@ -200,19 +200,3 @@ def _offset_m(i: int, estimation: TargetEstimation) -> Array | None:
     """Return a chaser's estimated centre (3,), TRF; None where it is not known."""
     own = estimation.own.get(i)
     return centre_in_target(estimation.target, own) if own and estimation.known else None
-
-
-def _directive(
-    chaser: ChaserMachine, known: ChaserTick, reference: ReferencePose | None
-) -> Directive:
-    """Return the guidance of a chaser after this tick."""
-    return Directive(
-        phase=chaser.phase,
-        phase_time_s=known.now_s - chaser.state.since_s,
-        latch=chaser.latch(),
-        free=chaser.is_free(),
-        isolated=chaser.isolated(known),
-        trusted=tuple(sorted(chaser.thrusters.trusted)),
-        reference=reference,
-        direct=chaser.direct_command(known),
-    )

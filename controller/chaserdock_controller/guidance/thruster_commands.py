@@ -25,6 +25,10 @@ class ThrusterCommands:
         self.trusted: set[int] = set()
         self._last_commands: dict[int, tuple[float, OperatorCommand]] = {}
 
+    def closed(self, stuck: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the thrusters that an operator has isolated, or that are ``stuck``."""
+        return tuple(sorted({*self.isolated, *self.untrusted(stuck)}))
+
     def untrusted(self, thrusters: tuple[int, ...]) -> tuple[int, ...]:
         """Return those of ``thrusters`` that no operator has restored."""
         return tuple(k for k in thrusters if k not in self.trusted)

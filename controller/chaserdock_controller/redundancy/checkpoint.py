@@ -30,6 +30,7 @@ from chaserdock_controller.estimation.replay import ReplayBuffer
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
+from chaserdock_controller.guidance.activities.detumble import detumbling_of
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.docking import DockingObservation
@@ -225,6 +226,7 @@ class Checkpoint:
         the checkpoint.
         """
         core = self._core
+        detumble = detumbling_of(core.guidance.activities)
         parts: dict[str, tuple[Any, type[Struct]]] = {
             "core": (core, CoreState),
             "sightings": (vars(core.estimation)["_converter"], SightingState),
@@ -233,10 +235,10 @@ class Checkpoint:
             "output": (core.output, OutputState),
             "fleet": (core.guidance.fleet, FleetState),
             "thruster_reports": (core.ingest.thrusters, ThrusterReportState),
-            "stack": (core.guidance.stack, WaitingState),
-            "stack_control": (core.guidance.stack.control, StackControlState),
-            "stack_plan": (core.guidance.stack.control.planner, StackPlanState),
-            "sequencer": (core.guidance.stack.control.sequencer, SequencerState),
+            "stack": (detumble, WaitingState),
+            "stack_control": (detumble.control, StackControlState),
+            "stack_plan": (detumble.control.planner, StackPlanState),
+            "sequencer": (detumble.control.sequencer, SequencerState),
             "composite": (core.estimation.composite, CompositeState),
             "history": (core.output.history, CommandHistoryState),
             "lost_chasers": (core.ingest.lost_chasers, LostChaserState),

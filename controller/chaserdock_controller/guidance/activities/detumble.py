@@ -16,26 +16,44 @@ from ..chaser_state import ChaserTick, TrackingErrors
 from ..detumble.control import DetumbleControl, StackState, StackTask
 from ..fleet import ChaserFleet
 from ..parameters import GUIDANCE
-from ..phases import DETUMBLING, Phase, Trigger
+from ..phases import BACKING_OUT, DETUMBLING, Phase, Trigger, next_phase
 from .docking import check_latch
 
-_COMMANDS = ("identify", "detumble")
 
-
-class Stack:
-    """The target with latched chasers, which is moved by all of them together.
-
-    ``thrusts``: commands of this tick by chaser; ``refusal``: why the chasers that its commands
-    name cannot stop the stack; ``waits``: it coasts while a chaser backs out.
+class DetumbleActivity(Activity):
+    """The stack is moved by all chasers in these phases together. ``control``: of its motion;
+    ``waits``: it coasts while a chaser backs out.
     """
+
+    phases = (Phase.IDENTIFY, *DETUMBLING)
+    commands = ("identify", "detumble")
 
     def __init__(self, fleet: ChaserFleet) -> None:
         self._fleet = fleet
         self.control = DetumbleControl(fleet.scenario)
-        self.thrusts: Mapping[int, DirectCommand] = {}
-        self.refusal = ""
         self.waits = False
         self._state: StackState | None = None
+        self._refusal = ""
+        self._thrusts: Mapping[int, DirectCommand] = {}
+
+    # -- one chaser --------------------------------------------------------------------------------
+
+    def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:
+        if reason := super().refuse(chaser, command, now_s):
+            return reason
+        if command.command == "identify":
+            return validation.why_not_identify(chaser.scenario)
+        return self._refusal
+
+    def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
+        """Back out when the latch opens; the rest is up to the stack."""
+        if chaser.seen is not None and (failed := check_latch(chaser, chaser.seen, known.now_s)):
+            chaser.fire(failed[0], known.now_s, failed[1])
+
+    def command(self, chaser: ChaserMachine, known: ChaserTick) -> DirectCommand | None:
+        return self._thrusts.get(chaser.number) or super().command(chaser, known)
+
+    # -- the stack ---------------------------------------------------------------------------------
 
     def observe(
         self,
@@ -47,20 +65,21 @@ class Stack:
         ``commands``.
         """
         self._state = None
-        if self._in(*DetumbleActivity.phases) or any(c.command in _COMMANDS for c in commands):
+        if self._in(*self.phases) or any(c.command in self.commands for c in commands):
             self._state = self.with_trusted(self.control.state(observation, estimation))
         named = {c.chaser for c in commands if c.command == "detumble"}
-        able = {c.number for c in self._fleet.chasers if c.number in named and c.may_detumble()}
-        self.refusal = self._why_not(able | self._in(*DETUMBLING), observation) if able else ""
+        able = {c.number for c in self._fleet.chasers if c.number in named and _may_stop_stack(c)}
+        self._refusal = self._why_not(able | self._in(*DETUMBLING), observation) if able else ""
 
-    def step(self, observation: Observation) -> None:
+    def conclude(self, observation: Observation) -> None:
         """Advance the phases of chasers that move the stack by its motion, and set their thrusts."""
         now_s = observation.time_s
+        identify_s = self._fleet.scenario.detumble.identification.duration_s
         for chaser in self._fleet.chasers:
-            if chaser.phase is Phase.IDENTIFY:
-                self._end_identification(chaser, now_s)
+            if chaser.phase is Phase.IDENTIFY and now_s - chaser.state.since_s >= identify_s:
+                chaser.fire(Trigger.IDENTIFIED, now_s)
         self._follow_motion(observation)
-        self.thrusts = self._thrusts(observation)
+        self._thrusts = self._command_thrusters(observation)
         self._report_waiting()
 
     def with_trusted(self, state: StackState | None) -> StackState | None:
@@ -78,12 +97,6 @@ class Stack:
 
     def _why_not(self, chasers: frozenset[int], observation: Observation) -> str:
         return self.control.why_not(self._state, chasers, observation.isolated)
-
-    def _end_identification(self, chaser: ChaserMachine, now_s: float) -> None:
-        """Let a chaser rest that has fired identifying pulses for long enough."""
-        duration_s = self._fleet.scenario.detumble.identification.duration_s
-        if now_s - chaser.state.since_s >= duration_s:
-            chaser.fire(Trigger.IDENTIFIED, now_s)
 
     def _follow_motion(self, observation: Observation) -> None:
         """Close the thrusters if those that are left cannot stop the stack; otherwise let the
@@ -115,7 +128,7 @@ class Stack:
         elif not holds and in_phase_s > timeout_s:
             chaser.fire(Trigger.DETUMBLE_FAILED, now_s, f"not stopped within {timeout_s:g} s")
 
-    def _thrusts(self, observation: Observation) -> Mapping[int, DirectCommand]:
+    def _command_thrusters(self, observation: Observation) -> Mapping[int, DirectCommand]:
         """Return the commands of chasers that move the stack, by chaser. Pulses that identify it
         wait while it is stopped.
         """
@@ -137,11 +150,11 @@ class Stack:
 
     def _leaving(self) -> list[ChaserMachine]:
         """Return the chasers that back out: the stack must not turn under them by thrust."""
-        return [chaser for chaser in self._fleet.chasers if chaser.is_leaving()]
+        return [chaser for chaser in self._fleet.chasers if _backs_out(chaser)]
 
     def _report_waiting(self) -> None:
         """Log when the stack begins to wait for chasers that back out, or goes on."""
-        leaving = self._leaving() if self._in(*DetumbleActivity.phases) else []
+        leaving = self._leaving() if self._in(*self.phases) else []
         if self.waits == bool(leaving):
             return
         self.waits = bool(leaving)
@@ -151,24 +164,18 @@ class Stack:
         self._fleet.notes.append(("info", text))
 
 
-class DetumbleActivity(Activity):
-    phases = (Phase.IDENTIFY, *DETUMBLING)
-    commands = _COMMANDS
+def _backs_out(chaser: ChaserMachine) -> bool:
+    """Return whether a chaser is on its way out of its corridor."""
+    leaves = chaser.phase in BACKING_OUT and not chaser.state.stuck
+    return leaves and chaser.is_free() and chaser.in_corridor()
 
-    def __init__(self, stack: Stack) -> None:
-        self._stack = stack
 
-    def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:
-        if reason := super().refuse(chaser, command, now_s):
-            return reason
-        if command.command == "identify":
-            return validation.why_not_identify(chaser.scenario)
-        return self._stack.refusal
+def _may_stop_stack(chaser: ChaserMachine) -> bool:
+    """Return whether a chaser stops the stack already, or may be commanded to."""
+    begins = next_phase(chaser.phase, Trigger.COMMAND_DETUMBLE, chaser.by_capture)
+    return chaser.phase in DETUMBLING or begins is not None
 
-    def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
-        """Back out when the latch opens; the rest is up to the stack."""
-        if chaser.seen is not None and (failed := check_latch(chaser, chaser.seen, known.now_s)):
-            chaser.fire(failed[0], known.now_s, failed[1])
 
-    def command(self, chaser: ChaserMachine, known: ChaserTick) -> DirectCommand | None:
-        return self._stack.thrusts.get(chaser.number) or super().command(chaser, known)
+def detumbling_of(activities: Sequence[Activity]) -> DetumbleActivity:
+    """Return the activity that moves the stack."""
+    return next(a for a in activities if isinstance(a, DetumbleActivity))

@@ -64,8 +64,7 @@ class DockingActivity(Activity):
                 return replace(begun, move=stop(chaser.motion(now_s), now_s))
             case Phase.ALIGN, trigger:
                 again = trigger is Trigger.NEXT_ATTEMPT
-                here, entry = chaser.motion(now_s), _dock(chaser).entry()
-                move = moves.move(here, entry, now_s, moves.goto_m_s, chaser.relative)
+                move = moves.move(chaser, _dock(chaser).entry(), now_s, moves.goto_m_s)
                 return replace(begun, move=move, attempt=begun.attempt + 1 if again else 1)
             case Phase.APPROACH, _:
                 return replace(begun, move=_way_in(_dock(chaser), now_s))

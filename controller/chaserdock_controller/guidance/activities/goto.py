@@ -34,7 +34,7 @@ class GotoActivity(Activity):
             return reason
         goal_m = np.asarray(command.offset_m)
         return validation.why_not_in_cone(scenario, i, goal_m) or self._fleet.moves.why_not_safe(
-            chaser.motion(now_s), goal_m, now_s, chaser.relative
+            chaser, goal_m, now_s
         )
 
     def start(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> None:
@@ -48,13 +48,9 @@ class GotoActivity(Activity):
         assert cause.place_m is not None
         if cause.trigger is Trigger.TARGET_SETTLED:
             here = stay(cause.place_m, now_s)
-            return replace(
-                begun, move=move_to(here, chaser.nominal_m, now_s, moves.goto_m_s), faces=True
-            )
-        here = chaser.motion(now_s)
-        return replace(
-            begun, move=moves.move(here, cause.place_m, now_s, moves.goto_m_s, chaser.relative)
-        )
+            move = move_to(here, chaser.nominal_m, now_s, moves.goto_m_s)
+            return replace(begun, move=move, faces=True)
+        return replace(begun, move=moves.move(chaser, cause.place_m, now_s, moves.goto_m_s))
 
     def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
         if chaser.state.move.over_at(known.now_s):

@@ -42,9 +42,7 @@ class InspectActivity(Activity):
                 return (
                     f"the way around the target comes within {apart:.3g} m of chaser {other.number}"
                 )
-        return self._fleet.moves.why_not_safe(
-            chaser.motion(now_s), path.goal_m, now_s, chaser.relative
-        )
+        return self._fleet.moves.why_not_safe(chaser, path.goal_m, now_s)
 
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
         return replace(begun, move=_circuit(chaser, cause.now_s), faces=True)

@@ -7,7 +7,7 @@ from ..chaser_machine import Activity
 from ..fleet import ChaserFleet
 from .approach import ApproachActivity
 from .calibrate import CalibrateActivity
-from .detumble import DetumbleActivity, Stack
+from .detumble import DetumbleActivity
 from .docking import DockingActivity
 from .goto import GotoActivity
 from .hold import HoldActivity
@@ -16,7 +16,7 @@ from .retreat import RetreatActivity
 from .search import SearchActivity
 
 
-def activities_of(fleet: ChaserFleet, stack: Stack) -> tuple[Activity, ...]:
+def activities_of(fleet: ChaserFleet) -> tuple[Activity, ...]:
     """Return the activities that the chasers of a fleet have in common."""
     return (
         HoldActivity(),
@@ -27,5 +27,5 @@ def activities_of(fleet: ChaserFleet, stack: Stack) -> tuple[Activity, ...]:
         RetreatActivity(fleet),
         InspectActivity(fleet),
         CalibrateActivity(fleet),
-        DetumbleActivity(stack),
+        DetumbleActivity(fleet),
     )

@@ -5,20 +5,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from chaserdock_controller.interfaces import Observation
+
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, NextMove, TrackingErrors
 from ..fleet import ChaserFleet
 from ..parameters import GUIDANCE
-from ..phases import ATTACHED, Phase, Trigger
+from ..phases import ATTACHED, BACKING_OUT, Phase, Trigger
 from ..trajectories import Escape, Move, move_to, stay
 
 
 class RetreatActivity(Activity):
-    phases = (Phase.RETREAT, Phase.ABORT)
+    phases = BACKING_OUT
     commands = ("retreat", "abort")
 
     def __init__(self, fleet: ChaserFleet) -> None:
-        self._moves = fleet.moves
+        self._fleet, self._moves = fleet, fleet.moves
 
     def _speed_m_s(self, phase: Phase) -> float:
         return self._moves.abort_m_s if phase is Phase.ABORT else self._moves.approach_m_s
@@ -33,12 +35,10 @@ class RetreatActivity(Activity):
             elif cause.trigger is Trigger.ATTEMPT_FAILED and _may_try_again(chaser):
                 then = NextMove.ATTEMPT
             return replace(begun, move=self._way_out(chaser, begun.phase, now_s), then=then)
-        escape = self._escape(chaser, now_s) if aborts else None
-        speed, here = self._speed_m_s(begun.phase), chaser.motion(now_s)
-        return replace(
-            begun,
-            move=escape or self._moves.move(here, chaser.nominal_m, now_s, speed, chaser.relative),
-        )
+        move, speed = self._escape(chaser, now_s) if aborts else None, self._speed_m_s(begun.phase)
+        if move is None:
+            move = self._moves.move(chaser, chaser.nominal_m, now_s, speed)
+        return replace(begun, move=move)
 
     def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
         if chaser.state.move.over_at(known.now_s):
@@ -47,6 +47,16 @@ class RetreatActivity(Activity):
             self._watch_latch(chaser, known.now_s)
         elif chaser.phase is Phase.ALIGN:
             chaser.step(known, errors)  # the next attempt begins with this tick
+
+    def conclude(self, observation: Observation) -> None:
+        """Compute the margins of the best aborts where passive safety is enforced, once a second."""
+        escapes = self._moves.escapes
+        renew = observation.tick % self._fleet.scenario.time.rate_hz == 0
+        for chaser in self._fleet.chasers:
+            if escapes is None or chaser.relative is None or not chaser.enforces_safety():
+                chaser.abort_margin = None
+            elif renew or chaser.abort_margin is None:
+                chaser.abort_margin = escapes.escape(chaser.relative, observation.time_s)[1]
 
     def _continue(self, chaser: ChaserMachine, now_s: float) -> None:
         """Begin what follows the move that is complete."""

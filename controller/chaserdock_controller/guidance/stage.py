@@ -66,7 +66,8 @@ class GuidanceStage:
             fleet.follow_target(now_s, known, target.status == "tracking", is_settled(target))
         else:
             fleet.miss_target(now_s, target.status == "lost")
-        for chaser, tick in zip(fleet.chasers, known, strict=True):
+        ticks = tuple(zip(fleet.chasers, known, strict=True))
+        for chaser, tick in ticks:
             chaser.follow_planning(tick)
 
         commands = (*fleet.due_commands(now_s), *observation.commands)
@@ -74,22 +75,17 @@ class GuidanceStage:
             activity.observe(commands, observation, estimation)
         replies = self._reply(commands, observation)
 
-        references: list[ReferencePose | None] = [None] * len(known)
-        if estimation.known:
-            references = [
-                None if tick.own is None else self._step(chaser, tick, tick.own)
-                for chaser, tick in zip(fleet.chasers, known, strict=True)
-            ]
-        for chaser, tick in zip(fleet.chasers, known, strict=True):
+        references: dict[int, ReferencePose] = {}
+        for chaser, tick in ticks:
+            if estimation.known and tick.own is not None:
+                references[chaser.number] = self._step(chaser, tick, tick.own)
+        for chaser, tick in ticks:
             chaser.follow_safety(tick)
         for activity in self.activities:
             activity.conclude(observation)
 
         horizon = self._horizon(known, estimation)
-        directives = {
-            chaser.number: chaser.directive(tick, reference)
-            for chaser, tick, reference in zip(fleet.chasers, known, references, strict=True)
-        }
+        directives = {c.number: c.directive(tick, references.get(c.number)) for c, tick in ticks}
         margins = {c.number: c.abort_margin for c in fleet.chasers if c.abort_margin is not None}
         return GuidanceResult(directives, horizon, replies, fleet.drain_events(), margins)
 
@@ -99,6 +95,7 @@ class GuidanceStage:
         """Return what is known of each chaser in this tick, by number."""
         failures = history.failures(observation.time_ns)
         unsafe = history.unsafe(observation.time_ns)
+        stuck = {} if estimation.stack is None else estimation.stack.failed
         return tuple(
             ChaserTick(
                 now_s=observation.time_s,
@@ -110,9 +107,7 @@ class GuidanceStage:
                 failure=failures.get(i),
                 camera=next((c for c in estimation.cameras if c.chaser == i), None),
                 acquiring=next((s.acquiring for s in observation.sightings if s.chaser == i), None),
-                stuck_thrusters=()
-                if estimation.stack is None
-                else estimation.stack.failed.get(i, ()),
+                stuck_thrusters=stuck.get(i, ()),
                 invalid=i in observation.invalid,
                 latched=i in estimation.latched and i in estimation.own,
                 doubtful=i in estimation.doubtful,

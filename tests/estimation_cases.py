@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from chaserdock_controller.estimation.types import Estimate, EstimatorInputs, TargetState
+from chaserdock_controller.estimation.types import ChaserMeasurement, Estimate, EstimatorInputs
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations as rot
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.codec import vector
@@ -64,7 +67,11 @@ def see(
         covariance=vector(R),
         reprojection_rms_px=0.1,
     )
-    head = {"tick": round(time_ns * HZ / 1e9), "sim_time_ns": time_ns, "chaser": chaser}
+    head: dict[str, Any] = {
+        "tick": round(time_ns * HZ / 1e9),
+        "sim_time_ns": time_ns,
+        "chaser": chaser,
+    }
     return (
         Odometry(
             **head, position_m=vector(place), q_wxyz=vector(attitude), velocity_m_s=ZERO,
@@ -79,15 +86,12 @@ def see(
 
 def inputs_of(time_ns: int, seen: Iterable[Seen]) -> EstimatorInputs:
     """The inputs of a tick; what was measured before it arrives late."""
-    odometry, sightings = zip(*seen, strict=True) if seen else ((), ())
-    return EstimatorInputs(
-        time_ns,
-        {o.chaser: o for o in odometry if o.sim_time_ns == time_ns},
-        tuple(sightings),
-        np.zeros((4, 6)),
-        1.0 / HZ,
-        outdated={o.chaser: o for o in odometry if o.sim_time_ns < time_ns},
-    )
+    seen = list(seen)
+    chasers = [ChaserMeasurement(i, np.zeros(6)) for i in range(4)]
+    for o, _ in seen:
+        field = "odometry" if o.sim_time_ns == time_ns else "outdated"
+        chasers[o.chaser] = replace(chasers[o.chaser], **{field: o})
+    return EstimatorInputs(time_ns, 1.0 / HZ, tuple(chasers), tuple(s for _, s in seen))
 
 
 def errors(e: TargetState) -> np.ndarray:

@@ -6,13 +6,9 @@ controller's.
 from __future__ import annotations
 
 import numpy as np
-from chaserdock_controller.estimation.types import (
-    Estimate,
-    Estimator,
-    EstimatorInputs,
-    TargetState,
-)
+from chaserdock_controller.estimation.types import Estimate, Estimator, EstimatorInputs
 from chaserdock_controller.guidance.reference import predict_target
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_protocol.scenario.bodies import Target
 
 _VARIANCE = 1e-12

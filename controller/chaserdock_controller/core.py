@@ -47,22 +47,22 @@ class ControllerCore:
 
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
-        observation = self.ingest.run(inputs, self.output.history)
+        observation = self.ingest.run(inputs, self.output.sent)
         estimation = self.estimation.run(observation, self.inspecting)
         guidance = self.guidance.run(observation, estimation, self.planning.history)
-        self.inspecting = guidance.inspecting
+        self.inspecting = frozenset(d.chaser for d in guidance.directives if d.inspects)
         plan = self.planning.run(observation, estimation, guidance)
         return self.output.run(observation, estimation, guidance, plan)
 
     def estimate(self, inputs: TickInputs) -> TargetEstimate:
         """Run ingest and estimation only, in place of ``step``."""
-        observation = self.ingest.run(inputs, self.output.history)
+        observation = self.ingest.run(inputs, self.output.sent)
         return target_message(observation, self.estimation.run(observation))
 
-    @property
-    def doubtful(self) -> frozenset[int]:
-        """Return the chasers whose odometry may be wrong, after the last tick."""
-        return self.estimation.consistency.doubtful
+    def doubts(self, chaser: int) -> bool:
+        """Return whether the odometry of a chaser may be wrong, after the last tick."""
+        consistency = self.estimation.consistency
+        return chaser < len(consistency) and consistency[chaser].doubtful
 
     @property
     def estimator(self) -> Estimator:

@@ -7,16 +7,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.body_shape import (
+from chaserdock_controller.bodies.body_shape import (
     INERTIA_ROWS,
     BodyShape,
     mass_covariance,
     shape_covariance,
     shape_of,
 )
+from chaserdock_controller.bodies.mass_properties import inertia_ratios, prior_of, with_shape
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.joint import motion_models as motion
-from chaserdock_controller.estimation.mass_properties import inertia_ratios, prior_of, with_shape
-from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array

@@ -9,6 +9,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.estimator import relative_poses
 from chaserdock_controller.estimation.joint.measurements import (
@@ -37,7 +38,6 @@ from chaserdock_controller.estimation.joint.state import (
     inject,
 )
 from chaserdock_controller.estimation.joint.update import update
-from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import EstimatorInputs, Shock
 from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_turns
 from chaserdock_models import rotations
@@ -46,7 +46,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from flight_cases import scenario
-from joint_cases import PERIOD_S, SyntheticFlight, navigation, parameters
+from joint_cases import PERIOD_S, SyntheticFlight, changed, navigation, odometry_in, parameters
 from scipy.stats import chi2
 
 SCENARIO = scenario()
@@ -106,7 +106,7 @@ def test_jacobians_agree_with_finite_differences(seed: int) -> None:
     )
     mounting = mounting_of(p.camera)
     flight = SyntheticFlight(SCENARIO, p.navigation, 2, seed)
-    odometry, sighting = flight.inputs().odometry[1], flight.inputs().sightings[1].solutions[0]
+    odometry, sighting = odometry_in(flight.inputs(), 1), flight.inputs().sightings[1].solutions[0]
     predicted = predict_sighting(state, 1, mounting)
     sighting = msgspec.structs.replace(
         sighting, position_m=vector(predicted.position_m), q_wxyz=vector(predicted.q_wxyz)
@@ -175,7 +175,7 @@ def test_update_is_that_of_a_kalman_filter(chasers: int) -> None:
         random_state(4, chasers), covariance=spread @ spread.T, updates=p.iterated_updates
     )
     flight, last = SyntheticFlight(SCENARIO, p.navigation, chasers, 5), chasers - 1
-    odometry, sighting = flight.inputs().odometry[last], flight.inputs().sightings[last]
+    odometry, sighting = odometry_in(flight.inputs(), last), flight.inputs().sightings[last]
     mounting, wide = mounting_of(p.camera), replace(p, gate_sighting=np.inf, gate_odometry=np.inf)
     after, report = update(state, {last: odometry}, {last: sighting}, mounting, wide)
     assert report.accepted == (last,)
@@ -298,13 +298,14 @@ def test_late_odometry_counts_at_its_tick() -> None:
     measured, missing = [], flight.inputs()
     for tick in range(30):
         inputs = flight.inputs()
-        measured.append(inputs.odometry[1])
-        missing = replace(inputs, odometry={0: inputs.odometry[0]})
+        measured.append(odometry_in(inputs, 1))
+        missing = changed(inputs, 1, odometry=None)
         prompt.update(inputs if tick < 28 else missing)
-        late.update(inputs if tick < 10 else replace(missing, outdated={1: measured[-3]}))
+        late.update(inputs if tick < 10 else changed(missing, 1, outdated=measured[-3]))
         flight.step()
-    late.update(replace(missing, time_ns=flight.time_ns, sightings=(), outdated={1: measured[0]}))
-    prompt.update(replace(missing, time_ns=flight.time_ns, sightings=()))
+    missing = replace(missing, time_ns=flight.time_ns, sightings=())
+    late.update(changed(missing, 1, outdated=measured[0]))
+    prompt.update(missing)
     assert prompt.state is not None
     assert late.state is not None
     np.testing.assert_array_equal(prompt.state.covariance, late.state.covariance)
@@ -323,11 +324,11 @@ def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) 
     field = {"position": "position_m", "velocity": "velocity_m_s"}[channel]
 
     def lie(inputs: EstimatorInputs) -> EstimatorInputs:
-        o = inputs.odometry[1]
+        o = odometry_in(inputs, 1)
         wrong = msgspec.structs.replace(
             o, **{field: vector(np.add(getattr(o, field), [shift, 0.0, 0.0]))}
         )
-        return replace(inputs, odometry={**inputs.odometry, 1: wrong})
+        return changed(inputs, 1, odometry=wrong)
 
     flight.texts.clear()
     fly(estimator, flight, 1.0, lie)
@@ -349,9 +350,10 @@ def test_command_of_a_chaser_without_odometry_is_uncertain() -> None:
         unknown.update(inputs)
         flight.step()
     inputs = flight.inputs()
-    missing = replace(inputs, odometry={0: inputs.odometry[0]}, sightings=())
+    missing = replace(changed(inputs, 1, odometry=None), sightings=())
     known.update(missing)
-    unknown.update(replace(missing, last_commands={1: np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])}))
+    last = np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    unknown.update(changed(missing, 1, last_command=last))
     assert known.state is not None
     assert unknown.state is not None
     velocity = block(1).start + 3 + np.arange(3)
@@ -373,7 +375,7 @@ def test_chaser_that_contradicts_all_measurements_is_started_again(turns: bool) 
     stated: list[Odometry] = []
 
     def moved(inputs: EstimatorInputs) -> EstimatorInputs:
-        o, since_s = inputs.odometry[1], (inputs.time_ns - start_ns) * 1e-9
+        o, since_s = odometry_in(inputs, 1), (inputs.time_ns - start_ns) * 1e-9
         turn = so3.exp(np.array([0.0, 0.0, 0.2 + 0.3 * since_s]) if turns else np.zeros(3))
         elsewhere = msgspec.structs.replace(
             o,
@@ -384,7 +386,7 @@ def test_chaser_that_contradicts_all_measurements_is_started_again(turns: bool) 
         )
         stated.append(elsewhere)
         sightings = tuple(s for s in inputs.sightings if s.chaser != 1)
-        return replace(inputs, odometry={**inputs.odometry, 1: elsewhere}, sightings=sightings)
+        return replace(changed(inputs, 1, odometry=elsewhere), sightings=sightings)
 
     flight.texts.clear()
     fly(estimator, flight, 2.0, moved)
@@ -404,17 +406,17 @@ def test_chaser_whose_sightings_and_pose_contradict_the_estimate_is_started_agai
     estimator = estimator_for(flight.errors, 3)
 
     def displaced(inputs: EstimatorInputs) -> EstimatorInputs:
-        o = inputs.odometry[1]
+        o = odometry_in(inputs, 1)
         elsewhere = msgspec.structs.replace(
             o, position_m=vector(np.add(o.position_m, [0.0, 0.0, 0.17]))
         )
-        return replace(inputs, odometry={**inputs.odometry, 1: elsewhere})
+        return changed(inputs, 1, odometry=elsewhere)
 
     fly(estimator, flight, 5.0, displaced)
     assert estimator.state is not None
     assert estimator.state.rejections[1, SIGHTING_CHANNEL] > 0
     fly(estimator, flight, 2.0)
-    honest = flight.inputs().odometry[1]
+    honest = odometry_in(flight.inputs(), 1)
     np.testing.assert_allclose(estimator.state.positions_m[1], honest.position_m, atol=0.01)
     assert not estimator.state.rejections[1].any()
 
@@ -430,12 +432,12 @@ def test_only_a_repeated_misfit_of_the_velocity_passes_for_a_force(
     forces_N = []
     for k in range(ticks + 3):
         inputs = flight.inputs()
-        o = inputs.odometry[0]
+        o = odometry_in(inputs, 0)
         if k < ticks:
             o = msgspec.structs.replace(
                 o, velocity_m_s=vector(np.add(o.velocity_m_s, [0.006, 0.0, 0.0]))
             )
-        estimator.update(replace(inputs, odometry={0: o}))
+        estimator.update(changed(inputs, 0, odometry=o))
         flight.step()
         assert estimator.state is not None
         forces_N.append(float(np.linalg.norm(estimator.state.extra[0, :3])))
@@ -448,11 +450,10 @@ def test_odometry_noisier_than_stated_is_reported() -> None:
     estimator = estimator_for(flight.errors, 1)
 
     def overconfident(inputs: EstimatorInputs) -> EstimatorInputs:
-        o = inputs.odometry[0]
+        o = odometry_in(inputs, 0)
         stated = vector(np.reshape(o.velocity_covariance_m2_s2, (3, 3)) / 9.0)
-        return replace(
-            inputs, odometry={0: msgspec.structs.replace(o, velocity_covariance_m2_s2=stated)}
-        )
+        o = msgspec.structs.replace(o, velocity_covariance_m2_s2=stated)
+        return changed(inputs, 0, odometry=o)
 
     fly(estimator, flight, 8.0, overconfident)
     assert any("velocity is overconfident" in text for text in flight.texts)
@@ -563,7 +564,7 @@ def test_mounting_rotation_is_observable_with_calibration_manoeuvre_only(seed: i
                 flight.turns[0] = calibration_turns([k * PERIOD_S])[0]
             estimator.update(flight.inputs())
             flight.step()
-        (found,) = estimator.cameras()
+        found = estimator.cameras()[0]
         off = found.turn_rad - flight.chasers[0].camera_turn_rad
         residual_rad[manoeuvre] = float(np.linalg.norm(off))
         assert residual_rad[manoeuvre] < 4.0 * math.sqrt(float(np.trace(found.covariance[:3, :3])))

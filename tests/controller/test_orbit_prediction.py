@@ -118,12 +118,11 @@ def odometry(row: Array) -> Odometry:
 def test_planning_cancels_the_wrench_of_the_orbit() -> None:
     scenario = mission()
     assert scenario.orbit is not None
-    observation = observation_of(0, {0: odometry(STATE)})
-    found = (
-        EstimationStage(scenario, make_estimator("joint", scenario))
-        .run(observation)
-        .disturbances[0]
-    )
+    observation = observation_of(0, {0: odometry(STATE)}, chasers=1)
+    stage = EstimationStage(scenario, make_estimator("joint", scenario))
+    own = stage.run(observation).chasers[0].own
+    assert own is not None
+    found = own.disturbance
     body = scenario.chaser
     mean_motion = scenario.orbit.elements.mean_motion_rad_s
     assert found == pytest.approx(

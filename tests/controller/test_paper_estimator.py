@@ -15,9 +15,11 @@ from chaserdock_controller.estimation.paper import (
     PaperParameters,
     average_quaternion,
 )
-from chaserdock_controller.estimation.types import Estimate, TargetState, no_estimate
+from chaserdock_controller.estimation.types import Estimate, no_estimate
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations as rot
 from estimation_cases import CAMERA, HZ, V, W, errors, inputs_of, ns, same, see, truth
+from joint_cases import changed
 
 
 def fly(estimator: PaperEstimator, chasers: int, seconds: float) -> list[TargetState]:
@@ -96,7 +98,7 @@ def test_sighting_without_its_odometry_waits_for_no_one() -> None:
     f, (odometry, sighting) = PaperEstimator(CAMERA), see(np.random.default_rng(0), 0, ns(0))
     blind = dataclasses.replace(inputs_of(ns(0), []), sightings=(sighting,))
     assert f.update(blind).target.status == "none"
-    late = dataclasses.replace(blind, time_ns=ns(1), outdated={0: odometry})
+    late = dataclasses.replace(changed(blind, 0, outdated=odometry), time_ns=ns(1))
     assert f.update(late).target.status == "tracking"
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.chaser_state import ChaserTick
 from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Trigger
@@ -22,14 +21,14 @@ from chaserdock_controller.guidance.pointing import (
     search_angles,
     search_wrench,
 )
-from chaserdock_controller.interfaces import TickInputs
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
 from estimation_cases import V, W
-from flight_cases import fleet_of, known, odometry, order, scenario, step
+from flight_cases import fleet_of, known, odometry, order, scenario, step, tick_inputs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -178,7 +177,7 @@ def test_controller_without_sightings_searches_and_reports_it() -> None:
             i: _odometry(i, k, np.concatenate([p, np.zeros(3), q, np.zeros(3)]))
             for i, (p, q) in enumerate(places)
         }
-        out = flight.step(TickInputs(k, now[0].sim_time_ns, now, ()))
+        out = flight.step(tick_inputs(k, now[0].sim_time_ns, now, ()))
         events += [e.what for e in out.events]
         modes.append(out.wrenches[0].mode)
         torque = out.wrenches[0].torque_N_m

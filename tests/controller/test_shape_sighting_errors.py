@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -51,9 +52,7 @@ class ShapeFlight(SyntheticFlight):
         self.logarithms = fade * self.logarithms + more
         inputs = super().inputs()
         sightings = tuple(self._by_shape(s) for s in inputs.sightings)
-        return EstimatorInputs(
-            inputs.time_ns, inputs.odometry, sightings, self.impulses.copy(), inputs.covered_s
-        )
+        return replace(inputs, sightings=sightings)
 
     def _by_shape(self, sighting: Sighting) -> Sighting:
         error, scale = (
@@ -115,15 +114,7 @@ def test_an_invalid_covariance_does_not_change_the_units() -> None:
     solution = inputs.sightings[0].solutions[0]
     invalid = msgspec.structs.replace(solution, covariance=vector(-np.eye(6)))
     spoilt = msgspec.structs.replace(inputs.sightings[0], solutions=(invalid,))
-    estimator.update(
-        EstimatorInputs(
-            inputs.time_ns,
-            inputs.odometry,
-            (spoilt, *inputs.sightings[1:]),
-            inputs.impulses,
-            inputs.covered_s,
-        )
-    )
+    estimator.update(replace(inputs, sightings=(spoilt, *inputs.sightings[1:])))
     after = estimator.state
     assert before is not None
     assert after is not None

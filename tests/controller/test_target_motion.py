@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.body_shape import shape_of
+from chaserdock_controller.bodies.body_shape import shape_of
+from chaserdock_controller.bodies.target_body import TargetBody, attach_bodies, predict_path
 from chaserdock_controller.estimation.composite_body import target_body
 from chaserdock_controller.estimation.joint import motion_models as motion
-from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies, predict_path
 from chaserdock_controller.guidance.reference import feed_forward
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import groupby
 from typing import NamedTuple
@@ -25,7 +25,9 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.messages import Odometry, Sighting
 
-from .types import Estimate, Estimator, EstimatorEvent, EstimatorInputs, TargetState, no_estimate
+from chaserdock_controller.interfaces import TargetState
+
+from .types import Estimate, Estimator, EstimatorEvent, EstimatorInputs, no_estimate
 
 _ODOMETRY_KEPT_NS = 2_000_000_000
 """A sighting that arrives later than this is not used: twice the buffer of the joint filter."""
@@ -122,7 +124,7 @@ class PaperEstimator(Estimator):
         """Combine the sightings of a tick."""
         events: list[EstimatorEvent] = []
         now_ns = inputs.time_ns
-        self._keep_odometry((*inputs.odometry.values(), *inputs.outdated.values()), now_ns)
+        self._keep_odometry(inputs)
         usable = [s for s in inputs.sightings if self._is_usable(s, now_ns)]
         usable.sort(key=lambda s: (s.sim_time_ns, s.chaser, len(s.solutions)))
         for time_ns, group in groupby(usable, key=lambda s: s.sim_time_ns):
@@ -172,10 +174,13 @@ class PaperEstimator(Estimator):
             self._rejected,
         )
 
-    def _keep_odometry(self, measured: Iterable[Odometry], now_ns: int) -> None:
-        for o in measured:
-            self._odometry[o.chaser, o.sim_time_ns] = o
-        for key in [k for k in self._odometry if k[1] < now_ns - _ODOMETRY_KEPT_NS]:
+    def _keep_odometry(self, inputs: EstimatorInputs) -> None:
+        for c in inputs.chasers:
+            for o in (c.odometry, c.outdated):
+                if o is not None:
+                    self._odometry[o.chaser, o.sim_time_ns] = o
+        oldest_ns = inputs.time_ns - _ODOMETRY_KEPT_NS
+        for key in [k for k in self._odometry if k[1] < oldest_ns]:
             del self._odometry[key]
 
     def _is_usable(self, sighting: Sighting, now_ns: int) -> bool:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 import msgspec
@@ -20,18 +20,22 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_controller.ingest.latency_compensation import predict_state
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_controller.interfaces import (
+    ChaserEstimate,
+    ChaserObservation,
     IdentifiedStack,
     LogEntry,
     Observation,
+    OwnMotion,
     TargetEstimation,
+    TargetState,
 )
 
 from .composite_body import CompositeBody
 from .identification.stage import StackIdentification
 from .target_shape import ShapeEstimation, shape_parameters
-from .types import CameraError, ChaserMotion, Estimator, EstimatorInputs, TargetState
+from .types import ChaserMeasurement, ChaserMotion, Estimator, EstimatorInputs
 
-_NO_DISTURBANCE = np.zeros(6)
+_NOTHING = np.zeros(6)
 
 
 class EstimationStage:
@@ -40,9 +44,9 @@ class EstimationStage:
     def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self.estimator = estimator
         self.composite = CompositeBody(scenario, estimator)
-        self.consistency = SensorConsistency()
+        self.consistency = tuple(SensorConsistency(i) for i in range(len(scenario.chasers)))
         self._body, self._period_s = scenario.chaser, 1.0 / scenario.time.rate_hz
-        self._count, orbit = len(scenario.chasers), scenario.orbit
+        orbit = scenario.orbit
         self._passive_safety = scenario.limits.passive_safety != "off"
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self._camera = scenario.camera_model()
@@ -51,7 +55,7 @@ class EstimationStage:
         enabled = scenario.detumble.identification.enabled
         self.identification = StackIdentification(scenario) if enabled else None
 
-    def run(self, observation: Observation, inspecting: Collection[int] = ()) -> TargetEstimation:
+    def run(self, observation: Observation, inspecting: Set[int] = frozenset()) -> TargetEstimation:
         """Update the estimator with a tick's inputs, and with contacts and impulses from before
         them; then the geometry by pairs of images and those of the chasers that were ``inspecting``
         after the tick before, and the identification of the stack, whose result the estimator takes
@@ -68,42 +72,72 @@ class EstimationStage:
         return estimation
 
     def _estimate(self, observation: Observation) -> TargetEstimation:
-        o, before = observation, self.composite.latched
-        self.composite.disturb(o.docking, o.odometry, o.impulses, o.time_ns)
-        found = self.estimator.update(self._inputs(o, before))
+        o, latched_before = observation, self.composite.latched
+        self.composite.disturb(o)
+        found = self.estimator.update(self._inputs(o, latched_before))
         target, motions = found.target, {m.chaser: m for m in found.chasers}
-        own = {i: _estimated(odometry, motions.get(i)) for i, odometry in o.odometry.items()}
         known = target.status in ("tracking", "predicting")
+        own = tuple(_estimated(c.odometry, motions.get(c.chaser)) for c in o.chasers)
         if known:
             self.composite.update_body(target, own)
-        disturbances = self._disturbances(own, motions)
-        visible_to = frozenset(s.chaser for s in o.sightings if s.solutions)
+        seeing = {s.chaser for s in o.sightings if s.solutions}
         events: list[LogEntry] = [(e.level, e.text) for e in found.events]
-        accepted, rejected = sorted(visible_to - set(target.rejected)), sorted(target.rejected)
-        events += self.consistency.update(o.time_s, accepted, rejected, o.interrupted)
+        events += self._follow_consistency(o, seeing, target)
+        cameras = camera_calibrations(found.chasers, self._camera)
         return TargetEstimation(
             target=target,
             at_effect=self.estimator.estimate_at(o.effective_ns) if known else None,
-            own=own,
-            own_at_effect={
-                i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own
-            },
-            disturbances=disturbances,
-            motion_covariances={
-                i: m.motion_covariance
-                for i, m in motions.items()
-                if known and self._passive_safety and i in own and m.motion_covariance is not None
-            },
-            relative=tuple(m.relative for m in found.chasers if m.relative is not None),
-            visible_to=visible_to,
-            doubtful=self.consistency.doubtful,
-            cameras=camera_calibrations(
-                [m.camera for m in found.chasers if m.camera is not None], self._camera
+            chasers=tuple(
+                self._chaser(c, state, motions.get(c.chaser), known, seeing, cameras)
+                for c, state in zip(o.chasers, own, strict=True)
             ),
-            latched=self.composite.latched,
             body=self.composite.moving,
             events=tuple(events),
             stack=self._free_target(target) if known else None,
+        )
+
+    def _follow_consistency(
+        self, o: Observation, seeing: Set[int], target: TargetState
+    ) -> list[LogEntry]:
+        """Follow whether the sightings of each chaser agree with the estimate; return the events."""
+        for c in o.chasers:
+            if c.interrupted:
+                self.consistency[c.chaser].interrupt(o.time_s)
+        rejected = set(target.rejected)
+        events = [self.consistency[i].update(o.time_s, True) for i in sorted(seeing - rejected)]
+        events += [self.consistency[i].update(o.time_s, False) for i in sorted(rejected)]
+        return [event for event in events if event is not None]
+
+    def _chaser(
+        self,
+        c: ChaserObservation,
+        state: Odometry | None,
+        motion: ChaserMotion | None,
+        known: bool,
+        seeing: Set[int],
+        cameras: Mapping[int, CameraCalibration],
+    ) -> ChaserEstimate:
+        """Return what is known of a chaser with the estimated ``state``; ``known``: the target's pose
+        is.
+        """
+        i, own, latched = c.chaser, None, c.chaser in self.composite.latched
+        if state is not None:
+            disturbance = self._disturbance(state, motion, latched)
+            own = OwnMotion(
+                state, predict_state(state, c.ahead, disturbance, self._body), disturbance
+            )
+        relevant = motion if own is not None else None
+        return ChaserEstimate(
+            chaser=i,
+            own=own,
+            motion_covariance=relevant.motion_covariance
+            if relevant is not None and known and self._passive_safety
+            else None,
+            relative=None if relevant is None else relevant.relative,
+            camera=cameras.get(i),
+            visible=i in seeing,
+            latched=latched,
+            doubtful=self.consistency[i].doubtful,
         )
 
     def _free_target(self, target: TargetState) -> IdentifiedStack | None:
@@ -116,47 +150,44 @@ class EstimationStage:
             target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s
         )
         found = self.composite.target
-        return IdentifiedStack(found, found, {}, motion, {}, {}, tuple)
+        return IdentifiedStack(found, found, (), motion, frozenset(), tuple)
 
     def _inputs(self, o: Observation, latched_before: frozenset[int]) -> EstimatorInputs:
-        impulses = np.zeros((self._count, 6))
-        for i, applied in o.impulses.items():
-            impulses[i] = applied.impulse
-        touched = {i for i, s in o.docking.items() if s.contact and not s.latched}
         latched = self.composite.latched
-        return EstimatorInputs(
-            time_ns=o.time_ns,
-            odometry=o.measured,
-            sightings=o.sightings,
-            impulses=impulses,
-            covered_s=self._period_s,
-            last_commands=o.last_commands,
-            outdated=o.outdated,
-            latched=latched,
-            contacts=frozenset(touched | (latched ^ latched_before)),
+        changed = latched ^ latched_before
+        chasers = tuple(
+            ChaserMeasurement(
+                chaser=c.chaser,
+                impulse=_NOTHING if c.impulse is None else c.impulse.impulse,
+                odometry=c.measured,
+                outdated=c.outdated,
+                last_command=c.last_command,
+                latched=c.chaser in latched,
+                contact=c.touches or c.chaser in changed,
+            )
+            for c in o.chasers
         )
+        return EstimatorInputs(o.time_ns, self._period_s, chasers, o.sightings)
 
-    def _disturbances(
-        self, own: Mapping[int, Odometry], motions: Mapping[int, ChaserMotion]
-    ) -> dict[int, Array]:
-        """Return the wrench of the orbit on each chaser, with the estimated disturbance; none on a
+    def _disturbance(self, own: Odometry, motion: ChaserMotion | None, latched: bool) -> Array:
+        """Return the wrench of the orbit on a chaser, with the estimated disturbance; none on a
         latched one, whose motion is the target's."""
-        found = dict.fromkeys(own, _NO_DISTURBANCE)
-        if self._mean_motion_rad_s:
-            found |= {i: self._orbital_wrench(own[i]) for i in own.keys() - self.composite.latched}
-        for i in own.keys() & motions.keys() - self.composite.latched:
-            estimated = motions[i].disturbance
-            found[i] = found[i] + estimated if self._mean_motion_rad_s else estimated
-        return found
+        if latched:
+            return _NOTHING
+        estimated = _NOTHING if motion is None else motion.disturbance
+        if not self._mean_motion_rad_s:
+            return estimated
+        orbital = self._orbital_wrench(own)
+        return orbital if motion is None else orbital + estimated
 
     def _orbital_wrench(self, o: Odometry) -> Array:
         state = np.array([*o.position_m, *o.velocity_m_s, *o.q_wxyz, *o.omega_rad_s])
         return cw_wrench(self._mean_motion_rad_s, state, self._body.mass_kg, self._body.inertia)
 
 
-def _estimated(odometry: Odometry, motion: ChaserMotion | None) -> Odometry:
+def _estimated(odometry: Odometry | None, motion: ChaserMotion | None) -> Odometry | None:
     """Return a chaser's estimated state in place of its odometry, where it is known."""
-    if motion is None:
+    if odometry is None or motion is None:
         return odometry
     return msgspec.structs.replace(
         odometry,
@@ -168,19 +199,22 @@ def _estimated(odometry: Odometry, motion: ChaserMotion | None) -> Odometry:
 
 
 def camera_calibrations(
-    errors: Sequence[CameraError], camera: Camera
-) -> tuple[CameraCalibration, ...]:
-    """Return the estimated errors of the cameras in CRF axes; ``camera``: the nominal calibration."""
-    if not errors:
-        return ()
+    motions: Sequence[ChaserMotion], camera: Camera
+) -> dict[int, CameraCalibration]:
+    """Return the estimated errors of the chasers' cameras in CRF axes, by chaser; ``camera``: the
+    nominal calibration.
+    """
+    found = [(m.chaser, m.camera) for m in motions if m.camera is not None]
+    if not found:
+        return {}
     axes = rotations.to_matrix(camera.q_crf_irf_wxyz)
-    covariances = np.array([e.covariance for e in errors])
+    covariances = np.array([e.covariance for _, e in found])
     turns, shifts = (axes @ covariances[:, i : i + 3, i : i + 3] @ axes.T for i in (0, 3))
     diagonals = [np.einsum("nii->ni", part) for part in (turns, shifts, covariances[:, 6:, 6:])]
     sigmas = np.sqrt(np.concatenate(diagonals, axis=1)).tolist()
-    return tuple(
-        CameraCalibration(
-            chaser=e.chaser,
+    return {
+        i: CameraCalibration(
+            chaser=i,
             turn_rad=vector(axes @ e.turn_rad),
             turn_sigma_rad=(t1, t2, t3),
             shift_m=vector(axes @ e.shift_m),
@@ -188,5 +222,5 @@ def camera_calibrations(
             focal_share=e.focal_share,
             focal_sigma_share=focal,
         )
-        for e, (t1, t2, t3, s1, s2, s3, focal) in zip(errors, sigmas, strict=True)
-    )
+        for (i, e), (t1, t2, t3, s1, s2, s3, focal) in zip(found, sigmas, strict=True)
+    }

@@ -5,7 +5,6 @@ SI units and radians.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -13,85 +12,56 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Level, Odometry, Sighting
 
-from .body_shape import BodyShape
-from .target_body import TargetBody
+from chaserdock_controller.bodies.body_shape import BodyShape
+from chaserdock_controller.bodies.target_body import TargetBody
+from chaserdock_controller.interfaces import RelativePose, TargetState
+
+
+@dataclass(frozen=True, eq=False)
+class ChaserMeasurement:
+    """What is measured and known of one chaser in a tick.
+
+    ``odometry``: measured in this tick. ``outdated``: the newest one where there is none of this
+    tick, with the time of the tick at which it was measured. ``impulse`` (6,): N s and N m s, body
+    axes, that its actuators gave in the last ``EstimatorInputs.covered_s``. ``last_command`` (6,):
+    N and N m, of a chaser without odometry in this tick, which flies by a plan that the controller
+    does not know. ``latched``: its latch holds the target. ``contact``: since the tick before.
+    """
+
+    chaser: int
+    impulse: Array
+    odometry: Odometry | None = None
+    outdated: Odometry | None = None
+    last_command: Array | None = None
+    latched: bool = False
+    contact: bool = False
 
 
 @dataclass(frozen=True)
 class EstimatorInputs:
-    """Inputs of a tick: measured odometry by chaser, and sightings, which may belong to earlier
-    ticks.
-
-    impulses (N, 6): N s and N m s, body axes, that the chasers' actuators gave in the last
-    ``covered_s``. latched: chasers whose latch holds the target. contacts: chasers with a contact
-    since the tick before. last_commands: last commands (6,), N and N m, of chasers without odometry
-    in this tick, which fly by plans that the controller does not know. outdated: newest odometry of
-    chasers that have none of this tick, with the times of the ticks at which it was measured.
+    """Inputs of a tick. ``chasers``: one for every chaser of the mission, in order. ``sightings``:
+    may belong to earlier ticks.
     """
 
     time_ns: int
-    odometry: Mapping[int, Odometry]
-    sightings: tuple[Sighting, ...]
-    impulses: Array
     covered_s: float
-    latched: frozenset[int] = frozenset()
-    contacts: frozenset[int] = frozenset()
-    last_commands: Mapping[int, Array] = field(default_factory=dict)
-    outdated: Mapping[int, Odometry] = field(default_factory=dict)
+    chasers: tuple[ChaserMeasurement, ...]
+    sightings: tuple[Sighting, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class CameraError:
-    """Estimated calibration error of a chaser's camera.
+    """Estimated calibration error of a camera.
 
     turn_rad: (3,) rotation vector from nominal to true camera axes, in nominal IRF. shift_m: (3,)
     of the optical centre, in IRF. focal_share: relative error of the focal length. covariance: (7,
     7) in that order.
     """
 
-    chaser: int
     turn_rad: Array
     shift_m: Array
     focal_share: float
     covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class RelativePose:
-    """Estimated pose of a chaser relative to the target.
-
-    position_m: (3,) origin of CRF in TRF. q_wxyz: (4,) CRF to TRF. covariance: (6, 6), order
-    (position in TRF axes, m; dtheta in CRF axes, rad).
-    """
-
-    chaser: int
-    position_m: Array
-    q_wxyz: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class TargetState:
-    """Estimated state of the target at ``time_ns``.
-
-    position_m, velocity_m_s: (3,) WRF. q_wxyz: (4,) TRF to WRF. omega_rad_s: (3,) TRF axes.
-    covariance: (12, 12), order (position WRF, velocity WRF, dtheta TRF, omega TRF).
-    status: "none" (no measurement yet: pose and rates are zero, the covariance is 1e6 times identity),
-        "tracking" (a measurement was accepted recently), "predicting" (motion model only), "lost" (too
-        uncertain to use).
-    sightings: number of chasers whose measurements were accepted at the newest exposure.
-    rejected: chasers whose measurements were gated out at the newest exposure.
-    """
-
-    time_ns: int
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
-    covariance: Array
-    status: str
-    sightings: int
-    rejected: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)

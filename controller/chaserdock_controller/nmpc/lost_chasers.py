@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +30,7 @@ def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
 
 
 def with_lost_chasers(
-    problem: NmpcInput, lost: Mapping[int, Odometry], from_ns: int, step_s: float
+    problem: NmpcInput, lost: Sequence[Odometry], from_ns: int, step_s: float
 ) -> NmpcInput:
     """Return the problem with a row for each lost chaser after the others: it coasts, and only the
     others avoid it.
@@ -42,11 +42,11 @@ def with_lost_chasers(
     n, nodes = problem.references.shape[:2]
     times_s = step_s * np.arange(nodes)
     states, references = [], []
-    for last in lost.values():
+    for last in lost:
         places, q = coasting(last, from_ns, times_s), np.asarray(last.q_wxyz)
         states.append(np.concatenate([places[0], last.velocity_m_s, q, np.zeros(3)]))
         references.append(np.concatenate([places, np.tile(q, (nodes, 1))], axis=1))
-    lost_s = [(from_ns - last.sim_time_ns) / 1e9 + float(times_s[-1]) for last in lost.values()]
+    lost_s = [(from_ns - last.sim_time_ns) / 1e9 + float(times_s[-1]) for last in lost]
     margins_m = [margin_m(s) for s in lost_s]
     between = _with_margins(problem.min_distance_chasers_m, n, margins_m)
     apart = problem.min_distance_shapes_m

@@ -20,8 +20,8 @@ from chaserdock_models.arrays import Array, IntArray
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, Sighting
 
-from chaserdock_controller.estimation.body_shape import SHAPE, BodyShape
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.bodies.body_shape import SHAPE, BodyShape
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.types import (
     CameraError,
     ChaserMotion,
@@ -29,11 +29,10 @@ from chaserdock_controller.estimation.types import (
     Estimator,
     EstimatorEvent,
     EstimatorInputs,
-    RelativePose,
     Shock,
-    TargetState,
     no_estimate,
 )
+from chaserdock_controller.interfaces import RelativePose, TargetState
 
 from .hypotheses import FilterState, is_lost, mixture_covariance, target_state
 from .measurements import mounting_of
@@ -100,13 +99,20 @@ class JointEstimator(Estimator):
 
     def update(self, inputs: EstimatorInputs) -> Estimate:
         """Process a tick. Sightings and odometry of ticks that are not kept any more are ignored."""
-        records, own = self._buffer.records, dataclasses.replace(inputs, sightings=(), outdated={})
-        records.append(TickRecord(time_ns=inputs.time_ns, parameters=self.target, inputs=own))
+        records = self._buffer.records
+        record = TickRecord(
+            time_ns=inputs.time_ns,
+            parameters=self.target,
+            covered_s=inputs.covered_s,
+            chasers=tuple(dataclasses.replace(c, outdated=None) for c in inputs.chasers),
+        )
+        records.append(record)
         first = len(records) - 1
         for sighting in sorted(inputs.sightings, key=lambda s: (s.sim_time_ns, s.chaser)):
             first = min(first, self._insert(sighting))
-        for odometry in inputs.outdated.values():
-            first = min(first, self._insert_odometry(odometry))
+        for chaser in inputs.chasers:
+            if chaser.outdated is not None:
+                first = min(first, self._insert_odometry(chaser.outdated))
         self._buffer.replay(first, self._process)
         self._buffer.trim(self.parameters.target.buffer_s)
         target = self.estimate_at(inputs.time_ns)
@@ -165,8 +171,7 @@ class JointEstimator(Estimator):
         s = self.state
         if s is None:
             return ()
-        relative = {r.chaser: r for r in self.relative_poses()}
-        cameras = {e.chaser: e for e in self.cameras()}
+        relative, cameras = self.relative_poses(), self.cameras()
         return tuple(
             ChaserMotion(
                 i,
@@ -175,8 +180,10 @@ class JointEstimator(Estimator):
                 s.attitudes_wxyz[i],
                 s.omegas_rad_s[i],
                 _NO_DISTURBANCE
-                if i in inputs.latched
-                else disturbance(s, i, inputs.impulses[i] / inputs.covered_s, self.parameters),
+                if inputs.chasers[i].latched
+                else disturbance(
+                    s, i, inputs.chasers[i].impulse / inputs.covered_s, self.parameters
+                ),
                 relative.get(i),
                 self.motion_covariance(i),
                 cameras.get(i),
@@ -184,14 +191,15 @@ class JointEstimator(Estimator):
             for i in np.flatnonzero(s.alive).tolist()
         )
 
-    def relative_poses(self) -> tuple[RelativePose, ...]:
-        """Return the poses of the chasers relative to the target after the newest tick, if the
-        target is known.
+    def relative_poses(self) -> dict[int, RelativePose]:
+        """Return the poses of the chasers relative to the target after the newest tick, by chaser,
+        if the target is known.
         """
         s = self.state
         if s is None or not s.target_known:
-            return ()
-        return tuple(relative_poses(s, np.flatnonzero(s.alive).tolist()))
+            return {}
+        chasers = np.flatnonzero(s.alive).tolist()
+        return dict(zip(chasers, relative_poses(s, chasers), strict=True))
 
     def motion_covariance(self, chaser: int) -> Array | None:
         """Return the covariance (6, 6) of a chaser's position and velocity relative to the target,
@@ -205,16 +213,16 @@ class JointEstimator(Estimator):
         p, cross = s.covariance, s.covariance[own, target]
         return p[own, own] + p[target, target] - cross - cross.T
 
-    def cameras(self) -> tuple[CameraError, ...]:
-        """Return the estimated calibration errors of the cameras after the newest tick."""
-        s, errors = self.state, []
+    def cameras(self) -> dict[int, CameraError]:
+        """Return the estimated calibration errors of the cameras after the newest tick, by chaser."""
+        s, errors = self.state, {}
         if s is None or not s.target_known or self.parameters.camera_turn_rad == 0.0:
-            return ()
+            return {}
         for i in np.flatnonzero(s.alive).tolist():
             part = slice(block(i).start + TURN.start, block(i).start + FOCAL.stop)
             e = s.of(i, slice(TURN.start, FOCAL.stop))
-            errors.append(CameraError(i, e[:3], e[3:6], float(e[6]), s.covariance[part, part]))
-        return tuple(errors)
+            errors[i] = CameraError(e[:3], e[3:6], float(e[6]), s.covariance[part, part])
+        return errors
 
     def _with(self, target: TargetParameters) -> JointParameters:
         """Return the parameters with another model of the target."""
@@ -237,10 +245,11 @@ class JointEstimator(Estimator):
         index, or that of the newest.
         """
         i, record = self._buffer.find(odometry.sim_time_ns)
-        if record is None or odometry.chaser in record.inputs.odometry:
+        k = odometry.chaser
+        if record is None or record.chasers[k].odometry is not None:
             return len(self._buffer.records) - 1
-        known = dict(sorted({**record.inputs.odometry, odometry.chaser: odometry}.items()))
-        record.inputs = dataclasses.replace(record.inputs, odometry=known)
+        known = dataclasses.replace(record.chasers[k], odometry=odometry)
+        record.chasers = (*record.chasers[:k], known, *record.chasers[k + 1 :])
         return i
 
     def _process(
@@ -276,6 +285,6 @@ def relative_poses(s: JointState, chasers: Sequence[int]) -> list[RelativePose]:
         j[row, 0:3, 3:6] = so3.skew(place)
     covariances = j @ s.covariance[rows[:, :, None], rows[:, None, :]] @ j.transpose(0, 2, 1)
     return [
-        RelativePose(i, place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)
+        RelativePose(place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)
         for i, place, covariance in zip(chasers, places, covariances, strict=True)
     ]

@@ -16,7 +16,8 @@ from chaserdock_models.arrays import Array
 from msgspec import Struct
 from msgspec.structs import replace
 
-from chaserdock_controller.estimation.types import EstimatorEvent, Shock, TargetState
+from chaserdock_controller.estimation.types import EstimatorEvent, Shock
+from chaserdock_controller.interfaces import TargetState
 
 from .parameters import TargetParameters
 from .state import RATES, JointState

@@ -16,7 +16,7 @@ from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import rk4_step
 
-from chaserdock_controller.estimation.body_shape import RATIO_BASIS, SHAPE, BodyShape
+from chaserdock_controller.bodies.body_shape import RATIO_BASIS, SHAPE, BodyShape
 
 _EYE3, _EYE12, _ZERO3 = np.eye(3), np.eye(12), np.zeros(3)
 

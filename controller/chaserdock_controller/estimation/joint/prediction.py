@@ -22,7 +22,7 @@ from chaserdock_models.relative_motion import cw_wrench
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from msgspec.structs import replace
 
-from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE
+from chaserdock_controller.bodies.body_shape import RATIOS, SHAPE
 
 from . import kernels
 from .kernels import CHASER_MEAN, TARGET_MEAN

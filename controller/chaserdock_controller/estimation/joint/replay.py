@@ -9,9 +9,9 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from chaserdock_protocol.messages import Sighting
+from chaserdock_protocol.messages import Odometry, Sighting
 
-from chaserdock_controller.estimation.types import EstimatorEvent, EstimatorInputs, Shock
+from chaserdock_controller.estimation.types import ChaserMeasurement, EstimatorEvent, Shock
 
 from .hypotheses import FilterState, apply_shocks
 from .parameters import TargetParameters
@@ -27,17 +27,23 @@ class TickRecord:
     """What the filter needs to process a tick again, and the state and the events that result.
 
     ``parameters``, with the target's model, apply from the tick before to this one; ``shocks``
-    change the rates after it. ``inputs``: without sightings and outdated odometry. ``sightings``:
-    those that were exposed at the tick, by chaser.
+    change the rates after it. ``chasers``, ``covered_s``: as in ``EstimatorInputs``, without outdated
+    odometry. ``sightings``: those that were exposed at the tick, by chaser.
     """
 
     time_ns: int
     parameters: TargetParameters
-    inputs: EstimatorInputs
+    covered_s: float
+    chasers: tuple[ChaserMeasurement, ...]
     sightings: dict[int, Sighting] = field(default_factory=dict)
     shocks: list[Shock] = field(default_factory=list)
     state: FilterState | None = None
     events: tuple[EstimatorEvent, ...] = ()
+
+    @property
+    def odometry(self) -> dict[int, Odometry]:
+        """Return the odometry of the tick, by chaser."""
+        return {c.chaser: c.odometry for c in self.chasers if c.odometry is not None}
 
 
 @dataclass

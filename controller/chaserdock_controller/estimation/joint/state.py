@@ -15,7 +15,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from chaserdock_controller.estimation.body_shape import (
+from chaserdock_controller.bodies.body_shape import (
     RATIOS,
     SHAPE,
     BodyShape,

@@ -87,7 +87,7 @@ def process_tick(
     _report_restarts(old.hypotheses[0], record, p, events)
     hypotheses = [_propagate(h, record, p) for h in old.hypotheses]
     seen = {i: s for i, s in record.sightings.items() if s.solutions and hypotheses[0].alive[i]}
-    results = [update(h, record.inputs.odometry, seen, mounting, p) for h in hypotheses]
+    results = [update(h, record.odometry, seen, mounting, p) for h in hypotheses]
     updated = tuple(r[0] for r in results)
     now = replace(old, time_ns=record.time_ns, hypotheses=updated, seen=(), rejected=())
     if seen and not now.hypotheses[0].target_known:
@@ -109,23 +109,25 @@ def _propagate(state: JointState, record: TickRecord, p: JointParameters) -> Joi
     A state that contradicts all of its measurements for long cannot recover by them, as none passes
     its gate.
     """
-    inputs = record.inputs
     state = with_body(state, p.target)
-    state = predict(state, record.time_ns, inputs.impulses, p, inputs.latched, inputs.covered_s)
+    latched = frozenset(c.chaser for c in record.chasers if c.latched)
+    impulses = np.array([c.impulse for c in record.chasers])
+    state = predict(state, record.time_ns, impulses, p, latched, record.covered_s)
     newest = state.odometry_ns.copy()
-    for i, odometry in inputs.odometry.items():
+    for i, odometry in record.odometry.items():
         if not state.alive[i] or min(newest[i], state.measured_ns[i]) < _stale_ns(record, p):
             state = start_chaser(state, i, odometry, p)
         newest[i] = record.time_ns
     variances = rate_variances(p.contact_velocity_m_s, p.contact_omega_rad_s)
-    for i in inputs.contacts:
-        state = replace(state, covariance=widened(state.covariance, variances, block(i).start))
-    for i, wrench in inputs.last_commands.items():
-        if state.alive[i] and i not in inputs.latched:
-            state = replace(
-                state,
-                covariance=_with_unknown_command(state.covariance, i, wrench, inputs.covered_s, p),
+    covariance = state.covariance
+    for c in record.chasers:
+        if c.contact:
+            covariance = widened(covariance, variances, block(c.chaser).start)
+        if c.last_command is not None and state.alive[c.chaser] and not c.latched:
+            covariance = _with_unknown_command(
+                covariance, c.chaser, c.last_command, record.covered_s, p
             )
+    state = replace(state, covariance=covariance)
     return replace(state, odometry_ns=newest)
 
 
@@ -150,7 +152,7 @@ def _report_restarts(
 ) -> None:
     """Report chasers that are started again although their odometry has arrived."""
     stale = _stale_ns(record, p)
-    for i in sorted(record.inputs.odometry):
+    for i in record.odometry:
         if state.alive[i] and state.measured_ns[i] < stale <= state.odometry_ns[i]:
             text = f"chaser {i}: no measurement supported its estimate for {p.restart_after_s:g} s; started again from its odometry"
             events.append(EstimatorEvent(record.time_ns, "warning", text))

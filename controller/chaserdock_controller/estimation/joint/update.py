@@ -30,7 +30,7 @@ from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from chaserdock_controller.estimation.body_shape import SHAPE
+from chaserdock_controller.bodies.body_shape import SHAPE
 
 from . import kernels
 from .hypotheses import TargetRates

@@ -39,7 +39,7 @@ from .hypotheses import FilterState, is_lost, mixture_covariance, target_state
 from .measurements import mounting_of
 from .parameters import JointParameters, TargetParameters, rows_of
 from .prediction import disturbance, predict_target
-from .replay import ReplayBuffer, TickRecord
+from .replay import FilterTick, ReplayBuffer
 from .state import (
     CHASER,
     FOCAL,
@@ -101,7 +101,7 @@ class JointEstimator(Estimator):
     def update(self, inputs: EstimatorInputs) -> Estimate:
         """Process a tick. Sightings and odometry of ticks that are not kept any more are ignored."""
         records, own = self._buffer.records, dataclasses.replace(inputs, sightings=(), outdated={})
-        records.append(TickRecord(time_ns=inputs.time_ns, parameters=self.target, inputs=own))
+        records.append(FilterTick(time_ns=inputs.time_ns, parameters=self.target, inputs=own))
         first = len(records) - 1
         for sighting in sorted(inputs.sightings, key=lambda s: (s.sim_time_ns, s.chaser)):
             first = min(first, self._insert(sighting))
@@ -244,7 +244,7 @@ class JointEstimator(Estimator):
         return i
 
     def _process(
-        self, before: FilterState | None, record: TickRecord
+        self, before: FilterState | None, record: FilterTick
     ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
         return process_tick(
             before, record, self.chasers, self._mounting, self._with(record.parameters)

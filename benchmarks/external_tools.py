@@ -5,7 +5,7 @@
 Installs evo, pymcap-cli, mcap and rerun into a separate virtual environment (``--tools``: kept
 there, otherwise temporary) and checks:
 
-- evo_ape on the tracks of ``chaserdock log tracks``: root mean square errors within 1 % of ours;
+- evo_ape on the tracks of ``chaserdock log --export --format tum``: root mean square errors within 1 % of ours;
 - pymcap-cli doctor: no error;
 - the reader of the mcap package: every channel has a schema, every message is readable;
 - rerun: draws the log without a window and saves the image to ``--image``. Without a graphics card

@@ -35,9 +35,9 @@ key's name; frames: WRF world, CRF chaser, TRF target, IRF image ([frames.md](fr
 values out of range are errors, one line each.
 
 ```sh
-chaserdock scenario new mine            # writes mine.toml, a commented example
-chaserdock scenario validate mine.toml  # status 2, and one line per error
-chaserdock scenario show single         # all values of a scenario
+chaserdock scenario mine --new          # writes mine.toml, a commented example
+chaserdock scenario mine.toml           # status 2, and one line per error
+chaserdock scenario single --show       # all values of a scenario
 chaserdock run single --set seed=3 --set 'chasers.0.position_m=[-1.5, 0.0, 0.0]'
 ```
 
@@ -50,7 +50,7 @@ chaserdock run single --set seed=3 --set 'chasers.0.position_m=[-1.5, 0.0, 0.0]'
   `look_at = "target"`; two of them are an error.
 - **Format.** `format = 3` states the version of the file's format. Without it, the present one is assumed. A key of an older
   format is an error that names the present key. Scenarios in old logs are converted.
-- **Editors.** `chaserdock scenario schema` prints a JSON schema. With taplo or VS Code's Even Better TOML, save it beside the
+- **Editors.** `chaserdock scenario --schema` prints a JSON schema. With taplo or VS Code's Even Better TOML, save it beside the
   file and begin the file with `#:schema ./scenario.schema.json`.
 """
 

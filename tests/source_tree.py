@@ -36,13 +36,15 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported(path: Path) -> Iterator[str]:
-    """Yield the full names of the modules that a module imports, anywhere in it; relative names are
-    resolved.
+def imported(path: Path, at_once: bool = False) -> Iterator[str]:
+    """Yield the full names of the modules that a module imports; relative names are resolved.
+
+    ``at_once``: only those that are imported with it, not when a function is called.
     """
     package = next(f for f in PACKAGES.values() if path.is_relative_to(f))
     parts = (package.name, *path.relative_to(package).parts[:-1])
-    for node in ast.walk(tree_of(path)):
+    tree = tree_of(path)
+    for node in tree.body if at_once else ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

@@ -82,7 +82,7 @@ KeysOpt = Annotated[
         "--keys",
         envvar="CHASERDOCK_KEYS",
         metavar="DIR",
-        help="keys of the mission or of this process (see `keys init`): connect to a router over TLS",
+        help="keys of the mission or of this process (see `deploy`): connect to a router over TLS",
     ),
 ]
 JoinTimeoutOpt = Annotated[
@@ -119,6 +119,17 @@ OutOpt = Annotated[
     typer.Option("--out", help="folder for log and summary; a new folder in runs/ by default"),
 ]
 LogArg = Annotated[Path, typer.Argument(help="folder of a run, or its mission.mcap")]
+LogFilesArg = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG", help="folder of a run, its mission.mcap, or the files of a rotated log"
+    ),
+]
+FromOpt = Annotated[float, typer.Option("--from", min=0.0, help="first simulated time, seconds")]
+ToOpt = Annotated[
+    float | None,
+    typer.Option("--to", min=0.0, help="last simulated time, seconds; the end by default"),
+]
 
 
 def fail(text: str) -> typer.Exit:
@@ -126,6 +137,15 @@ def fail(text: str) -> typer.Exit:
     for line in text.splitlines():
         print(f"chaserdock: {line}", file=sys.stderr)
     return typer.Exit(BAD_INPUT)
+
+
+def refuse_options(context: typer.Context, names: Iterable[str], reason: str) -> None:
+    """Exit with status 2 if one of these parameters was given on the command line."""
+    refused = set(names)
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in refused and source is not None and source.name == "COMMANDLINE":
+            raise fail(f"{parameter.opts[0]}: {reason}")
 
 
 def print_result(as_json: bool, value: dict[str, Any], lines: Iterable[str]) -> None:
@@ -352,6 +372,7 @@ def tls_of(keys: Path, process: str) -> Tls:
         if not os.access(file, os.R_OK):
             raise fail(
                 f"--keys {keys}: {file} does not exist or is not readable; "
-                f"make a mission's keys with `chaserdock keys init {keys}`, and give {name} its folder"
+                f"make a mission's keys with `chaserdock deploy --keys {keys}`, and give {name} "
+                "its folder"
             )
     return tls

@@ -210,7 +210,7 @@ def check_keys(keys: Path, chasers: int) -> None:
 
     if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
         raise RunError(
-            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`"
+            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock deploy --keys {keys}`"
         )
 
 

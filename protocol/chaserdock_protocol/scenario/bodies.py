@@ -300,7 +300,7 @@ class Body(Section):
     )
     thruster_faults_by_command: bool = Field(
         default=False,
-        description="Whether operators may inject thruster faults (`chaserdock thruster-fault`).",
+        description="Whether operators may inject thruster faults (`chaserdock command thruster-fault`).",
     )
 
     @model_validator(mode="before")

@@ -56,7 +56,7 @@ class Tls:
 
     @classmethod
     def in_folder(cls, folder: Path) -> Tls:
-        """Return the files of one process in the layout that ``chaserdock keys init`` writes."""
+        """Return the files of one process in the layout that ``chaserdock deploy --keys`` writes."""
         return cls(folder / "ca.pem", folder / "cert.pem", folder / "key.pem")
 
 

@@ -5,14 +5,17 @@ missions of several chasers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario.bodies import Target
-from msgspec import Struct
+from chaserdock_protocol.shipped_scenarios import find_scenario
 
-from chaserdock.evaluation.study_cases import StudyCase
+from chaserdock.experiments.plan import Alone, ExperimentError, Flight, Plan, plan_flight
 
 from .paper import BASELINE, PAPER_S, ROWS, PaperRow
 
@@ -76,32 +79,9 @@ def dispersed_start(draw: int) -> tuple[str, ...]:
     )
 
 
-class Mission(Struct, frozen=True):
-    """A shipped scenario of several chasers, flown with images in the settings of a column."""
-
-    scenario: str
-    column: str
-    overrides: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """A name that is unique in the plan."""
-        return f"{self.scenario}, {self.column}"
-
-
-@dataclass(frozen=True)
-class ReproductionPlan:
-    """All flights. ``duration_s``: of each single-chaser flight."""
-
-    quick: bool
-    duration_s: float
-    cases: tuple[StudyCase, ...]
-    missions: tuple[Mission, ...]
-
-
-def needs_open(item: Mission | StudyCase) -> bool:
+def needs_open(flight: Flight) -> bool:
     """Return whether a flight uses OpEn, the paper's solver."""
-    return OPEN in item.overrides
+    return OPEN in flight.overrides
 
 
 def table_name(column: str, row: PaperRow, draw: int) -> str:
@@ -145,42 +125,75 @@ DELAYS_S: dict[str, tuple[float, ...]] = {
 """Delays of the command with which the rows with failed runs are flown."""
 
 
-def _table(quick: bool, scenario: str, length: str) -> list[StudyCase]:
-    """Return the flights of the paper's table, with images; first one of each row."""
+_PACKAGES = (
+    "chaserdock",
+    "chaserdock_agents",
+    "chaserdock_controller",
+    "chaserdock_models",
+    "chaserdock_protocol",
+    "chaserdock_world",
+)
+
+
+@cache
+def code_digest() -> str:
+    """Return a digest of the code that flies and of its scenarios, so that results of another
+    version are not reused. Raise ExperimentError unless all packages are installed.
+    """
+    digest = hashlib.sha256()
+    own = Path(__file__).resolve().parent
+    for package in _PACKAGES:
+        spec = find_spec(package)
+        if spec is None or spec.origin is None:
+            raise ExperimentError(
+                f"{package} is not installed; a reproduction needs all packages on this machine"
+            )
+        folder = Path(spec.origin).resolve().parent
+        for path in sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".c", ".h")):
+            if path.parent != own:
+                digest.update(path.read_bytes())
+    for path in sorted(find_scenario(SCENARIO).parent.glob("*.toml")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def flight_of(
+    label: str, scenario: str, overrides: tuple[str, ...], alone: Alone | None = None, **varied: str
+) -> Flight:
+    """Return a flight of a shipped scenario, with this version of the code."""
+    path = find_scenario(scenario)
+    salt = code_digest()
+    return plan_flight(label, path, overrides, varied=varied, alone=alone, salt=salt)
+
+
+def _table(quick: bool, length: str) -> list[Flight]:
+    """Return the flights of the paper's table; first one of each row."""
     out = []
     for draw in DRAWS:
         for column, settings in COLUMNS.items():
             for row in ROWS:
                 if draw in draws_of(quick, column, row):
                     sets = (*row.overrides, *settings, *dispersed_start(draw), length)
-                    name = table_name(column, row, draw)
-                    out.append(StudyCase(name=name, scenario=scenario, overrides=sets, images=True))
+                    out.append(flight_of(table_name(column, row, draw), SCENARIO, sets))
     return out
 
 
-def _explanations(scenario: str, length: str) -> list[StudyCase]:
-    """Return the flights of the paper's controller alone, on perfect knowledge from the nominal
-    start, and lower bounds.
+def _explanations(length: str) -> list[Flight]:
+    """Return the flights of the paper's controller alone, from the nominal start, and those that
+    give lower bounds.
     """
     out = []
 
-    def add(name: str, *overrides: str, floor: bool = False, delay_s: float | None = None) -> None:
-        sets = (*overrides, length)
-        out.append(
-            StudyCase(name=name, scenario=scenario, overrides=sets, floor=floor, delay_s=delay_s)
-        )
+    def add(label: str, *overrides: str, floor: bool = False, delay_s: float | None = None) -> None:
+        out.append(flight_of(label, SCENARIO, (*overrides, length), Alone(delay_s, floor)))
 
     for draw in DRAWS:
         add(floor_name(draw), *dispersed_start(draw), floor=True)
     for row in ROWS:
         add(f"alone/{row.name}", *row.overrides, OPEN, floor=row == BASELINE)
         if row.name in STAGE_WEIGHTS:
-            add(
-                f"weights/{row.name}",
-                *row.overrides,
-                *_stage_weights(STAGE_WEIGHTS[row.name]),
-                OPEN,
-            )
+            weights = _stage_weights(STAGE_WEIGHTS[row.name])
+            add(f"weights/{row.name}", *row.overrides, *weights, OPEN)
         for delay_s in DELAYS_S.get(row.name, ()):
             add(f"delay/{row.name}/{delay_s:g}", *row.overrides, OPEN, delay_s=delay_s)
     for name, start in STARTS.items():
@@ -202,22 +215,35 @@ _PAPER_SETTINGS = (
 )
 
 
-def _missions() -> list[Mission]:
+def mission_name(scenario: str, column: str) -> str:
+    """Return the name of a mission of several chasers."""
+    return f"{scenario}, {column}"
+
+
+def mission(scenario: str, column: str, overrides: tuple[str, ...] = ()) -> Flight:
+    """Return a mission of several chasers, in the settings of a column."""
+    label = mission_name(scenario, column)
+    return flight_of(label, scenario, overrides, mission=scenario, chain=column)
+
+
+def missions_of(plan: Plan) -> list[Flight]:
+    """Return the missions of several chasers of a plan."""
+    return [flight for flight in plan.flights if "mission" in flight.varied]
+
+
+def _missions() -> list[Flight]:
     """Return the paper's missions of several chasers: ours as shipped; EPnP only where the paper
     reports a spike.
     """
-    out = [Mission(TRACKING, WRITTEN, (*_PAPER_SETTINGS, *COLUMNS[WRITTEN]))]
+    out = [mission(TRACKING, WRITTEN, (*_PAPER_SETTINGS, *COLUMNS[WRITTEN]))]
     for scenario in MISSIONS:
-        out.append(Mission(scenario, CODE, (*_PAPER_SETTINGS, *COLUMNS[CODE])))
-        out.append(Mission(scenario, DEFAULT))
+        out.append(mission(scenario, CODE, (*_PAPER_SETTINGS, *COLUMNS[CODE])))
+        out.append(mission(scenario, DEFAULT))
     return out
 
 
-def make_plan(quick: bool, scenario: str) -> ReproductionPlan:
-    """Return the whole plan; ``scenario`` is the path of ``paper-single``. A quick plan has one
-    short flight per row.
-    """
-    duration_s = QUICK_S if quick else PAPER_S
-    length = f"duration_s={duration_s}"
-    cases = (*_explanations(scenario, length), *_table(quick, scenario, length))
-    return ReproductionPlan(quick, duration_s, cases, () if quick else tuple(_missions()))
+def make_plan(quick: bool) -> Plan:
+    """Return the whole plan; a quick one has one short flight per row, and no missions."""
+    length = f"duration_s={QUICK_S if quick else PAPER_S}"
+    missions = [] if quick else _missions()
+    return Plan("reproduction", (*_explanations(length), *_table(quick, length), *missions))

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from .paper import BASELINE, ROWS, PaperRow
 from .plan import CODE, DEFAULT, DELAYS_S, STAGE_WEIGHTS
-from .runner import ReproductionResults
 from .tables import (
     QUANTITIES,
     Quantity,
+    Results,
     cell,
     changes,
     comes_out,
-    errors_by_name,
+    errors_by_label,
     errors_of,
     paper_change,
     spread,
@@ -23,7 +23,7 @@ from .tables import (
 NONE = "-"
 
 
-def trend_rows(results: ReproductionResults) -> list[tuple[str, ...]]:
+def trend_rows(results: Results) -> list[tuple[str, ...]]:
     """Return a row for every row of the paper's table but the baseline: paper, chains, controller
     alone, explanation.
     """
@@ -48,7 +48,7 @@ def change_text(change: float) -> str:
     return f"{100 * change:+.1f} %" if abs(change) < 1.0 else f"x {1 + change:.3g}"
 
 
-def _chain_text(results: ReproductionResults, column: str, row: PaperRow) -> str:
+def _chain_text(results: Results, column: str, row: PaperRow) -> str:
     texts = []
     for q in QUANTITIES:
         values = changes(results, column, row, q)
@@ -59,13 +59,13 @@ def _chain_text(results: ReproductionResults, column: str, row: PaperRow) -> str
     return "; ".join(texts)
 
 
-def _alone_change(results: ReproductionResults, name: str, quantity: Quantity) -> float | None:
+def _alone_change(results: Results, name: str, quantity: Quantity) -> float | None:
     """Return the change of a flight on perfect knowledge from the baseline's; None without results."""
-    one, base = (errors_by_name(results, n) for n in (name, f"alone/{BASELINE.name}"))
+    one, base = (errors_by_label(results, n) for n in (name, f"alone/{BASELINE.name}"))
     return None if one is None or base is None else one.of(quantity) / base.of(quantity) - 1.0
 
 
-def explanation(results: ReproductionResults, row: PaperRow) -> str:
+def explanation(results: Results, row: PaperRow) -> str:
     """Return what was measured about a trend that does not come out in both errors of the paper's
     chain.
     """
@@ -84,12 +84,12 @@ def explanation(results: ReproductionResults, row: PaperRow) -> str:
     return " ".join(filter(None, texts)) or "Unexplained."
 
 
-def _by_delay(results: ReproductionResults, row: PaperRow) -> str:
+def _by_delay(results: Results, row: PaperRow) -> str:
     """Find the delay of the command that brings the position error of the controller alone to the
     paper's.
     """
-    solved = results.cases.get(f"alone/{row.name}")
-    flown = [(d, errors_by_name(results, f"delay/{row.name}/{d:g}")) for d in DELAYS_S[row.name]]
+    solved = results.get(f"alone/{row.name}")
+    flown = [(d, errors_by_label(results, f"delay/{row.name}/{d:g}")) for d in DELAYS_S[row.name]]
     known = [(d, e.position) for d, e in flown if e is not None]
     if solved is None or not known:
         return ""
@@ -98,9 +98,10 @@ def _by_delay(results: ReproductionResults, row: PaperRow) -> str:
     shown = known[-1:] if reached is None else known[max(reached - 1, 0) : reached + 1]
     delayed = ", ".join(f"{_error_text(value)} if {d:g} s late" for d, value in shown)
     found = "Unexplained" if reached is None else "A late command gives as much"
+    solve_ms = solved["solver"]["solve_s"]["p50"] * 1e3
     return (
-        f"{found}: the controller alone has {errors_of(solved).position:.3g} m^2, {delayed}, the paper {paper:.3g}. The "
-        f"median solve of OpEn took {solved.solve_p50_s * 1e3:.1f} ms here."
+        f"{found}: the controller alone has {errors_of(solved).position:.3g} m^2, {delayed}, the "
+        f"paper {paper:.3g}. The median solve of OpEn took {solve_ms:.1f} ms here."
     )
 
 
@@ -108,7 +109,7 @@ def _error_text(position_mse_m2: float) -> str:
     return f"{position_mse_m2:.3g}" if position_mse_m2 < 10.0 else "divergence"
 
 
-def _by_stage_weights(results: ReproductionResults, row: PaperRow) -> str:
+def _by_stage_weights(results: Results, row: PaperRow) -> str:
     """Compare with the same dt at stage weights that keep the sum of the stage costs."""
     before = _alone_change(results, f"alone/{row.name}", "position")
     after = _alone_change(results, f"weights/{row.name}", "position")
@@ -120,7 +121,7 @@ def _by_stage_weights(results: ReproductionResults, row: PaperRow) -> str:
     return f"Eq. 6 counts the final cost once for any dt, which explains ours: {text}. The paper's is unexplained."
 
 
-def _by_spread(results: ReproductionResults, row: PaperRow) -> str:
+def _by_spread(results: Results, row: PaperRow) -> str:
     """Compare the paper's changes with the spread of the baseline over the dispersed starts."""
     runs = list(cell(results, CODE, BASELINE).values())
     if len(runs) < 2:

@@ -6,17 +6,20 @@ from the baseline.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from chaserdock.evaluation.study_cases import StudyResult
+from chaserdock.experiments.plan import Plan
+from chaserdock.experiments.worker import Outcome
 
 from .paper import BASELINE, PAPER_S, PaperRow
 from .plan import DRAWS, NOMINAL_OFFSET_M, table_name
-from .runner import ReproductionResults
+
+Results = dict[str, dict[str, Any]]
+"""Summaries of flights by their label."""
 
 BAND = (1.0 / 1.35, 1.35)
 """Ratios of a measured value to the paper's that count as met."""
@@ -93,30 +96,37 @@ def over_two_minutes(whole: float, steady: float, flown_s: float) -> float:
     return (whole * flown_s + steady * (PAPER_S - flown_s)) / PAPER_S
 
 
-def errors_of(r: StudyResult) -> Errors:
-    """Return the errors of a flight; it failed if the chaser came closer than d_min or did not come
-    nearer.
+def results_by_label(plan: Plan, outcomes: Mapping[str, Outcome]) -> Results:
+    """Return the summaries of the flights that have one."""
+    ended = ((f.label, outcomes[f.name].summary) for f in plan.flights if f.name in outcomes)
+    return {label: summary for label, summary in ended if summary is not None}
+
+
+def errors_of(summary: Mapping[str, Any]) -> Errors:
+    """Return the errors of chaser 0 by a flight's summary. The flight failed if the chaser came
+    closer than d_min or did not come nearer.
     """
+    own, flown_s = summary["chasers"]["0"], summary["sim_time_s"]
+    steady = {name: math.inf if v is None else v for name, v in own["steady"].items()}
+    steady_position = steady["position_mse_m2"]
     return Errors(
-        position=over_two_minutes(r.position_mse_m2, r.steady_position_mse_m2, r.duration_s),
+        position=over_two_minutes(own["position_mse_m2"], steady_position, flown_s),
         orientation=over_two_minutes(
-            r.orientation_mse_rad2, r.steady_orientation_mse_rad2, r.duration_s
+            own["orientation_mse_rad2"], steady["orientation_mse_rad2"], flown_s
         ),
-        steady_position=r.steady_position_mse_m2,
-        failed=r.min_distance_target_m < MIN_DISTANCE_M
-        or not r.steady_position_mse_m2 <= LOST_M**2,
+        steady_position=steady_position,
+        failed=own["min_distance_target_m"] < MIN_DISTANCE_M or not steady_position <= LOST_M**2,
     )
 
 
-def errors_by_name(results: ReproductionResults, name: str) -> Errors | None:
+def errors_by_label(results: Results, label: str) -> Errors | None:
     """Return the errors of a flight; None without a result."""
-    result = results.cases.get(name)
-    return None if result is None else errors_of(result)
+    return errors_of(results[label]) if label in results else None
 
 
-def cell(results: ReproductionResults, column: str, row: PaperRow) -> dict[int, Errors]:
+def cell(results: Results, column: str, row: PaperRow) -> dict[int, Errors]:
     """Return the errors of a table cell by draw, as far as flown."""
-    found = {draw: errors_by_name(results, table_name(column, row, draw)) for draw in DRAWS}
+    found = {draw: errors_by_label(results, table_name(column, row, draw)) for draw in DRAWS}
     return {draw: errors for draw, errors in found.items() if errors is not None}
 
 
@@ -130,9 +140,7 @@ def paper_change(row: PaperRow, quantity: Quantity) -> float:
     return paper_value(row, quantity) / paper_value(BASELINE, quantity) - 1.0
 
 
-def changes(
-    results: ReproductionResults, column: str, row: PaperRow, quantity: Quantity
-) -> list[float]:
+def changes(results: Results, column: str, row: PaperRow, quantity: Quantity) -> list[float]:
     """Return the changes of a row from the baseline row of the same start, as shares."""
     runs, base = cell(results, column, row), cell(results, column, BASELINE)
     return [runs[d].of(quantity) / base[d].of(quantity) - 1.0 for d in runs if d in base]

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario.bodies import Target
 
-from .page import PageSection, Table
+from chaserdock.experiments.page import PageSection, Table
+from chaserdock.experiments.plan import Plan
+
 from .paper import BASELINE, PAPER_S, ROWS
 from .plan import (
     ATTITUDE_BOUND_RAD,
@@ -21,24 +24,26 @@ from .plan import (
     DEFAULT,
     DRAWS,
     OFFSET_BOUND_M,
+    QUICK_S,
     RATE_BOUND,
     ROTATION_BOUND_RAD,
     STARTS,
     TRACKING,
     WRITTEN,
-    ReproductionPlan,
     floor_name,
+    mission_name,
+    missions_of,
 )
 from .provenance import Provenance
-from .runner import MissionResult, ReproductionResults
 from .tables import (
     BAND,
     LOST_M,
     MIN_DISTANCE_M,
     QUANTITIES,
     Quantity,
+    Results,
     cell,
-    errors_by_name,
+    errors_by_label,
     paper_value,
     spread,
     verdict,
@@ -53,21 +58,19 @@ UNITS: dict[Quantity, tuple[float, str]] = {
 """Factor and name of the paper's units."""
 
 
-def sections(
-    plan: ReproductionPlan, results: ReproductionResults, about: Provenance
-) -> list[PageSection]:
-    """Return the whole page."""
+def sections(plan: Plan, results: Results, about: Provenance, quick: bool) -> list[PageSection]:
+    """Return the whole page; ``quick``: of the quick plan."""
     return [
-        _result(plan, results, about),
+        _result(plan, results, about, quick),
         *(_table(results, quantity) for quantity in QUANTITIES),
         _trends(results),
-        *([] if plan.quick else [_missions(plan, results)]),
+        *([] if quick else [_missions(plan, results)]),
         _start(results),
-        _method(plan),
+        _method(quick),
     ]
 
 
-def _result(plan: ReproductionPlan, results: ReproductionResults, about: Provenance) -> PageSection:
+def _result(plan: Plan, results: Results, about: Provenance, quick: bool) -> PageSection:
     """Return provenance, and the number of figures met by column."""
     rows = []
     for column in COLUMNS:
@@ -76,9 +79,8 @@ def _result(plan: ReproductionPlan, results: ReproductionResults, about: Provena
         failed = f"{sum(e.failed for e in runs)} of {len(runs)}" if runs else NONE
         rows.append((column, *cells, failed))
     rows.append(("the paper", NONE, NONE, f"{sum(row.failed for row in ROWS)} of {3 * len(ROWS)}"))
-    missing = [f.name for f in plan.cases if f.name not in results.cases]
-    missing += [m.name for m in plan.missions if m.name not in results.missions]
-    command = "chaserdock reproduce --quick" if plan.quick else "chaserdock reproduce"
+    missing = [f.label for f in plan.flights if f.label not in results]
+    command = "chaserdock reproduce --quick" if quick else "chaserdock reproduce"
     parts: list[str | Table] = [
         "The paper is Fourlas, Viswanathan, Satpute and Nikolakopoulos, Vision Based Docking of Multiple Satellites with an "
         f"Uncooperative Target (IFAC 2023). This page is the output of `{command}`; flown on {about}.",
@@ -93,15 +95,15 @@ def _result(plan: ReproductionPlan, results: ReproductionResults, about: Provena
         "face of the target that a chaser sees most of the time (tests/agents/test_perception.py).",
     ]
     if missing:
-        total = len(plan.cases) + len(plan.missions)
         parts.insert(
             0,
-            f"NOT COMPLETE: {len(missing)} of {total} flights have no result (a dash); the same command resumes them.",
+            f"NOT COMPLETE: {len(missing)} of {len(plan.flights)} flights have no result (a dash); "
+            "the same command resumes them.",
         )
     return PageSection("Result", tuple(parts))
 
 
-def _met(results: ReproductionResults, column: str, quantity: Quantity) -> str:
+def _met(results: Results, column: str, quantity: Quantity) -> str:
     verdicts = [
         verdict(spread(ratios).median)
         for row in ROWS
@@ -110,12 +112,12 @@ def _met(results: ReproductionResults, column: str, quantity: Quantity) -> str:
     return f"{verdicts.count('met')} of {len(verdicts)}" if verdicts else NONE
 
 
-def _ratios(results: ReproductionResults, column: str, row, quantity: Quantity) -> list[float]:
+def _ratios(results: Results, column: str, row, quantity: Quantity) -> list[float]:
     paper = paper_value(row, quantity)
     return [e.of(quantity) / paper for e in cell(results, column, row).values()]
 
 
-def _table(results: ReproductionResults, quantity: Quantity) -> PageSection:
+def _table(results: Results, quantity: Quantity) -> PageSection:
     """Return the nine rows of one error: ratios to the paper's, with spread and verdict."""
     factor, unit = UNITS[quantity]
     rows = []
@@ -144,12 +146,10 @@ def _spread_text(values: Sequence[float]) -> str:
     )
 
 
-def _trends(results: ReproductionResults) -> PageSection:
+def _trends(results: Results) -> PageSection:
     """Return the changes from the baseline row and the spike, with explanations."""
-    spike = [
-        _spike_text(results.missions.get(f"{TRACKING}, {column}")) for column in (CODE, DEFAULT)
-    ]
-    written = _spike_text(results.missions.get(f"{TRACKING}, {WRITTEN}"))
+    spike = [_spike_text(results.get(mission_name(TRACKING, column))) for column in (CODE, DEFAULT)]
+    written = _spike_text(results.get(mission_name(TRACKING, WRITTEN)))
     rows = [
         *trend_rows(results),
         ("two chasers: error at 100 s", "a spike", *spike, NONE, _spike_explanation(written)),
@@ -163,18 +163,15 @@ def _trends(results: ReproductionResults) -> PageSection:
     return PageSection("Trends", (text, Table(header, tuple(rows), text=True)))
 
 
-def _spike_text(result: MissionResult | None) -> str:
-    if result is None:
+def _spike_text(summary: dict[str, Any] | None) -> str:
+    if summary is None:
         return NONE
-    if result.estimate_max_rad is None or result.estimate_rms_rad is None:
+    estimate = summary["target_estimate"]
+    most, rms = estimate["max_orientation_error_rad"], estimate["orientation_rms_rad"]
+    if most is None or rms is None:
         return "no estimate"
-    angle, ratio = (
-        math.degrees(result.estimate_max_rad),
-        result.estimate_max_rad / result.estimate_rms_rad,
-    )
-    return (
-        f"at most {angle:.3g} deg, {ratio:.1f} times the RMS, at {result.estimate_max_at_s:.0f} s"
-    )
+    at_s = estimate["max_orientation_error_at_s"]
+    return f"at most {math.degrees(most):.3g} deg, {most / rms:.1f} times the RMS, at {at_s:.0f} s"
 
 
 def pitch_rad(time_s: float) -> float:
@@ -197,14 +194,13 @@ def _spike_explanation(written: str) -> str:
     )
 
 
-def _missions(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
+def _missions(plan: Plan, results: Results) -> PageSection:
     """Return the paper's missions of several chasers."""
     rows = []
-    for m in plan.missions:
-        result = results.missions.get(m.name)
-        rows.append(
-            (m.scenario, m.column, *((NONE,) * 5 if result is None else _mission_cells(result)))
-        )
+    for flight in missions_of(plan):
+        summary = results.get(flight.label)
+        cells = (NONE,) * 5 if summary is None else _mission_cells(summary)
+        rows.append((flight.varied["mission"], flight.varied["chain"], *cells))
     header = (
         "mission",
         "chain",
@@ -223,39 +219,47 @@ def _missions(plan: ReproductionPlan, results: ReproductionResults) -> PageSecti
     return PageSection("Missions", (text, Table(header, tuple(rows))))
 
 
-def _mission_cells(r: MissionResult) -> tuple[str, ...]:
-    events = [f"{i} docked at {t:.0f} s" for i, t in r.dock_time_s.items()]
-    events += [f"{i} arrived at {t:.0f} s" for i, t in r.reached_time_s.items()]
-    position, angle, between = (
-        r.steady_position_rms_m,
-        r.steady_orientation_rms_rad,
-        r.min_distance_chasers_m,
+def _mission_cells(summary: dict[str, Any]) -> tuple[str, ...]:
+    chasers: dict[str, Any] = summary["chasers"]
+    events = [f"{i} docked at {c['dock_time_s']:.0f} s" for i, c in chasers.items() if c["docked"]]
+    events += [
+        f"{i} arrived at {c['reached_time_s']:.0f} s"
+        for i, c in chasers.items()
+        if c["reached_time_s"] is not None
+    ]
+    position, angle = (
+        _worst([c["steady"][name] for c in chasers.values()])
+        for name in ("position_mse_m2", "orientation_mse_rad2")
     )
+    least = min(c["min_distance_target_m"] for c in chasers.values())
+    between = summary["min_distance_chasers_m"]
     return (
         NONE if position is None else f"{position * 1e3:.3g}",
         NONE if angle is None else f"{math.degrees(angle):.2g}",
-        f"{r.min_distance_target_m:.3f}",
+        f"{least:.3f}",
         NONE if between is None else f"{between:.3f}",
         ", ".join(events) or NONE,
     )
 
 
-def _start(results: ReproductionResults) -> PageSection:
+def _worst(mean_squares: Sequence[float | None]) -> float | None:
+    """Return the largest root of mean squares; None if one is missing."""
+    known = [math.sqrt(x) for x in mean_squares if x is not None]
+    return max(known) if len(known) == len(mean_squares) else None
+
+
+def _start(results: Results) -> PageSection:
     """Return what the start contributes: other starts, and the lower bound."""
-    nominal = errors_by_name(results, f"alone/{BASELINE.name}")
+    nominal = errors_by_label(results, f"alone/{BASELINE.name}")
     rows = []
     for name in ("nominal", *STARTS):
-        errors = nominal if name == "nominal" else errors_by_name(results, f"start/{name}")
+        errors = nominal if name == "nominal" else errors_by_label(results, f"start/{name}")
         if errors is not None:
             rows.append(
                 (name, *(f"{errors.of(q) / paper_value(BASELINE, q):.2f}" for q in QUANTITIES))
             )
     names = [f"alone/{BASELINE.name}", *map(floor_name, DRAWS)]
-    floors = [
-        (name, r.floor_m2_s / PAPER_S)
-        for name in names
-        if (r := results.cases.get(name)) is not None and r.floor_m2_s is not None
-    ]
+    floors = [(name, results[name]["floor_m2_s"] / PAPER_S) for name in names if name in results]
     parts: list[str | Table] = [
         "The paper does not state the start. The nominal one is inferred from its baseline row: 0.85 m straight back in front of "
         "the target, at rest in the world frame, turned by 0.575 rad. Distance, angle and axis are fitted to both errors of that "
@@ -281,12 +285,12 @@ def _start(results: ReproductionResults) -> PageSection:
     return PageSection("Start", tuple(parts))
 
 
-def _method(plan: ReproductionPlan) -> PageSection:
+def _method(quick: bool) -> PageSection:
     """Return definitions and settings."""
     length = (
         f"Flights take {PAPER_S:g} s, as the paper's."
-        if not plan.quick
-        else f"Quick: one start in place of {len(DRAWS)}, flights of {plan.duration_s:g} s, extrapolated to the paper's "
+        if not quick
+        else f"Quick: one start in place of {len(DRAWS)}, flights of {QUICK_S:g} s, extrapolated to the paper's "
         f"{PAPER_S:g} s with their steady state (20 s to the end), no missions."
     )
     return PageSection(

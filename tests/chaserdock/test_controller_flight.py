@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from chaserdock_models import rotations
@@ -21,8 +19,8 @@ from hypothesis import strategies as st
 from chaserdock.evaluation.flight_record import record_flight
 from chaserdock.evaluation.least_transient import gauss_times, least_square_integral
 from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
-from chaserdock.evaluation.study import fly_case
-from chaserdock.evaluation.study_cases import StudyCase, StudyError, StudyResult
+from chaserdock.experiments.controller_flight import fly_alone
+from chaserdock.experiments.plan import Alone
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -178,37 +176,12 @@ def test_perfect_estimate_refuses_a_free_target() -> None:
         PerfectEstimator(scenario("single", "target.motion='torque_free'").target)
 
 
-@pytest.fixture(scope="module")
-def baseline() -> StudyResult:
-    case = StudyCase(
-        name="x",
-        scenario=str(SCENARIOS / "paper-single.toml"),
-        overrides=("duration_s=25.0",),
-        floor=True,
-    )
-    return fly_case(case)
-
-
-def test_no_flight_is_better_than_the_floor(baseline: StudyResult) -> None:
+def test_no_flight_is_better_than_the_floor() -> None:
     """And the paper's settings come near it: the table is about this transient."""
-    assert baseline.floor_m2_s is not None
-    assert 1.0 < baseline.position_mse_m2 * 25.0 / baseline.floor_m2_s < 1.2
-    assert baseline.failed_solves == 0
-
-
-def test_study_with_images_flies_the_estimator(baseline: StudyResult) -> None:
-    small = ("camera.width_px=480", "camera.height_px=270", "time.rate_hz=10", "time.image_hz=10")
-    blind = msgspec.structs.replace(
-        baseline.case, overrides=("duration_s=21.0", *small), floor=False
-    )
-    perfect, seen = fly_case(blind), fly_case(msgspec.structs.replace(blind, images=True))
-    assert (
-        seen.position_mse_m2
-        != perfect.position_mse_m2
-        == pytest.approx(seen.position_mse_m2, rel=0.5)
-    )
-    # From 1.85 m in front of the target to its reference pose at 1 m.
-    assert seen.min_distance_target_m == pytest.approx(1.0, abs=0.15)
+    summary = fly_alone(scenario("paper-single", "duration_s=25.0"), Alone(floor=True))
+    position_mse_m2 = summary["chasers"]["0"]["position_mse_m2"]
+    assert 1.0 < position_mse_m2 * 25.0 / summary["floor_m2_s"] < 1.2
+    assert summary["solver"]["failures"] == 0
 
 
 def test_delay_makes_long_horizons_fail_first() -> None:
@@ -223,24 +196,6 @@ def test_delay_makes_long_horizons_fail_first() -> None:
     assert worst(10.0, 0.1) < 0.02
     assert worst(3.0, 0.5) < 0.05
     assert worst(10.0, 0.5) > 1.0
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"delay_s": -0.1}, "x: delay_s must be finite, not negative"),
-        ({"delay_s": math.nan}, "x: delay_s must be finite, not negative"),
-        ({"delay_s": 0.1, "delay_measured": True}, "not beside delay_measured"),
-        (
-            {"overrides": ("target.motion='torque_free'",)},
-            "x: target.motion must be constant_rates or static",
-        ),
-        ({"overrides": ("duration_s=3.0",)}, r"x: duration_s \(3\) ends before settling_s \(20\)"),
-    ],
-)
-def test_bad_cases_are_named(changed: dict[str, Any], message: str) -> None:
-    with pytest.raises(StudyError, match=message):
-        fly_case(StudyCase(name="x", scenario=str(SCENARIOS / "paper-single.toml"), **changed))
 
 
 def test_delay_counts_missed_ticks() -> None:

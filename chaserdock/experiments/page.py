@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page of sections as Markdown and as one self-contained HTML file."""
+"""The page of an experiment: sections as Markdown, or as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from chaserdock.html_page import html_page, table
+from chaserdock.html_page import Markup, html_page, table
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,9 @@ class Table:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A heading, followed by paragraphs (text, with code in backticks) and tables."""
+    """A heading (none: ""), followed by paragraphs (text, with code in backticks), tables, and HTML
+    (``Markup``), which Markdown leaves out.
+    """
 
     title: str
     parts: tuple[str | Table, ...]
@@ -41,11 +43,11 @@ def markdown(title: str, sections: Sequence[PageSection]) -> str:
     """Return the page as Markdown."""
     lines = [f"# {title}", ""]
     for section in sections:
-        lines += [f"## {section.title}", ""]
+        lines += [f"## {section.title}", ""] if section.title else []
         for part in section.parts:
             if isinstance(part, Table):
                 lines += _markdown_table(part)
-            else:
+            elif not isinstance(part, Markup):
                 lines += [part, ""]
     return "\n".join(lines).rstrip("\n") + "\n"
 
@@ -62,7 +64,8 @@ def html(title: str, sections: Sequence[PageSection]) -> str:
     """Return the page as HTML without external resources."""
     body = [f"<h1>{escape(title)}</h1>"]
     for section in sections:
-        body.append(f"<h2>{escape(section.title)}</h2>")
+        if section.title:
+            body.append(f"<h2>{escape(section.title)}</h2>")
         body += [
             table(p.header, p.rows, p.text) if isinstance(p, Table) else _paragraph(p)
             for p in section.parts
@@ -71,4 +74,6 @@ def html(title: str, sections: Sequence[PageSection]) -> str:
 
 
 def _paragraph(text: str) -> str:
+    if isinstance(text, Markup):
+        return text
     return "<p>" + re.sub("`([^`]+)`", r"<code>\1</code>", escape(text)) + "</p>"

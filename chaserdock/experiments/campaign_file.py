@@ -1,28 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Campaign file and the runs it defines.
+"""Campaign file and the plan it defines.
 
 A campaign is a scenario, values shared by all runs, and varied parameters: a grid (every
-combination of ``values``) or a random sample (each parameter drawn from its distribution). Equal
-files give equal runs with equal names.
+combination of ``values``) or a random sample (each parameter drawn from its distribution).
 """
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
-from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.errors import ScenarioError, invalid
 from chaserdock_protocol.scenario.fields import Name, Number, Positive, Section
 from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
 from pydantic import Field, ValidationError, model_validator
 
 from chaserdock.toml_text import toml_value
+
+from .plan import Alone, Flight, Plan, plan_flight
 
 MAX_RUNS = 100_000
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
@@ -51,9 +49,18 @@ class Variation(Section):
         return self
 
 
+class AloneSection(Section):
+    """Section ``[alone]``: fly the controller alone. See ``Alone``."""
+
+    delay_s: Annotated[float, Field(ge=0.0, le=3600.0)] | None = None
+    floor: bool = False
+
+
 class CampaignFile(Section):
-    """Content of a campaign file. ``seeds``: number of seeds (0, 1, ...) or list of seeds for every
-    combination.
+    """Content of a campaign file.
+
+    ``seeds``: number of seeds (0, 1, ...), or list of seeds, of every combination. ``alone``: fly
+    the controller alone, in one process, with perfect knowledge of the target.
     """
 
     name: Name
@@ -64,6 +71,7 @@ class CampaignFile(Section):
     seeds: Annotated[int, Field(ge=1, le=MAX_RUNS)] | tuple[Seed, ...] = 1
     set: dict[str, Any] = Field(default_factory=dict)
     vary: dict[str, Variation] = Field(default_factory=dict)
+    alone: AloneSection | None = None
 
     @model_validator(mode="after")
     def _check_method(self) -> CampaignFile:
@@ -81,28 +89,7 @@ class CampaignFile(Section):
         return self
 
 
-class Run(msgspec.Struct, frozen=True):
-    """One run. ``name`` is a digest of the resolved scenario; ``varied`` holds the values that
-    differ between runs.
-    """
-
-    index: int
-    name: str
-    scenario: Path
-    seed: int
-    varied: dict[str, Any]
-    overrides: tuple[str, ...]
-
-
-class Campaign(msgspec.Struct, frozen=True):
-    """Runs and the names of the varied parameters."""
-
-    name: str
-    parameters: tuple[str, ...]
-    runs: tuple[Run, ...]
-
-
-def load_campaign(path: Path) -> Campaign:
+def load_campaign(path: Path) -> Plan:
     """Read a campaign file and validate every run's scenario; raise ScenarioError with one line per
     fault.
     """
@@ -120,22 +107,7 @@ def load_campaign(path: Path) -> Campaign:
         scenario = local if local.is_file() else find_scenario(file.scenario)
     except ScenarioNotFound as error:
         raise ScenarioError(f"{path}: scenario: {error}") from None
-    return Campaign(file.name, tuple(file.vary), _runs(file, scenario, path))
-
-
-def make_run(
-    index: int,
-    scenario: Path,
-    seed: int,
-    varied: dict[str, Any],
-    overrides: tuple[str, ...],
-    salt: str = "",
-) -> tuple[Run, Scenario]:
-    """Return a run and its resolved scenario; ``salt`` also enters the name. Raise ScenarioError."""
-    overrides = (*overrides, f"seed={seed}")
-    resolved = load_scenario(scenario, overrides)
-    name = hashlib.sha256((salt + resolved.model_dump_json()).encode()).hexdigest()[:12]
-    return Run(index, name, scenario, seed, varied, overrides), resolved
+    return Plan(file.name, _flights(file, scenario, path), tuple(file.vary))
 
 
 def _combinations(file: CampaignFile) -> list[dict[str, Any]]:
@@ -157,34 +129,42 @@ def _draw(v: Variation, rng: np.random.Generator) -> Any:
     return values[int(rng.integers(len(values)))]
 
 
-def _runs(file: CampaignFile, scenario: Path, path: Path) -> tuple[Run, ...]:
+def _flights(file: CampaignFile, scenario: Path, path: Path) -> tuple[Flight, ...]:
     seeds = tuple(range(file.seeds)) if isinstance(file.seeds, int) else file.seeds
     combinations = _combinations(file)
     if len(combinations) * len(seeds) > MAX_RUNS:
         raise ScenarioError(
-            f"{path}: {len(combinations)} combinations times {len(seeds)} seeds exceed {MAX_RUNS} runs"
+            f"{path}: {len(combinations)} combinations times {len(seeds)} seeds exceed {MAX_RUNS} "
+            "runs"
         )
-    shared = [f"{key}={toml_value(value)}" for key, value in file.set.items()]
-    runs = []
+    alone = None if file.alone is None else Alone(file.alone.delay_s, file.alone.floor)
+    shared = _overrides(file.set)
+    flights: list[Flight] = []
     for varied in combinations:
-        own = [f"{key}={toml_value(value)}" for key, value in varied.items()]
+        own = _overrides(varied)
         for seed in seeds:
+            label = f"run {len(flights)}"
+            sets = (*shared, *own, f"seed={seed}")
             try:
-                runs.append(make_run(len(runs), scenario, seed, varied, (*shared, *own))[0])
+                flight = plan_flight(label, scenario, sets, varied=varied, alone=alone)
             except ScenarioError as error:
-                raise ScenarioError(
-                    f"{path}: run {len(runs)} ({', '.join(own) or 'nothing varied'}): {error}"
-                ) from None
-    _reject_duplicates(runs, path)
-    return tuple(runs)
+                what = ", ".join(own) or "nothing varied"
+                raise ScenarioError(f"{path}: {label} ({what}): {error}") from None
+            flights.append(flight)
+    _reject_duplicates(flights, path)
+    return tuple(flights)
 
 
-def _reject_duplicates(runs: list[Run], path: Path) -> None:
-    seen: dict[str, int] = {}
-    for run in runs:
-        if run.name in seen:
+def _overrides(values: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(f"{key}={toml_value(value)}" for key, value in values.items())
+
+
+def _reject_duplicates(flights: list[Flight], path: Path) -> None:
+    seen: dict[str, str] = {}
+    for flight in flights:
+        if flight.name in seen:
             raise ScenarioError(
-                f"{path}: runs {seen[run.name]} and {run.index} are the same scenario; a value is repeated or has "
-                "no effect"
+                f"{path}: {seen[flight.name]} and {flight.label} are the same scenario; a value is "
+                "repeated or has no effect"
             )
-        seen[run.name] = run.index
+        seen[flight.name] = flight.label

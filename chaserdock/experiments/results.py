@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of a campaign as a table, and the statistics of the table."""
+"""Results of a plan as a table, and the statistics of the table."""
 
 from __future__ import annotations
 
@@ -7,62 +7,64 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from .plan import Run
-from .worker import FinishedRun
+from .plan import Flight, Plan
+from .worker import Outcome
 
-RunRow = dict[str, Any]
+Row = dict[str, Any]
 _FIXED = ("run", "index", "seed", "success", "cause", "failures", "digest", "log")
 
+_OF_CHASERS: tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]], ...] = (
+    ("steady_position_mse_m2", ("steady", "position_mse_m2"), max),
+    ("steady_orientation_mse_rad2", ("steady", "orientation_mse_rad2"), max),
+    ("position_mse_m2", ("position_mse_m2",), max),
+    ("orientation_mse_rad2", ("orientation_mse_rad2",), max),
+    ("relative_estimate_position_rms_m", ("relative_estimate", "position_rms_m"), max),
+    ("relative_estimate_orientation_rms_rad", ("relative_estimate", "orientation_rms_rad"), max),
+    ("min_distance_target_m", ("min_distance_target_m",), min),
+    ("impulse_N_s", ("impulse_N_s",), sum),
+)
+"""Columns of results by chaser: name, place in a chaser's summary, and how chasers are combined."""
 
-def row_of(run: Run, result: FinishedRun) -> RunRow:
-    """Return a run as a row of plain values: varied values (``vary.NAME``), outcome and results in
-    SI units.
 
-    No value depends on the speed of the machine: equal campaigns give equal tables.
+def row_of(index: int, flight: Flight, outcome: Outcome) -> Row:
+    """Return a flight as a row of plain values: varied values (``vary.NAME``), outcome, and results
+    in SI units.
+
+    No value depends on the speed of the machine: equal plans give equal tables.
     """
-    s = result.summary or {}
+    s = outcome.summary or {}
     failures = list(s.get("failures", [])) or (
-        [result.last_words or "ended without output"] if result.status else []
+        [outcome.last_words or "ended without output"] if outcome.status else []
     )
-    row: RunRow = {
-        "run": run.name,
-        "index": run.index,
-        "seed": run.seed,
-        "success": result.status == 0,
+    row: Row = {
+        "run": flight.name,
+        "index": index,
+        "seed": flight.seed,
+        "success": outcome.status == 0,
         "cause": cause_of(failures[0]) if failures else "",
         "failures": json.dumps(failures),
         "digest": s.get("digest", ""),
-        "log": result.log or "",
+        "log": outcome.log or "",
     }
     row |= {
         f"vary.{k}": v if isinstance(v, int | float | str | bool) else json.dumps(v)
-        for k, v in run.varied.items()
+        for k, v in flight.varied.items()
     }
     chasers = s.get("chasers", {}).values()
-    for name, path, aggregate in (
-        ("steady_position_mse_m2", ("steady", "position_mse_m2"), max),
-        ("steady_orientation_mse_rad2", ("steady", "orientation_mse_rad2"), max),
-        ("position_mse_m2", ("position_mse_m2",), max),
-        ("orientation_mse_rad2", ("orientation_mse_rad2",), max),
-        ("relative_estimate_position_rms_m", ("relative_estimate", "position_rms_m"), max),
-        (
-            "relative_estimate_orientation_rms_rad",
-            ("relative_estimate", "orientation_rms_rad"),
-            max,
-        ),
-        ("min_distance_target_m", ("min_distance_target_m",), min),
-        ("impulse_N_s", ("impulse_N_s",), sum),
-    ):
+    for name, path, combine in _OF_CHASERS:
         values = [v for c in chasers if (v := _value_at(c, path)) is not None]
-        row[name] = float(aggregate(values)) if values else math.nan
+        row[name] = float(combine(values)) if values else math.nan
     row["docked"] = sum(bool(c.get("docked")) for c in chasers)
     row["collisions"] = int(s.get("collisions", 0))
     row["min_distance_chasers_m"] = _number(s.get("min_distance_chasers_m"))
     for key, value in s.get("target_estimate", {}).items():
         row[f"estimate_{key}"] = _number(value)
+    if flight.alone is not None and flight.alone.floor:
+        row["floor_m2_s"] = _number(s.get("floor_m2_s"))
     return row
 
 
@@ -81,14 +83,18 @@ def cause_of(failure: str) -> str:
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", failure)
 
 
-def rows_of(finished: list[tuple[Run, FinishedRun]]) -> list[RunRow]:
-    """Return the table in the campaign's order; all rows have the same columns."""
-    rows = [row_of(run, result) for run, result in finished]
+def rows_of(plan: Plan, outcomes: Mapping[str, Outcome]) -> list[Row]:
+    """Return the table in the plan's order, as far as flown; all rows have the same columns."""
+    rows = [
+        row_of(index, flight, outcomes[flight.name])
+        for index, flight in enumerate(plan.flights)
+        if flight.name in outcomes
+    ]
     columns = list(dict.fromkeys(key for row in rows for key in row))
     return [{c: row.get(c, math.nan) for c in columns} for row in rows]
 
 
-def metrics_of(rows: list[RunRow]) -> list[str]:
+def metrics_of(rows: list[Row]) -> list[str]:
     """Return the names of the columns with numerical results."""
     names = [c for c in (rows[0] if rows else {}) if c not in _FIXED and not c.startswith("vary.")]
     return [
@@ -108,8 +114,8 @@ def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, fl
     return float(interval.low), float(interval.high)
 
 
-def causes(rows: list[RunRow]) -> list[tuple[str, int]]:
-    """Return the causes of failures and their numbers of runs, most frequent first."""
+def causes(rows: list[Row]) -> list[tuple[str, int]]:
+    """Return the causes of failures and their numbers of flights, most frequent first."""
     return sorted(
         Counter(r["cause"] for r in rows if not r["success"]).items(),
         key=lambda item: (-item[1], item[0]),
@@ -132,7 +138,7 @@ def rank_correlation(x: list[float], y: list[float]) -> float:
     return float(result.statistic)
 
 
-def numbers_of(rows: list[RunRow], column: str) -> list[float] | None:
+def numbers_of(rows: list[Row], column: str) -> list[float] | None:
     """Return a column as numbers, or None when it contains text."""
     values = [r[column] for r in rows]
     if any(isinstance(v, str) for v in values):
@@ -140,13 +146,15 @@ def numbers_of(rows: list[RunRow], column: str) -> list[float] | None:
     return [float(v) for v in values]
 
 
-def rerun_command(run: Run) -> str:
-    """Return the command that flies one run again."""
-    sets = " ".join(f"--set '{o}'" for o in run.overrides)
-    return f"chaserdock run {run.scenario} {sets}"
+def repeat_command(flight: Flight) -> str:
+    """Return the command that flies one flight of a campaign again."""
+    if flight.alone is not None:
+        return f"chaserdock campaign FILE --only {flight.label.removeprefix('run ')}"
+    sets = " ".join(f"--set '{o}'" for o in flight.overrides)
+    return f"chaserdock run {flight.scenario} {sets}"
 
 
-def write_table(rows: list[RunRow], path: Path) -> None:
+def write_table(rows: list[Row], path: Path) -> None:
     """Write the table as Parquet; column names include units."""
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``chaserdock reproduce``: fly the plan, write the page."""
+"""``chaserdock reproduce``: fly the paper's experiments, write the page."""
 
 from __future__ import annotations
 
@@ -9,40 +9,42 @@ from pathlib import Path
 import msgspec
 from chaserdock_controller.nmpc.open_backend import missing_part
 from chaserdock_protocol.errors import errors_of_writing
-from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
+from chaserdock.experiments.page import html, markdown
+from chaserdock.experiments.plan import ExperimentError, Plan
+from chaserdock.experiments.worker import Progress, Workers, fly_plan
 from chaserdock.launch.signals import stop_on_signals
 
 from .content import sections
-from .page import html, markdown
-from .plan import SCENARIO, ReproductionPlan, make_plan, needs_open
+from .plan import code_digest, make_plan, needs_open
 from .provenance import Provenance, provenance
-from .runner import ReproductionError, code_digest, fly, results_of
+from .tables import results_by_label
 
 TITLE = "Reproduction of the paper's results"
 
 
-def reproduce(quick: bool, out: Path) -> int:
+def reproduce(quick: bool, out: Path, jobs: int) -> int:
     """Fly what has no result yet; write ``reproduction.md`` and ``.html`` into ``out``; return the
     exit status.
 
     Without the paper's solver its chain is left out, and the status is FAILED. Raise
-    ReproductionError, StudyError or ScenarioError when a flight is not possible.
+    ExperimentError or ScenarioError when a flight is not possible.
     """
-    return fly_plan(make_plan(quick, str(find_scenario(SCENARIO))), out.absolute())
+    return fly_and_report(make_plan(quick), out.absolute(), quick, jobs)
 
 
-def fly_plan(plan: ReproductionPlan, out: Path) -> int:
-    """Fly any plan; return the exit status."""
+def fly_and_report(plan: Plan, out: Path, quick: bool = False, jobs: int = 1) -> int:
+    """Fly any plan of the reproduction; return the exit status."""
     missing = missing_part()
-    flyable = plan if missing is None else _without_open(plan)
-    with errors_of_writing(out, ReproductionError):
+    flights = tuple(f for f in plan.flights if missing is None or not needs_open(f))
+    with errors_of_writing(out, ExperimentError):
         out.mkdir(parents=True, exist_ok=True)
         about = begun(out)
-        with stop_on_signals("stops after this flight") as stop:
-            fly(flyable, out, stop, _report)
-        parts = sections(plan, results_of(plan, out), about)
+        with stop_on_signals("stopping after the active flights") as stop:
+            flyable = Plan(plan.name, flights)
+            outcomes = fly_plan(flyable, out, Workers(jobs), Progress(), stop)
+        parts = sections(plan, results_by_label(plan, outcomes), about, quick)
         for name, text in (
             ("reproduction.md", markdown(TITLE, parts)),
             ("reproduction.html", html(TITLE, parts)),
@@ -52,10 +54,13 @@ def fly_plan(plan: ReproductionPlan, out: Path) -> int:
     if stop.is_set():
         _report("stopped; repeat the command to resume")
         return STOPPED
-    if flyable != plan:
+    for flight in flights:
+        if outcomes[flight.name].summary is None:
+            _report(f"chaserdock: {flight.label}: {outcomes[flight.name].last_words}")
+    if missing is not None and len(flights) < len(plan.flights):
         _report(f"chaserdock: the paper's chain was not flown: {missing}")
-        return FAILED
-    return DONE
+    complete = all(f.name in outcomes and outcomes[f.name].summary for f in plan.flights)
+    return DONE if complete else FAILED
 
 
 def begun(out: Path) -> Provenance:
@@ -66,15 +71,6 @@ def begun(out: Path) -> Provenance:
     if not path.exists():
         path.write_bytes(msgspec.json.encode(provenance()))
     return msgspec.json.decode(path.read_bytes(), type=Provenance)
-
-
-def _without_open(plan: ReproductionPlan) -> ReproductionPlan:
-    return ReproductionPlan(
-        plan.quick,
-        plan.duration_s,
-        tuple(c for c in plan.cases if not needs_open(c)),
-        tuple(m for m in plan.missions if not needs_open(m)),
-    )
 
 
 def _report(text: str) -> None:

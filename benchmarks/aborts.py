@@ -4,15 +4,14 @@
 
 The guidance of the controller chooses each abort (controller.md, passive safety); its burn and two
 orbits of coast are those of the nonlinear relative motion with J2. Counts those that enter the
-keep-out (chaserdock/evaluation/abort_study.py).
+keep-out (benchmarks/flights/abort_study.py).
 """
 
 from __future__ import annotations
 
 from common import make_parser, print_figures, write_json
-
-from chaserdock.evaluation.abort_study import study
-from chaserdock.evaluation.transfers import load_shipped
+from flights import load_shipped
+from flights.abort_study import study
 
 
 def main() -> None:

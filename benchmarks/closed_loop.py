@@ -29,18 +29,12 @@ from collections.abc import Callable, Iterable
 
 from chaserdock_protocol.scenario import Scenario
 from common import Figures, make_parser, run_parts
+from flights import load_shipped
+from flights.measured_poses import measurement_model
+from flights.transfers import CLUTTER, DENSE_CLUTTER, avoidance, clutter, fly_transfer, swap
 
 from chaserdock.evaluation.flight_record import FlightRecord, record_flight
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
-from chaserdock.evaluation.transfers import (
-    CLUTTER,
-    DENSE_CLUTTER,
-    avoidance,
-    clutter,
-    fly_transfer,
-    load_shipped,
-    swap,
-)
+from chaserdock.evaluation.perception import PerceptionModel, RenderedImages
 
 NOISE_M, NOISE_RAD = 0.002, math.radians(0.1)
 STEADY_FROM_S = 40.0

@@ -13,14 +13,14 @@ Prints the time until the stack stays below 0.05 degrees/s and 1 mm/s, the impul
 until then, and both over those of the linear programme: the shortest time, and the least impulse in
 that time, if the attitude were frozen. ``--silent``: nobody commands; each chaser damps the stack
 by its own odometry for at most 120 s, until 10 s after it stopped. The stack is then one rigid body
-(``chaserdock.evaluation.rigid_stack``), not the physics engine's.
+(``flights.rigid_stack``), not the physics engine's.
 
 ``--limits FORCE TORQUE``: load limits (N, N m) of every port, kept by the controller. The largest
 loads at a port are printed: from the physics engine's joints in every step, or with ``--rigid``
 from the equations of motion at the same rate of 960 Hz.
 
 ``--rigid CASE``: identification and plan in closed loop with one rigid body
-(``chaserdock.evaluation.rigid_control``). The stated mass and inertia are 30 % wrong, the stated
+(``flights.rigid_control``). The stated mass and inertia are 30 % wrong, the stated
 centre of mass 88 mm; thrusts (3 %) and pulses (2 %) have errors. CASE: ``plan`` (13.5 s; two
 chasers 14.4 s, one 50 s), ``known`` (the same, but mass, centre and inertia are stated as they
 are), ``identify`` (10 s of identifying pulses before it, 30 s in all), ``fast`` (feedback only),
@@ -37,7 +37,7 @@ which tumbles at 7 degrees/s about an axis drawn from the seed, with the same wr
 Prints the errors of the ratios of the inertia (its elements over its trace, as a share of the
 largest moment over the trace) and of the centre of mass, and the normalized squared errors of
 ratios (expected 5), centre (3) and relative poses (6). Sightings are drawn
-(``chaserdock.evaluation.free_tumble_flights``), or with ``--set 'perception.name="default"'`` those
+(``flights.free_tumble_flights``), or with ``--set 'perception.name="default"'`` those
 of images.
 
 ``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in
@@ -63,16 +63,14 @@ from common import (
     read_lines,
     write_json,
 )
-
-from chaserdock.evaluation.detumble_flights import (
+from flights.detumble_flights import (
     DetumbleOutcome,
     fly_stack,
     stack_scenario,
     with_load_limits,
 )
-from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, tumble_scenario, watch_tumble
-from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import (
+from flights.free_tumble_flights import TumbleOutcome, tumble_scenario, watch_tumble
+from flights.rigid_control import (
     FlightEvents,
     StackFlight,
     fly_controlled,
@@ -80,7 +78,9 @@ from chaserdock.evaluation.rigid_control import (
     right_knowledge,
     wrong_knowledge,
 )
-from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
+from flights.rigid_stack import SilentOutcome, fly_silent
+
+from chaserdock.evaluation.perception import RenderedImages
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
 PLAN_S = {2: 14.4}

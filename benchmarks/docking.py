@@ -37,8 +37,7 @@ from common import (
     read_lines,
     write_json,
 )
-
-from chaserdock.evaluation.docking_flights import (
+from flights.docking_flights import (
     APPROACH_AT_S,
     DockingOutcome,
     Failure,
@@ -46,7 +45,9 @@ from chaserdock.evaluation.docking_flights import (
     dock,
     docking_scenario,
 )
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
+from flights.measured_poses import measurement_model
+
+from chaserdock.evaluation.perception import PerceptionModel, RenderedImages
 
 PerceptionOf = Callable[[Scenario], PerceptionModel]
 KINDS = ("stuck_on", "stuck_off")

@@ -3,7 +3,7 @@
 [--quick] [--json FILE]``.
 
 Parts: ``free``, ``thrusters``, ``capture`` and ``stack`` (open loop, 30 s, ``--quick`` 5 s; the
-cases of ``chaserdock.evaluation.engine_comparison``) print the largest differences of any body and
+cases of ``flights.engine_comparison``) print the largest differences of any body and
 port, the change of momentum on each engine where no load acts, and the time per physics step.
 ``missions`` flies ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s) and
 ``four-chaser-capture`` (75 s) as ``chaserdock simulate`` does, on each engine with the perception
@@ -22,10 +22,10 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_protocol.shipped_scenarios import shipped_scenario
 from common import Figures, make_parser, print_figures, run_parts
+from flights.engine_comparison import CASES, ENGINES, difference, fly_case
 
 from chaserdock.analysis.flight import Track, load_flight
 from chaserdock.analysis.summary import summary_of
-from chaserdock.evaluation.engine_comparison import CASES, ENGINES, difference, fly_case
 from chaserdock.simulation.mission import simulate
 
 MISSIONS = {

@@ -33,11 +33,11 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
 from common import Figures, append_line, commit, make_parser, read_lines, run_parts, use_one_thread
+from flights import load_shipped
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.transfers import load_shipped
 
 SCENARIOS = {
     "docking": "markerless-docking",

@@ -16,10 +16,10 @@ from typing import ParamSpec, TypeVar
 
 from chaserdock_protocol.scenario import Scenario
 from common import Figures, make_parser, print_figures, write_json
+from flights import load_shipped
 
 from chaserdock.evaluation.in_process import InProcessMission
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.transfers import load_shipped
 
 P = ParamSpec("P")
 T = TypeVar("T")

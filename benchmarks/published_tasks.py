@@ -15,8 +15,7 @@ import argparse
 from collections.abc import Callable
 
 from common import Figures, make_parser, run_parts
-
-from chaserdock.evaluation.published_tasks import (
+from flights.published_tasks import (
     AfrlOutcome,
     ArchOutcome,
     afrl_docking,

@@ -17,11 +17,11 @@ import math
 import time
 
 from common import Figures, make_parser, print_figures, write_json
+from flights import load_shipped
+from flights.rendezvous import last_leg, leg, rendezvous
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rendezvous import last_leg, leg, rendezvous
-from chaserdock.evaluation.transfers import load_shipped
 
 
 def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:

@@ -28,8 +28,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.shape_distance import box_table, chaser_boxes, distance_from_cuboids, moved
 from chaserdock_models.targets import Box
 from common import Figures, make_parser, print_figures, write_json
-
-from chaserdock.evaluation.transfers import load_shipped
+from flights import load_shipped
 
 CUBOIDS = 8
 

@@ -27,12 +27,12 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import true_camera
 from common import Figures, make_parser, run_parts, use_one_thread
+from flights import load_shipped
 from markerless_missions import QUICK, SCENARIOS
 
 from chaserdock.analysis.pose_errors import pose_error
 from chaserdock.evaluation.in_process import InProcessMission
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.transfers import load_shipped
 
 LAGS_S = (0.0, 1.0, 5.0, 20.0)
 """Lags of the correlations; 0 stands for the next image."""

@@ -42,10 +42,10 @@ from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from common import Figures, make_parser, percentiles, run_parts
+from flights import load_shipped
 from numpy.typing import NDArray
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error
-from chaserdock.evaluation.transfers import load_shipped
 
 CAMERA_POSITION, CAMERA_ATTITUDE = np.zeros(3), rotations.IDENTITY  # IRF = WRF
 HFOV = np.deg2rad(60.0)

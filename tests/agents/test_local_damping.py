@@ -21,8 +21,7 @@ from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario
 from chaserdock_protocol.scenario.mounting import plume_free_thrusters
 from chaserdock_protocol.transport import ReceivedMessage
-
-from chaserdock.evaluation.transfers import load_shipped
+from flights import load_shipped
 
 
 def scenario_of(*changes: str) -> FlightScenario:

@@ -8,9 +8,8 @@ import math
 import numpy as np
 from chaserdock_protocol.messages import Sighting
 from chaserdock_world.rendering.cameras import States
-
-from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario
-from chaserdock.evaluation.rigid_stack import RigidStack, fly_silent
+from flights.detumble_flights import StackMission, stack_scenario
+from flights.rigid_stack import RigidStack, fly_silent
 
 
 def no_sight(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:

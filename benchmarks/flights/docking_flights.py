@@ -18,9 +18,10 @@ from chaserdock_protocol.messages import OperatorCommand, ProbeTouch
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET, Physics
 
-from .in_process import InProcessMission
-from .perception import PerceptionModel
-from .transfers import load_shipped
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import PerceptionModel
+
+from . import load_shipped
 
 APPROACH_AT_S = 4.0
 LIMIT_S = 96.0

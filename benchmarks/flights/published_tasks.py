@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from chaserdock.analysis.summary import summarize
 from chaserdock.simulation.mission import simulate
 
-from .transfers import load_shipped
+from . import load_shipped
 
 # -- ARCH-COMP: metres and minutes, in the orbit's plane -------------------------------------------
 

@@ -23,7 +23,7 @@ from chaserdock_world.physics.port_loads import IntervalLoads
 from chaserdock_world.physics.simulation import TARGET, Physics
 from chaserdock_world.rendering.cameras import States
 
-from .transfers import load_shipped
+from . import load_shipped
 
 ENGINES = ("pybullet", "mujoco")
 _TUMBLE = "target.omega_rad_s=[0.045, 0.135, 0.09]"

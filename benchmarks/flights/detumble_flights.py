@@ -15,11 +15,7 @@ from chaserdock_agents.chaser.local_damping import LocalDamping
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.allocation import MinimumTime, minimum_time
-from chaserdock_controller.guidance.detumble.stack import (
-    StackMotion,
-    stack_motion,
-    thruster_wrenches,
-)
+from chaserdock_controller.guidance.detumble.stack import StackMotion, thruster_wrenches
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import stay
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
@@ -36,10 +32,11 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
-from .in_process import InProcessMission, TickRecord
-from .latched_stack import attach_plants, body_of_plant, with_port_error
-from .perception import PerceptionModel
-from .transfers import load_shipped
+from chaserdock.evaluation.in_process import InProcessMission, TickRecord
+from chaserdock.evaluation.perception import PerceptionModel
+
+from . import load_shipped
+from .latched_stack import attach_plants, body_of_plant, stack_motion, with_port_error
 
 COMMAND_AT_S = 5.0
 """Until then the estimator settles."""

@@ -8,7 +8,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
+from chaserdock_controller.guidance.detumble.stack import StackMotion
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.plant import Plant
@@ -40,3 +42,15 @@ def attach_plants(
         axes = q if plant.frame is None else rotations.multiply(q, plant.frame.q_wxyz)
         parts.append((plant.mass_kg, np.array(plant.moments_kg_m2), centre, axes))
     return attach_bodies(target, parts)
+
+
+def stack_motion(
+    body: TargetBody, velocity_m_s: Array, q_wxyz: Array, omega_rad_s: Array
+) -> StackMotion:
+    """Return the momentum of a stack with velocity (3,) of TRF's origin in WRF, attitude (4,) and
+    rate (3,) in TRF.
+    """
+    own = rotations.rotate_inverse(q_wxyz, velocity_m_s) + rotations.cross(
+        omega_rad_s, body.centre_trf_m
+    )
+    return StackMotion(body.mass_kg * own, body.inertia_kg_m2 @ omega_rad_s)

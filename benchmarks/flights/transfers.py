@@ -13,15 +13,17 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
-from chaserdock_models.shape_distance import box_table, distance_between, moved, separations
-from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.shipped_scenarios import shipped_scenario
-from chaserdock_world.physics.simulation import TARGET, BodyState
+from chaserdock_models.shape_distance import box_table, distance_between
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 from numpy.typing import ArrayLike
 
-from .in_process import InProcessMission
-from .perception import PerceptionModel
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import PerceptionModel
+
+from . import load_shipped
+from .shape_gaps import shape_gap_m
 
 SYMMETRIC_EVERY = 4
 SMALL = {"width_px": 640, "height_px": 360}
@@ -29,11 +31,6 @@ CLUTTER_S = 100.0
 CLUTTER_TIMING = ("time.rate_hz=10", "time.image_hz=10", "time.physics_hz=120")
 _DIAGONAL = 9.0
 """m: stands for a chaser's distance to itself, larger than any between two."""
-
-
-def load_shipped(name: str, *overrides: str) -> Scenario:
-    """Load a shipped scenario by name. Raises ScenarioNotFound or ScenarioError."""
-    return load_scenario(shipped_scenario(name), overrides)
 
 
 def avoidance(seed: int, full_images: bool = False) -> Scenario:
@@ -256,28 +253,6 @@ def _note_distances(out: TransferOutcome, scenario: Scenario, states: States) ->
     between = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + _DIAGONAL * np.eye(n)
     out.to_target_m = min(out.to_target_m, float(to_target.min()))
     out.between_m = min(out.between_m, float(between.min()))
-
-
-def shape_gap_m(scenario: Scenario, states: States) -> float:
-    """Return the least gap between the shapes of two bodies, negative exactly if two overlap, at
-    most their distance, m.
-    """
-    shape, names = (
-        box_table(scenario.chaser.boxes()),
-        [f"chaser/{i}" for i in range(len(scenario.chasers))],
-    )
-    tables = [_placed(box_table(scenario.target_model().boxes), states[TARGET])]
-    tables += [_placed(shape, states[name]) for name in names]
-    cuboids, owner = (
-        np.concatenate(tables),
-        np.repeat(np.arange(len(tables)), [len(t) for t in tables]),
-    )
-    one, other = np.nonzero(owner[:, None] < owner)
-    return float(separations(cuboids[one], cuboids[other]).min())
-
-
-def _placed(table: Array, body: BodyState) -> Array:
-    return moved(table, body.position_m[None], body.q_wxyz[None])[0]
 
 
 def _goal_distance_m(chaser: int, offset_m: tuple[float, float, float], states: States) -> float:

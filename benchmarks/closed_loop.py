@@ -2,7 +2,7 @@
 """Controller performance in closed loop: ``python benchmarks/closed_loop.py [--only PART ...]
 [--quick] [--json FILE]``.
 
-Complete missions in one process (``chaserdock.evaluation.in_process``). Parts:
+Complete missions in one process (``chaserdock.experiments.in_process``). Parts:
 
 - ``avoidance``: 20 seeded variations of ``collision-avoidance`` with images of 640 x 360
   (``--full-images``: the scenario's own, with four times as many pixels), every fourth exactly
@@ -33,8 +33,8 @@ from flights import load_shipped
 from flights.measured_poses import measurement_model
 from flights.transfers import CLUTTER, DENSE_CLUTTER, avoidance, clutter, fly_transfer, swap
 
-from chaserdock.evaluation.flight_record import FlightRecord, record_flight
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages
+from chaserdock.experiments.flight_record import FlightRecord, record_flight
+from chaserdock.experiments.perception import PerceptionModel, RenderedImages
 
 NOISE_M, NOISE_RAD = 0.002, math.radians(0.1)
 STEADY_FROM_S = 40.0

@@ -80,7 +80,7 @@ from flights.rigid_control import (
 )
 from flights.rigid_stack import SilentOutcome, fly_silent
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
 PLAN_S = {2: 14.4}

@@ -36,8 +36,8 @@ from common import (
     run_parts,
 )
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 
 SCENARIOS = {
     "four-chaser-docking": 100,

@@ -38,8 +38,8 @@ from chaserdock_world.sensors.errors import true_camera
 from common import Figures, append_line, make_parser, read_lines, run_parts
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages, States
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages, States
 
 Row = dict[str, Any]
 SIDES = (((-1.0, 0.0, 0.0), 0.0), ((0.0, -1.0, 0.0), 90.0), ((1.0, 0.0, 0.0), 180.0))

@@ -2,7 +2,7 @@
 """Missions with perception by shape: ``python benchmarks/markerless_missions.py [--only PART]
 [--flights N] [--first SEED] [--set KEY=VALUE] [--results FILE] [--quick] [--json FILE]``.
 
-Complete missions in one process (``chaserdock.evaluation.in_process``), with rendered images. The
+Complete missions in one process (``chaserdock.experiments.in_process``), with rendered images. The
 seed draws the errors of the target's geometry, of sensors and of images.
 
 - ``docking``: ``markerless-docking`` to its end;
@@ -36,8 +36,8 @@ from common import Figures, append_line, commit, make_parser, read_lines, run_pa
 from flights import load_shipped
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 SCENARIOS = {
     "docking": "markerless-docking",

@@ -20,8 +20,8 @@ from common import Figures, make_parser, print_figures, write_json
 from flights import load_shipped
 from flights.rendezvous import last_leg, leg, rendezvous
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 
 def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:

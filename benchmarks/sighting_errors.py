@@ -31,8 +31,8 @@ from flights import load_shipped
 from markerless_missions import QUICK, SCENARIOS
 
 from chaserdock.analysis.pose_errors import pose_error
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 
 LAGS_S = (0.0, 1.0, 5.0, 20.0)
 """Lags of the correlations; 0 stands for the next image."""

@@ -32,8 +32,8 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
 from .latched_stack import attach_plants, body_of_plant, stack_motion, with_port_error

@@ -17,8 +17,8 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import PerceptionModel
 
 HOLD_S = 20.0
 """Time before the next command over which tracking at a hold point is measured."""

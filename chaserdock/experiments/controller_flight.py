@@ -19,11 +19,11 @@ from chaserdock_models.rotations import rotate
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import Scenario, load_scenario
 
-from chaserdock.evaluation.flight_record import FlightRecord, record_flight
-from chaserdock.evaluation.least_transient import gauss_times, least_square_integral
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock.exit_codes import BAD_INPUT, DONE
 
+from .flight_record import FlightRecord, record_flight
+from .least_transient import gauss_times, least_square_integral
+from .perfect_knowledge import PerfectEstimator
 from .plan import Alone, Flight
 
 _FLOOR_S = 15.0

@@ -16,10 +16,10 @@ from chaserdock_world.physics.simulation import prescribed_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.least_transient import gauss_times, least_square_integral
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock.experiments.controller_flight import fly_alone
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.least_transient import gauss_times, least_square_integral
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 from chaserdock.experiments.plan import Alone
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"

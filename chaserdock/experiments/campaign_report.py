@@ -33,7 +33,7 @@ def sections(plan: Plan, rows: list[Row], folder: Path) -> list[PageSection]:
     passed, ended = sum(bool(r["success"]) for r in rows), len(rows)
     low, high = wilson(passed, ended)
     missing = len(plan.flights) - ended
-    scenarios = ", ".join(sorted({str(flight.scenario) for flight in plan.flights}))
+    scenarios = ", ".join(sorted({flight.scenario for flight in plan.flights}))
     flown = f"Scenario `{scenarios}`, {ended} of {len(plan.flights)} runs flown"
     resume = f"; {missing} are missing; repeat the command to resume" if missing else ""
     rate = Markup(

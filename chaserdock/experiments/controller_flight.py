@@ -36,7 +36,7 @@ def main() -> int:
     """Fly the flight on standard input; return the exit status."""
     try:
         flight = msgspec.json.decode(sys.stdin.read(), type=Flight)
-        summary = fly_alone(load_scenario(flight.scenario, flight.overrides), flight.alone)
+        summary = fly_alone(load_scenario(Path(flight.scenario), flight.overrides), flight.alone)
     except ChaserdockError as error:
         print(f"chaserdock: {error}", file=sys.stderr)
         return BAD_INPUT

@@ -35,12 +35,12 @@ class Flight(Struct, frozen=True, kw_only=True):
     """One flight: all processes of a mission, recorded and judged, or the controller ``alone``.
 
     ``name``: a digest of all that is flown. ``label``: what the experiment calls the flight.
-    ``varied``: the values in which flights of the plan differ.
+    ``scenario``: path of its file. ``varied``: the values in which flights of the plan differ.
     """
 
     name: str
     label: str
-    scenario: Path
+    scenario: str
     overrides: tuple[str, ...]
     seed: int
     varied: dict[str, Any] = {}
@@ -73,7 +73,7 @@ def plan_flight(
     return Flight(
         name=hashlib.sha256(flown.encode()).hexdigest()[:12],
         label=label,
-        scenario=scenario,
+        scenario=str(scenario),
         overrides=overrides,
         seed=resolved.seed,
         varied=varied or {},

@@ -155,7 +155,7 @@ def _program(flight: Flight, out: Path) -> list[str]:
     if flight.alone is not None:
         return ["chaserdock.experiments.controller_flight", str(out)]
     sets = [item for override in flight.overrides for item in ("--set", override)]
-    return ["chaserdock", "run", str(flight.scenario), "--out", str(out), "--quiet", *sets]
+    return ["chaserdock", "run", flight.scenario, "--out", str(out), "--quiet", *sets]
 
 
 def _move_log(log: Path, folder: Path) -> str:

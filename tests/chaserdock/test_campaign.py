@@ -101,7 +101,7 @@ def test_grid_contains_every_combination_with_every_seed(tmp_path: Path) -> None
     )
     assert len({r.name for r in campaign.flights}) == 8
     for run in campaign.flights:
-        scenario = load_scenario(run.scenario, run.overrides)
+        scenario = load_scenario(Path(run.scenario), run.overrides)
         assert scenario.seed == run.seed
         assert scenario.duration_s == 8.0
         assert scenario.controller.solver == run.varied["controller.solver"]

@@ -66,7 +66,7 @@ plan = cache(make_plan)
 
 
 def scenario_of(flight: Flight) -> Scenario:
-    return load_scenario(flight.scenario, flight.overrides)
+    return load_scenario(Path(flight.scenario), flight.overrides)
 
 
 def table_flights(p: Plan) -> list[Flight]:

@@ -5,6 +5,8 @@ counts as stopped.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
 
 from .fields import NotNegative, Positive, Section, UnitQuaternion
@@ -46,10 +48,9 @@ class Detumble(RestLimits):
     ([detumble.md](detumble.md)).
     """
 
-    response_s: Positive = Field(
-        default=0.5,
-        description="Time in which the feedback would stop the stack with unlimited thrust, s.",
-    )
+    response_s: ClassVar[float] = 0.5
+    """Time in which the feedback would stop the stack with unlimited thrust, s: some ticks of the
+    default rate. Thrusters are far from unlimited, so that it only matters near rest."""
     timeout_s: Positive = Field(
         default=60.0,
         description="Longest time to stop the stack, s. A command that needs longer is refused; after it the thrusters close.",

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -72,20 +72,10 @@ class Modulation(Section):
         default=True,
         description="Add impulse that a period could not give, as below the minimum on-time, to the next one.",
     )
-    schmitt_on: float = Field(
-        default=0.75,
-        gt=0,
-        le=1,
-        allow_inf_nan=False,
-        description="Share of full thrust at which `schmitt` opens.",
-    )
-    schmitt_off: float = Field(
-        default=0.25,
-        ge=0,
-        lt=1,
-        allow_inf_nan=False,
-        description="Share of full thrust below which `schmitt` closes. Less than `schmitt_on`.",
-    )
+    schmitt_on: ClassVar[float] = 0.75
+    schmitt_off: ClassVar[float] = 0.25
+    """Shares of full thrust at which `schmitt` opens, and below which it closes: symmetric about
+    one half, so that it has no bias, and half a thrust apart, which bounds its switching."""
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Modulation:
@@ -95,8 +85,6 @@ class Modulation(Section):
             raise ValueError(
                 f"resolution_s ({self.resolution_s}) must be at most half a carrier period"
             )
-        if self.schmitt_off >= self.schmitt_on:
-            raise ValueError("schmitt_off must be less than schmitt_on")
         return self
 
 

@@ -27,8 +27,8 @@ def replay(
         str,
         typer.Option(
             metavar="STAGE",
-            help="part of the software: perception, fusion, controller, or one that a package provides "
-            "(entry points of `chaserdock.replays`)",
+            help="part of the software: perception, fusion, controller, or one that a package "
+            "provides (entry points of `chaserdock.replays`)",
         ),
     ],
     overrides: SetOpt = None,

@@ -195,7 +195,8 @@ def _table(title: str, f: dict[str, float]) -> list[str]:
     add = "add_s" if "add_s_right_share" in f else "add"
     lines = [title, f"images {count}, with a pose {found} ({found / count:.1%})"]
     lines += [
-        f"SPEED score {year}: {f[f'speed_score_{year}']:.5f} over all images, {f[f'speed_score_{year}_with_pose']:.5f} over poses"
+        f"SPEED score {year}: {f[f'speed_score_{year}']:.5f} over all images, "
+        f"{f[f'speed_score_{year}_with_pose']:.5f} over poses"
         for year in ("2019", "2021")
     ]
     lines.append(f"{'':24}{'mean':>12}{'p50':>12}{'p95':>12}")
@@ -213,9 +214,11 @@ def _table(title: str, f: dict[str, float]) -> list[str]:
             )
     if f"{add}_right_share" in f:
         lines.append(
-            f"{add.upper().replace('_', '-')} below 10 % of {f['diameter_m']:.3f} m: {f[f'{add}_right_share']:.1%} of all images"
+            f"{add.upper().replace('_', '-')} below 10 % of {f['diameter_m']:.3f} m: "
+            f"{f[f'{add}_right_share']:.1%} of all images"
         )
     lines.append(
-        f"CPU time per image: {1e3 * f['cpu_s_mean']:.1f} ms mean, {1e3 * f['cpu_s_max']:.1f} ms max"
+        f"CPU time per image: {1e3 * f['cpu_s_mean']:.1f} ms mean, {1e3 * f['cpu_s_max']:.1f} ms "
+        "max"
     )
     return lines

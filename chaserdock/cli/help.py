@@ -26,7 +26,8 @@ class FiniteCommand(TyperCommand):
             value = ctx.params.get(param.name)
             values = cast("Sequence[Any]", value if isinstance(value, list | tuple) else [value])
             if any(isinstance(v, float) and not math.isfinite(v) for v in values):
-                raise typer.BadParameter("must be a finite number", ctx=ctx, param=param)  # type: ignore[arg-type]
+                text = "must be a finite number"
+                raise typer.BadParameter(text, ctx=ctx, param=param)  # type: ignore[arg-type]
         return super().invoke(ctx)
 
 

@@ -100,15 +100,19 @@ def main() -> None:
 
 _PLAIN_TEXTS = {
     "Value error, ": "",
-    "Input should be a valid integer, unable to parse string as an integer": "must be a whole number",
-    "Input should be a valid integer, got a number with a fractional part": "must be a whole number",
+    "Input should be a valid integer, unable to parse string as an integer": "must be a whole "
+    "number",
+    "Input should be a valid integer, got a number with a fractional part": "must be a whole "
+    "number",
     "Input should be a valid number, unable to parse string as a number": "must be a number",
     "Input should be": "must be",
 }
 
 
 def _report_usage_error(error: Any) -> int:
-    """Print typer's error as one line, or the help where that is the error; return the exit status."""
+    """Print typer's error as one line, or the help where that is the error; return the exit
+    status.
+    """
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
         return error.exit_code

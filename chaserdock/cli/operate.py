@@ -155,7 +155,8 @@ def view(
         list[Path] | None,
         typer.Argument(
             metavar="[LOG]",
-            help="folder of a run, its mission.mcap, or the files of a rotated log; the running mission by default",
+            help="folder of a run, its mission.mcap, or the files of a rotated log; the running "
+            "mission by default",
         ),
     ] = None,
     host: Annotated[
@@ -177,7 +178,9 @@ def view(
     link: LinkOptions,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """Show a running mission, or a log, in a web browser: scene, images, plots, phases, commands."""
+    """Show a running mission, or a log, in a web browser: scene, images, plots, phases,
+    commands.
+    """
     from chaserdock.viewer.live import ViewOptions, view_live
 
     options = ViewOptions(host, port, dark, truth)

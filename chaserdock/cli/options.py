@@ -47,7 +47,9 @@ class NetMode(StrEnum):
 
 
 def complete_scenario(incomplete: str) -> list[str]:
-    """Return shipped scenarios and TOML files that begin with ``incomplete``, for shell completion."""
+    """Return shipped scenarios and TOML files that begin with ``incomplete``, for shell
+    completion.
+    """
     folder, _, stem = incomplete.rpartition("/")
     files = [
         f"{folder}/{path.name}" if folder else path.name
@@ -73,7 +75,8 @@ SeedOpt = Annotated[
 ModeOpt = Annotated[
     ModeOption,
     typer.Option(
-        help="lockstep: simulated time waits for every process (reproducible); realtime: it follows the wall clock"
+        help="lockstep: simulated time waits for every process (reproducible); realtime: it "
+        "follows the wall clock"
     ),
 ]
 KeysOpt = Annotated[
@@ -98,7 +101,8 @@ StallOpt = Annotated[
     typer.Option(
         "--stall-s",
         min=1.0,
-        help="seconds without progress after which a lock-step mission ends, or without the world after which a process ends",
+        help="seconds without progress after which a lock-step mission ends, or without the "
+        "world after which a process ends",
     ),
 ]
 ReplyTimeoutOpt = Annotated[
@@ -182,7 +186,9 @@ _OTHER_ENDPOINT = re.compile(r"(?:unixsock-stream|unixpipe|serial|vsock)/\S+")
 
 
 def check_endpoints(option: str, endpoints: Iterable[str], tls: bool = False) -> None:
-    """Exit with status 2 for a malformed endpoint and, with ``tls``, for one that is not encrypted."""
+    """Exit with status 2 for a malformed endpoint and, with ``tls``, for one that is not
+    encrypted.
+    """
     for endpoint in endpoints:
         found = _ADDRESS_PORT.fullmatch(endpoint)
         if not (_OTHER_ENDPOINT.fullmatch(endpoint) or (found and int(found[1]) <= 65_535)):
@@ -352,7 +358,8 @@ def with_link_options(
         def wrapper(**values: Any) -> None:
             command(link=LinkOptions(**{p.name: values.pop(p.name) for p in options}), **values)
 
-        wrapper.__signature__ = Signature([*own[:place], *options, *own[place + 1 :]])  # type: ignore[attr-defined]
+        shown = Signature([*own[:place], *options, *own[place + 1 :]])
+        wrapper.__signature__ = shown  # type: ignore[attr-defined]
         return wrapper
 
     return decorate

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from chaserdock_protocol.scenario import Scenario
 
 _NEW = """\
-# A scenario: what flies, and when a mission is a success. Every key: docs/scenario.md, or for editors
-# `chaserdock scenario --schema`. Check it with
+# A scenario: what flies, and when a mission is a success. Every key: docs/scenario.md, or for
+# editors `chaserdock scenario --schema`. Check it with
 #   chaserdock scenario {file}
 # and run it with
 #   chaserdock run {file}
@@ -30,7 +30,8 @@ duration_s = 40.0
 # The steady interval, which the errors under [success] refer to, begins here.
 settling_s = 20.0
 
-# Initial motion of the target, in m/s and rad/s. `model` is `paper`, `servicer`, or the path of a target file.
+# Initial motion of the target, in m/s and rad/s. `model` is `paper`, `servicer`, or the path of a
+# target file.
 [target]
 model = "paper"
 velocity_m_s = [0.015, 0.0075, 0.03]
@@ -44,7 +45,8 @@ grade = "exact"
 width_px = 960
 height_px = 540
 
-# One table per chaser: its place relative to the target, and where it starts relative to that place.
+# One table per chaser: its place relative to the target, and where it starts relative to that
+# place.
 [[chasers]]
 position_m = [-1.0, 0.0, 0.0]
 look_at = "target"

@@ -113,7 +113,8 @@ def simulate(
     counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common()) or "none flown"
     mean, flights = consistency(results)
     print(
-        f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 over {flights} flights"
+        f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 "
+        f"over {flights} flights"
     )
     if reason := inconsistency(results):
         print(f"chaserdock: {reason}", file=sys.stderr)

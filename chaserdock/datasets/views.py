@@ -53,11 +53,13 @@ class ViewLimits:
     def __post_init__(self) -> None:
         if not 0.0 < self.range_m[0] <= self.range_m[1]:
             raise DatasetError(
-                f"range: must be positive and in ascending order, not {self.range_m[0]:g} to {self.range_m[1]:g}"
+                f"range: must be positive and in ascending order, not {self.range_m[0]:g} to "
+                f"{self.range_m[1]:g}"
             )
         if not 0.0 <= self.phase_deg[0] <= self.phase_deg[1] <= 180.0:
             raise DatasetError(
-                f"phase: must be 0 to 180 degrees in ascending order, not {self.phase_deg[0]:g} to {self.phase_deg[1]:g}"
+                f"phase: must be 0 to 180 degrees in ascending order, not {self.phase_deg[0]:g} "
+                f"to {self.phase_deg[1]:g}"
             )
         if not 0.0 <= self.offset_share <= 1.0:
             raise DatasetError(f"offset: must be 0 to 1, not {self.offset_share:g}")
@@ -131,7 +133,8 @@ class ViewRenderer:
         self.camera = scenario.camera_model()
         if true_camera(scenario, 0) != self.camera:
             raise DatasetError(
-                "truth.camera and navigation: labels hold for a camera without errors; remove the errors of the camera"
+                "truth.camera and navigation: labels hold for a camera without errors; remove "
+                "the errors of the camera"
             )
         self._scenario, self._limits = scenario, limits
         self._cameras = Cameras(scenario)

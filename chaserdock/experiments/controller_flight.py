@@ -27,8 +27,8 @@ from .perfect_knowledge import PerfectEstimator
 from .plan import Alone, Flight
 
 _FLOOR_S = 15.0
-"""The lower bound covers this time, s, and is zero after it: twice what 2 N need to bring 30 kg over
-the paper's 0.85 m to rest, 2 sqrt(0.85 m / (2 N / 30 kg)) = 7.1 s.
+"""The lower bound covers this time, s, and is zero after it: twice what 2 N need to bring 30 kg
+over the paper's 0.85 m to rest, 2 sqrt(0.85 m / (2 N / 30 kg)) = 7.1 s.
 """
 
 

@@ -231,7 +231,9 @@ class InProcessMission:
     def _act(
         self, outputs: TickOutputs | None, odometry: Mapping[int, Odometry], time_ns: int
     ) -> tuple[dict[int, ActuatorCommand], dict[int, ActuatorOutput]]:
-        """Deliver the commands when a lock-step mission does, and move the bodies to the next tick."""
+        """Deliver the commands when a lock-step mission does, and move the bodies to the next
+        tick.
+        """
         timing = self.scenario.timing
         begin, end = timing.step_of_tick(self.tick), timing.step_of_tick(self.tick + 1)
         if self._solve_delay_s is None:

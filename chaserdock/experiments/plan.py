@@ -64,7 +64,9 @@ def plan_flight(
     alone: Alone | None = None,
     salt: str = "",
 ) -> Flight:
-    """Return a flight, named by the resolved scenario, ``alone`` and ``salt``. Raise ScenarioError."""
+    """Return a flight, named by the resolved scenario, ``alone`` and ``salt``. Raise
+    ScenarioError.
+    """
     resolved = load_scenario(scenario, overrides)
     flown = salt + resolved.model_dump_json()
     if alone is not None:

@@ -79,7 +79,9 @@ def _number(value: Any) -> float:
 
 
 def cause_of(failure: str) -> str:
-    """Replace the numbers in a failure by ``#``, so that failures of one kind count as one cause."""
+    """Replace the numbers in a failure by ``#``, so that failures of one kind count as one
+    cause.
+    """
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", failure)
 
 

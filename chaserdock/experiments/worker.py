@@ -80,7 +80,9 @@ def fly_plan(
 
 
 def results_of(plan: Plan, folder: Path) -> dict[str, Outcome]:
-    """Return the results of a plan so far, by flight name. Raise ExperimentError for a damaged one."""
+    """Return the results of a plan so far, by flight name. Raise ExperimentError for a damaged
+    one.
+    """
     found = ((f.name, read_result(folder, f.name)) for f in plan.flights)
     return {name: outcome for name, outcome in found if outcome is not None}
 

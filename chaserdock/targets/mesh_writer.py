@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write meshes as files through trimesh, for ``chaserdock_protocol.scenario.mesh_files`` to read."""
+"""Write meshes as files through trimesh, for ``chaserdock_protocol.scenario.mesh_files`` to
+read.
+"""
 
 from __future__ import annotations
 
@@ -57,5 +59,9 @@ def _phong(m: Material) -> Any:
 
     grey, gloss = [round(255 * m.diffuse)] * 3, [round(255 * m.specular)] * 3
     return SimpleMaterial(
-        name=m.name.replace(" ", "_"), diffuse=[*grey, 255], ambient=[*grey, 255], specular=[*gloss, 255], glossiness=m.shininess
-    )  # fmt: skip
+        name=m.name.replace(" ", "_"),
+        diffuse=[*grey, 255],
+        ambient=[*grey, 255],
+        specular=[*gloss, 255],
+        glossiness=m.shininess,
+    )

@@ -249,7 +249,9 @@ class FaultLayer:
 def create_fault_layer(
     faults: ProcessFaults, name: str, timing: Timing, lockstep: bool, host: Host
 ) -> FaultLayer | None:
-    """Return the fault layer of process ``name``, which runs on ``host``, or None without faults."""
+    """Return the fault layer of process ``name``, which runs on ``host``, or None without
+    faults.
+    """
     return (
         FaultLayer(faults.faults, name, timing, faults.seed, lockstep, host)
         if faults.faults

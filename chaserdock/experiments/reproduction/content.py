@@ -82,17 +82,22 @@ def _result(plan: Plan, results: Results, about: Provenance, quick: bool) -> Pag
     missing = [f.label for f in plan.flights if f.label not in results]
     command = "chaserdock reproduce --quick" if quick else "chaserdock reproduce"
     parts: list[str | Table] = [
-        "The paper is Fourlas, Viswanathan, Satpute and Nikolakopoulos, Vision Based Docking of Multiple Satellites with an "
-        f"Uncooperative Target (IFAC 2023). This page is the output of `{command}`; flown on {about}.",
-        f'Three chains fly the nine rows of its table, with images. "{WRITTEN}": the paper\'s perception (EPnP), its moving '
-        f'average of all estimates and its solver OpEn, in its settings. "{CODE}": the same with OpenCV\'s iterative PnP, '
-        f'which the authors\' public code calls in place of EPnP. "{DEFAULT}": the default settings of chaserdock.',
+        "The paper is Fourlas, Viswanathan, Satpute and Nikolakopoulos, Vision Based Docking of "
+        "Multiple Satellites with an "
+        f"Uncooperative Target (IFAC 2023). This page is the output of `{command}`; flown on "
+        f"{about}.",
+        f'Three chains fly the nine rows of its table, with images. "{WRITTEN}": the paper\'s '
+        "perception (EPnP), its moving average of all estimates and its solver OpEn, in its "
+        f"settings. \"{CODE}\": the same with OpenCV's iterative PnP, which the authors' public "
+        f'code calls in place of EPnP. "{DEFAULT}": the default settings of chaserdock.',
         Table(
             ("chain", "position rows met", "orientation rows met", "failed flights"), tuple(rows)
         ),
-        f"A row is met if the median ratio of our error to the paper's is between {BAND[0]:.2f} and {BAND[1]:.2f}: a smaller "
-        "error is as much a difference as a larger one. OpenCV's EPnP has gross errors for coplanar points, as on the single "
-        "face of the target that a chaser sees most of the time (tests/agents/test_perception.py).",
+        f"A row is met if the median ratio of our error to the paper's is between {BAND[0]:.2f} "
+        f"and {BAND[1]:.2f}: a smaller "
+        "error is as much a difference as a larger one. OpenCV's EPnP has gross errors for "
+        "coplanar points, as on the single face of the target that a chaser sees most of the "
+        "time (tests/agents/test_perception.py).",
     ]
     if missing:
         parts.insert(
@@ -130,7 +135,8 @@ def _table(results: Results, quantity: Quantity) -> PageSection:
             )
         rows.append((row.label, f"{paper_value(row, quantity) * factor:.3g}", *cells))
     text = (
-        f"Mean square error over two minutes. Ratio to the paper's: median (least to greatest) over the {len(DRAWS)} starts, "
+        "Mean square error over two minutes. Ratio to the paper's: median (least to greatest) "
+        f"over the {len(DRAWS)} starts, "
         "and the verdict on the median."
     )
     header = ("row", f"paper, {unit}", *COLUMNS)
@@ -155,9 +161,10 @@ def _trends(results: Results) -> PageSection:
         ("two chasers: error at 100 s", "a spike", *spike, NONE, _spike_explanation(written)),
     ]
     text = (
-        "Change of the MSE from the baseline row of the same start, position; orientation (median). yes: it has the paper's "
-        "direction from every start and half to twice its size. Controller alone: OpEn on perfect knowledge of the target, "
-        "from the nominal start. Spike: attitude error of the target estimate after 20 s."
+        "Change of the MSE from the baseline row of the same start, position; orientation "
+        "(median). yes: it has the paper's direction from every start and half to twice its "
+        "size. Controller alone: OpEn on perfect knowledge of the target, from the nominal "
+        "start. Spike: attitude error of the target estimate after 20 s."
     )
     header = ("trend", "paper", CODE, DEFAULT, "controller alone", "explanation")
     return PageSection("Trends", (text, Table(header, tuple(rows), text=True)))
@@ -175,7 +182,9 @@ def _spike_text(summary: dict[str, Any] | None) -> str:
 
 
 def pitch_rad(time_s: float) -> float:
-    """Return the pitch (Z-Y-X Euler angles in WRF) of the paper's target, which begins unrotated."""
+    """Return the pitch (Z-Y-X Euler angles in WRF) of the paper's target, which begins
+    unrotated.
+    """
     attitude = rotations.exp(np.multiply(Target().omega_rad_s, time_s))
     return -math.asin(float(rotations.to_matrix(attitude)[2, 0]))
 
@@ -188,9 +197,11 @@ def _spike_explanation(written: str) -> str:
     pitch = np.abs([pitch_rad(t) for t in times])
     k = int(np.argmax(pitch))
     return (
-        "The paper blames an Euler angle singularity of PnP. From an unrotated start the target's pitch is "
-        f"{math.degrees(pitch[times == 100.0][0]):.0f} deg at 100 s and at most {math.degrees(pitch[k]):.0f} deg, so there is "
-        f"none; and no chain here uses Euler angles. With EPnP: {written}."
+        "The paper blames an Euler angle singularity of PnP. From an unrotated start the "
+        "target's pitch is "
+        f"{math.degrees(pitch[times == 100.0][0]):.0f} deg at 100 s and at most "
+        f"{math.degrees(pitch[k]):.0f} deg, so there is none; and no chain here uses Euler "
+        f"angles. With EPnP: {written}."
     )
 
 
@@ -211,9 +222,12 @@ def _missions(plan: Plan, results: Results) -> PageSection:
         "docked or arrived",
     )
     text = (
-        "The paper shows plots without numbers and claims: two chasers hold their poses on shared sightings; chasers 0 and 3 "
-        f"of four dock after a command at 60 s; chaser 0 passes the target no closer than {MIN_DISTANCE_M:g} m on the "
-        f'sightings of chaser 1. RMS of the worst chaser. "{DEFAULT}" flies the shipped scenarios: navigation grade lab, '
+        "The paper shows plots without numbers and claims: two chasers hold their poses on "
+        "shared sightings; chasers 0 and 3 "
+        "of four dock after a command at 60 s; chaser 0 passes the target no closer than "
+        f"{MIN_DISTANCE_M:g} m on the "
+        f'sightings of chaser 1. RMS of the worst chaser. "{DEFAULT}" flies the shipped '
+        "scenarios: navigation grade lab, "
         "15 Hz, latency; the paper's chains fly its settings, with exact navigation."
     )
     return PageSection("Missions", (text, Table(header, tuple(rows))))
@@ -261,12 +275,14 @@ def _start(results: Results) -> PageSection:
     names = [f"alone/{BASELINE.name}", *map(floor_name, DRAWS)]
     floors = [(name, results[name]["floor_m2_s"] / PAPER_S) for name in names if name in results]
     parts: list[str | Table] = [
-        "The paper does not state the start. The nominal one is inferred from its baseline row: 0.85 m straight back in front of "
-        "the target, at rest in the world frame, turned by 0.575 rad. Distance, angle and axis are fitted to both errors of that "
-        "row, which is therefore no evidence; the other rows are not fitted. Each row is flown from "
-        f"{len(DRAWS)} starts, seeded and equal in all rows, uniform about the nominal one: each component of the offset within "
-        f"{OFFSET_BOUND_M:g} m, of the rotation vector within {ROTATION_BOUND_RAD:g} rad, of the target's initial rotation "
-        f"within {ATTITUDE_BOUND_RAD:g} rad, of its velocities within {100 * RATE_BOUND:.0f} %.",
+        "The paper does not state the start. The nominal one is inferred from its baseline row: "
+        "0.85 m straight back in front of the target, at rest in the world frame, turned by "
+        "0.575 rad. Distance, angle and axis are fitted to both errors of that row, which is "
+        "therefore no evidence; the other rows are not fitted. Each row is flown from "
+        f"{len(DRAWS)} starts, seeded and equal in all rows, uniform about the nominal one: each "
+        f"component of the offset within {OFFSET_BOUND_M:g} m, of the rotation vector within "
+        f"{ROTATION_BOUND_RAD:g} rad, of the target's initial rotation within "
+        f"{ATTITUDE_BOUND_RAD:g} rad, of its velocities within {100 * RATE_BOUND:.0f} %.",
         Table(
             ("baseline row, controller alone", "position / paper", "orientation / paper"),
             tuple(rows),
@@ -277,10 +293,12 @@ def _start(results: Results) -> PageSection:
         best = min(ROWS, key=lambda row: row.position_mse_m2)
         compared = "below" if best.position_mse_m2 < floors[0][1] else "above"
         parts.append(
-            "Lower bound of the position MSE for any controller with 2 N along each body axis that turns as ours turned (a convex "
-            f"quadratic programme over the first 15 s): {floors[0][1] * 1e2:.3g}e-2 m^2 from the nominal start, least "
-            f"{least * 1e2:.3g}e-2 over all starts. The paper's row {best.label} ({best.position_mse_m2 * 1e2:.3g}e-2) is "
-            f"{compared} that of the nominal start."
+            "Lower bound of the position MSE for any controller with 2 N along each body axis "
+            "that turns as ours turned (a convex "
+            f"quadratic programme over the first 15 s): {floors[0][1] * 1e2:.3g}e-2 m^2 from the "
+            f"nominal start, least {least * 1e2:.3g}e-2 over all starts. The paper's row "
+            f"{best.label} ({best.position_mse_m2 * 1e2:.3g}e-2) is {compared} that of the "
+            "nominal start."
         )
     return PageSection("Start", tuple(parts))
 
@@ -290,25 +308,32 @@ def _method(quick: bool) -> PageSection:
     length = (
         f"Flights take {PAPER_S:g} s, as the paper's."
         if not quick
-        else f"Quick: one start in place of {len(DRAWS)}, flights of {QUICK_S:g} s, extrapolated to the paper's "
-        f"{PAPER_S:g} s with their steady state (20 s to the end), no missions."
+        else f"Quick: one start in place of {len(DRAWS)}, flights of {QUICK_S:g} s, extrapolated "
+        f"to the paper's {PAPER_S:g} s with their steady state (20 s to the end), no "
+        "missions."
     )
     return PageSection(
         "Method",
         (
-            "Errors: mean over the flight of the squared distance of the chaser's centre from its reference pose on the true "
-            "target, and of the squared angle between the two attitudes, from the first tick. The paper states MSE without a "
+            "Errors: mean over the flight of the squared distance of the chaser's centre from "
+            "its reference pose on the true target, and of the squared angle between the two "
+            "attitudes, from the first tick. The paper states MSE without a "
             f"definition. {length}",
-            f"A flight failed if the chaser came closer than {MIN_DISTANCE_M:g} m to the target, or if its RMS distance from the "
-            f"reference pose after 20 s exceeds {LOST_M:g} m, the distance at the start. The paper does not define failure.",
-            "The paper's settings: 30 Hz control and images of 1280 x 720 pixels, forward Euler in the prediction, u_ref = 0, no "
-            "latency; its weights, body, target and camera. Ours: RK4, feed-forward, 15 Hz, 1/30 s from exposure to actuation; "
-            'joint estimator, rti solver. All table flights have `navigation.grade = "exact"`, as the paper assumes.',
-            "The paper leaves the combiner's window and outlier limits, and OpEn's tolerances and iteration limits open; ours are "
-            "in the code. Distances are a penalty in the cost in place of OpEn's augmented Lagrangian.",
-            f'"{WRITTEN}" is flown in the baseline row only, because it does not depend on the controller whether EPnP works; '
-            f'"{DEFAULT}" from one start in the other rows.',
-            "All flights run in one process, in simulated time: a plan is never late unless a delay is stated. "
-            "`tests/missions/test_in_process.py` and `test_simulation.py` show that they equal those of `chaserdock run`.",
+            f"A flight failed if the chaser came closer than {MIN_DISTANCE_M:g} m to the target, "
+            f"or if its RMS distance from the reference pose after 20 s exceeds {LOST_M:g} m, "
+            "the distance at the start. The paper does not define failure.",
+            "The paper's settings: 30 Hz control and images of 1280 x 720 pixels, forward Euler "
+            "in the prediction, u_ref = 0, no latency; its weights, body, target and camera. "
+            "Ours: RK4, feed-forward, 15 Hz, 1/30 s from exposure to actuation; "
+            'joint estimator, rti solver. All table flights have `navigation.grade = "exact"`, '
+            "as the paper assumes.",
+            "The paper leaves the combiner's window and outlier limits, and OpEn's tolerances "
+            "and iteration limits open; ours are in the code. Distances are a penalty in the "
+            "cost in place of OpEn's augmented Lagrangian.",
+            f'"{WRITTEN}" is flown in the baseline row only, because it does not depend on the '
+            f'controller whether EPnP works; "{DEFAULT}" from one start in the other rows.',
+            "All flights run in one process, in simulated time: a plan is never late unless a "
+            "delay is stated. `tests/missions/test_in_process.py` and `test_simulation.py` show "
+            "that they equal those of `chaserdock run`.",
         ),
     )

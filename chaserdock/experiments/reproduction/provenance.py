@@ -62,4 +62,7 @@ def _machine() -> str:
         )
     except (OSError, StopIteration):
         pass  # not Linux, or a CPU without a model name
-    return f"{cpu} ({os.cpu_count()} logical CPUs), {platform.system()}, Python {platform.python_version()}"
+    return (
+        f"{cpu} ({os.cpu_count()} logical CPUs), {platform.system()}, Python "
+        f"{platform.python_version()}"
+    )

@@ -60,7 +60,9 @@ def _chain_text(results: Results, column: str, row: PaperRow) -> str:
 
 
 def _alone_change(results: Results, name: str, quantity: Quantity) -> float | None:
-    """Return the change of a flight on perfect knowledge from the baseline's; None without results."""
+    """Return the change of a flight on perfect knowledge from the baseline's; None without
+    results.
+    """
     one, base = (errors_by_label(results, n) for n in (name, f"alone/{BASELINE.name}"))
     return None if one is None or base is None else one.of(quantity) / base.of(quantity) - 1.0
 
@@ -115,10 +117,16 @@ def _by_stage_weights(results: Results, row: PaperRow) -> str:
     after = _alone_change(results, f"weights/{row.name}", "position")
     if before is None or after is None:
         return ""
-    text = f"position {change_text(before)} alone, {change_text(after)} with stage weights times {STAGE_WEIGHTS[row.name]:.2g}"
+    text = (
+        f"position {change_text(before)} alone, {change_text(after)} with stage weights times "
+        f"{STAGE_WEIGHTS[row.name]:.2g}"
+    )
     if abs(after) >= 0.5 * abs(before):
         return f"Unexplained: {text}."
-    return f"Eq. 6 counts the final cost once for any dt, which explains ours: {text}. The paper's is unexplained."
+    return (
+        f"Eq. 6 counts the final cost once for any dt, which explains ours: {text}. The paper's "
+        "is unexplained."
+    )
 
 
 def _by_spread(results: Results, row: PaperRow) -> str:

@@ -61,7 +61,8 @@ bound is not checked); it states nothing else."""
 
 Preset = Literal["none", "idss", "atv", "soyuz"]
 _PRESET_TEXT = (
-    "Contact conditions of a docking system, in place of the defaults of the keys that it states; keys that are given override it "
+    "Contact conditions of a docking system, in place of the defaults of the keys that it "
+    "states; keys that are given override it "
     "([docking.md](docking.md#contact-conditions-of-docking-systems))."
 )
 
@@ -83,7 +84,9 @@ class _ContactConditions(Corridor):
 
 
 class Final(_ContactConditions):
-    """Limits over the last `final_m`. The closing speed is checked once the chaser has slowed down."""
+    """Limits over the last `final_m`. The closing speed is checked once the chaser has slowed
+    down.
+    """
 
     lateral_m: Positive = Field(default=0.008, description="Lateral offset of the probe's tip, m.")
     angle_deg: Positive = Field(default=2.0, description="Attitude error, degrees.")
@@ -105,7 +108,9 @@ class Tolerances(_ContactConditions):
 
 
 class Docking(Section):
-    """How docking ends. Distances are between the probe's tip and the port, along the port's axis."""
+    """How docking ends. Distances are between the probe's tip and the port, along the port's
+    axis.
+    """
 
     # Figures of the procedure that are no keys: flight software and its checks share them.
     overdrive_m: ClassVar[float] = 0.03
@@ -129,8 +134,8 @@ class Docking(Section):
 
     kind: Literal["held", "capture"] = Field(
         default="held",
-        description="`held`: the chaser holds at a distance, within the tolerances of `[approach]`, as in the paper. "
-        "`capture`: it flies into its port and is latched.",
+        description="`held`: the chaser holds at a distance, within the tolerances of "
+        "`[approach]`, as in the paper. `capture`: it flies into its port and is latched.",
     )
     ports: tuple[Port, ...] = ()
     entry_m: Positive = Field(
@@ -152,14 +157,16 @@ class Docking(Section):
         gt=0.0,
         lt=90.0,
         allow_inf_nan=False,
-        description="Half angle of the cone about the corridor's axis in which a chaser on its way in or out is planned, "
-        "degrees. It replaces `limits.min_distance_target_m` for that chaser.",
+        description="Half angle of the cone about the corridor's axis in which a chaser on its "
+        "way in or out is planned, degrees. It replaces `limits.min_distance_target_m` for "
+        "that chaser.",
     )
     final: Final = Final()
     tolerances: Tolerances = Tolerances()
     clearance_m: NotNegative = Field(
         default=0.45,
-        description="A chaser waits if its corridor comes this near to one in use, between body centres, m.",
+        description="A chaser waits if its corridor comes this near to one in use, between body "
+        "centres, m.",
     )
     at_once: int = Field(
         default=2, ge=1, description="Most chasers on their way in at the same time; others wait."
@@ -184,8 +191,8 @@ class Docking(Section):
             )
         if self.contact_speed_m_s > self.approach_speed_m_s:
             raise ValueError(
-                f"contact_speed_m_s ({self.contact_speed_m_s:g}) must not exceed approach_speed_m_s "
-                f"({self.approach_speed_m_s:g})"
+                f"contact_speed_m_s ({self.contact_speed_m_s:g}) must not exceed "
+                f"approach_speed_m_s ({self.approach_speed_m_s:g})"
             )
         return self
 

@@ -77,11 +77,13 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
     mesh, deviation_m = decimation.limited(mesh, MAX_TRIANGLES)
     if before > MAX_TRIANGLES:
         notes.append(
-            f"decimated from {before:,} to {mesh.triangle_count:,} triangles; largest deviation {1e3 * deviation_m:.2f} mm"
+            f"decimated from {before:,} to {mesh.triangle_count:,} triangles; largest deviation "
+            f"{1e3 * deviation_m:.2f} mm"
         )
         if mesh.triangle_count > 2 * MAX_TRIANGLES:
             raise ScenarioError(
-                f"{path}: {before:,} triangles in many parts or with many handles; simplify it to {MAX_TRIANGLES:,}"
+                f"{path}: {before:,} triangles in many parts or with many handles; simplify it "
+                f"to {MAX_TRIANGLES:,}"
             )
     return MeshFile(mesh, tuple(notes), deviation_m)
 
@@ -148,7 +150,8 @@ def _part(
         material = SurfaceMaterial.model_validate(extras.get("material", {})).material()
     except (ValidationError, AttributeError):
         raise ScenarioError(
-            f"{path}: part {plain!r}: its extras {EXTRAS!r} must be as `chaserdock target --mesh` writes them"
+            f"{path}: part {plain!r}: its extras {EXTRAS!r} must be as `chaserdock target "
+            "--mesh` writes them"
         ) from None
     return MeshPart(plain, material, vertices, triangles, str(extras.get("joint", "")))
 
@@ -276,14 +279,17 @@ def _check_size(path: Path, mesh: TriangleMesh, scale: float) -> None:
 
 
 def _closed(path: Path, part: MeshPart, notes: list[str]) -> MeshPart:
-    """Return a part with its triangles counter-clockwise. Raises ScenarioError for one with holes."""
+    """Return a part with its triangles counter-clockwise. Raises ScenarioError for one with
+    holes.
+    """
     if open_edges(part):
         part = _consistent(part)
     at = hole_m(part)
     if at is not None:
         x, y, z = at.tolist()
         raise ScenarioError(
-            f"{path}: part {part.name!r} has a hole: {open_edges(part)} open edges, one near ({x:.3f}, {y:.3f}, {z:.3f}) m; "
+            f"{path}: part {part.name!r} has a hole: {open_edges(part)} open edges, one near "
+            f"({x:.3f}, {y:.3f}, {z:.3f}) m; "
             "close its surface (a sheet needs a thickness)"
         )
     volume = volume_m3(part)

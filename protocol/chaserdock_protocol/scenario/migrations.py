@@ -125,14 +125,17 @@ def old_format(values: dict[str, Any]) -> list[str]:
         lines = old_keys(values)
         if "navigation" not in values and "odometry" not in values:
             lines.append(
-                'odometry and cameras are not exact by default any more (navigation.grade = "exact")'
+                "odometry and cameras are not exact by default any more (navigation.grade = "
+                '"exact")'
             )
         changes = "; ".join(lines) or "no key of this file has another name"
         return [
-            f"format: {stated} is not supported any more; set format = {FORMAT} and change: {changes}"
+            f"format: {stated} is not supported any more; set format = {FORMAT} and change: "
+            f"{changes}"
         ]
     return [
-        f"format: must be {FORMAT}, the format that this version of chaserdock reads (got {stated!r})"
+        f"format: must be {FORMAT}, the format that this version of chaserdock reads (got "
+        f"{stated!r})"
     ]
 
 

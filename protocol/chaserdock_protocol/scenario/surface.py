@@ -102,7 +102,8 @@ class SurfacePart(Section):
         description="Vertices (TRF), m: rows x, y, z, 32-bit floats, compressed by zlib, base64."
     )
     triangles: str = Field(
-        description="Vertices of each triangle, counter-clockwise from outside: rows of 32-bit integers, compressed by zlib, base64."
+        description="Vertices of each triangle, counter-clockwise from outside: rows of 32-bit "
+        "integers, compressed by zlib, base64."
     )
 
     def part(self) -> MeshPart:
@@ -138,7 +139,8 @@ class Surface(Section):
     )
     known: bool = Field(
         default=False,
-        description="Whether it is what the flight software knows: simplified, without missing parts.",
+        description="Whether it is what the flight software knows: simplified, without missing "
+        "parts.",
     )
     parts: tuple[SurfacePart, ...] = Field(min_length=1, max_length=MAX_PARTS)
     joints: tuple[SurfaceJoint, ...] = Field(default=(), max_length=MAX_PARTS)

@@ -33,7 +33,8 @@ class Thruster(Section):
     )
     rise_s: NotNegative = Field(
         default=0.002,
-        description="Time of the linear rise of the thrust after the valve opens, s. At most `min_on_s`.",
+        description="Time of the linear rise of the thrust after the valve opens, s. At most "
+        "`min_on_s`.",
     )
     fall_s: NotNegative = Field(
         default=0.002,
@@ -55,8 +56,8 @@ class Modulation(Section):
 
     modulator: Literal["pwm", "schmitt"] = Field(
         default="pwm",
-        description="`pwm`: one pulse per carrier period, its width proportional to the thrust. `schmitt`: open for whole "
-        "periods, with hysteresis.",
+        description="`pwm`: one pulse per carrier period, its width proportional to the thrust. "
+        "`schmitt`: open for whole periods, with hysteresis.",
     )
     carrier_hz: int = Field(
         default=10,
@@ -70,7 +71,8 @@ class Modulation(Section):
     )
     carry_over: bool = Field(
         default=True,
-        description="Add impulse that a period could not give, as below the minimum on-time, to the next one.",
+        description="Add impulse that a period could not give, as below the minimum on-time, to "
+        "the next one.",
     )
     schmitt_on: ClassVar[float] = 0.75
     schmitt_off: ClassVar[float] = 0.25
@@ -95,7 +97,8 @@ class ThrusterFailure(Section):
     thruster: Index = Field(description="Number of the thruster, from 0.")
     at_s: NotNegative = Field(description="Begin, s of mission time.")
     kind: FailureKind = Field(
-        description="`stuck_off`: it never opens. `stuck_on`: it never closes. `weak`: it gives `factor` of its thrust."
+        description="`stuck_off`: it never opens. `stuck_on`: it never closes. `weak`: it gives "
+        "`factor` of its thrust."
     )
     factor: float | None = Field(
         default=None,
@@ -106,7 +109,8 @@ class ThrusterFailure(Section):
     )
     reported: bool = Field(
         default=False,
-        description="Whether the chaser is informed at once. Otherwise it has to detect the failure.",
+        description="Whether the chaser is informed at once. Otherwise it has to detect the "
+        "failure.",
     )
 
     @model_validator(mode="after")
@@ -136,8 +140,8 @@ def check_layout(thrusters: Sequence[Thruster], wrench_max: Array) -> None:
         )
     if scale < 1.0:
         raise ValueError(
-            f"force_max_N {wrench_max[0]:g} and torque_max_N_m {wrench_max[3]:g} on all axes at once are more than "
-            f"the thrusters can give; at most {scale:.3f} of both"
+            f"force_max_N {wrench_max[0]:g} and torque_max_N_m {wrench_max[3]:g} on all axes at "
+            f"once are more than the thrusters can give; at most {scale:.3f} of both"
         )
 
 
@@ -148,11 +152,12 @@ def check_pulses(thrusters: Sequence[Thruster], modulation: Modulation, physics_
     carrier = modulation.carrier_hz
     if physics_hz % carrier:
         raise ValueError(
-            f"time.physics_hz must be a multiple of chaser.modulation.carrier_hz ({physics_hz}, {carrier})"
+            f"time.physics_hz must be a multiple of chaser.modulation.carrier_hz ({physics_hz}, "
+            f"{carrier})"
         )
     longest = max(t.min_on_s + t.fall_s for t in thrusters)
     if longest > 1.0 / carrier:
         raise ValueError(
-            f"chaser.modulation.carrier_hz: a period of {1.0 / carrier:g} s is shorter than the shortest pulse "
-            f"including its fall, {longest:g} s"
+            f"chaser.modulation.carrier_hz: a period of {1.0 / carrier:g} s is shorter than the "
+            f"shortest pulse including its fall, {longest:g} s"
         )

@@ -14,7 +14,9 @@ MAX_ITEMS = 200_000
 
 
 class BoundedQueue(Generic[T]):
-    """FIFO queue between threads that drops items when it is full, and counts them in ``dropped``."""
+    """FIFO queue between threads that drops items when it is full, and counts them in
+    ``dropped``.
+    """
 
     def __init__(self, max_bytes: int = MAX_BYTES, max_items: int = MAX_ITEMS) -> None:
         self.dropped = 0

@@ -24,8 +24,8 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import Figures, make_parser, run_parts
 
 from chaserdock.simulation.campaign import Swarm, fly_seed
+from chaserdock.simulation.flight import memory_folder
 from chaserdock.simulation.mission import simulate
-from chaserdock.simulation.swarm import memory_folder
 
 SCENARIO = "fault-drill"
 STATISTICAL = 'perception.name="statistical"'
@@ -72,7 +72,7 @@ from pathlib import Path
 from chaserdock_models.native import KernelLibrary
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock.simulation.mission import simulate
-from chaserdock.simulation.swarm import memory_folder
+from chaserdock.simulation.flight import memory_folder
 KernelLibrary.level = property(lambda self: 2)  # valgrind does not know all instructions of the other one
 for duration in sys.argv[2:]:
     short = ("timeline=[]", "settling_s=0.0", "steady_until_s=1.0", "success.docked=[]", f"duration_s={duration}")

@@ -182,6 +182,19 @@ def test_scenario_of_format_1_is_migrated() -> None:
     assert json.loads(migrated(json.dumps(FORMAT_1))) == FORMAT_3
 
 
+def test_key_of_the_renderer_is_dropped() -> None:
+    """Logs state it; in files only the value that is left is accepted."""
+    camera: dict[str, Any] = {"renderer": "pybullet", "width_px": 640}
+    text = json.dumps({"format": FORMAT, "camera": camera})
+    assert json.loads(migrated(text))["camera"] == {"width_px": 640}
+    (line,) = old_keys({"camera": camera})
+    assert line.startswith("camera.renderer: PyBullet's renderer")
+    exact = {"camera": camera | {"renderer": "exact"}}
+    drop_removed_keys(exact)
+    assert old_keys(exact) == []
+    assert "renderer" not in exact["camera"]
+
+
 def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
     text = json.dumps(
         {
@@ -228,7 +241,9 @@ def test_removed_keys_are_accepted_with_the_value_that_holds_now() -> None:
     values = json.loads(json.dumps(tables))
     drop_removed_keys(values)
     assert values == {"docking": {"pull_N": 0.4}, "detumble": {"response_s": 0.7}}
-    assert old_keys(values) == ["detumble.response_s: was removed: it is 0.5 in every flight now"]
+    assert old_keys(values) == [
+        "detumble.response_s: it is 0.5 in every flight now; remove the key"
+    ]
     assert json.loads(migrated(json.dumps({"format": FORMAT, **tables}))) == {
         "format": FORMAT, "docking": {"pull_N": 0.4}, "detumble": {},
     }  # fmt: skip

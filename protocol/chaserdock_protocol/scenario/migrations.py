@@ -56,20 +56,23 @@ _MOVED_KEYS: dict[tuple[str, ...], str] = {
 """Path of a key in format 2 -> its present path."""
 
 _REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
-    path: (value, f"it is {value:g} in every flight now")
-    for path, value in {
-        ("docking", "overdrive_m"): 0.03,
-        ("docking", "approach_timeout_s"): 60.0,
-        ("docking", "final_timeout_s"): 30.0,
-        ("docking", "contact_timeout_s"): 5.0,
-        ("docking", "settle_s"): 2.0,
-        ("docking", "pull_s"): 1.0,
-        ("docking", "verify_position_m"): 0.005,
-        ("docking", "verify_angle_deg"): 0.5,
-        ("detumble", "response_s"): 0.5,
-        ("chaser", "modulation", "schmitt_on"): 0.75,
-        ("chaser", "modulation", "schmitt_off"): 0.25,
-    }.items()
+    ("camera", "renderer"): ("exact", "PyBullet's renderer is not a part of chaserdock any more"),
+    **{
+        path: (value, f"it is {value:g} in every flight now")
+        for path, value in {
+            ("docking", "overdrive_m"): 0.03,
+            ("docking", "approach_timeout_s"): 60.0,
+            ("docking", "final_timeout_s"): 30.0,
+            ("docking", "contact_timeout_s"): 5.0,
+            ("docking", "settle_s"): 2.0,
+            ("docking", "pull_s"): 1.0,
+            ("docking", "verify_position_m"): 0.005,
+            ("docking", "verify_angle_deg"): 0.5,
+            ("detumble", "response_s"): 0.5,
+            ("chaser", "modulation", "schmitt_on"): 0.75,
+            ("chaser", "modulation", "schmitt_off"): 0.25,
+        }.items()
+    },
 }
 """Path of a key of format 3 that was removed -> the value that states what is always done now, and
 what became of the others.
@@ -109,7 +112,7 @@ def old_keys(values: dict[str, Any]) -> list[str]:
     for old, new in _MOVED_KEYS.items():
         lines += [f"{path}: is now called {new}" for _, path in _holders(values, old)]
     for old, (_, reason) in _REMOVED_KEYS.items():
-        lines += [f"{path}: was removed: {reason}" for _, path in _holders(values, old)]
+        lines += [f"{path}: {reason}; remove the key" for _, path in _holders(values, old)]
     for table, path in _holders(values, ("fault", "*", "topic")):
         if table["topic"] == "jets":
             lines.append(f"{path}: 'jets' is now called 'thrusters'")
@@ -153,6 +156,8 @@ def migrated(text: str) -> str:
         _rename_keys(values)
     if values.get("format", 1) != FORMAT:
         _state_navigation(values)
+    elif not any(True for path in _REMOVED_KEYS for _ in _holders(values, path)):
+        return text
     for path in _REMOVED_KEYS:
         for table, _ in _holders(values, path):
             del table[path[-1]]

@@ -19,8 +19,13 @@ from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 LEAST_IMAGES = 6
+"""Usable images: twice the three that determine a camera matrix (Z. Zhang, 2000), for distortion
+and for outliers."""
 _LEAST_CORNERS = 8
+"""Corners in an image: twice the four that determine the pose of a plane."""
 _OUTLIER_RATIO, _OUTLIER_PX = 3.0, 0.5
+"""RMS error of an outlier: above this multiple of the median, and above this many pixels, which
+sharp corners do not reach."""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 

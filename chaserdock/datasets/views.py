@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from .shapes import shape_of
 from .types import DatasetError, PoseLabel
 
-_STREAM = 0xDA7A
+_STREAM = 0xDA7A  # separates these random numbers from others of the same seed
 _WHITE = Material("mask", diffuse=1.0)
 _FULL_LIGHT = Light(sun=0.0, ambient=1.0)
 

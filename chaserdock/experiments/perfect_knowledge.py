@@ -19,6 +19,7 @@ from chaserdock_controller.guidance.reference import predict_target
 from chaserdock_protocol.scenario.bodies import Target
 
 _VARIANCE = 1e-12
+"""Variance of every number (SI units): nothing, but positive, as a covariance must be."""
 
 
 class PerfectEstimator:

@@ -25,9 +25,11 @@ from numpy.typing import NDArray
 
 SHEETS_MM = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 _EDGE_MM, _GAP_MM, _TEXT_MM, _MARK_MM, _LINE_MM = 12.0, 8.0, 3.0, 3.0, 0.1
+"""Margin, which printers leave blank; between markers, for scissors; height of text; length of
+cutting marks; width of lines."""
 # Footer of a sheet: a ruler to check the scale, and the sheet's name.
 _FOOT_MM = 14.0
-_MM_PER_INCH = 25.4
+_MM_PER_INCH = 25.4  # exact
 _POINTS_PER_MM = 72.0 / _MM_PER_INCH
 _STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fonttype": 42}
 

@@ -20,8 +20,8 @@ from .arrays import Array
 from .rigid_body import rk4_step
 from .scalar_rotations import cross_components
 
-EARTH_MU_M3_S2 = 3.986004415e14
-EARTH_RADIUS_M = 6378136.3
+EARTH_MU_M3_S2 = 3.986004415e14  # EGM96
+EARTH_RADIUS_M = 6378136.3  # EGM96
 EARTH_J2 = 1.0826269e-3
 """Gravitational parameter, equatorial radius and second zonal coefficient: EGM96."""
 

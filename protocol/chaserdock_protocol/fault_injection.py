@@ -36,7 +36,7 @@ from .messages import Message, Odometry, PoseSolution, Sighting, WrenchCommand
 from .topics import Topic
 from .transport.network import Host
 
-_CORRUPTED_BYTES = 4
+_CORRUPTED_BYTES = 4  # as a burst of noise; one byte is often within a number, and harmless
 _SENDER_FIELDS = ("commander", "instance", "holder")
 """Fields that name a sender. In real time a reader must refuse a message that names another one;
 see ``FaultLayer``.

@@ -20,6 +20,7 @@ from chaserdock.experiments.plan import Alone, ExperimentError, Flight, Plan, pl
 from .paper import BASELINE, PAPER_S, ROWS, PaperRow
 
 QUICK_S = 40.0
+"""Duration of a quick flight: the transient, and 20 s of steady state."""
 SCENARIO = "paper-single"
 """The scenario of every single-chaser flight: the paper's settings and its baseline row."""
 
@@ -28,17 +29,18 @@ DRAWS = range(3)
 equal starts in all rows.
 """
 
-NOMINAL_OFFSET_M = (0.85, 0.0, 0.0)
+NOMINAL_OFFSET_M = (0.85, 0.0, 0.0)  # m, TRF
 NOMINAL_ROTATION_RAD = (0.42, 0.0, -0.3927)
 """The start of ``paper-single``, from the reference pose: in TRF, and as a rotation vector in body
 axes.
 """
 
-OFFSET_BOUND_M = 0.05
-ROTATION_BOUND_RAD = 0.05
-ATTITUDE_BOUND_RAD = 0.2
-RATE_BOUND = 0.2
-"""Bounds of the dispersed starts, uniform about the nominal one: each component of the chaser's
+OFFSET_BOUND_M = 0.05  # m
+ROTATION_BOUND_RAD = 0.05  # rad
+ATTITUDE_BOUND_RAD = 0.2  # rad
+RATE_BOUND = 0.2  # share
+"""Bounds of the dispersed starts, assumed, because the paper does not state how well its starts were
+repeated; uniform about the nominal one: each component of the chaser's
 offset and of its rotation vector; each component of the rotation vector of the target's initial
 attitude; each component of the target's velocity and angular velocity, as a share of its value."""
 

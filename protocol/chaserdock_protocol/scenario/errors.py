@@ -16,7 +16,7 @@ from chaserdock_protocol.errors import ChaserdockError
 from .fields import LARGEST
 from .json_schema import SchemaNode, expected_text, key_paths, node_at, schema_of
 
-_LONGEST_VALUE = 60
+_LONGEST_VALUE = 60  # characters of a value in an error, so that it stays one line
 _WITH_BOUNDS = ("greater_than_equal", "less_than_equal")
 _FROM_SCHEMA = (
     "float_type",

@@ -28,8 +28,12 @@ from .surface import MAX_PARTS, MAX_TRIANGLES, SUFFIXES, Surface, SurfaceJoint, 
 EXTRAS = "chaserdock"
 """Key of a node's extras, and of a scene's, with what the format itself cannot say."""
 _SMALLEST_M, _LARGEST_M = 0.02, 50.0
+"""Sizes of a target: from a pocket satellite to half a space station. Others are a wrong unit."""
 _MOST_READ = 5_000_000
+"""Triangles of a file, 250 for each that is drawn: bounds time and memory of reading it."""
 _WELD_SHARE = 1e-7
+"""Vertices nearer than this share of the size are one: the rounding of single precision, in which
+most formats store them."""
 _UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (1000.0, "kilometres"))
 
 

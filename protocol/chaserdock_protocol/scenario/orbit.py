@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from .fields import Positive, Section
 
 LOWEST_ALTITUDE_M = 100e3
+"""Where the table of the atmosphere begins; below, no orbit lasts for a revolution."""
 Angle = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
 
 

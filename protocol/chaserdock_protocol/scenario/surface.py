@@ -24,9 +24,11 @@ from .fields import Fraction, Name, NotNegative, Positive, Section, Vector
 SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply")
 """Endings of mesh files that can be read."""
 MAX_PARTS = 256
+"""Parts of a mesh: each has collision hulls of its own, which physics compares in pairs."""
 MAX_TRIANGLES = 20_000
 """Triangles of a mesh that is drawn; files with more are decimated when they are read."""
 _MAX_BYTES = 64_000_000
+"""Size of unpacked numbers: far above those of `MAX_TRIANGLES`, to stop a decompression bomb."""
 
 
 def _packed(values: NDArray[np.generic]) -> str:

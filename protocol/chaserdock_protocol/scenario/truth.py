@@ -239,7 +239,7 @@ class TruthValues(Section):
         return matrix
 
 
-_OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
+_OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))  # places of the products of inertia xy, xz, yz
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,9 @@ from chaserdock_protocol.topics import Role
 from . import Node, ReceivedMessage
 
 EARLY_PERIOD_S = 0.05
+"""Period (s) with which a process announces itself before the first tick, which waits for it."""
 STEADY_PERIOD_S = 1.0
+"""The same in flight: often enough for `chaserdock status`, which listens for 3 s."""
 
 
 class JoinRefused(ChaserdockError):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from chaserdock_agents.chaser.command_gate import damping_command
@@ -183,13 +184,17 @@ def least_time(
 
 @dataclass(frozen=True)
 class DetumbleOutcome:
-    """One flight. ``time_s`` from the command until the stack stays below the limits, None if it
-    does not; ``impulse_N_s`` of all thrusters until then, and ``held_N_s`` from then to the end,
-    ``held_s`` long. ``least``: at the command. ``peak_*``: largest loads at a port in any physics
-    step after the command."""
+    """One flight from the command to stop on.
+
+    ``time_s`` until the stack stays below the limits (None: it does not); ``impulse_N_s`` of all
+    thrusters until then, and ``held_N_s`` from then to the end, ``held_s`` long. ``least``: with a
+    frozen attitude, at the command. ``peak_*``: largest loads at a port in any physics step.
+    ``failed``: thrusters found and isolated. Errors of the identified target, if a controller
+    identified it: mass (share), centre (m), worst inertia (share of the largest moment); ``nees``
+    per degree of freedom of the stack's mass properties.
+    """
 
     seed: int
-    chasers: int
     rate_deg_s: float
     refused: str
     time_s: float | None
@@ -199,57 +204,97 @@ class DetumbleOutcome:
     least: MinimumTime | None
     final_rate_deg_s: float
     final_speed_m_s: float
-    peak_force_N: float | None = None
-    peak_torque_N_m: float | None = None
+    peak_force_N: float
+    peak_torque_N_m: float
+    failed: str = ""
+    mass_share: float | None = None
+    centre_m: float | None = None
+    inertia_share: float | None = None
+    nees: float | None = None
+
+    def line(self) -> str:
+        """Return one line for people."""
+        if self.refused:
+            return f"{self.rate_deg_s:.1f} degrees/s, refused: {self.refused}"
+        text = "not stopped" if self.time_s is None else f"{self.time_s:.2f} s"
+        text = f"{self.rate_deg_s:.1f} degrees/s, {text}, {self.impulse_N_s:.1f} N s"
+        if self.least is not None:
+            text += f"; LP {self.least.time_s:.2f} s, {self.least.impulse_N_s:.1f} N s"
+        return f"{text}; {self.failed}" if self.failed else text
+
+
+class DetumbleLog:
+    """What the outcome of a flight needs of each of its ticks."""
+
+    def __init__(self, limits: RestLimits, period_s: float) -> None:
+        self._limits, self._period_s = limits, period_s
+        self._impulses_N_s: list[float] = []
+        self._peaks = np.zeros(2)
+        self._rest_ticks = 0
+        self._rates = 0.0, 0.0
+
+    def add(self, impulse_N_s: float, rates: tuple[float, float], *loads: Sequence[float]) -> None:
+        """Take a tick: the impulse of all thrusters, the speed (m/s) and rate (rad/s) after it, and
+        force (N) and torque (N m) at ports.
+        """
+        self._impulses_N_s.append(impulse_N_s)
+        self._rates = rates
+        speed_m_s, rate_deg_s = rates[0], math.degrees(rates[1])
+        rests = speed_m_s < self._limits.speed_m_s and rate_deg_s < self._limits.rate_deg_s
+        self._rest_ticks = self._rest_ticks + 1 if rests else 0
+        for load in loads:
+            self._peaks = np.maximum(self._peaks, load)
+
+    @property
+    def at_rest_s(self) -> float:
+        """Return for how long the stack has been at rest."""
+        return self._rest_ticks * self._period_s
+
+    def figures(self) -> dict[str, Any]:
+        """Return the fields of the outcome."""
+        since = len(self._impulses_N_s) - self._rest_ticks
+        return {
+            "time_s": since * self._period_s if self._rest_ticks else None,
+            "impulse_N_s": float(sum(self._impulses_N_s[:since])),
+            "held_N_s": float(sum(self._impulses_N_s[since:])),
+            "held_s": self.at_rest_s,
+            "final_speed_m_s": self._rates[0],
+            "final_rate_deg_s": math.degrees(self._rates[1]),
+            "peak_force_N": float(self._peaks[0]),
+            "peak_torque_N_m": float(self._peaks[1]),
+        }
 
 
 def fly_stack(
     scenario: Scenario,
     perception_of: Callable[[Scenario], PerceptionModel],
     duration_s: float = 30.0,
-    limits: RestLimits | None = None,
-    silent_after_s: float = math.inf,
 ) -> DetumbleOutcome:
-    """Fly a stack from ``COMMAND_AT_S`` on for ``duration_s``; ``limits``: of rest, without any the
-    scenario's.
-
-    ``silent_after_s`` after the command the controller falls silent.
-    """
-    limits = limits or scenario.detumble
-    with StackMission(scenario, perception_of(scenario), COMMAND_AT_S + silent_after_s) as mission:
+    """Fly a stack in the physics engine from ``COMMAND_AT_S`` on for ``duration_s``."""
+    log = DetumbleLog(scenario.detumble, 1.0 / scenario.time.rate_hz)
+    with StackMission(scenario, perception_of(scenario)) as mission:
         while mission.time_s < COMMAND_AT_S:
             mission.step()
-        states = mission.states()
-        body, mounted, motion = mission.truth(states)
+        body, mounted, motion = mission.truth(mission.states())
         least = least_time(scenario, body, mounted, motion)
-        rate_deg_s = math.degrees(motion.rates(body)[1])
         commands = tuple(OperatorCommand(command="detumble", chaser=i) for i in mission.chasers)
-        first = mission.step(commands)
-        replies = [] if first.outputs is None else first.outputs.replies
+        record = mission.step(commands)
+        replies = [] if record.outputs is None else record.outputs.replies
         refused = next((reply.reason for reply in replies if not reply.accepted), "")
-        impulses, inside, peaks = [_impulse(first)], [False], np.zeros(2)
         while not refused and mission.time_s < COMMAND_AT_S + duration_s:
+            rates = mission.truth(mission.states())[2].rates(body)
+            log.add(_impulse(record), rates, *_peaks(record))
             record = mission.step()
-            impulses.append(_impulse(record))
-            for load in record.loads.values():
-                peaks = np.maximum(peaks, [load.peak_force_N, load.peak_torque_N_m])
-            speed, rate = mission.truth(record.states)[2].rates(body)
-            inside.append(speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s)
-        speed, rate = mission.truth(mission.states())[2].rates(body)
-    since = len(inside) - next((k for k, x in enumerate(reversed(inside)) if not x), len(inside))
-    stopped, period_s = since < len(inside), 1.0 / scenario.time.rate_hz
+        log.add(_impulse(record), mission.truth(mission.states())[2].rates(body), *_peaks(record))
     return DetumbleOutcome(
         seed=scenario.seed,
-        chasers=len(scenario.chasers),
-        rate_deg_s=rate_deg_s,
+        rate_deg_s=math.degrees(motion.rates(body)[1]),
         refused=refused,
-        time_s=since * period_s if stopped else None,
-        impulse_N_s=float(sum(impulses[:since])),
-        held_N_s=float(sum(impulses[since:])),
-        held_s=(len(inside) - since) * period_s,
         least=least,
-        final_rate_deg_s=math.degrees(rate),
-        final_speed_m_s=speed,
-        peak_force_N=float(peaks[0]),
-        peak_torque_N_m=float(peaks[1]),
+        **log.figures(),
     )
+
+
+def _peaks(record: TickRecord) -> list[tuple[float, float]]:
+    """Return the largest force (N) and torque (N m) at each port since the tick before."""
+    return [(load.peak_force_N, load.peak_torque_N_m) for load in record.loads.values()]

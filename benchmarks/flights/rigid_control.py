@@ -13,12 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from chaserdock_controller.estimation.identification.stage import StackIdentification
 from chaserdock_controller.estimation.mass_properties import properties_of
 from chaserdock_controller.estimation.types import TargetState
-from chaserdock_controller.guidance.detumble.allocation import MinimumTime
 from chaserdock_controller.guidance.detumble.control import DetumbleControl, StackState, StackTask
 from chaserdock_controller.guidance.detumble.planning import plan_stop
 from chaserdock_controller.guidance.detumble.stack import StackMotion
@@ -28,7 +28,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 
-from .detumble_flights import least_time
+from .detumble_flights import DetumbleLog, DetumbleOutcome, least_time
 from .rigid_stack import RigidStack, StackStep
 
 _POSE_M, _POSE_RAD = 0.001, math.radians(0.1)
@@ -36,32 +36,6 @@ _SETTLE_TICKS = 2
 _OPTIMUM_STEP_S = 0.5
 _SILENT_REST_S = 10.0
 """A flight without controller ends so long after the stack came to rest."""
-
-
-@dataclass(frozen=True)
-class StackFlight:
-    """One flight. ``time_s`` until the stack stays below the limits (None: it does not),
-    ``impulse_N_s`` until then, and ``held_N_s`` from then to the end. ``least``: with a frozen
-    attitude. Errors of the identified target: mass (share), centre (m), worst inertia (share of the
-    largest moment); ``nees`` per degree of freedom of the stack's mass properties (None if the
-    controller fell silent). ``peak_*``: largest loads at a port at 960 Hz."""
-
-    seed: int
-    rate_deg_s: float
-    refused: str
-    time_s: float | None
-    impulse_N_s: float
-    held_N_s: float
-    least: MinimumTime | None
-    final_rate_deg_s: float
-    final_speed_m_s: float
-    mass_share: float | None
-    centre_m: float | None
-    inertia_share: float | None
-    nees: float | None
-    failed: str
-    peak_force_N: float | None = None
-    peak_torque_N_m: float | None = None
 
 
 class ControlledStack:
@@ -209,26 +183,24 @@ def fly_controlled(
     duration_s: float,
     identify_s: float = 0.0,
     events: FlightEvents | None = None,
-) -> StackFlight:
+) -> DetumbleOutcome:
     """Stop a stack from the first tick on, after ``identify_s`` of identifying pulses."""
-    flight, rate_hz, events = (
-        ControlledStack(scenario),
-        scenario.time.rate_hz,
-        events or FlightEvents(),
-    )
+    flight, rate_hz = ControlledStack(scenario), scenario.time.rate_hz
+    events = events or FlightEvents()
     if events.reported is not None:
         flight.reported = {events.reported[0]: (events.reported[1],)}
     true = flight.state()
     least = least_time(scenario, true.body, dict(true.chasers), true.motion)
     rate_deg_s = math.degrees(flight.stack.rates()[1])
-    limits, log, refused = scenario.detumble, _FlightLog(), ""
+    log, refused = DetumbleLog(scenario.detumble, 1.0 / rate_hz), ""
     begin = round(identify_s * rate_hz) + _SETTLE_TICKS
     tasks = _Tasks(begin, rate_hz)
     for k in range(begin + round(duration_s * rate_hz)):
         since_s = (k - begin) / rate_hz
+        silent = since_s >= events.silent_from_s
         if events.loss is not None and since_s >= events.loss[0]:
             flight.lost = frozenset({events.loss[1]})
-        if since_s >= events.silent_from_s:
+        if silent:
             flown = flight.damp()
         else:
             observation, estimation = flight.estimate()
@@ -239,27 +211,19 @@ def fly_controlled(
                     break
             flown = flight.step(tasks.at(k, flight.control, state), observation, estimation)
         if k >= begin:
-            speed, rate = flight.stack.rates()
-            at_rest = speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s
-            log.add(flown, at_rest)
-            if since_s >= events.silent_from_s and log.rest_ticks >= _SILENT_REST_S * rate_hz:
+            load = flown.peak_force_N, flown.peak_torque_N_m
+            log.add(flown.used_N_s, flight.stack.rates(), load)
+            if silent and log.at_rest_s >= _SILENT_REST_S:
                 break
-    since = log.stopped_at()
-    speed, rate = flight.stack.rates()
-    return StackFlight(
+    identified = {} if math.isfinite(events.silent_from_s) else identification_errors(flight)
+    return DetumbleOutcome(
         seed=scenario.seed,
         rate_deg_s=rate_deg_s,
         refused=refused,
-        time_s=None if since is None else since / rate_hz,
-        impulse_N_s=float(sum(log.impulses[:since])),
-        held_N_s=0.0 if since is None else float(sum(log.impulses[since:])),
         least=least,
-        final_rate_deg_s=math.degrees(rate),
-        final_speed_m_s=speed,
         failed="; ".join(flight.events),
-        peak_force_N=log.peak_force_N,
-        peak_torque_N_m=log.peak_torque_N_m,
-        **identification_errors(None if math.isfinite(events.silent_from_s) else flight),
+        **log.figures(),
+        **identified,
     )
 
 
@@ -286,37 +250,8 @@ class _Tasks:
         return StackTask.HOLD if self._holding > self._rest_ticks else StackTask.STOP
 
 
-class _FlightLog:
-    """Impulses per tick, whether the stack was at rest after it, and the largest loads."""
-
-    def __init__(self) -> None:
-        self.impulses: list[float] = []
-        self._at_rest: list[bool] = []
-        self.peak_force_N = self.peak_torque_N_m = 0.0
-
-    def add(self, flown: StackStep, at_rest: bool) -> None:
-        self.impulses.append(flown.used_N_s)
-        self._at_rest.append(at_rest)
-        self.peak_force_N = max(self.peak_force_N, flown.peak_force_N)
-        self.peak_torque_N_m = max(self.peak_torque_N_m, flown.peak_torque_N_m)
-
-    @property
-    def rest_ticks(self) -> int:
-        """Return for how many ticks the stack has been at rest."""
-        moved = max((k for k, rests in enumerate(self._at_rest) if not rests), default=-1)
-        return len(self._at_rest) - moved - 1
-
-    def stopped_at(self) -> int | None:
-        """Return the tick from which on the stack stays at rest; None without one."""
-        return len(self._at_rest) - self.rest_ticks if self.rest_ticks else None
-
-
-def identification_errors(flight: ControlledStack | None) -> dict[str, float | None]:
-    """Return the errors of the identified mass properties, by field of ``StackFlight``; all None
-    without a flight.
-    """
-    if flight is None:
-        return dict.fromkeys(("mass_share", "centre_m", "inertia_share", "nees"))
+def identification_errors(flight: ControlledStack) -> dict[str, Any]:
+    """Return the errors of the identified mass properties, by field of ``DetumbleOutcome``."""
     found, true = flight.identification.target, properties_of(flight.stack.target)
     error = found.values - true
     largest = float(np.linalg.eigvalsh(flight.stack.target.inertia_kg_m2)[-1])

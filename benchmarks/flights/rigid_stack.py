@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stack of target and latched chasers as one rigid body, damped by its chasers without a
-controller.
+"""A stack of target and latched chasers as one rigid body.
 
-Joints, contacts and images of the physics engine, which a silent controller does not need, are left
-out. Thrusters and sensors are those of the simulator;
-``tests/chaserdock/test_silent_controller.py`` compares both.
+Joints, contacts and images of the physics engine are left out. Thrusters and sensors are those of
+the simulator; ``tests/chaserdock/test_silent_controller.py`` compares both.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -36,20 +33,6 @@ from .latched_stack import attach_plants, body_of_plant, with_port_error
 _SUBSTEPS = 4
 _LOAD_HZ = 960
 """Rate of the loads at the ports: that of the physics engine."""
-
-
-@dataclass(frozen=True)
-class SilentOutcome:
-    """A flight without controller: time until the stack stays below the limits (None: it does not),
-    the impulse of all thrusters until then, that after it in ``held_s``, and the motion at the end.
-    """
-
-    time_s: float | None
-    impulse_N_s: float
-    held_N_s: float
-    held_s: float
-    final_rate_deg_s: float
-    final_speed_m_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,34 +209,3 @@ class RigidStack:
             self.q_wxyz, self.omega_rad_s + turn, self.body.inertia_kg_m2, step_s, 2
         )
         self.q_wxyz, self.omega_rad_s = qs[1], omegas[1] + turn
-
-
-def fly_silent(
-    scenario: Scenario, duration_s: float = 120.0, rest_s: float = math.inf
-) -> SilentOutcome:
-    """Let all chasers damp the scenario's tumble without a controller, for ``duration_s`` or until
-    ``rest_s`` after it stopped.
-    """
-    stack, limits = RigidStack(scenario), scenario.detumble
-    impulses, at_rest, rate_hz = [], 0, scenario.time.rate_hz  # at_rest: number of ticks in a row
-    for _ in range(round(duration_s * rate_hz)):
-        impulses.append(stack.step(stack.damping()).used_N_s)
-        speed, rate = stack.rates()
-        at_rest = (
-            at_rest + 1
-            if speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s
-            else 0
-        )
-        if at_rest and at_rest >= rest_s * rate_hz:
-            break
-    since = len(impulses) - at_rest
-    speed, rate = stack.rates()
-    period_s = 1.0 / rate_hz
-    return SilentOutcome(
-        time_s=since * period_s if at_rest else None,
-        impulse_N_s=float(sum(impulses[:since])),
-        held_N_s=float(sum(impulses[since:])),
-        held_s=at_rest * period_s,
-        final_rate_deg_s=math.degrees(rate),
-        final_speed_m_s=speed,
-    )

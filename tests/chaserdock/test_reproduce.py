@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -46,7 +45,7 @@ from chaserdock.experiments.reproduction.plan import (
     needs_open,
     table_name,
 )
-from chaserdock.experiments.reproduction.provenance import Provenance, commit_of
+from chaserdock.experiments.reproduction.provenance import Provenance
 from chaserdock.experiments.reproduction.reproduce import fly_and_report
 from chaserdock.experiments.reproduction.tables import (
     Results,
@@ -481,18 +480,6 @@ def test_missing_solver_is_one_error_and_a_failed_status(
     ]
     assert errors == ["chaserdock: the paper's chain was not flown: solver 'open' needs cargo"]
     assert "NOT COMPLETE: 1 of 1 flights" in (tmp_path / "reproduction.md").read_text()
-
-
-def test_commit_of_a_folder_without_git_is_unknown(tmp_path: Path) -> None:
-    assert commit_of(tmp_path).startswith("unknown (chaserdock ")
-    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
-    (tmp_path / "a").write_text("1")
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    for command in (["add", "a"], ["commit", "-qm", "a"]):
-        subprocess.run([*git, *command], check=True)
-    assert re.fullmatch("[0-9a-f]{12}", commit_of(tmp_path))
-    (tmp_path / "a").write_text("2")
-    assert re.fullmatch("[0-9a-f]{12}-dirty", commit_of(tmp_path))
 
 
 def test_result_with_other_settings_counts_as_not_flown() -> None:

@@ -701,7 +701,7 @@ def report() -> None:
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         log = str(logs / "docking-contact" / "run")
-        chaserdock("figures", log, "--out", name, "--format", "png")
+        chaserdock("report", log, "--figures", "--out", name, "--format", "png")
         tiles = []
         for figure in ("trajectories", "docking", "tracking", "thrusters"):
             image = np.asarray(cv2.imread(str(out / f"{figure}.png")))
@@ -737,13 +737,13 @@ def first_flight() -> None:
             "run", "single", "--set", "duration_s=20", "--set", "success={}", "--out", str(out)
         )
     command = "chaserdock run single --set duration_s=20 --set 'success={}' --out runs/first"
-    terminal("terminal", command, chaserdock("summary", str(out)).splitlines()[:14])
+    terminal("terminal", command, chaserdock("judge", str(out)).splitlines()[:14])
 
 
 def log_info() -> None:
     flight("docking-contact")
     log = str(logs / "docking-contact" / "run")
-    text = chaserdock("log", "info", log).replace(log, "runs/capture")
+    text = chaserdock("log", log).replace(log, "runs/capture")
     terminal("status", "chaserdock log runs/capture", text.splitlines()[:16])
 
 

@@ -41,9 +41,11 @@ _NOT_DOCKED = "ends in phase "
 
 
 @dataclass(frozen=True)
-class Swarm:
-    """What to fly: a scenario by name or path; with rendered images; in one mode only; until a
-    violation only.
+class SeedOptions:
+    """Options of flights with random faults.
+
+    ``scenario``: name or path. ``images``: render instead of drawing measurements. ``mode``: fly
+    all seeds in this mode; drawn by default. ``to_violation``: end at the first violation.
     """
 
     scenario: str
@@ -60,42 +62,42 @@ class UnflownSeed:
     reason: str
 
 
-def _load(swarm: Swarm) -> tuple[str, Scenario]:
+def _load(options: SeedOptions) -> tuple[str, Scenario]:
     """Return the scenario and what cases extend it by. Raises ScenarioError if no seed can fly it."""
-    path = find_scenario(swarm.scenario)
+    path = find_scenario(options.scenario)
     scenario = load_scenario(path)
-    if not (swarm.images or scenario.target_model().markers):
+    if not (options.images or scenario.target_model().markers):
         raise ScenarioError(
             f"{path}: the target has no markers to draw measurements of; use --images"
         )
-    return (str(path.resolve()) if path == Path(swarm.scenario) else path.stem), scenario
+    return (str(path.resolve()) if path == Path(options.scenario) else path.stem), scenario
 
 
-def fly_seed(swarm: Swarm, seed: int) -> SimulationResult:
+def fly_seed(options: SeedOptions, seed: int) -> SimulationResult:
     """Draw and fly the case of a seed. Raises ScenarioError."""
-    name, scenario = _load(swarm)
-    case = draw_case(name, seed, scenario, images=swarm.images, mode=swarm.mode)
-    return fly_case(case, seed, to_violation=swarm.to_violation)
+    name, scenario = _load(options)
+    case = draw_case(name, seed, scenario, images=options.images, mode=options.mode)
+    return fly_case(case, seed, to_violation=options.to_violation)
 
 
-def _fly(swarm: Swarm, seed: int) -> SimulationResult | UnflownSeed:
+def _fly(options: SeedOptions, seed: int) -> SimulationResult | UnflownSeed:
     try:
-        return fly_seed(swarm, seed)
+        return fly_seed(options, seed)
     except ScenarioError as error:
         return UnflownSeed(seed, str(error))
 
 
 def fly_seeds(
-    swarm: Swarm, seeds: Iterable[int], jobs: int = 1
+    options: SeedOptions, seeds: Iterable[int], jobs: int = 1
 ) -> Iterator[SimulationResult | UnflownSeed]:
     """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can
     be flown.
 
     With several ``jobs``, these processes end at once when the generator does.
     """
-    _load(swarm)
+    _load(options)
     if jobs == 1:
-        yield from (_fly(swarm, seed) for seed in seeds)
+        yield from (_fly(options, seed) for seed in seeds)
         return
     os.environ.update(
         SINGLE_THREADED
@@ -103,7 +105,7 @@ def fly_seeds(
     workers: list[_Worker] = []
     try:
         for _ in range(jobs):
-            workers.append(_Worker(swarm))
+            workers.append(_Worker(options))
         yield from _fly_on(workers, iter(seeds))
     finally:
         for worker in workers:
@@ -115,14 +117,14 @@ class _Worker:
     order of all.
     """
 
-    def __init__(self, swarm: Swarm) -> None:
-        self.swarm, self.seed, self.turn = swarm, 0, 0
+    def __init__(self, options: SeedOptions) -> None:
+        self.options, self.seed, self.turn = options, 0, 0
         self._start()
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(self.swarm, theirs), daemon=True)
+        self._process = context.Process(target=_work, args=(self.options, theirs), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -145,7 +147,7 @@ class _Worker:
         self.connection.close()
 
 
-def _work(swarm: Swarm, connection: Connection) -> None:
+def _work(options: SeedOptions, connection: Connection) -> None:
     """Fly the seeds that arrive until the connection closes, and send back results, or errors that
     concern all seeds.
     """
@@ -156,7 +158,7 @@ def _work(swarm: Swarm, connection: Connection) -> None:
         while True:
             seed = connection.recv()
             try:
-                connection.send(_fly(swarm, seed))
+                connection.send(_fly(options, seed))
             except ChaserdockError as error:
                 connection.send(error)
 

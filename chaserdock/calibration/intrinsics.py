@@ -39,8 +39,8 @@ class TooFew(Exception):
 
 @dataclass(frozen=True)
 class Board:
-    """``points_m`` (n, 3): inner corners; ``charuco``: OpenCV's board, or None for a chessboard of
-    ``size`` corners.
+    """A calibration board. ``points_m`` (n, 3): inner corners, in board axes. ``charuco``: OpenCV's
+    board; None for a chessboard, which has ``size`` corners.
     """
 
     points_m: NDArray[np.float32]
@@ -50,8 +50,11 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibration:
-    """``matrix`` (3, 3), ``distortion`` (5,) k1, k2, p1, p2, k3; ``sigma`` (4,): one standard
-    deviation of fx, fy, cx, cy, pixels; ``rms_px``: by used image; ``excluded``: reason by image.
+    """A calibrated camera and how well the images fit it.
+
+    ``matrix`` (3, 3), pixels. ``distortion`` (5,): k1, k2, p1, p2, k3. ``sigma`` (4,): standard
+    deviations of fx, fy, cx and cy, pixels. ``rms_px``: error of each image that was used.
+    ``excluded``: why each other image was not.
     """
 
     width_px: int

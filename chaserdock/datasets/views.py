@@ -75,9 +75,11 @@ class TargetView:
 
 @dataclass(frozen=True, eq=False)
 class ViewImage:
-    """Image (h, w) of a view; ``mask`` (h, w): pixels that the target covers by half; ``visible``
-    (h, w): without those behind the chaser's own probe; ``silhouette``: the mask on a canvas that
-    reaches ``margin_px`` (2,) columns and rows beyond the image, so that it is not cut off there.
+    """A rendered view with its masks.
+
+    ``image`` (h, w). ``mask`` (h, w): pixels of which the target covers half or more. ``visible``
+    (h, w): the same without those behind the chaser's own probe. ``silhouette``: the mask on a
+    larger canvas, ``margin_px`` (2,) columns and rows on every side, that does not cut it off.
     """
 
     view: TargetView
@@ -179,10 +181,10 @@ class ViewRenderer:
 
 
 class _Coverage:
-    """Masks of a target: a white one, in light from everywhere, in front of the stars of one
-    attitude of the camera.
+    """Finds the pixels that a target covers: renders it white, in light from everywhere, before the
+    stars of one attitude of the camera.
 
-    ``own``: a box, in the axes of the chaser, that is drawn in black.
+    ``own``: a box in chaser axes that is drawn in black and hides the target.
     """
 
     def __init__(self, camera: Camera, mesh: TriangleMesh, own: Box | None = None) -> None:

@@ -36,8 +36,8 @@ _STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fontty
 
 @dataclass
 class Sheet:
-    """``rectangles`` (x, y, width, height), black; ``lines`` (x0, y0, x1, y1); ``texts`` (x, y of
-    the baseline, text).
+    """What is printed on one sheet, mm: black ``rectangles`` (x, y, width, height), ``lines`` (x0,
+    y0, x1, y1) and ``texts`` (x, y of the baseline, text).
     """
 
     size_mm: tuple[float, float]

@@ -74,8 +74,8 @@ _REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
         }.items()
     },
 }
-"""Path of a key of format 3 that was removed -> the value that states what is always done now, and
-what became of the others.
+"""Path of a removed key of format 3 -> the value that every flight has now, which is accepted, and
+why no other is.
 """
 
 
@@ -94,7 +94,7 @@ def _holders(
 
 
 def drop_removed_keys(values: dict[str, Any]) -> None:
-    """Remove, in place, keys that state what is always done now."""
+    """Delete, in place, removed keys that state what every flight does now."""
     for path, (value, _) in _REMOVED_KEYS.items():
         for table, _ in _holders(values, path):
             if table[path[-1]] == value:

@@ -77,9 +77,10 @@ class TargetView:
 class ViewImage:
     """A rendered view with its masks.
 
-    ``image`` (h, w). ``mask`` (h, w): pixels of which the target covers half or more. ``visible``
-    (h, w): the same without those behind the chaser's own probe. ``silhouette``: the mask on a
-    larger canvas, ``margin_px`` (2,) columns and rows on every side, that does not cut it off.
+    ``pixels`` (h, w): the image. ``mask`` (h, w): pixels of which the target covers half or more.
+    ``visible`` (h, w): the same without those behind the chaser's own probe. ``silhouette``: the
+    mask on a larger canvas, ``margin_px`` (2,) columns and rows on every side, that does not cut it
+    off.
     """
 
     view: TargetView

@@ -329,6 +329,7 @@ def test_controller_alone_needs_what_it_can_fly(
         campaign_of(ALONE.replace(old, new), tmp_path)
 
 
+@pytest.mark.slow
 def test_controller_alone_is_flown_and_tabulated(tmp_path: Path) -> None:
     campaign = campaign_of(ALONE, tmp_path)
     assert [f.alone for f in campaign.flights] == [Alone(0.1)] * 2
@@ -341,7 +342,8 @@ def test_controller_alone_is_flown_and_tabulated(tmp_path: Path) -> None:
     assert status == 0, said
     rows = table(tmp_path / "alone")
     assert [row["vary.controller.horizon_s"] for row in rows] == [1.0, 3.0]
-    assert all(0.0 < row["steady_position_mse_m2"] < 1e-3 for row in rows)
+    # A horizon of 1 s is too short for the transient.
+    assert rows[1]["steady_position_mse_m2"] < 1e-3 < rows[0]["steady_position_mse_m2"]
 
 
 def test_bad_arguments_print_one_line_errors(tmp_path: Path) -> None:

@@ -332,8 +332,8 @@ def _method(quick: bool) -> PageSection:
             "cost in place of OpEn's augmented Lagrangian.",
             f'"{WRITTEN}" is flown in the baseline row only, because it does not depend on the '
             f'controller whether EPnP works; "{DEFAULT}" from one start in the other rows.',
-            "All flights run in one process, in simulated time: a plan is never late unless a "
-            "delay is stated. `tests/missions/test_in_process.py` and `test_simulation.py` show "
-            "that they equal those of `chaserdock run`.",
+            "All flights run in simulated time, so that a plan is never late unless a delay is "
+            "stated: the table's and the missions' as `chaserdock run` flies them, the controller "
+            "alone in one process, which flies the same (`tests/missions/test_in_process.py`).",
         ),
     )

@@ -231,7 +231,9 @@ def measure() -> dict[str, Any]:
         lines = texts_of(files[root])
         checks = sum(len(re.findall(r"\bis (?:not )?None\b", line)) for line in lines)
         figures[f"none_checks_per_1000_lines_{root}"] = round(1000 * checks / len(lines), 1)
-    maps = [line for line in texts_of(files["controller"]) if re.search(r"(dict|Mapping)\[int", line)]
+    maps = [
+        line for line in texts_of(files["controller"]) if re.search(r"(dict|Mapping)\[int", line)
+    ]
     figures["maps_by_chaser_number_controller"] = len(maps)
     types = [line for line in texts if "isinstance" in line and "Estimator" in line]
     figures["type_tests_of_estimators"] = len(types)
@@ -248,7 +250,9 @@ def measure() -> dict[str, Any]:
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, help="write the figures to FILE as well", metavar="FILE")
+    parser.add_argument(
+        "--json", type=Path, help="write the figures to FILE as well", metavar="FILE"
+    )
     options = parser.parse_args()
     figures = measure()
     for name, value in figures.items():

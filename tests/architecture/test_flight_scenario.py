@@ -53,7 +53,7 @@ FORBIDDEN_ANYWHERE = {
     "simulation", "world",
     "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
-    "renderer", "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
+    "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
 }  # fmt: skip
 FORBIDDEN_PATHS = {"target.position_m", "target.q_wxyz", "target.attitude_deg"}
 

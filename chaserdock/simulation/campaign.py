@@ -42,8 +42,9 @@ _NOT_DOCKED = "ends in phase "
 
 @dataclass(frozen=True)
 class Swarm:
-    """What to fly: a scenario by name or path; with rendered images; in one mode only; until a
-    violation only.
+    """Options of the flights of many seeds. ``scenario``: name or path. ``images``: render images
+    instead of drawing measurements. ``mode``: the only one to fly, None for both.
+    ``to_violation``: end a flight at its first violation.
     """
 
     scenario: str
@@ -61,7 +62,7 @@ class UnflownSeed:
 
 
 def _load(swarm: Swarm) -> tuple[str, Scenario]:
-    """Return the scenario and what cases extend it by. Raises ScenarioError if no seed can fly it."""
+    """Return what cases extend, and the scenario. Raises ScenarioError if no seed can fly it."""
     path = find_scenario(swarm.scenario)
     scenario = load_scenario(path)
     if not (swarm.images or scenario.target_model().markers):
@@ -164,7 +165,7 @@ def _work(swarm: Swarm, connection: Connection) -> None:
 def _fly_on(
     workers: Sequence[_Worker], seeds: Iterator[int]
 ) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds in their order; each worker that is free flies the next one."""
+    """Yield the results of the seeds in their order; a worker that is free flies the next one."""
     flying: dict[Connection, _Worker] = {}
     flown: dict[int, SimulationResult | UnflownSeed] = {}
     turns, turn = itertools.count(), 0
@@ -192,8 +193,8 @@ def _fly_on(
 
 
 def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
-    """Yield flights of simpler and simpler cases with the first violation of a result, in other
-    numbers.
+    """Reduce the case of a result: yield flights of simpler and simpler cases with its first
+    violation, in other numbers.
     """
     first, flown = result.violations[0], result
     judges_docking = _NOT_DOCKED in first.text

@@ -30,7 +30,7 @@ LINK_BYTES = 1 << 20
 ``transport.config`` does.
 """
 LEASE_S = 2.0
-"""Time (s) after which a silent process counts as lost in real time, as under ``chaserdock run``."""
+"""Time (s) after which a silent process counts as lost in real time, as under `chaserdock run`."""
 _RETRY_S = 0.2
 """Time (s) after which a lost message that must not be lost is sent again: as TCP does in Linux
 (TCP_RTO_MIN)."""
@@ -279,7 +279,7 @@ class SimulatedNetwork:
     # -- partitions and liveliness -----------------------------------------------------------------
 
     def _cut_until_s(self, sender: str, receiver: str) -> float:
-        """Return the end of the partition between two processes (virtual time, s), 0 without one."""
+        """Return when the partition between two processes ends (virtual time, s), 0 without one."""
         now_s, end_s = self.mission_s, 0.0
         if now_s < 0.0:
             return 0.0
@@ -520,7 +520,7 @@ class SimulatedHost:
         return EPOCH_NS + round(self.now_s() * 1e9)
 
     def pause(self, timeout_s: float | None, over: Callable[[], bool] = lambda: False) -> None:
-        """Wait until ``over``, after which the task is woken, or for a time of this host's clock."""
+        """Wait until ``over``, after which the task is woken, or for a time of the host's clock."""
         end_s = None if timeout_s is None else self._scheduler.now_s + timeout_s / self._rate
         while not over() and (end_s is None or self._scheduler.now_s < end_s):
             self._scheduler.pause(None if end_s is None else end_s - self._scheduler.now_s)

@@ -359,7 +359,7 @@ class TumbleFalls(Check):
 
 
 def angular_momentum(bodies: Sequence[tuple[BodyTruth, DrawnBody]]) -> Array:
-    """Return the angular momentum (3,), WRF, of bodies about their common centre of mass (N m s)."""
+    """Return the angular momentum (3,), WRF, N m s, of bodies about their common centre of mass."""
     mass = np.array([drawn.mass_kg for _, drawn in bodies])
     spin = np.zeros(3)
     at, velocity = np.zeros((len(bodies), 3)), np.zeros((len(bodies), 3))

@@ -176,7 +176,7 @@ class FlightView(MessageReader):
         self.tick = max(self.tick, tick.tick)
         self.lost.difference_update(f"chaser/{i}" for i in tick.chasers)
 
-    # -- bodies: the world publishes probes, then bodies, then its own state ------------------------
+    # -- bodies: the world publishes probes, then bodies, then its own state -----------------------
 
     @reads(DrawnTruth)
     def _on_drawn(self, drawn: DrawnTruth) -> None:

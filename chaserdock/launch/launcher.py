@@ -345,7 +345,7 @@ _folders_lock = threading.Lock()
 
 
 def _new_folder(name: str) -> Path:
-    """Return a folder ``runs/NAME-TIME`` that does not exist, with a number appended where needed."""
+    """Return a folder ``runs/NAME-TIME`` that does not exist, with a number appended if needed."""
     base = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
     folder, number = base, 1
     with _folders_lock:

@@ -216,9 +216,11 @@ class DockingOutcome:
             kind, thruster, at_s = self.failure
             delay_s = self.detection_delay_s()
             detected = "not detected" if delay_s is None else f"detected after {delay_s:.2f} s"
-            text += f"; thruster {thruster} {kind} at {at_s:.2f} s, {detected}, peak {self.peak_m * 1e3:.1f} mm"
+            text += f"; thruster {thruster} {kind} at {at_s:.2f} s, {detected}"
+            text += f", peak {self.peak_m * 1e3:.1f} mm"
         if (t := self.touch) is not None:
-            text += f"; {t.lateral_m * 1e3:.2f} mm, {math.degrees(t.angle_rad):.3f} deg, {t.closing_m_s * 1e3:.2f} mm/s"
+            text += f"; {t.lateral_m * 1e3:.2f} mm, {math.degrees(t.angle_rad):.3f} deg"
+            text += f", {t.closing_m_s * 1e3:.2f} mm/s"
         if self.linear_error is not None and self.angular_error is not None:
             text += f"; momentum errors {self.linear_error:.1e}, {self.angular_error:.1e}"
         if self.opened_s is not None:

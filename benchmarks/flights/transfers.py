@@ -194,10 +194,11 @@ class TransferOutcome:
     def line(self) -> str:
         """Return one line for people."""
         return (
-            f"{self.seed:3d}  to target {self.to_target_m:.4f} m  between chasers {self.between_m:.4f} m  "
-            f"between shapes {self.shapes_m:.4f} m  "
-            f"reached after {self.reached_s:.1f} s, {self.end_m * 1e3:.1f} mm  missed {self.missed}  failed {self.failed}  "
-            f"relaxed {self.relaxed}  contacts {self.contacts}"
+            f"{self.seed:3d}  to target {self.to_target_m:.4f} m  "
+            f"between chasers {self.between_m:.4f} m  between shapes {self.shapes_m:.4f} m  "
+            f"reached after {self.reached_s:.1f} s, {self.end_m * 1e3:.1f} mm  "
+            f"missed {self.missed}  failed {self.failed}  relaxed {self.relaxed}  "
+            f"contacts {self.contacts}"
         )
 
 

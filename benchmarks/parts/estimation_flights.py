@@ -73,7 +73,8 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
                 "ambient": 0.25,
                 "earth": {"direction": (0.25, 0.5, -0.83), "radius_deg": 64.0},
                 "intrinsics": {
-                    "width_px": 1280, "height_px": 720, "fx_px": 1105.0, "fy_px": 1107.0, "cx_px": 644.2, "cy_px": 356.8,
+                    "width_px": 1280, "height_px": 720,
+                    "fx_px": 1105.0, "fy_px": 1107.0, "cx_px": 644.2, "cy_px": 356.8,
                     "distortion": (-0.18, 0.05, 0.0006, -0.0004, 0.0),
                 },
                 "effects": {"exposure_s": 0.003, "glare": 500.0},

@@ -51,7 +51,7 @@ CheckedFigures = tuple[Figures, bool]
 
 
 def call(*command: str | Path, **environment: str) -> str:
-    """Measure a program and return its output. Raise RuntimeError if it fails."""
+    """Run a program and return its output. Raise RuntimeError if it fails."""
     done = subprocess.run(
         [str(c) for c in command],
         env=os.environ | environment,

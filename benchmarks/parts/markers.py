@@ -71,7 +71,7 @@ class Views:
         self.count = 0
 
     def view(self, position: Array, q: Array, to_sun: Array) -> View:
-        """Return an image with all default effects, encoded and decoded as between the processes."""
+        """Return an image with all default effects, encoded and decoded as between processes."""
         exact = self.renderer.render(
             CAMERA_POSITION, CAMERA_ATTITUDE, position, q, (), Light(tuple(to_sun.tolist()))
         )
@@ -248,7 +248,7 @@ def reach(count: int) -> Figures:
 
 
 def near_views(count: int) -> Figures:
-    """Evaluate random attitudes with the centre at 0.28 to 0.45 m, where the body fills the image."""
+    """Evaluate random attitudes with the centre at 0.28 to 0.45 m: the body fills the image."""
     views, results = Views("servicer"), ViewResults()
     perception = views.perception()
     for view in views.random_views(count, 0.28, 0.45, 8):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real time: ``four-chaser-docking`` with ticks and images at 30 Hz, 640 x 480, in separate processes
-on this machine.
+"""Real time: ``four-chaser-docking`` with ticks and images at 30 Hz, 640 x 480, in separate
+processes on this machine.
 
 ``image_to_command``: from the sending of an image to the sending of the actuator command of that
 tick, by the senders' time stamps; the images of a tick are sent together, as by cameras that expose
@@ -72,7 +72,7 @@ _head = msgspec.msgpack.Decoder(Head)
 
 @dataclass
 class LatencyObserver:
-    """Sending times (wall clock, ns) of ticks by tick, of images and commands by chaser and tick."""
+    """Sending times (wall clock, ns) of ticks, and of images and commands by chaser and tick."""
 
     ticks: dict[int, int] = field(default_factory=dict)
     images: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -239,7 +239,7 @@ def figures(name: str, windows: list[Window], observer: LatencyObserver) -> Figu
 
 
 def wait_for_images(observer: LatencyObserver, tick: int, fleet: Fleet, hub: Node) -> None:
-    """Wait until the images of a tick have been sent. Raise SystemExit if the mission ends before."""
+    """Wait until the images of a tick were sent. Raise SystemExit if the mission ends before."""
     while observer.last_tick < tick:
         received = hub.receive(0.05)
         exited = [c.last_line() for c in fleet.children if c.process.poll() is not None]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: two spacecraft 100 m apart fly one
-orbit under two-body gravity, and with J2.
+"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: two spacecraft 100 m apart fly
+one orbit under two-body gravity, and with J2.
 """
 
 from __future__ import annotations

@@ -337,9 +337,9 @@ def fly_failure(failure: str, seed: int) -> list[float]:
 
 
 def failures(options: Options) -> Figures:
-    """Fly four chasers under ``lab`` with plant mismatch and statistical perception: no sight for 20
-    s, and odometry of one chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a
-    tenth of its sigma of position.
+    """Fly four chasers under ``lab`` with plant mismatch and statistical perception: no sight for
+    20 s, and odometry of one chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or
+    a tenth of its sigma of position.
     """
     figures: Figures = {}
     for kind in ("blind", *ODOMETRY_FAILURES):

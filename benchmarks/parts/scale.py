@@ -112,7 +112,7 @@ def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
 
 
 def fly(n: int, duration_s: float) -> dict[str, float]:
-    """Measure the mission with ``n`` chasers; return wall time and processor time of each command, s
+    """Run the mission with ``n`` chasers; return wall time and processor time of each command, s
     per tick.
 
     Raise SystemExit if it fails.

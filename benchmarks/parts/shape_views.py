@@ -221,8 +221,14 @@ class CamerasAround:
         return cls(turns, rng.normal(0.0, LAB.camera_shift_m, (len(turns), 3)))
 
     def fused(
-        self, before: ShapeFilter, mesh: TrackerMesh, scene: SatelliteImages, rng: np.random.Generator, first: int, inspect: bool
-    ) -> ShapeFilter:  # fmt: skip
+        self,
+        before: ShapeFilter,
+        mesh: TrackerMesh,
+        scene: SatelliteImages,
+        rng: np.random.Generator,
+        first: int,
+        inspect: bool,
+    ) -> ShapeFilter:
         """Return the geometry after one image of each camera at 1 to 1.6 m: by their distances, and
         if they ``inspect`` by each.
         """
@@ -726,8 +732,8 @@ AT_RANGES: dict[str, tuple[Callable[[Cells, float, int], Figures], str]] = {
 VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     "inspect": (
         lambda _, views: inspect(views),
-        "Track at 1 m after the geometry has been estimated by the controller's filter from 36 views "
-        "at 1 to 1.6 m, by two cameras on opposite sides: twelve views of each drawn mesh.",
+        "Track at 1 m after the geometry has been estimated by the controller's filter from 36 "
+        "views at 1 to 1.6 m, by two cameras on opposite sides: twelve views of each drawn mesh.",
     ),
     "behind": (behind, "Track at 1 to 3 m in front of the Earth."),
     "backlit": (backlit, "Track at 1 to 3 m with the sun behind the target."),
@@ -744,13 +750,13 @@ VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     ),
     "blur": (
         blur,
-        "Track at 1 to 3 m a target that moves by four pixels during the exposure; the pose is that "
-        "in the middle of it.",
+        "Track at 1 to 3 m a target that moves by four pixels during the exposure; the pose is "
+        "that in the middle of it.",
     ),
     "gate": (
         gate,
-        "Track from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and "
-        "those that pass the gate.",
+        "Track from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, "
+        "and those that pass the gate.",
     ),
     "acquisition": (
         lambda cells, views: acquire(cells, "acquisition", views),
@@ -774,8 +780,8 @@ VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     ),
     "shaded": (
         lambda _, views: shaded(min(views, _SHADED_IMAGES)),
-        "Time images of the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that others "
-        "expect: the least of three repetitions, as other programs on the machine prolong it.",
+        "Time images of the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that "
+        "others expect: the least of three repetitions, as other programs prolong it.",
     ),
 }
 
@@ -786,13 +792,13 @@ def views_of(options: Options) -> int:
 
 
 def run_at_ranges(name: str, options: Options) -> Figures:
-    """Measure a cell at the ranges of the options."""
+    """Run a cell at the ranges of the options."""
     cells = Cells(options.results)
     return at_ranges(AT_RANGES[name][0], cells, options.ranges, views_of(options))
 
 
 def run_views(name: str, options: Options) -> Figures:
-    """Measure a cell."""
+    """Run a cell."""
     return VIEWS[name][0](Cells(options.results), views_of(options))
 
 

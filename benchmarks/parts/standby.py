@@ -259,7 +259,7 @@ def takeovers(name: str, flights: int) -> Figures:
 
 
 def is_identical(at_s: float) -> bool:
-    """Return whether all bodies move identically in lock-step with and without a killed controller."""
+    """Return whether all bodies move identically in lock-step if the controller is killed."""
     truths = []
     for fault in ("[]", f'[{{kind="kill", at_s={at_s}, process="controller"}}]'):
         with tempfile.TemporaryDirectory() as name:
@@ -271,7 +271,7 @@ def is_identical(at_s: float) -> bool:
 
 
 def identity(options: Options) -> Figures:
-    """Compare pairs of lock-step flights, one with the controller killed: bodies move identically."""
+    """Compare pairs of lock-step flights, one with the controller killed: equal motion."""
     pairs = 1 if options.quick else 2
     draw = random.Random("identity")
     same = [is_identical(round(draw.uniform(EARLIEST_S, LATEST_S), 1)) for _ in range(pairs)]

@@ -331,7 +331,7 @@ def far(count: int) -> Figures:
         make_perception(scenario),
         scenario.camera_model(),
     )
-    zero, out = np.zeros(3), {}
+    zero, out = np.zeros(3), Figures()
     for metres in (5.0, 6.0, 6.5, 7.0, 7.5):
         rng, found = np.random.default_rng([24, int(10 * metres)]), []
         for k in range(count):
@@ -354,17 +354,17 @@ def far(count: int) -> Figures:
             ]
             if errors:
                 found.append(min(errors, key=lambda e: float(np.linalg.norm(e[0][3:]))))
-        e = np.array([error for error, _ in found])
-        squares = normalized_square(e, np.array([covariance for _, covariance in found]))
         at = f"far_{metres:g}m_"
-        out |= {
-            f"{at}without_a_pose": count - len(found),
-            f"{at}nees_mean": float(squares.mean()),
-            f"{at}depth_rms_m": float(np.sqrt(np.mean(e[:, 2] ** 2))),
-            f"{at}angle_rms_deg": float(
-                np.degrees(np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1))))
-            ),
-        }
+        out[f"{at}without_a_pose"] = count - len(found)
+        if found:
+            e = np.array([error for error, _ in found])
+            squares = normalized_square(e, np.array([covariance for _, covariance in found]))
+            angles_rad = np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1)))
+            out |= {
+                f"{at}nees_mean": float(squares.mean()),
+                f"{at}depth_rms_m": float(np.sqrt(np.mean(e[:, 2] ** 2))),
+                f"{at}angle_rms_deg": float(np.degrees(angles_rad)),
+            }
     return out
 
 

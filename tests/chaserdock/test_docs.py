@@ -246,19 +246,3 @@ def test_commands_in_the_docs_exist() -> None:
             assert used <= options[verb] | {"--help"}, (page, command, used - options[verb])
             tried += 1
     assert tried > 30
-
-
-def test_benchmark_commands_in_the_docs_exist() -> None:
-    """Every ``python benchmarks/NAME.py --option`` names a script that defines the option."""
-    shared = (ROOT / "benchmarks" / "common.py").read_text(encoding="utf-8")
-    tried = 0
-    for page in (*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"):
-        text = page.read_text(encoding="utf-8")
-        for folder, name, arguments in re.findall(
-            r"python (benchmarks|docs)/([a-z]\w+)\.py([^`\n#]*)", text
-        ):
-            source = (ROOT / folder / f"{name}.py").read_text(encoding="utf-8") + shared
-            for option in re.findall(r"--[a-z][a-z-]*", arguments):
-                assert f'"{option}"' in source, (page.name, name, option)
-            tried += 1
-    assert tried > 30

@@ -50,6 +50,7 @@ OPTIMUM_S, OPTIMUM_GUESSES = 15.5, 40
 ALONE = ("detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002")
 """Limits of rest of a single chaser, whose thrusters push one way only."""
 ALONE_S = 90.0
+"""Time that a single chaser is given to stop the stack."""
 
 T = TypeVar("T")
 

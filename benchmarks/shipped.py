@@ -63,7 +63,9 @@ LONGEST_S = {
 }
 """Durations of digests: enough for each phase of the flight, in minutes of processor time."""
 LONGEST_WITH_IMAGES_S = {**LONGEST_S, "v-bar-images": 60.0}
+"""With images, `v-bar-images` costs much more."""
 QUICK_S = 5.0
+"""With ``--quick``."""
 QUICK = ("fault-drill", "single")
 
 

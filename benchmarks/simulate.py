@@ -66,6 +66,7 @@ def swarm(options: Options) -> Figures:
 
 
 _TICKS, _SHORT_TICKS = 40, 20
+"""Ticks that are counted, and ticks before them."""
 _FLIGHTS = """
 import sys, tempfile
 from pathlib import Path

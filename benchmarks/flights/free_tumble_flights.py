@@ -39,8 +39,8 @@ from chaserdock_world.sensors.publish import odometry_of
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
 from chaserdock.evaluation.perception import RenderedImages
 
-from .detumble_flights import moving_with, stack_scenario
-from .latched_stack import body_of_plant
+from .detumble_flights import stack_scenario
+from .latched_stack import body_of_plant, moving_with
 from .rigid_control import wrong_knowledge
 
 

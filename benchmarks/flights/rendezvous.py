@@ -10,19 +10,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import RelativeEstimate
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
+from chaserdock.analysis.pose_errors import pose_error, relative_pose
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import PerceptionModel
 
 HOLD_S = 20.0
 """Time before the next command over which tracking at a hold point is measured."""
 _AFTER_CAPTURE_S, _AFTER_COMMAND_S = 1.0, 1.0
+"""A flight ends so long after the verified latch, a leg after the next command."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +79,8 @@ def estimate_error(estimate: RelativeEstimate, states: States) -> Array:
     vector in CRF axes (rad).
     """
     own, target = states[f"chaser/{estimate.chaser}"], states[TARGET]
-    position = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
-    q = rotations.multiply(rotations.conjugate(target.q_wxyz), own.q_wxyz)
-    turn = rotations.log(rotations.multiply(rotations.conjugate(q), estimate.q_wxyz))
-    return np.concatenate([np.array(estimate.position_m) - position, turn])
+    truth = relative_pose(own.position_m, own.q_wxyz, target.position_m, target.q_wxyz)
+    return pose_error(*truth, np.array(estimate.position_m), np.array(estimate.q_wxyz))
 
 
 class _Recorder:

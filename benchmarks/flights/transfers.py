@@ -26,9 +26,13 @@ from . import load_shipped
 from .shape_gaps import shape_gap_m
 
 SYMMETRIC_EVERY = 4
+"""Every fourth variation of ``collision-avoidance`` is exactly symmetric."""
 SMALL = {"width_px": 640, "height_px": 360}
+"""A quarter of the scenario's pixels, to save time."""
 CLUTTER_S = 100.0
+"""Longest flight in clutter."""
 CLUTTER_TIMING = ("time.rate_hz=10", "time.image_hz=10", "time.physics_hz=120")
+"""Coarser than the scenario, to save time."""
 _DIAGONAL = 9.0
 """m: stands for a chaser's distance to itself, larger than any between two."""
 

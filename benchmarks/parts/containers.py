@@ -24,6 +24,7 @@ from compose_project import Project, compose_command, docker
 SMALL = "camera.width_px=640 camera.height_px=480 settling_s=10.0"
 TOLERANT = "success.steady_position_rms_m=0.5 success.steady_orientation_rms_deg=20.0"
 FAULT_AT_TICK = 60
+"""All containers have been up for some seconds."""
 
 
 def crash(container: str) -> None:

@@ -36,6 +36,7 @@ SIDES = (((-1.0, 0.0, 0.0), 0.0), ((0.0, -1.0, 0.0), 90.0), ((1.0, 0.0, 0.0), 18
 target.
 """
 SETTLED_S = 6.0
+"""From here on the estimate counts as settled."""
 
 
 def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: Any) -> Scenario:
@@ -245,6 +246,7 @@ ERRORS = {
     "camera_turn_deg": 0.3,
     "camera_shift_m": 5e-4,
 }
+"""Calibration errors of a camera, one sigma."""
 HEAVY = {
     "exposure_s": 0.003,
     "glare": 500.0,
@@ -253,6 +255,7 @@ HEAVY = {
     "point_spread_px": 0.9,
     "jpeg_quality": 75,
 }
+"""Image effects beyond the defaults."""
 
 
 def with_errors(scenario: Scenario) -> Scenario:
@@ -330,6 +333,7 @@ def calibrate(target: str, seed: int) -> Row:
 
 
 LOCKED_S = 3.0
+"""The estimate must be right for so long to count as found."""
 
 
 def acquire(seed: int) -> Row:
@@ -375,6 +379,7 @@ def acquire(seed: int) -> Row:
 
 
 WRONG_IRF_M, WRONG_RAD = (0.2, 0.0, 0.0), (0.0, 0.0, math.radians(15.0))
+"""Error of the poses that a chaser reports wrongly."""
 
 
 def fault(which: str, seed: int) -> Row:

@@ -36,12 +36,13 @@ from chaserdock.toml_text import toml_value
 
 SCENARIO = "fault-drill"
 TIMEOUT_S = 300.0
+"""A run that lasts longer has stalled."""
 GOOD = ("docked", "safe")
 
 
 @dataclass(frozen=True)
 class FaultResult:
-    """Outcome of one run. ``reason``: the first warning or error in the log since the fault began."""
+    """Outcome of one run. ``reason``: the first warning or error logged since the fault began."""
 
     number: int
     kind: str

@@ -44,8 +44,11 @@ from chaserdock.analysis.pose_errors import normalized_square, pose_error
 
 CAMERA_POSITION, CAMERA_ATTITUDE = np.zeros(3), rotations.IDENTITY  # IRF = WRF
 HFOV = np.deg2rad(60.0)
+"""Horizontal field of view, rad: that of the default camera."""
 GROSS_M, GROSS_RAD = 0.1, np.deg2rad(10.0)
+"""Errors of a pose above which it is grossly wrong."""
 JPEG_QUALITY = 85
+"""That of images between processes."""
 # Attitude of an upright face that faces the camera.
 FACING = rotations.from_matrix(np.diag([1.0, -1.0, -1.0]))
 

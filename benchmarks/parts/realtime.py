@@ -45,9 +45,11 @@ SCENARIO = ROOT / "scenarios" / "four-chaser-docking.toml"
 CHASERS = 4
 RATE_HZ = 30
 SETTLE_S = 6.0
+"""Time until processes have imported and compiled what they use."""
 PAUSE_S = 1.0
 """Between windows: a stopped process catches up."""
 LATE_S = 0.033
+"""A tick at 30 Hz: a later command is for the next one."""
 LEASE_MS = 60_000  # as under `chaserdock run`
 OVERRIDES = (
     f"time.rate_hz={RATE_HZ}",

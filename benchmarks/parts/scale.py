@@ -36,6 +36,7 @@ SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"
 WARM_TICKS = 15
 """Excluded from every figure: first calls and the estimator's start."""
 SAMPLE_S = 0.2
+"""Time between samples of the processor time of processes."""
 TOLERANT = (
     "settling_s=1.0",
     "success.steady_position_rms_m=0.3",

@@ -30,6 +30,7 @@ from common import Figures, Group, Options
 from flights import load_shipped
 
 CUBOIDS = 8
+"""Number of cuboids about the chaser."""
 
 
 def random_cuboids(rng: np.random.Generator) -> Array:

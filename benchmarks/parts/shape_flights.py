@@ -47,10 +47,12 @@ SCENARIOS = {
 }
 QUICK = ("duration_s=20.0", "settling_s=10.0", "steady_until_s=20.0", "timeline=[]")
 PROGRESS_S = 5.0
+"""Time between lines of progress."""
 LAGS_S = (0.0, 1.0, 5.0, 20.0)
 """Lags of the correlations; 0 stands for the next image."""
 KINDS = {"position": slice(0, 3), "rotation": slice(3, 6)}
 STEADY_RAD = math.radians(0.3)
+"""Bar of the tracking error with that of 3 mm."""
 
 
 class MarkerlessOutcome(msgspec.Struct, frozen=True):

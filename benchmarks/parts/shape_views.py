@@ -55,21 +55,29 @@ TARGET = "geo_servicer"
 EXACT = TrackerMesh.of_mesh(satellite(TARGET), 0.0, 0.0)
 KNOWN = satellite(TARGET, 0.001)
 EARTH_RADIUS_RAD = 1.1
+"""Angular radius of the Earth, in a low orbit."""
 PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
+"""Errors of a panel's joint about each axis, and of the scale (share), one sigma."""
 PRIOR, NEAR_PRIOR = (0.01, np.deg2rad(1.5)), (0.003, np.deg2rad(0.3))
+"""Errors of priors (share of the range, angle): of a new track, and of one that is followed."""
 FLIGHT_IMAGES = 30
 TURN = np.deg2rad(4.0) / 15.0 * np.array([0.6, 0.64, 0.48])
 """Turn of a tumbling target from image to image."""
 LEAST_GREY = 5.0
+"""A darker target is not seen by anyone."""
 MOST_UNSEEN = 120
+"""Images within which a target must be acquired: eight seconds."""
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
+"""Turn of the axes between opposite cameras."""
 RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0])))
+"""Turn of the axes between cameras at right angles."""
 
 ViewRow = dict[str, float]
 """Figures of one view."""
 LAB = NavigationSection(grade="lab").errors()
 """Errors of odometry and cameras of grade `lab`."""
 _EXPOSURES, _BLUR_PX, _LAMP = 8, 4.0, 60.0
+"""Renderings in a blurred image, its blur in pixels, power of the lamp (`harsh-light`)."""
 _SHADED = (
     (1.5, (0.3, -0.5, 1.0)),
     (1.0, (-0.2, 0.3, 1.0)),
@@ -79,6 +87,7 @@ _SHADED = (
 )
 """Ranges, and directions of the sun behind the target."""
 _SHADED_IMAGES = 40
+"""Images of each turning target."""
 _VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
 """Views of an inspection, and views of each mesh after it."""
 

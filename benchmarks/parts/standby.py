@@ -38,7 +38,9 @@ from chaserdock.launch.launcher import Fleet, fly_mission, free_port
 SCENARIO = ROOT / "scenarios" / "fault-drill.toml"
 CHASERS = 4
 OUTAGE_S = 3.0
+"""Longer than the lease, so that the standby takes over."""
 LEASE_MS = 2000
+"""Of the router's links."""
 EARLIEST_S, LATEST_S = 7.0, 14.0
 """Times of the fault: chasers 0 and 3 have been approaching since 5 s."""
 

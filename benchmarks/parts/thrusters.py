@@ -24,6 +24,7 @@ from chaserdock.evaluation.flight_record import FlightRecord, record_flight
 
 FAILED_AT_S = 30.01  # just after a tick: the longest time until two whole ticks are observed
 PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.045, 0.03)}
+"""Rates of the paper's target."""
 
 
 VARIANTS: dict[str, dict[str, Any]] = {

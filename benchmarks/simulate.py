@@ -20,8 +20,8 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import Figures, Group, Options, main
 
 from chaserdock.simulation.campaign import Swarm, fly_seed
+from chaserdock.simulation.flight import memory_folder
 from chaserdock.simulation.mission import simulate
-from chaserdock.simulation.swarm import memory_folder
 
 SCENARIO = "fault-drill"
 STATISTICAL = 'perception.name="statistical"'
@@ -73,7 +73,7 @@ from pathlib import Path
 from chaserdock_models.native import KernelLibrary
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock.simulation.mission import simulate
-from chaserdock.simulation.swarm import memory_folder
+from chaserdock.simulation.flight import memory_folder
 # valgrind does not know all instructions of the other kernels
 KernelLibrary.level = property(lambda self: 2)
 statistical = 'perception.name="statistical"'

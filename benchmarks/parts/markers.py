@@ -35,7 +35,6 @@ from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.rendering.rasterizer import Renderer
-from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from common import Figures, Group, Options, described, percentiles
 from flights import load_shipped
 from numpy.typing import NDArray
@@ -287,41 +286,28 @@ def speed(count: int) -> Figures:
 
 
 def rendering(count: int) -> Figures:
-    """Time the exact renderer and TinyRenderer (bias removed) at 640 x 480, and the errors of the
-    corners fitted in their images.
-    """
+    """Time an image of 640 x 480, and the errors of the corners fitted in it."""
     views = Views("servicer", 640, 480)
-    renderers = {
-        "exact": views.renderer,
-        "tinyrenderer": TinyRenderer(views.camera, views.model, supersampled=1),
-        "tinyrenderer_2x": TinyRenderer(views.camera, views.model, supersampled=2),
-    }
     perception = views.perception()
-    took: dict[str, list[float]] = {name: [] for name in renderers}
-    off: dict[str, list[float]] = {name: [] for name in renderers}
+    took: list[float] = []
+    off: list[float] = []
     generator = np.random.default_rng(12)
     for _ in range(count):
         position = np.array([*generator.uniform(-0.1, 0.1, 2), generator.uniform(0.7, 2.0)])
         q = rotations.normalize(generator.normal(size=4))
         light = Light(tuple((generator.normal(size=3) - (0, 0, 1.5)).tolist()))
-        for name, renderer in renderers.items():
-            begin_s = time.thread_time()
-            image = renderer.render(CAMERA_POSITION, CAMERA_ATTITUDE, position, q, (), light)
-            took[name].append(time.thread_time() - begin_s)
-            sighting = perception.estimate(image)
-            for i, corners in zip(sighting.marker_ids.tolist(), sighting.corners_px, strict=True):
-                marker = views.model.marker(i)
-                assert marker is not None
-                truth = views.camera.project(rotations.rotate(q, marker.corners_trf_m()) + position)
-                off[name] += np.linalg.norm(corners - truth, axis=1).tolist()
-    out: Figures = {}
-    for name in renderers:
-        out |= percentiles(took[name], f"render_{name}_cpu", "s", "median")
-        out |= percentiles(off[name], f"render_{name}_corner_error", "px", "median", "p95")
-    for key in ("cpu_median_s", "corner_error_median_px", "corner_error_p95_px"):
-        ratio = out[f"render_exact_{key}"] / out[f"render_tinyrenderer_{key}"]
-        out[f"render_exact_{key.rpartition('_')[0]}_over_tinyrenderer"] = ratio
-    return out
+        begin_s = time.thread_time()
+        image = views.renderer.render(CAMERA_POSITION, CAMERA_ATTITUDE, position, q, (), light)
+        took.append(time.thread_time() - begin_s)
+        sighting = perception.estimate(image)
+        for i, corners in zip(sighting.marker_ids.tolist(), sighting.corners_px, strict=True):
+            marker = views.model.marker(i)
+            assert marker is not None
+            truth = views.camera.project(rotations.rotate(q, marker.corners_trf_m()) + position)
+            off += np.linalg.norm(corners - truth, axis=1).tolist()
+    return percentiles(took, "render_exact_cpu", "s", "median") | percentiles(
+        off, "render_exact_corner_error", "px", "median", "p95"
+    )
 
 
 def far(count: int) -> Figures:

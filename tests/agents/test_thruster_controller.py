@@ -146,7 +146,7 @@ def test_contact_force_is_not_attributed_to_thrusters() -> None:
             thrusters.observe(moved, touched)
             thrusters.apply_command(wrench(s, tick))
             thrusters.add_pulses(passed_on(wrench(s, tick)))
-        assert thrusters.isolated == (() if touched else (3,))
+        assert thrusters.health.isolated == (() if touched else (3,))
 
 
 def test_reported_impulse_equals_commanded_impulse() -> None:

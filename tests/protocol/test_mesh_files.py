@@ -220,11 +220,7 @@ def test_invalid_geometry_is_one_line(override: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_renderer_and_centre_of_mass_are_checked(servicer_file: Path) -> None:
-    with pytest.raises(
-        ScenarioError, match=r'camera.renderer = "pybullet" draws OBJ and STL files'
-    ):
-        with_file(servicer_file, 'camera.renderer="pybullet"')
+def test_centre_of_mass_is_checked(servicer_file: Path) -> None:
     free = 'target.motion="torque_free"'
     with_file(servicer_file, free)
     with pytest.raises(

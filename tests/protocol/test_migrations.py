@@ -16,7 +16,12 @@ from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.recording import schema_migrations
 from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
 from chaserdock_protocol.recording.schema_migrations import UPGRADES, current_key, decode_logged
-from chaserdock_protocol.scenario.migrations import FORMAT, migrated, old_keys
+from chaserdock_protocol.scenario.migrations import (
+    FORMAT,
+    drop_removed_keys,
+    migrated,
+    old_keys,
+)
 from message_samples import BY_TYPE
 
 PRESENT: dict[str, msgspec.Struct] = {
@@ -175,6 +180,19 @@ FORMAT_3: dict[str, Any] = {
 
 def test_scenario_of_format_1_is_migrated() -> None:
     assert json.loads(migrated(json.dumps(FORMAT_1))) == FORMAT_3
+
+
+def test_key_of_the_renderer_is_dropped() -> None:
+    """Logs state it; in files only the value that is left is accepted."""
+    camera: dict[str, Any] = {"renderer": "pybullet", "width_px": 640}
+    text = json.dumps({"format": FORMAT, "camera": camera})
+    assert json.loads(migrated(text))["camera"] == {"width_px": 640}
+    (line,) = old_keys({"camera": camera})
+    assert line.startswith("camera.renderer: PyBullet's renderer")
+    exact = {"camera": camera | {"renderer": "exact"}}
+    drop_removed_keys(exact)
+    assert old_keys(exact) == []
+    assert "renderer" not in exact["camera"]
 
 
 def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:

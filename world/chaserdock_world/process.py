@@ -36,6 +36,7 @@ from chaserdock_protocol.transport.session import Heartbeat, ask_as_world
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
 from chaserdock_world.actuators.thrusters import make_actuators
+from chaserdock_world.lockstep.command_intake import CommandIntake
 from chaserdock_world.lockstep.membership import Membership
 from chaserdock_world.lockstep.tick_barrier import TickBarrier
 from chaserdock_world.physics.simulation import Physics
@@ -155,16 +156,20 @@ class World:
         heartbeat = Heartbeat(node, membership.instance)
         node.declare_liveliness()
         node.declare_queryable(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
+        commands = CommandIntake(
+            self._timing,
+            self._actuators,
+            lambda: self._physics.step_count,
+            self._physics.command_latch,
+            scenario.controller.command_lifetime_s,
+        )
         return TickBarrier(
             node,
             membership,
             heartbeat,
             self._timing,
-            self._actuators,
-            lambda: self._physics.step_count,
-            self._physics.command_latch,
+            commands,
             options.recorder_expected,
-            scenario.controller.command_lifetime_s,
             scenario.controller.standby,
         )
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 from chaserdock_models import rotations
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
@@ -172,11 +172,6 @@ class CameraSection(FlightCamera):
     +Z.
     """
 
-    renderer: Literal["exact", "pybullet"] = Field(
-        default="exact",
-        description="`exact`: analytic edges, for cuboids and markers. `pybullet`: PyBullet's renderer, which also draws "
-        "meshes.",
-    )
     calibration: str | None = Field(
         default=None,
         exclude=True,

@@ -264,11 +264,6 @@ def _check_mesh(scenario: Scenario) -> None:
         raise ValueError(
             f"chaser.mesh: drawn only with a target that has a mesh; {scenario.target.model!r} has none"
         )
-    if scenario.camera.renderer != "exact":
-        shipped = "" if geometry is not None else scenario.target_model().satellite
-        for key, name in (("target.model", shipped), ("chaser.mesh", scenario.chaser.mesh)):
-            if name:
-                raise ValueError(f'{key}: only camera.renderer = "exact" draws the mesh {name!r}')
 
 
 def _check_mesh_file(scenario: Scenario, geometry: Geometry) -> None:
@@ -278,15 +273,6 @@ def _check_mesh_file(scenario: Scenario, geometry: Geometry) -> None:
             f"{key}: {geometry.mesh!r} is read in scenario and target files only; "
             f"shipped: {', '.join(satellite_names())}"
         )
-    if scenario.camera.renderer == "pybullet":
-        if not geometry.mesh.lower().endswith((".obj", ".stl")):
-            raise ValueError(
-                f'{key}: camera.renderer = "pybullet" draws OBJ and STL files, not {geometry.mesh!r}'
-            )
-        if any(geometry.mesh_origin_m):
-            raise ValueError(
-                'target.geometry.mesh_origin_m: camera.renderer = "pybullet" needs (0, 0, 0)'
-            )
     if (
         target.motion == "torque_free"
         and target.inertia_kg_m2 is None

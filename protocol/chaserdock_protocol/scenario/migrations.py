@@ -55,6 +55,13 @@ _MOVED_KEYS: dict[tuple[str, ...], str] = {
 }
 """Path of a key in format 2 -> its present path."""
 
+_REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
+    ("camera", "renderer"): ("exact", "PyBullet's renderer is not a part of chaserdock any more"),
+}
+"""Path of a key of format 3 that was removed -> the value that states what is always done now, and
+what became of the others.
+"""
+
 
 def _holders(
     values: Any, path: tuple[str, ...], at: tuple[str, ...] = ()
@@ -70,6 +77,14 @@ def _holders(
             yield from _holders(item, path[1:], (*at, str(i)))
 
 
+def drop_removed_keys(values: dict[str, Any]) -> None:
+    """Remove, in place, keys that state what is always done now."""
+    for path, (value, _) in _REMOVED_KEYS.items():
+        for table, _ in _holders(values, path):
+            if table[path[-1]] == value:
+                del table[path[-1]]
+
+
 def old_keys(values: dict[str, Any]) -> list[str]:
     """Return one line per key, or value, of an older format, naming its present name."""
     lines = []
@@ -80,6 +95,8 @@ def old_keys(values: dict[str, Any]) -> list[str]:
             )
     for old, new in _MOVED_KEYS.items():
         lines += [f"{path}: is now called {new}" for _, path in _holders(values, old)]
+    for old, (_, reason) in _REMOVED_KEYS.items():
+        lines += [f"{path}: {reason}; remove the key" for _, path in _holders(values, old)]
     for table, path in _holders(values, ("fault", "*", "topic")):
         if table["topic"] == "jets":
             lines.append(f"{path}: 'jets' is now called 'thrusters'")
@@ -107,18 +124,24 @@ def old_format(values: dict[str, Any]) -> list[str]:
 
 
 def migrated(text: str) -> str:
-    """Return a resolved scenario (JSON) in the present format. Text that is not JSON is returned
-    unchanged.
+    """Return a resolved scenario (JSON) in the present format, without removed keys. Text that is
+    not JSON is returned unchanged.
     """
     try:
         values = json.loads(text)
     except (json.JSONDecodeError, RecursionError):
         return text
-    if not isinstance(values, dict) or values.get("format", 1) not in (1, 2):
+    if not isinstance(values, dict) or values.get("format", 1) not in (1, 2, FORMAT):
         return text
     if values.get("format", 1) == 1:
         _rename_keys(values)
-    _state_navigation(values)
+    if values.get("format", 1) != FORMAT:
+        _state_navigation(values)
+    elif not any(True for path in _REMOVED_KEYS for _ in _holders(values, path)):
+        return text
+    for path in _REMOVED_KEYS:
+        for table, _ in _holders(values, path):
+            del table[path[-1]]
     return json.dumps({**values, "format": FORMAT})
 
 

@@ -215,8 +215,6 @@ class Geometry(Section):
             self.dictionary,
             (x, y, z),
             self.white_margin_m,
-            self.mesh,
-            self.mesh_scale,
             "" if mesh is None else name,
             mesh is not None and not self.cuboids,
         )

@@ -93,17 +93,6 @@ def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.
     return finished
 
 
-def label_texture(model: TargetModel, marker: Marker) -> NDArray[np.uint8]:
-    """Return reflectance times 255 (n, n) of one marker with its white border, as a label on a
-    surface.
-    """
-    side = marker.side_m + 2.0 * model.white_margin_m
-    texture = np.full((max(2, round(side / FINEST_TEXEL_M)),) * 2, WHITE, dtype=np.float32)
-    cells = np.where(marker_cells(model.dictionary, marker.id) > 0, WHITE, BLACK)
-    _print(texture, cells, np.zeros(2), marker.side_m / 2.0, side, side)
-    return np.rint(texture * np.float32(255.0)).astype(np.uint8)
-
-
 def _print(
     texture: NDArray[np.float32],
     cells: Array,

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold for each published message by itself, beyond what the decoder checks. Pure
-functions.
-"""
+"""Invariant of each published message by itself, beyond what the decoder checks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,19 +24,46 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 
-_UNIT = 1e-6
-_LIMIT_SHARE = 1.01
+from .check import Check
+
+QUATERNION_ROUNDING = 1e-6
+"""Largest difference of a quaternion's length from 1, by rounding."""
+LIMIT_SHARE = 1.01
 """Share of a limit up to which chasers accept commands."""
-_SYMMETRY = 1e-9
+SYMMETRY = 1e-9
 """Largest asymmetry and largest negative eigenvalue of a covariance, as a share of its largest
-variance.
+variance; rounding gives less.
 """
+LIFETIME_ROUNDING_S = 1e-6
+"""Largest difference (s) of a command's lifetime from the stated one: stamps are in whole ns."""
+
+
+@dataclass
+class ValidMessages(Check):
+    """Every message passes the decoder; quaternions are of unit length, covariances symmetric and
+    positive semidefinite; commands are within the body's limits and live for
+    `controller.command_lifetime_s`; pulses of a thruster do not overlap."""
+
+    name = "valid messages"
+
+    def readers(self) -> Iterator[tuple[type, Callable[[Any], None]]]:
+        for kind in DEFECTS:
+            yield kind, self.judge
+
+    def judge(self, message: Any) -> None:
+        """Judge a message of one of the types in ``DEFECTS``."""
+        for text in DEFECTS[type(message)](message, self.scenario):
+            self.violate(self.view.key, text)
+
+    def refuse(self, why: str) -> None:
+        """Report a message that does not pass the decoder."""
+        self.violate(self.view.sender, f"{self.view.key}: {why}")
 
 
 def defects_of(message: Any, scenario: Scenario) -> list[str]:
     """Return what is wrong with a message, given its scenario; empty if nothing is."""
-    check = _CHECKS.get(type(message))
-    return [] if check is None else list(check(message, scenario))
+    find = DEFECTS.get(type(message))
+    return [] if find is None else list(find(message, scenario))
 
 
 def covariance_defect(values: Sequence[float]) -> str:
@@ -48,18 +74,18 @@ def covariance_defect(values: Sequence[float]) -> str:
     matrix, scale = np.array(values).reshape(size, size), max(map(abs, values))
     if not (matrix == matrix.T).all():
         asymmetry = float(np.abs(matrix - matrix.T).max())
-        if asymmetry > _SYMMETRY * scale:
+        if asymmetry > SYMMETRY * scale:
             return f"covariance is not symmetric: {asymmetry:.2e} of {scale:.2e}"
     shifted = matrix.copy()
-    shifted.reshape(-1)[:: size + 1] += _SYMMETRY * scale
+    shifted.reshape(-1)[:: size + 1] += SYMMETRY * scale
     try:
-        # Exists unless an eigenvalue is below -_SYMMETRY * scale, and is faster than the
+        # Exists unless an eigenvalue is below -SYMMETRY * scale, and is faster than the
         # eigenvalues.
         np.linalg.cholesky(shifted)
         return ""
     except np.linalg.LinAlgError:
         least = float(np.linalg.eigvalsh(matrix)[0])
-    if least < -_SYMMETRY * scale:
+    if least < -SYMMETRY * scale:
         return f"covariance is not positive semidefinite: eigenvalue {least:.2e}"
     return ""
 
@@ -74,9 +100,9 @@ def _is_covariance_3(
     return e > 0.0 and i - f * f / e > 0.0
 
 
-def _quaternions(values: Iterable[Sequence[float]], tolerance: float = _UNIT) -> Iterator[str]:
+def _quaternions(values: Iterable[Sequence[float]]) -> Iterator[str]:
     for q in values:
-        if abs(math.hypot(*q) - 1.0) > tolerance:
+        if abs(math.hypot(*q) - 1.0) > QUATERNION_ROUNDING:
             yield f"quaternion of length {math.hypot(*q):.9g}"
 
 
@@ -119,7 +145,7 @@ def _estimate(estimate: TargetEstimate, scenario: Scenario) -> Iterator[str]:
 def _reference(reference: Reference, scenario: Scenario) -> Iterator[str]:
     yield from _quaternions([reference.q_wxyz])
     away_m, most_m = math.hypot(*reference.offset_m), scenario.limits.max_reference_distance_m
-    if away_m > most_m * _LIMIT_SHARE:
+    if away_m > most_m * LIMIT_SHARE:
         yield f"reference {away_m:.1f} m from the target, at most {most_m:g} allowed"
 
 
@@ -142,7 +168,7 @@ def _within_limits(
     if single:
         limits = np.maximum(limits, np.abs(wrench_matrix(thrusters)) @ thrusts_max(thrusters))
     shares = np.abs(np.array(wrenches).reshape(-1, 6)) / limits
-    if len(shares) and (share := float(shares.max())) > _LIMIT_SHARE:
+    if len(shares) and (share := float(shares.max())) > LIMIT_SHARE:
         yield f"wrench of {share:.3f} of the body's limits"
 
 
@@ -154,9 +180,8 @@ def _wrench(command: WrenchCommand, scenario: Scenario) -> Iterator[str]:
         return
     lifetime_s = (command.expires_ns - command.sim_time_ns) * 1e-9
     stated_s = scenario.controller.command_lifetime_s
-    if (
-        command.sim_time_ns and abs(lifetime_s - stated_s) > 1e-6
-    ):  # stamps of a wrong clock end at 0
+    is_wrong = abs(lifetime_s - stated_s) > LIFETIME_ROUNDING_S
+    if command.sim_time_ns and is_wrong:  # stamps of a wrong clock end at 0
         yield f"command with a lifetime of {lifetime_s:g} s, {stated_s:g} stated"
 
 
@@ -175,10 +200,11 @@ def _actuators(command: ActuatorCommand, scenario: Scenario) -> Iterator[str]:
 def _report(report: ThrusterReport, scenario: Scenario) -> Iterator[str]:
     yield from _within_limits([*report.force_max_N, *report.torque_max_N_m], scenario)
     if len(report.thrusters) != len(scenario.chaser.thrusters):
-        yield f"states of {len(report.thrusters)} thrusters, the body has {len(scenario.chaser.thrusters)}"
+        has = len(scenario.chaser.thrusters)
+        yield f"states of {len(report.thrusters)} thrusters, the body has {has}"
 
 
-_CHECKS: dict[type, Callable[[Any, Scenario], Iterator[str]]] = {
+DEFECTS: dict[type, Callable[[Any, Scenario], Iterator[str]]] = {
     BodyTruth: _body,
     Odometry: _odometry,
     Sighting: _sighting,
@@ -189,3 +215,4 @@ _CHECKS: dict[type, Callable[[Any, Scenario], Iterator[str]]] = {
     ActuatorCommand: _actuators,
     ThrusterReport: _report,
 }
+"""What finds the defects of messages of each type."""

@@ -118,11 +118,9 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     velocity = np.array(start.velocity_m_s) + rotations.rotate(
         q0, np.cross(omega0, body.centre_trf_m)
     )
-    camera, sensor, estimator = (
-        RenderedImages(scenario),
-        OdometrySensor(scenario),
-        estimator_of(flight),
-    )
+    camera = RenderedImages(scenario)
+    sensor = OdometrySensor(scenario)
+    estimator = estimator_of(flight)
     if not isinstance(estimator, JointEstimator):
         raise ValueError('needs estimator.name = "joint"')
     chasers, before, nees = range(len(scenario.chasers)), None, []

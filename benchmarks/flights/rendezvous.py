@@ -28,9 +28,11 @@ _AFTER_CAPTURE_S, _AFTER_COMMAND_S = 1.0, 1.0
 
 @dataclass(frozen=True)
 class HoldPoint:
-    """Tracking of a hold point over the last `HOLD_S` before ``until_s``: RMS of the distance from
-    the reference pose on the true target, largest angle, and RMS of the error of the estimated
-    relative position; ``range_m``: distance from the target."""
+    """How well a chaser waited at a hold point, over the last `HOLD_S` before ``until_s``.
+
+    ``range_m``: distance from the target. ``position_rms_m``, ``angle_max_deg``: from the reference
+    pose on the true target. ``estimate_rms_m``: error of the estimated relative position.
+    """
 
     until_s: float
     range_m: float
@@ -41,9 +43,12 @@ class HoldPoint:
 
 @dataclass(frozen=True)
 class HandOver:
-    """The first markers: at ``range_m``. ``step_m`` and ``step_deg``: change of the estimate's
-    error by the tick that uses them; ``step_sigmas``: its largest component over the estimate's
-    standard deviation before; ``error_sigmas`` as well for the error before the step."""
+    """How the estimate changed when the first markers were seen, at ``range_m``.
+
+    ``step_m``, ``step_deg``: change of the estimate's error by the tick that uses them.
+    ``step_sigmas``: its largest component over the estimate's standard deviation before.
+    ``error_sigmas``: the same of the error before.
+    """
 
     time_s: float
     range_m: float
@@ -55,9 +60,12 @@ class HandOver:
 
 @dataclass
 class RendezvousOutcome:
-    """One flight. ``verified_s``: None unless the latch was verified. ``delta_v_m_s``: impulse,
-    summed over axes, over mass. ``keep_out_margin_m``: least distance from the target before the
-    port's corridor, less ``limits.min_distance_target_m``."""
+    """One rendezvous of chaser 0.
+
+    ``verified_s``: when the latch was verified, or None. ``delta_v_m_s``: impulse, summed over
+    axes, over mass. ``keep_out_margin_m``: least distance from the target outside the port's
+    corridor, less ``limits.min_distance_target_m``.
+    """
 
     verified_s: float | None = None
     phase: str = ""

@@ -46,10 +46,8 @@ def avoidance(seed: int, full_images: bool = False) -> Scenario:
     random in WRF. Otherwise starts, goal and chaser 1's place are scattered by up to 10 cm (the
     goal up to 5 cm), attitudes by 0.1 rad.
     """
-    rng, scenario = (
-        np.random.default_rng([seed, 0xA701]),
-        load_shipped("collision-avoidance", f"seed={seed}"),
-    )
+    rng = np.random.default_rng([seed, 0xA701])
+    scenario = load_shipped("collision-avoidance", f"seed={seed}")
     symmetric = seed % SYMMETRIC_EVERY == 0
     rotated = seed > 11 or not symmetric
     attitude = (
@@ -178,11 +176,14 @@ def _places(
 
 @dataclass
 class TransferOutcome:
-    """Figures of one flight: least true distances between centres; ``shapes_m``: least gap between
-    the shapes of two bodies (probes included), if the scenario limits it; ``reached_s``: when the
-    last of the chasers with a goal was there for good, from its command on (NaN if never);
-    ``end_m``: the largest final distance from a goal; ``missed``: chasers that are not at their
-    goal at the end."""
+    """How near bodies came in one flight, and whether chasers reached their goals.
+
+    ``to_target_m``, ``between_m``: least true distances of centres, chaser to target and chaser to
+    chaser. ``shapes_m``: least gap between the shapes of two bodies, probes included, if the
+    scenario limits it. ``reached_s``: from its command on until the last chaser stayed at its goal
+    (NaN: never). ``end_m``: largest distance from a goal at the end. ``missed``: number of chasers
+    not at their goal then. ``failed``, ``relaxed``: solves of single chasers.
+    """
 
     seed: int
     to_target_m: float = math.inf

@@ -88,9 +88,10 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
 
 @dataclass
 class EstimatorErrors:
-    """An estimator's errors against ground truth by tick: position (m), angle (rad), velocity
-    (m/s), rate (rad/s), NEES of the pose (6 degrees of freedom), the share of its six components
-    inside 3 sigma, and the status."""
+    """An estimator's errors against ground truth, one value a tick.
+
+    ``nees``: of the pose, 6 expected. ``inside``: share of its six components inside 3 sigma.
+    """
 
     time_s: list[float] = field(default_factory=list)
     position_m: list[float] = field(default_factory=list)
@@ -132,9 +133,12 @@ class EstimatorErrors:
 
 @dataclass
 class EstimationFlight:
-    """A flight: errors of its estimator and of the parallel estimators, tracking errors as (time s,
-    m, rad) of all chasers, events as (time s, level, text), whether each image had a detection by
-    chaser, the last outputs, and reinitializations."""
+    """What a flight shows of its estimator.
+
+    ``estimates``: its errors; ``parallel``: those of the estimators beside it, by name.
+    ``tracking``: (time s, m, rad) of all chasers. ``events``: (time s, level, text).
+    ``detections``: whether each image had one, by chaser. ``last``: outputs of the last tick.
+    """
 
     estimates: EstimatorErrors
     parallel: dict[str, EstimatorErrors]

@@ -315,19 +315,15 @@ def far(count: int) -> Figures:
     of two solutions the nearer.
     """
     scenario = load_shipped("docking-contact", 'navigation.grade="exact"')
-    cameras, perception, camera = (
-        Cameras(scenario),
-        make_perception(scenario),
-        scenario.camera_model(),
-    )
+    cameras = Cameras(scenario)
+    perception = make_perception(scenario)
+    camera = scenario.camera_model()
     zero, out = np.zeros(3), Figures()
     for metres in (5.0, 6.0, 6.5, 7.0, 7.5):
         rng, found = np.random.default_rng([24, int(10 * metres)]), []
         for k in range(count):
-            q, turn = (
-                rotations.exp(rng.normal(0.0, 0.15, 3)),
-                rotations.exp(rng.normal(0.0, 0.01, 3)),
-            )
+            q = rotations.exp(rng.normal(0.0, 0.15, 3))
+            turn = rotations.exp(rng.normal(0.0, 0.01, 3))
             own = np.array([-metres, *rng.normal(0.0, 0.05 * metres, 2)])
             states = {
                 "target": BodyState(zero, zero, q, zero),
@@ -379,20 +375,12 @@ def bearing(count: int) -> Figures:
     perception, camera = make_perception(scenarios[0]), scenarios[0].camera_model()
     zero, still, out = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), {}
     for metres in (7.0, 10.0, 15.0, 20.0, 30.0, 50.0, 80.0, 120.0, 160.0, 200.0):
-        rng, errors, squares, ranges, alone, wrong, missed = (
-            np.random.default_rng([24, int(metres)]),
-            [],
-            [],
-            [],
-            0,
-            0,
-            0,
-        )
+        rng = np.random.default_rng([24, int(metres)])
+        errors, squares, ranges = [], [], []
+        alone = wrong = missed = 0
         for k in range(count):
-            q, own = (
-                rotations.normalize(rng.normal(size=4)),
-                np.array([-metres, *rng.uniform(-0.2, 0.2, 2) * metres]),
-            )
+            q = rotations.normalize(rng.normal(size=4))
+            own = np.array([-metres, *rng.uniform(-0.2, 0.2, 2) * metres])
             states = {
                 "target": BodyState(zero, zero, q, zero),
                 "chaser/0": BodyState(own, zero, still, zero),

@@ -87,11 +87,9 @@ def relative_error(tick: TickRecord, chaser: int) -> tuple[Array, float]:
     if found is not None:
         error = estimate_error(found, tick.states)
         return error, float(normalized_square(error, np.reshape(found.covariance, (6, 6))))
-    true, own, odometry = (
-        tick.states["target"],
-        tick.states[f"chaser/{chaser}"],
-        tick.odometry[chaser],
-    )
+    true = tick.states["target"]
+    own = tick.states[f"chaser/{chaser}"]
+    odometry = tick.odometry[chaser]
     truth = relative_pose(own.position_m, own.q_wxyz, true.position_m, true.q_wxyz)
     own_pose = np.array(odometry.position_m), np.array(odometry.q_wxyz)
     target_pose = np.array(estimate.position_m), np.array(estimate.q_wxyz)

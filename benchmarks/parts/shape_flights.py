@@ -56,7 +56,7 @@ STEADY_RAD = math.radians(0.3)
 
 
 class MarkerlessOutcome(msgspec.Struct, frozen=True):
-    """How one flight ended.
+    """How one flight ended, and what perception, estimate and computer did in it.
 
     ``steady_position_m``, ``steady_orientation_rad``: RMS tracking errors of the worst chaser in
     the steady interval. ``estimate_*``: of the target's estimate from its first sighting on, RMS

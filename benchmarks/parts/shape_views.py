@@ -117,10 +117,8 @@ class SatelliteImages:
         """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure,
         ``pose`` in the middle of it.
         """
-        q, total = (
-            rotations.from_matrix(pose.rotation),
-            np.zeros((CAMERA.height_px, CAMERA.width_px)),
-        )
+        q = rotations.from_matrix(pose.rotation)
+        total = np.zeros((CAMERA.height_px, CAMERA.width_px))
         shares = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
         for share in shares:
             at = pose.position + share * step_m
@@ -277,10 +275,8 @@ def inspected(
     scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int
 ) -> ShapeFilter:
     """Return the geometry by the views of two cameras on opposite sides of the target."""
-    cameras, fused = (
-        CamerasAround.drawn((np.eye(3), HALF_TURN), rng),
-        ShapeFilter.prior(len(mesh.modes_m)),
-    )
+    cameras = CamerasAround.drawn((np.eye(3), HALF_TURN), rng)
+    fused = ShapeFilter.prior(len(mesh.modes_m))
     for number in range(0, _VIEWS_BEFORE, 2):
         fused = cameras.fused(fused, mesh, scene, rng, first + number, inspect=True)
     return fused

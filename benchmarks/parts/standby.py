@@ -120,8 +120,10 @@ class TakeoverObserver:
 
 @dataclass(frozen=True)
 class Takeover:
-    """Outcome of one flight. ``takeover_s``: from the fault to the first command of another
-    controller; infinite if none.
+    """How a standby took over in one flight.
+
+    ``takeover_s``: from the fault to the first command of another controller; infinite without one.
+    ``two_commanding``: commands of an older term that a chaser executed after one of a newer term.
     """
 
     takeover_s: float

@@ -10,7 +10,11 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 MAX_BYTES = 256_000_000
+"""Bytes of a queue: some 200 images of 1280 x 960; a process that stands still for seconds loses
+nothing, and one that floods it cannot exhaust the memory.
+"""
 MAX_ITEMS = 200_000
+"""Items of a queue, which bounds the memory of small messages alike."""
 
 
 class BoundedQueue(Generic[T]):

@@ -24,9 +24,15 @@ BodyPose = tuple[Array, Array]
 """Position (3,) WRF and attitude (4,) body to WRF."""
 
 _NEAR_M = 0.02
+"""Least depth (m) of what is drawn, so that no division overflows. Chosen; bodies are farther away.
+"""
 _SHIFT = 4
+"""Bits of OpenCV's fixed-point coordinates behind the point: 1/16 px, finer than antialiasing shows.
+"""
 _SPACE = (26, 21, 18)
+"""Colour (BGR, 0 to 255) of space without a background. Chosen."""
 _TARGET_PATH = (150, 150, 150)
+"""Colour (BGR, 0 to 255) of the path of the target. Chosen; grey, as chasers are coloured."""
 _PLUME = np.array([255.0, 214.0, 150.0])
 
 

@@ -15,6 +15,8 @@ from chaserdock_protocol.scenario import Scenario
 from .flight import LoadHistory, RecordedFlight
 
 _CONTACT_SLACK_M = 0.02
+"""Distance (m) by which a chaser in contact may be nearer than latched: by its tilt and the spring of
+its probe. Chosen."""
 _VERIFIED = ("verified", "identify", "detumble", "stack_hold")
 """Phases of a chaser whose latch has passed the test."""
 

@@ -16,6 +16,8 @@ from chaserdock_protocol.topics import IMAGE, SIGHTING
 Pair = tuple[Image, Sighting | None]
 
 _MAX_WAITING = 4
+"""Images of a chaser that wait for their sightings. Chosen: it may follow the next image, and one
+that is lost is to delay few."""
 
 
 def pairs(log: Path, chasers: int) -> Iterator[Pair]:

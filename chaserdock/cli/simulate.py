@@ -18,7 +18,7 @@ from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from .options import ModeOption, ScenarioArg, fail
 
 if TYPE_CHECKING:
-    from chaserdock.simulation.swarm import SimulationResult
+    from chaserdock.simulation.flight import SimulationResult
 
 
 def _seed_range(text: str) -> range:
@@ -146,7 +146,7 @@ def _fly_one(scenario: str, out: Path, mode: Any) -> int:
     """Fly a scenario with its own faults and conditions; print what it violates."""
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
-    from chaserdock.simulation.swarm import fly_case
+    from chaserdock.simulation.flight import fly_case
 
     path = find_scenario(scenario)
     case: dict[str, Any] = {"extends": str(path.resolve())}

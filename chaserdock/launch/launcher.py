@@ -43,7 +43,11 @@ from .progress import ProgressReporter, Show, print_json_line
 from .signals import deferred_signals
 
 _START_TIMEOUT_S = 120
+"""Time (s) that processes have to start and to find each other. Chosen, for busy
+machines."""
 _END_TIMEOUT_S = 30.0
+"""Time (s) that processes have to end after the mission; the recorder closes its log in it. Chosen.
+"""
 _WORLD_ENDS_S = 15.0
 """Time (s) that the world has for ending a stalled mission itself."""
 STOPPED_BY_OPERATOR = "stopped by the operator"

@@ -23,8 +23,11 @@ from .flight_state import FlightState
 from .json_events import CommandNotice, EventNotice, JsonLine, Progress, Start, encode_line
 
 _LIVE_EVERY_S = 0.25
+"""Time (s) between two updates of the table on a terminal. Chosen, to be read."""
 _LINE_EVERY_S = 5.0
+"""Time (s) between two lines where output is no terminal. Chosen, for short logs."""
 _JSON_EVERY_S = 1.0
+"""Time (s) between two JSON lines of progress. Chosen."""
 _STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 _SUBSCRIBED = (
     topics.TICK,

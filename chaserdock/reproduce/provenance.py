@@ -5,14 +5,12 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
+from chaserdock_protocol.recording.provenance import commit_of
 from msgspec import Struct
-
-_FOLDER = Path(__file__).resolve().parent
 
 
 class Provenance(Struct, frozen=True, kw_only=True):
@@ -31,26 +29,10 @@ class Provenance(Struct, frozen=True, kw_only=True):
 def provenance() -> Provenance:
     """Return date, commit and machine of this process."""
     return Provenance(
-        date=f"{datetime.now(UTC):%Y-%m-%d}", commit=commit_of(_FOLDER), machine=_machine()
+        date=f"{datetime.now(UTC):%Y-%m-%d}",
+        commit=commit_of() or f"unknown (chaserdock {version('chaserdock')}, not a git checkout)",
+        machine=_machine(),
     )
-
-
-def commit_of(folder: Path) -> str:
-    """Return the commit of the working copy that tracks ``folder``; without one, the package's
-    version.
-    """
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(folder), *arguments]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-        except OSError:  # git is not installed
-            return ""
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    if not git("ls-files", "."):
-        return f"unknown (chaserdock {version('chaserdock')}, not a git checkout)"
-    return git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
 
 
 def _machine() -> str:

@@ -25,15 +25,17 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.toml_text import toml_document
 
-from .invariants import Violation
+from .checks.check import Violation
+from .checks.estimates import (
+    LEAST_FLIGHTS,
+    LEAST_MEAN_NEES,
+    MOST_MEAN_NEES,
+    CovarianceConsistency,
+)
+from .flight import SimulationResult, fly_case
 from .shrinking import shrink
-from .swarm import Case, SimulationResult, draw_case, fly_case
+from .swarm import Case, draw_case
 
-NEES_LIMITS = (1.5, 12.0)
-"""Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights
-without lying sensors.
-"""
-LEAST_NEES_FLIGHTS = 20
 _NOT_DOCKED = "ends in phase "
 """Begin of the text on a chaser that should have docked, or should be safe."""
 
@@ -255,7 +257,8 @@ def inconsistency(results: Iterable[SimulationResult]) -> str | None:
     the ensemble is small.
     """
     mean, number = consistency(results)
-    low, high = NEES_LIMITS
-    if number < LEAST_NEES_FLIGHTS or low <= mean <= high:
+    if number < LEAST_FLIGHTS or LEAST_MEAN_NEES <= mean <= MOST_MEAN_NEES:
         return None
-    return f"covariance consistency: mean NEES {mean:.2f} over {number} flights, allowed {low:g} to {high:g}"
+    allowed = f"{LEAST_MEAN_NEES:g} to {MOST_MEAN_NEES:g}"
+    found = f"mean NEES {mean:.2f} over {number} flights, allowed {allowed}"
+    return f"{CovarianceConsistency.name}: {found}"

@@ -30,11 +30,12 @@ LINK_BYTES = 1 << 20
 ``transport.config`` does.
 """
 LEASE_S = 2.0
-"""Time after which a silent process counts as lost in real time, as under ``chaserdock run``."""
+"""Time (s) after which a silent process counts as lost in real time, as under ``chaserdock run``."""
 _RETRY_S = 0.2
-"""Time after which a lost message that must not be lost is sent again."""
+"""Time (s) after which a lost message that must not be lost is sent again: as TCP does in Linux
+(TCP_RTO_MIN)."""
 EPOCH_NS = 1_800_000_000 * 10**9
-"""Wall-clock time at the begin of a simulation."""
+"""Wall-clock time (ns) at the begin of a simulation. Chosen: in January 2027."""
 
 
 @lru_cache(maxsize=128)

@@ -30,6 +30,7 @@ class Killed(BaseException):
 Due = tuple[float, float]
 """Virtual time (s) of an event, and its place among those of the same time."""
 NEVER: Due = (0.0, 0.0)
+"""A time before all events."""
 SPREAD, WAKE_SPREAD = 32.0, 128.0
 """How many later events of the same time may come before an event, and before a task that is woken
 continues.

@@ -17,8 +17,10 @@ from chaserdock_protocol.errors import ChaserdockError
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
+"""First TCP port that is tried: the usual one of a local page."""
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _TRIES = 20
+"""Ports that are tried. Chosen."""
 TOKEN_VARIABLE = "CHASERDOCK_VIEWER_TOKEN"
 """Environment variable with the token of the page: unlike an argument, other users cannot read it.
 """

@@ -35,7 +35,10 @@ from chaserdock.analysis.mass_properties import values_of
 from .snapshot import TARGET, keep_newest
 
 MOST_POINTS = 40_000
+"""Most points of a curve: an hour at 10 Hz, and thinned beyond that. Chosen, for memory."""
 _MOST_LINES = 500
+"""Most lines of the event list, and an eighth of the most points of a trail. Chosen, for memory.
+"""
 
 ChartQuantity = Literal[
     "position_error_mm",

@@ -34,12 +34,20 @@ from .server import page_server
 from .snapshot import OF_CHASERS, MissionState
 
 PERIOD_S = 0.1
+"""Time (s) between two drawings: as long as a tick of 10 Hz."""
 _STATES, _EVENTS = 16, 256
+"""Messages of a state and of events that may wait for a drawing. Chosen; 16 states last
+1.6 s at 10 Hz."""
 _REPLY_TIMEOUT_S = 5.0
+"""Time (s) that a controller has to answer a command of the page. Chosen."""
 _SILENCE_S = 3.0
+"""Time (s) without messages after which a new mission is looked for. Chosen."""
 _JOIN_PERIOD_S = 2.0
+"""Time (s) between two attempts to find it. Chosen."""
 _RECONNECT_S = 10.0
+"""Time (s) without an answer after which the session is opened again. Chosen."""
 _DRAWING_NICE = 10
+"""Priority (nice) of drawing: below that of missions on the same machine, half of the range."""
 _ATTEMPT_S = 2.0
 """Longest time (s) of one attempt to connect to a router."""
 _WAITING = "no mission is running"

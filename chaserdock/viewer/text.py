@@ -15,6 +15,7 @@ from .snapshot import ChaserState, MissionState
 
 _MARKS = {"info": "", "warning": "⚠ ", "error": "⛔ "}
 _FRESH_S = 2.0
+"""Age (s) up to which a latency is shown. Chosen."""
 _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
 
 

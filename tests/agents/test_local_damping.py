@@ -20,8 +20,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import DockingStatus, Odometry, Tick, WrenchCommand
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario
 from chaserdock_protocol.scenario.mounting import plume_free_thrusters
-
-from chaserdock.evaluation.transfers import load_shipped
+from flights import load_shipped
 
 
 def scenario_of(*changes: str) -> FlightScenario:

@@ -26,10 +26,10 @@ from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterRepo
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.faults import faults_of
 from flight_cases import odometry
+from flights.measured_poses import measurement_model
 from thruster_cases import at_rest, box, mission, wrench
 
 from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perception import measurement_model
 
 
 def limits(report: ThrusterReport) -> np.ndarray:

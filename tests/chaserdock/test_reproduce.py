@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -49,7 +48,7 @@ from chaserdock.reproduce.plan import (
     needs_open,
     table_name,
 )
-from chaserdock.reproduce.provenance import Provenance, commit_of
+from chaserdock.reproduce.provenance import Provenance
 from chaserdock.reproduce.runner import MissionResult, ReproductionResults, code_digest, results_of
 from chaserdock.reproduce.tables import (
     changes,
@@ -479,18 +478,6 @@ def test_missing_solver_is_one_error_and_a_failed_status(
     ]
     assert errors == ["chaserdock: the paper's chain was not flown: solver 'open' needs cargo"]
     assert "NOT COMPLETE: 1 of 1 flights" in (tmp_path / "reproduction.md").read_text()
-
-
-def test_commit_of_a_folder_without_git_is_unknown(tmp_path: Path) -> None:
-    assert commit_of(tmp_path).startswith("unknown (chaserdock ")
-    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
-    (tmp_path / "a").write_text("1")
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    for command in (["add", "a"], ["commit", "-qm", "a"]):
-        subprocess.run([*git, *command], check=True)
-    assert re.fullmatch("[0-9a-f]{12}", commit_of(tmp_path))
-    (tmp_path / "a").write_text("2")
-    assert re.fullmatch("[0-9a-f]{12}-dirty", commit_of(tmp_path))
 
 
 def test_incomplete_line_and_changed_settings_count_as_not_flown(tmp_path: Path) -> None:

@@ -26,8 +26,11 @@ from chaserdock.simulation.campaign import (
     shrink_result,
     write_case,
 )
-from chaserdock.simulation.invariants import Invariants
-from chaserdock.simulation.swarm import draw_case, fly_case
+from chaserdock.simulation.checks import flight_checks
+from chaserdock.simulation.checks.check import Check
+from chaserdock.simulation.checks.reader import reads
+from chaserdock.simulation.flight import fly_case
+from chaserdock.simulation.swarm import draw_case
 
 SHORT = """
 extends = "single"
@@ -179,12 +182,15 @@ def test_a_case_inherits_thruster_failures() -> None:
 def test_a_flight_may_end_at_the_first_violation(
     good: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(checks: Invariants, tick: Tick) -> None:
-        checks._tick = tick.tick
-        if tick.tick == 3:
-            checks.violate("no contact", "test", "third tick")
+    class ThirdTick(Check):
+        name = "no third tick"
 
-    monkeypatch.setattr(Invariants, "_on_tick", fail)
+        @reads(Tick)
+        def judge(self, tick: Tick) -> None:
+            if tick.tick == 3:
+                self.violate("test", "third tick")
+
+    monkeypatch.setattr(flight_checks, "CHECKS", (*flight_checks.CHECKS, ThirdTick))
     rate_hz = load_scenario(good).time.rate_hz
     for to_violation, end_s in ((True, 3 / rate_hz), (False, 1.0)):
         result = fly_case({"extends": str(good)}, 0, to_violation=to_violation)

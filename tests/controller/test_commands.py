@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario
+from flights.measured_poses import measurement_model
 
 from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import measurement_model
 
 V = (0.0, 2.0, 0.0)
 

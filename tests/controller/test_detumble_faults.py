@@ -19,15 +19,15 @@ from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointEr
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import flight_scenario
-
-from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario, with_load_limits
-from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import (
+from flights.detumble_flights import StackMission, stack_scenario, with_load_limits
+from flights.rigid_control import (
     ControlledStack,
     FlightEvents,
     fly_controlled,
     wrong_knowledge,
 )
+
+from chaserdock.evaluation.perception import RenderedImages
 
 
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:

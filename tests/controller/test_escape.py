@@ -23,11 +23,11 @@ from chaserdock_models.orbit import OrbitalElements, propagate, state_of
 from chaserdock_models.relative_motion import propagate_relative
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario, flight_scenario, parse_scenario
+from flights.measured_poses import measurement_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import measurement_model
 
 GOOD = np.diag([2e-3**2] * 3 + [2e-5**2] * 3)
 KEEP_OUT_M = 2.0

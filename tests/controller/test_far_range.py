@@ -16,9 +16,8 @@ from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.pose_image import WIDTH_PX, encode_pose
 from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario, parse_scenario
-
-from chaserdock.evaluation.abort_study import study
-from chaserdock.evaluation.transfers import load_shipped
+from flights import load_shipped
+from flights.abort_study import study
 
 
 def scenario(**changes: Any) -> Scenario:

@@ -23,13 +23,13 @@ from chaserdock_models.shape_distance import (
     distance_from_cuboids,
     moved,
     reach_along,
-    separations,
     signed_distance,
 )
 from chaserdock_models.targets import Box
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import ScenarioError, parse_scenario
 from chaserdock_protocol.scenario.checks import shape_distance_m
+from flights.shape_gaps import separations
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
 from nmpc_kernels import build_rows
 

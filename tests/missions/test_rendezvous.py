@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flights import load_shipped
+from flights.rendezvous import last_leg, rendezvous
 
 from chaserdock.evaluation.in_process import InProcessMission
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rendezvous import last_leg, rendezvous
-from chaserdock.evaluation.transfers import load_shipped
 
 
 def test_last_leg_starts_at_the_last_hold_point() -> None:

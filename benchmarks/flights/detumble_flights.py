@@ -116,7 +116,7 @@ class StackMission(InProcessMission):
             self.physics.place(f"chaser/{i}", moving_with(target, place, own.q_wxyz))
             self.physics.close_latch(i)
             verified = ChaserGuidance(Phase.VERIFIED, 0.0, stay(place, 0.0))
-            self.controller.guidance.machine.chasers[i] = verified
+            self.controller.guidance.chasers[i].state = verified
 
     def _control(self, inputs: TickInputs) -> TickOutputs | None:
         return None if inputs.time_ns / 1e9 >= self._silent_from_s else super()._control(inputs)

@@ -185,9 +185,8 @@ def rendezvous(
     with InProcessMission(scenario, perception) as flight:
         while flight.tick < scenario.ticks:
             record = flight.step()
-            recorder.note(
-                record, flight.phase(0), flight.controller.guidance.machine.in_corridor(0)
-            )
+            chaser = flight.controller.guidance.chasers[0]
+            recorder.note(record, chaser.phase, chaser.in_corridor())
             report(record, flight)
             if out.phase == "verified" and out.verified_s is None:
                 out.verified_s = record.time_s

@@ -13,7 +13,7 @@ from msgspec import Struct
 
 
 class SteadyErrors(Struct, frozen=True, kw_only=True):
-    """Mean square tracking errors after the settling time; None where the flight has no such part."""
+    """Mean square tracking errors after the settling time; None in flights without such a part."""
 
     position_mse_m2: float | None
     orientation_mse_rad2: float | None

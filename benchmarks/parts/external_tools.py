@@ -32,6 +32,7 @@ from chaserdock.simulation.mission import simulate
 
 PACKAGES = ("evo", "pymcap-cli", "mcap", "mcap-ros2-support-fast", "rerun-sdk")
 TOLERANCE = 0.01
+"""Largest difference of evo's and our errors, share."""
 LEAST_GREY_LEVELS = 64
 """An image of an empty window has fewer."""
 
@@ -51,7 +52,7 @@ CheckedFigures = tuple[Figures, bool]
 
 
 def call(*command: str | Path, **environment: str) -> str:
-    """Measure a program and return its output. Raise RuntimeError if it fails."""
+    """Run a program and return its output. Raise RuntimeError if it fails."""
     done = subprocess.run(
         [str(c) for c in command],
         env=os.environ | environment,

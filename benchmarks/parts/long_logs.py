@@ -64,7 +64,7 @@ def repeat(log: Path, out: Path, hours: float) -> int:
 
 
 def cost_of(*arguments: str | Path) -> tuple[float, float]:
-    """Measure ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise
+    """Run ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise
     SystemExit if it fails.
     """
     begin_s = time.perf_counter()
@@ -103,7 +103,7 @@ QUICK = ("duration_s=10.0", "settling_s=5.0", "steady_until_s=10.0", "timeline=[
 
 
 def logs(options: Options) -> Figures:
-    """Measure each command that reads a log on ``--log`` (default: a flight of the main mission), and
+    """Run each command that reads a log on ``--log`` (default: a flight of the main mission), and
     on a log of ten hours (``--quick``: 0.2) made of it by repetition.
     """
     with tempfile.TemporaryDirectory(prefix="long-log-") as folder:

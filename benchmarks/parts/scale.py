@@ -36,6 +36,7 @@ SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"
 WARM_TICKS = 15
 """Excluded from every figure: first calls and the estimator's start."""
 SAMPLE_S = 0.2
+"""Time between samples of the processor time of processes."""
 TOLERANT = (
     "settling_s=1.0",
     "success.steady_position_rms_m=0.3",
@@ -112,7 +113,7 @@ def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
 
 
 def fly(n: int, duration_s: float) -> dict[str, float]:
-    """Measure the mission with ``n`` chasers; return wall time and processor time of each command, s
+    """Run the mission with ``n`` chasers; return wall time and processor time of each command, s
     per tick.
 
     Raise SystemExit if it fails.

@@ -55,21 +55,29 @@ TARGET = "geo_servicer"
 EXACT = TrackerMesh.of_mesh(satellite(TARGET), 0.0, 0.0)
 KNOWN = satellite(TARGET, 0.001)
 EARTH_RADIUS_RAD = 1.1
+"""Angular radius of the Earth, in a low orbit."""
 PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
+"""Errors of a panel's joint about each axis, and of the scale (share), one sigma."""
 PRIOR, NEAR_PRIOR = (0.01, np.deg2rad(1.5)), (0.003, np.deg2rad(0.3))
+"""Errors of priors (share of the range, angle): of a new track, and of one that is followed."""
 FLIGHT_IMAGES = 30
 TURN = np.deg2rad(4.0) / 15.0 * np.array([0.6, 0.64, 0.48])
 """Turn of a tumbling target from image to image."""
 LEAST_GREY = 5.0
+"""A darker target is not seen by anyone."""
 MOST_UNSEEN = 120
+"""Images within which a target must be acquired: eight seconds."""
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
+"""Turn of the axes between opposite cameras."""
 RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0])))
+"""Turn of the axes between cameras at right angles."""
 
 ViewRow = dict[str, float]
 """Figures of one view."""
 LAB = NavigationSection(grade="lab").errors()
 """Errors of odometry and cameras of grade `lab`."""
 _EXPOSURES, _BLUR_PX, _LAMP = 8, 4.0, 60.0
+"""Renderings in a blurred image, its blur in pixels, power of the lamp (`harsh-light`)."""
 _SHADED = (
     (1.5, (0.3, -0.5, 1.0)),
     (1.0, (-0.2, 0.3, 1.0)),
@@ -79,6 +87,7 @@ _SHADED = (
 )
 """Ranges, and directions of the sun behind the target."""
 _SHADED_IMAGES = 40
+"""Images of each turning target."""
 _VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
 """Views of an inspection, and views of each mesh after it."""
 
@@ -108,10 +117,8 @@ class SatelliteImages:
         """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure,
         ``pose`` in the middle of it.
         """
-        q, total = (
-            rotations.from_matrix(pose.rotation),
-            np.zeros((CAMERA.height_px, CAMERA.width_px)),
-        )
+        q = rotations.from_matrix(pose.rotation)
+        total = np.zeros((CAMERA.height_px, CAMERA.width_px))
         shares = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
         for share in shares:
             at = pose.position + share * step_m
@@ -221,8 +228,14 @@ class CamerasAround:
         return cls(turns, rng.normal(0.0, LAB.camera_shift_m, (len(turns), 3)))
 
     def fused(
-        self, before: ShapeFilter, mesh: TrackerMesh, scene: SatelliteImages, rng: np.random.Generator, first: int, inspect: bool
-    ) -> ShapeFilter:  # fmt: skip
+        self,
+        before: ShapeFilter,
+        mesh: TrackerMesh,
+        scene: SatelliteImages,
+        rng: np.random.Generator,
+        first: int,
+        inspect: bool,
+    ) -> ShapeFilter:
         """Return the geometry after one image of each camera at 1 to 1.6 m: by their distances, and
         if they ``inspect`` by each.
         """
@@ -262,10 +275,8 @@ def inspected(
     scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int
 ) -> ShapeFilter:
     """Return the geometry by the views of two cameras on opposite sides of the target."""
-    cameras, fused = (
-        CamerasAround.drawn((np.eye(3), HALF_TURN), rng),
-        ShapeFilter.prior(len(mesh.modes_m)),
-    )
+    cameras = CamerasAround.drawn((np.eye(3), HALF_TURN), rng)
+    fused = ShapeFilter.prior(len(mesh.modes_m))
     for number in range(0, _VIEWS_BEFORE, 2):
         fused = cameras.fused(fused, mesh, scene, rng, first + number, inspect=True)
     return fused
@@ -726,8 +737,8 @@ AT_RANGES: dict[str, tuple[Callable[[Cells, float, int], Figures], str]] = {
 VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     "inspect": (
         lambda _, views: inspect(views),
-        "Track at 1 m after the geometry has been estimated by the controller's filter from 36 views "
-        "at 1 to 1.6 m, by two cameras on opposite sides: twelve views of each drawn mesh.",
+        "Track at 1 m after the geometry has been estimated by the controller's filter from 36 "
+        "views at 1 to 1.6 m, by two cameras on opposite sides: twelve views of each drawn mesh.",
     ),
     "behind": (behind, "Track at 1 to 3 m in front of the Earth."),
     "backlit": (backlit, "Track at 1 to 3 m with the sun behind the target."),
@@ -744,13 +755,13 @@ VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     ),
     "blur": (
         blur,
-        "Track at 1 to 3 m a target that moves by four pixels during the exposure; the pose is that "
-        "in the middle of it.",
+        "Track at 1 to 3 m a target that moves by four pixels during the exposure; the pose is "
+        "that in the middle of it.",
     ),
     "gate": (
         gate,
-        "Track from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and "
-        "those that pass the gate.",
+        "Track from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, "
+        "and those that pass the gate.",
     ),
     "acquisition": (
         lambda cells, views: acquire(cells, "acquisition", views),
@@ -774,8 +785,8 @@ VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     ),
     "shaded": (
         lambda _, views: shaded(min(views, _SHADED_IMAGES)),
-        "Time images of the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that others "
-        "expect: the least of three repetitions, as other programs on the machine prolong it.",
+        "Time images of the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that "
+        "others expect: the least of three repetitions, as other programs prolong it.",
     ),
 }
 
@@ -786,13 +797,13 @@ def views_of(options: Options) -> int:
 
 
 def run_at_ranges(name: str, options: Options) -> Figures:
-    """Measure a cell at the ranges of the options."""
+    """Run a cell at the ranges of the options."""
     cells = Cells(options.results)
     return at_ranges(AT_RANGES[name][0], cells, options.ranges, views_of(options))
 
 
 def run_views(name: str, options: Options) -> Figures:
-    """Measure a cell."""
+    """Run a cell."""
     return VIEWS[name][0](Cells(options.results), views_of(options))
 
 

@@ -311,7 +311,9 @@ class InProcessMission:
             offset = rotations.rotate_inverse(estimate.q_wxyz, relative)
             q_offset = rotations.multiply(rotations.conjugate(estimate.q_wxyz), reference.q_wxyz)
         else:
-            offset = self.controller.guidance.chasers[chaser].move.at(np.array([self.time_s]))[0][0]
+            offset = self.controller.guidance.chasers[chaser].state.move.at(
+                np.array([self.time_s])
+            )[0][0]
             q_offset = np.array(self.scenario.chasers[chaser].q_wxyz)
         return pose_error(states[TARGET], offset, q_offset, states[f"chaser/{chaser}"])
 

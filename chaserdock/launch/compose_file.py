@@ -164,7 +164,7 @@ _CHASER = """
 
 
 def default_scenario(chasers: int) -> str:
-    """Return the shipped scenario that a mission of so many chaser services flies without SCENARIO."""
+    """Return the shipped scenario that so many chaser services fly without SCENARIO."""
     return _SHIPPED[max(n for n in _SHIPPED if n <= chasers)]
 
 

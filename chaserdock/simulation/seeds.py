@@ -166,7 +166,7 @@ def _work(options: SeedOptions, connection: Connection) -> None:
 def _fly_on(
     workers: Sequence[_Worker], seeds: Iterator[int]
 ) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds in their order; each worker that is free flies the next one."""
+    """Yield the results of the seeds in their order; a worker that is free flies the next one."""
     flying: dict[Connection, _Worker] = {}
     flown: dict[int, SimulationResult | UnflownSeed] = {}
     turns, turn = itertools.count(), 0
@@ -194,8 +194,8 @@ def _fly_on(
 
 
 def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
-    """Yield flights of simpler and simpler cases with the first violation of a result, in other
-    numbers.
+    """Reduce the case of a result: yield flights of simpler and simpler cases with its first
+    violation, in other numbers.
     """
     first, flown = result.violations[0], result
     judges_docking = _NOT_DOCKED in first.text

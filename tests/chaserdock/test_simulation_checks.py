@@ -57,8 +57,9 @@ from chaserdock.simulation.checks.flight_checks import CHECKS, FlightChecks
 from chaserdock.simulation.checks.messages import covariance_defect, defects_of
 from chaserdock.simulation.checks.processes import BoundedQueues, queue_limit
 from chaserdock.simulation.flight import SimulationResult
+from chaserdock.simulation.links import Traffic
 from chaserdock.simulation.mission import SimulatedFlight
-from chaserdock.simulation.network import EPOCH_NS, Traffic
+from chaserdock.simulation.network import EPOCH_NS
 from chaserdock.simulation.seeds import inconsistency, shrink_result
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import (

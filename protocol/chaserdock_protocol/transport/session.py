@@ -36,9 +36,13 @@ from chaserdock_protocol.topics import Role
 from . import Node, ReceivedMessage
 
 EARLY_PERIOD_S = 0.05
-"""Period (s) with which a process announces itself before the first tick, which waits for it."""
+"""Interval of presence before the first tick, s: the discovery barrier ends about two of them after
+the last declaration.
+"""
 STEADY_PERIOD_S = 1.0
-"""The same in flight: often enough for `chaserdock status`, which listens for 3 s."""
+"""Interval of presence in flight, s: a fifth of ``stall.SILENT_S``, after which a process counts as
+silent.
+"""
 
 
 class JoinRefused(ChaserdockError):

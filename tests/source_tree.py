@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,6 +25,7 @@ FLYING = [p for _, p in MODULES if p.is_relative_to(PACKAGES["chaserdock_control
 ]
 
 
+@cache
 def tree_of(path: Path) -> ast.Module:
     """Parse a source file."""
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
@@ -36,13 +38,20 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported(path: Path) -> Iterator[str]:
-    """Yield the full names of the modules that a module imports, anywhere in it; relative names are
-    resolved.
+@cache
+def imported(path: Path, at_once: bool = False) -> frozenset[str]:
+    """Return the full names of the modules that a module imports; relative names are resolved.
+
+    ``at_once``: only those that are imported with it, not when a function is called.
     """
+    return frozenset(_imported(path, at_once))
+
+
+def _imported(path: Path, at_once: bool) -> Iterator[str]:
     package = next(f for f in PACKAGES.values() if path.is_relative_to(f))
     parts = (package.name, *path.relative_to(package).parts[:-1])
-    for node in ast.walk(tree_of(path)):
+    tree = tree_of(path)
+    for node in tree.body if at_once else ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

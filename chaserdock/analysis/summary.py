@@ -210,6 +210,10 @@ def _greatest(x: Array) -> float | None:
     return float(np.max(x)) if len(x) else None
 
 
+def _time_of_greatest(x: Array, time_s: Array) -> float | None:
+    return float(time_s[np.argmax(x)]) if len(x) else None
+
+
 def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
     out: dict[str, float | None] = {
         n: float(np.percentile(x, p)) if len(x) else None for n, p in names.items()
@@ -307,6 +311,9 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             **_pose_figures(errors, s.settling_s),
             "velocity_rms_m_s": _rms(errors["velocity_m_s"][late]),
             "omega_rms_rad_s": _rms(errors["omega_rad_s"][late]),
+            "max_orientation_error_at_s": _time_of_greatest(
+                errors["orientation_rad"][late], errors["time_s"][late]
+            ),
         },
         "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
         "late_commands": flight.world.late_commands,

@@ -71,7 +71,7 @@ def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None
         return None
     return (
         f"SCENARIO={scenario} has {needed} chasers, but there are {services} chaser services; "
-        f"make others with chaserdock compose --chasers {needed} > compose.yaml"
+        f"make others with chaserdock deploy --chasers {needed} > compose.yaml"
     )
 
 

@@ -90,7 +90,7 @@ class Child:
 
 
 # Of Zenoh's two receiving threads the second mostly wakes up without work: with one, seven
-# processes on two cores need two thirds of the time per tick (benchmarks/realtime.py). Not for a
+# processes on two cores need two thirds of the time per tick (benchmarks/transport.py). Not for a
 # router, where one slow reader would block all others.
 _ZENOH_THREADS = "(rx: (worker_threads: 1))"
 
@@ -214,7 +214,7 @@ def check_keys(keys: Path, chasers: int) -> None:
 
     if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
         raise RunError(
-            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`"
+            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock deploy --keys {keys}`"
         )
 
 

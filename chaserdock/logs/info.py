@@ -137,7 +137,7 @@ def info_lines(info: LogInfo) -> list[str]:
             else f"cut off ({f.cut_bytes} bytes of a broken record)"
         )
         if not f.closed:
-            end += "; `chaserdock log recover` makes a complete file of it"
+            end += "; `chaserdock log --recover` makes a complete file of it"
         if f.recovered:
             end += "; recovered"
         lines.append(f"{f.path}: {f.bytes / 1e6:.1f} MB, {end}")

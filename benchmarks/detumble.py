@@ -41,7 +41,7 @@ from flights.rigid_control import (
     wrong_knowledge,
 )
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
 """Rate of a free tumble, and how long it is watched."""

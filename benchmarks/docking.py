@@ -26,7 +26,7 @@ from flights.docking_flights import (
 )
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages
+from chaserdock.experiments.perception import PerceptionModel, RenderedImages
 
 PerceptionOf = Callable[[Scenario], PerceptionModel]
 KINDS = {"stuck_on": "sticks open", "stuck_off": "sticks shut"}

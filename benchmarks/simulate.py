@@ -19,9 +19,9 @@ from pathlib import Path
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import Figures, Group, Options, main
 
-from chaserdock.simulation.campaign import Swarm, fly_seed
 from chaserdock.simulation.flight import memory_folder
 from chaserdock.simulation.mission import simulate
+from chaserdock.simulation.seeds import SeedOptions, fly_seed
 
 SCENARIO = "fault-drill"
 STATISTICAL = 'perception.name="statistical"'
@@ -51,7 +51,7 @@ def swarm(options: Options) -> Figures:
     seeds = 3 if options.quick else 50
     begin_s, outcomes, simulated_s = time.process_time(), Counter(), 0.0
     for seed in range(1, seeds + 1):
-        result = fly_seed(Swarm(SCENARIO), seed)
+        result = fly_seed(SeedOptions(SCENARIO), seed)
         outcomes[result.outcome] += 1
         simulated_s += result.sim_time_s
     elapsed_s = time.process_time() - begin_s

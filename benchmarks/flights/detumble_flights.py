@@ -31,8 +31,8 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
 from .latched_stack import (
@@ -116,7 +116,7 @@ class StackMission(InProcessMission):
             self.physics.place(f"chaser/{i}", moving_with(target, place, own.q_wxyz))
             self.physics.close_latch(i)
             verified = ChaserGuidance(Phase.VERIFIED, 0.0, stay(place, 0.0))
-            self.controller.guidance.machine.chasers[i] = verified
+            self.controller.guidance.chasers[i].state = verified
 
     def _control(self, inputs: TickInputs) -> TickOutputs | None:
         return None if inputs.time_ns / 1e9 >= self._silent_from_s else super()._control(inputs)

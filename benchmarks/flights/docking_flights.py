@@ -16,8 +16,8 @@ from chaserdock_protocol.messages import OperatorCommand, ProbeTouch
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
 from .momentum import Momentum, momentum_of

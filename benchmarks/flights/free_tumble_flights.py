@@ -37,7 +37,7 @@ from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import odometry_of
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 from .detumble_flights import stack_scenario
 from .latched_stack import body_of_plant, moving_with

@@ -17,8 +17,8 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
 from chaserdock.analysis.pose_errors import pose_error, relative_pose
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import PerceptionModel
 
 HOLD_S = 20.0
 """Time before the next command over which tracking at a hold point is measured."""
@@ -185,9 +185,8 @@ def rendezvous(
     with InProcessMission(scenario, perception) as flight:
         while flight.tick < scenario.ticks:
             record = flight.step()
-            recorder.note(
-                record, flight.phase(0), flight.controller.guidance.machine.in_corridor(0)
-            )
+            chaser = flight.controller.guidance.chasers[0]
+            recorder.note(record, chaser.phase, chaser.in_corridor())
             report(record, flight)
             if out.phase == "verified" and out.verified_s is None:
                 out.verified_s = record.time_s

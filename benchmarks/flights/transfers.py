@@ -19,8 +19,8 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 from numpy.typing import ArrayLike
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
 from .shape_gaps import shape_gap_m

@@ -27,8 +27,8 @@ from chaserdock_world.sensors.errors import true_camera
 from common import Figures, Group, Options, Results, described, seeds_of
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages, States
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages, States
 
 Row = dict[str, Any]
 SIDES = (((-1.0, 0.0, 0.0), 0.0), ((0.0, -1.0, 0.0), 90.0), ((1.0, 0.0, 0.0), 180.0))

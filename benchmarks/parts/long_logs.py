@@ -84,12 +84,12 @@ def costs(log: Path, label: str) -> Figures:
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         for command, arguments in {
-            "log_info": ("log", "info", log),
-            "summary": ("summary", log),
+            "log_info": ("log", log),
+            "summary": ("judge", log),
             "report": ("report", log, "--out", out / "report.html"),
-            "figures": ("figures", log, "--out", out / "figures"),
-            "log_export": ("log", "export", log, "--out", out / "tables"),
-            "log_tracks": ("log", "tracks", log, "--out", out / "tracks"),
+            "figures": ("report", log, "--figures", "--out", out / "figures"),
+            "log_export": ("log", log, "--export", out / "tables"),
+            "log_tracks": ("log", log, "--export", out / "tracks", "--format", "tum"),
         }.items():
             wall_s, peak_bytes = cost_of(*arguments)
             figures |= {

@@ -15,8 +15,8 @@ from chaserdock_protocol.scenario import Scenario
 from common import Figures, Group, Options
 from flights import load_shipped
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 
 P = ParamSpec("P")
 T = TypeVar("T")

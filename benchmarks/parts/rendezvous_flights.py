@@ -18,8 +18,8 @@ from flights import load_shipped
 from flights.abort_study import study
 from flights.rendezvous import last_leg, leg, rendezvous
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 
 def fly(name: str, seed: int, options: Options) -> Figures:

@@ -33,8 +33,8 @@ from flights.measured_poses import measurement_model
 from flights.rendezvous import estimate_error
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 SIGHTING_SIGMA_M, SIGHTING_SIGMA_RAD = 2e-4, math.radians(0.25)
 """Statistical sightings: about those of one large marker at 1 m."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cost of a tick with 1 to 16 chasers, by part: the first N of ``sixteen-chasers``.
 
-In one process (``chaserdock.evaluation.in_process``) each part is timed by the thread's processor
+In one process (``chaserdock.experiments.in_process``) each part is timed by the thread's processor
 time, medians over ticks: render, physics, perceive, fuse, solve, guide (references, prediction,
 messages). Then ``chaserdock run`` flies the same mission in lock-step: wall time per tick, and
 processor time of its processes. ``record`` is the recorder's; ``transport`` is what world, chasers
@@ -27,9 +27,9 @@ from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.rendering.cameras import Cameras
 from common import ROOT, Figures, Group, Options, chaserdock_command
 
-from chaserdock.evaluation import perception
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments import perception
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 from chaserdock.logs import open_log
 
 SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"

@@ -37,8 +37,8 @@ from common import Figures, Group, Options, Results, described, seeds_of
 from flights import load_shipped
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 SCENARIOS = {
     "docking": "markerless-docking",

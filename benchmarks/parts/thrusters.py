@@ -20,7 +20,7 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from common import Figures, Group, Options
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.flight_record import FlightRecord, record_flight
+from chaserdock.experiments.flight_record import FlightRecord, record_flight
 
 FAILED_AT_S = 30.01  # just after a tick: the longest time until two whole ticks are observed
 PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.045, 0.03)}

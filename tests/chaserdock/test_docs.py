@@ -24,7 +24,15 @@ from source_tree import MODULES
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 EVIDENCE = sorted((DOCS / "evidence").glob("*.md"))
-GENERATED = {"api.md", "cli.md", "phases.md", "protocol.md", "reproduction.md", "scenario.md"}
+GENERATED = {
+    "api.md",
+    "cli.md",
+    "invariants.md",
+    "phases.md",
+    "protocol.md",
+    "reproduction.md",
+    "scenario.md",
+}
 GUIDES = [page for page in PAGES if page.name not in GENERATED | {"results.md"}]
 WRITTEN = [
     *(page for page in (*PAGES, *EVIDENCE) if page.name not in GENERATED),

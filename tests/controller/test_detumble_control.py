@@ -25,7 +25,7 @@ from flights.latched_stack import moving_with, stack_motion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 SETTLED_S = 2.0
 

@@ -36,6 +36,7 @@ CHECKS: tuple[type[Check], ...] = (
     commands.CommandsAreFlown,
     commands.ThrustersOpen,
     commands.PlanIsFlown,
+    thrusters.NoHealthyThrusterSuspected,
     thrusters.ThrustersAsExpected,
     estimates.AccurateEstimate,
     docking.LatchHolds,

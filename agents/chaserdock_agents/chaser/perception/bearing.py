@@ -56,6 +56,9 @@ the optical axis.
 _NEAREST, _FARTHEST = 2.0, 1e4
 """Least and greatest range, in radii of the target."""
 _RASTER = 256
+"""Side, px, of the raster that a silhouette is drawn on: its radius is exact to half a raster pixel
+of some 100, far below the share by which a spot's radius may differ (``_SIZE_SHARE``).
+"""
 
 
 class BearingError(Exception):

@@ -72,7 +72,7 @@ def _limit_heap() -> None:
     """Make glibc return large blocks (images, chunks, indices) to the system when they are freed.
 
     By default glibc keeps blocks up to the largest one freed so far, in one heap per thread, and a
-    recorder grows for hours (``benchmarks/endurance.py``). No effect with other C libraries.
+    recorder grows for hours (``benchmarks/mission.py``, part ``endurance``). No effect with other C libraries.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

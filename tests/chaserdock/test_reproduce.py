@@ -507,6 +507,7 @@ def test_bad_input_prints_one_line_error(tmp_path: Path) -> None:
     assert said.strip() == f"chaserdock: {tmp_path / 'file'}: cannot be written: File exists"
 
 
+@pytest.mark.slow
 def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A flight with small images, its lower bound, and a mission; a second call flies nothing and
     writes an equal page.

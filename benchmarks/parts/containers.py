@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Failures of containers: a mission by compose.yaml for each fault, with access control, each in its
-own project. Needs Docker.
+"""Failures of containers: a mission by compose.yaml for each fault, with access control, each in
+its own project. Needs Docker.
 
 Figures: wall time until every process is expected again, simulated time without one, and whether
 the mission was a success.
@@ -24,6 +24,7 @@ from compose_project import Project, compose_command, docker
 SMALL = "camera.width_px=640 camera.height_px=480 settling_s=10.0"
 TOLERANT = "success.steady_position_rms_m=0.5 success.steady_orientation_rms_deg=20.0"
 FAULT_AT_TICK = 60
+"""All containers have been up for some seconds."""
 
 
 def crash(container: str) -> None:
@@ -109,7 +110,7 @@ def fly(fault: str, scenario: str, overrides: str) -> Figures:
 
 
 def figures(fault: str, log: Path, fault_ns: int, status: int, took_s: float) -> Figures:
-    """Return the figures of a flight from the ticks in its log, which state the expected processes."""
+    """Return the figures of a flight from its logged ticks, which state the expected processes."""
     ticks = [(r.sent_ns, r.message) for r in read_log(log, ["world/tick"])]
     chasers = max(len(t.chasers) for _, t in ticks)
     after = [(ns, t) for ns, t in ticks if ns > fault_ns]

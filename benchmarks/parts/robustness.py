@@ -30,10 +30,11 @@ from chaserdock_protocol.scenario.navigation import GRADES
 from chaserdock_world.rendering.cameras import States
 from common import ROOT, Figures, Group, Options, Results, map_jobs, print_figures, seeds_of
 from flights.measured_poses import measurement_model
+from flights.rendezvous import estimate_error
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 SIGHTING_SIGMA_M, SIGHTING_SIGMA_RAD = 2e-4, math.radians(0.25)
 """Statistical sightings: about those of one large marker at 1 m."""
@@ -81,20 +82,18 @@ def relative_error(tick: TickRecord, chaser: int) -> tuple[Array, float]:
     """Return the error (6,) of a chaser's estimated pose relative to the target (TRF, m; CRF, rad)
     and its NEES, NaN without a covariance."""
     assert tick.outputs is not None
-    estimate, true, own = (
-        tick.outputs.target,
-        tick.states["target"],
-        tick.states[f"chaser/{chaser}"],
-    )
-    truth = relative_pose(own.position_m, own.q_wxyz, true.position_m, true.q_wxyz)
+    estimate = tick.outputs.target
     found = next((r for r in estimate.relative if r.chaser == chaser), None)
-    if found is None:
-        odometry = tick.odometry[chaser]
-        own_pose = np.array(odometry.position_m), np.array(odometry.q_wxyz)
-        target_pose = np.array(estimate.position_m), np.array(estimate.q_wxyz)
-        return pose_error(*truth, *relative_pose(*own_pose, *target_pose)), math.nan
-    error = pose_error(*truth, np.array(found.position_m), np.array(found.q_wxyz))
-    return error, float(normalized_square(error, np.reshape(found.covariance, (6, 6))))
+    if found is not None:
+        error = estimate_error(found, tick.states)
+        return error, float(normalized_square(error, np.reshape(found.covariance, (6, 6))))
+    true = tick.states["target"]
+    own = tick.states[f"chaser/{chaser}"]
+    odometry = tick.odometry[chaser]
+    truth = relative_pose(own.position_m, own.q_wxyz, true.position_m, true.q_wxyz)
+    own_pose = np.array(odometry.position_m), np.array(odometry.q_wxyz)
+    target_pose = np.array(estimate.position_m), np.array(estimate.q_wxyz)
+    return pose_error(*truth, *relative_pose(*own_pose, *target_pose)), math.nan
 
 
 def fly(flight: Flight) -> Array:
@@ -273,6 +272,7 @@ ODOMETRY_FAILURES: dict[str, Callable[[Odometry], Odometry]] = {
     "overconfident": overconfident,
 }
 FAILED_AT_S, BLIND_S, FAILED_CHASER = 35.0, 20.0, 1
+"""The estimate is steady from 20 s on; a blind time of 20 s lets it drift visibly."""
 
 
 class FailureMission(InProcessMission):
@@ -337,9 +337,9 @@ def fly_failure(failure: str, seed: int) -> list[float]:
 
 
 def failures(options: Options) -> Figures:
-    """Fly four chasers under ``lab`` with plant mismatch and statistical perception: no sight for 20
-    s, and odometry of one chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a
-    tenth of its sigma of position.
+    """Fly four chasers under ``lab`` with plant mismatch and statistical perception: no sight for
+    20 s, and odometry of one chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or
+    a tenth of its sigma of position.
     """
     figures: Figures = {}
     for kind in ("blind", *ODOMETRY_FAILURES):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distance of a chaser's shape from cuboids: our kernel and the library coal, which the product does
-not need (``pip install coal``).
+"""Distance of a chaser's shape from cuboids: our kernel and the library coal, which the product
+does not need (``pip install coal``).
 
 Random poses of a chaser (body and probe) about random cuboids. Time per pair of a chaser and a
 cuboid: of the planner's kernel (gap along one direction, with its gradient) in a plan's check, and
@@ -30,6 +30,7 @@ from common import Figures, Group, Options
 from flights import load_shipped
 
 CUBOIDS = 8
+"""Number of cuboids about the chaser."""
 
 
 def random_cuboids(rng: np.random.Generator) -> Array:
@@ -122,7 +123,7 @@ def all_distances(
 
 
 def coal_figures(coal: Any, table: Array, states: Array, repeats: int) -> Figures:
-    """Return times per pair of chaser and cuboid, and how much less than the distance our gap is."""
+    """Return times per pair of chaser and cuboid, and by how much our gap is below the distance."""
     body = box_table(chaser_boxes())
     places = [placed(coal, row) for row in table]
     poses = [[placed(coal, r) for r in moved(body, s[None, :3], s[None, 6:10])[0]] for s in states]

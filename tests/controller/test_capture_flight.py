@@ -16,7 +16,7 @@ from flights import load_shipped
 from flights.docking_flights import ConservationMission, dock, docking_scenario
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 
 def test_docking_meets_its_tolerances_and_backs_out_again() -> None:

@@ -21,8 +21,8 @@ from docking_cases import scenario as capture_scenario
 from flight_cases import odometry
 from harness import ROOT
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 
 def three_chasers() -> Scenario:

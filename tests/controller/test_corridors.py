@@ -29,8 +29,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 LIMIT_M = 0.35
 NEAR = {"approach": {"dock_distance_m": 0.25, "max_speed_m_s": 0.03}}

@@ -20,12 +20,12 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CommandReply, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, ScenarioError
 from flights import load_shipped
-from flights.detumble_flights import StackMission, moving_with, stack_scenario
-from flights.latched_stack import stack_motion
+from flights.detumble_flights import StackMission, stack_scenario
+from flights.latched_stack import moving_with, stack_motion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 SETTLED_S = 2.0
 

@@ -28,7 +28,7 @@ from flights.rigid_control import (
     wrong_knowledge,
 )
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:

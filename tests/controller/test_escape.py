@@ -28,7 +28,7 @@ from flights.measured_poses import measurement_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 GOOD = np.diag([2e-3**2] * 3 + [2e-5**2] * 3)
 KEEP_OUT_M = 2.0

@@ -20,8 +20,10 @@ from chaserdock_protocol.scenario import (
     parse_scenario,
     scenario_from_json,
 )
-from chaserdock_protocol.scenario.mesh_files import read_mesh, write_mesh
+from chaserdock_protocol.scenario.mesh_files import read_mesh
 from scenario_samples import good
+
+from chaserdock.targets.mesh_writer import write_mesh
 
 MODEL = 'perception.name="model"'
 

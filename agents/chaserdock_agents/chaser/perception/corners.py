@@ -62,6 +62,7 @@ class _Settings(Structure):
     ]  # fmt: skip
 
 
+# Chosen by the corner errors in rendered images (benchmarks/perception.py, ``markers``).
 SETTINGS = _Settings(
     0.45, 1.25,
     8.0, 0.4, 4.0,
@@ -74,6 +75,7 @@ SETTINGS = _Settings(
     2.0, 120.0,
 )  # fmt: skip
 
+# Corners of a unit square, as those of a marker.
 _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 
 

@@ -152,10 +152,10 @@ class ConservationMission(InProcessMission):
 class DockingOutcome:
     """How one docking flight ended.
 
-    ``cause``: outcome in a few words. ``touch``: the one at which the latch closed. ``contacts``: pairs of bodies that collided.
-    ``peak_m``: the largest distance from the reference on the true target between the thruster's
-    ``failure`` and capture. ``thruster_events``: (time in s, text). ``verified_again``: whether a
-    second approach after an abort was.
+    ``cause``: outcome in a few words. ``touch``: the one at which the latch closed. ``contacts``:
+    pairs of bodies that collided. ``peak_m``: the largest distance from the reference on the true
+    target between the thruster's ``failure`` and capture. ``thruster_events``: (time in s, text).
+    ``verified_again``: whether a second approach after an abort was.
     """
 
     seed: int

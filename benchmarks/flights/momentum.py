@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GroupMomentum of bodies in the simulated world, to check what conserves it."""
+"""Momentum of bodies in the simulated world, to check what conserves it."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from chaserdock_protocol.messages import Odometry, Sighting
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.navigation import GRADES
 from chaserdock_world.rendering.cameras import States
-from common import ROOT, Figures, Group, Options, Results, map_jobs, print_figures, seeds_of
+from common import ROOT, Figures, Group, KeptResults, Options, map_jobs, print_figures, seeds_of
 from flights.measured_poses import measurement_model
 from flights.rendezvous import estimate_error
 
@@ -345,7 +345,7 @@ def failures(options: Options) -> Figures:
     """
     figures: Figures = {}
     for kind in ("blind", *ODOMETRY_FAILURES):
-        results = Results(options.results, {"failure": kind}, list[float])
+        results = KeptResults(options.results, {"failure": kind}, list[float])
         flown = results.of(seeds_of(options, 20, 1), partial(fly_failure, kind), jobs=options.jobs)
         rows = np.array(flown)
         figures |= {

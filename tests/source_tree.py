@@ -54,8 +54,18 @@ def imported(path: Path) -> Iterator[str]:
             # importlib.import_module("..."), __import__("...")
             name = node.func.attr if isinstance(node.func, ast.Attribute) else node.func.id
             if name in ("import_module", "__import__") and node.args:
-                assert isinstance(node.args[0], ast.Constant), f"{path}: import of a computed name"
-                yield str(node.args[0].value)
+                yield from _computed(node.args[0], path, ".".join(parts))
+
+
+def _computed(argument: ast.expr, path: Path, package: str) -> Iterator[str]:
+    """Yield what ``import_module(argument)`` imports: a constant name, or with f"{__name__}.{...}"
+    in the ``__init__.py`` of a folder all modules of this folder.
+    """
+    if path.name == "__init__.py" and ast.unparse(argument).startswith("f'{__name__}."):
+        yield from (f"{package}.{p.stem}" for p in sorted(path.parent.glob("[!_]*.py")))
+    else:
+        assert isinstance(argument, ast.Constant), f"{path}: import of a computed name"
+        yield str(argument.value)
 
 
 def short(item: object) -> str:

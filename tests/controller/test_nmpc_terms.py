@@ -39,7 +39,7 @@ def test_every_setting_changes_the_problem(name: str) -> None:
     """As C sees it: a weight, or a number of `Problem`."""
     problem_at, states = far_start(1)
     problem = check_input(problem_at(states, 0.0), PARAMS, 1)
-    changed = with_settings(PARAMS, **{name: 2.0 * settings_of(PARAMS.terms)[name]})
+    changed = with_settings(PARAMS, **{name: 1.0 + 2.0 * settings_of(PARAMS.terms)[name]})
     weights = [
         np.array_equal(a, b) for a, b in zip(*map(stage_weights, (PARAMS, changed)), strict=True)
     ]

@@ -3,16 +3,13 @@
 FROM python:3.11-slim AS wheel
 COPY docker/build-requirements.txt /src/docker/
 RUN pip install --no-cache-dir --require-hashes -r /src/docker/build-requirements.txt
-COPY pyproject.toml README.md LICENSE CITATION.cff build_hook.py /src/
-COPY release/version.py /src/release/
+COPY pyproject.toml README.md LICENSE build_hook.py /src/
 COPY scenarios /src/scenarios
 COPY chaserdock /src/chaserdock
 COPY protocol /src/protocol
 COPY world /src/world
 COPY agents /src/agents
 COPY controller /src/controller
-# docker build --build-arg CHASERDOCK_VERSION="$(python3 release/version.py)" .
-ARG CHASERDOCK_VERSION
 RUN pip wheel --no-deps --no-build-isolation --wheel-dir /wheels /src
 
 FROM python:3.11-slim AS image

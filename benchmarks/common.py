@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options, output and helpers that the benchmarks share."""
+"""What the benchmarks share: options, parts, results that a file keeps, and output.
+
+A benchmark is a command of one subject with parts: functions of the options that return figures.
+``main`` parses the options, runs the parts that ``--only`` chooses and writes their figures.
+"""
 
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import math
 import platform
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import cv2
+import msgspec
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -27,6 +35,148 @@ ROOT = Path(__file__).resolve().parents[1]
 Figures = dict[str, float]
 """Flat: name with SI unit -> number. Truth values are 0 and 1."""
 
+Options = argparse.Namespace
+Measure = Callable[[Options], Figures]
+
+
+class BenchmarkFailed(Exception):
+    """What a part measured misses its bar. Other parts still run; the command's status is 1."""
+
+    def __init__(self, text: str, figures: Figures) -> None:
+        super().__init__(text)
+        self.figures = figures
+
+
+# -- Options and parts -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Group:
+    """Parts of a benchmark by name, with the options that only they have.
+
+    ``uses``: those of ``SHARED`` that they read. ``on_request``: parts that run only by name.
+    """
+
+    parts: Mapping[str, Measure]
+    uses: Sequence[str] = ()
+    add_options: Callable[[argparse.ArgumentParser], object] | None = None
+    on_request: Sequence[str] = ()
+
+
+def described(run: Measure, text: str) -> Measure:
+    """Return a part that is made by a function, with the sentence for ``--help``."""
+    run.__doc__ = text
+    return run
+
+
+SHARED: dict[str, dict[str, Any]] = {
+    "flights": {"type": int, "metavar": "N", "help": "number of seeds of each part"},
+    "first": {"type": int, "default": 0, "metavar": "SEED", "help": "first seed (default: 0)"},
+    "jobs": {"type": int, "default": 1, "metavar": "N", "help": "flights at a time (default: 1)"},
+    "set": {
+        "action": "append",
+        "default": [],
+        "metavar": "KEY=VALUE",
+        "help": "override a scenario key (repeatable)",
+    },
+    "results": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "append what is flown; what FILE contains is not flown again",
+    },
+}
+"""Options that several benchmarks have, with the same meaning everywhere."""
+
+
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the options of all benchmarks."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="fewer or shorter runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
+    return parser
+
+
+def add_shared(parser: argparse.ArgumentParser, names: Iterable[str]) -> None:
+    """Add options that several benchmarks have."""
+    for name in dict.fromkeys(names):
+        parser.add_argument(f"--{name}", **SHARED[name])
+
+
+def parser_of(description: str | None, groups: Sequence[Group]) -> argparse.ArgumentParser:
+    """Return the parser of a benchmark with these groups of parts."""
+    parts = parts_of(groups)
+    parser = make_parser(description)
+    width = max(map(len, parts))
+    lines = [f"  {name:{width}}  {_purpose(part)}" for name, part in parts.items()]
+    parser.epilog = "parts:\n" + "\n".join(lines)
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        metavar="PART",
+        default=[name for g in groups for name in g.parts if name not in g.on_request],
+        help="parts by name, or by the begin of several names (before a hyphen)",
+    )
+    add_shared(parser, (name for group in groups for name in group.uses))
+    for group in groups:
+        if group.add_options is not None:
+            group.add_options(parser)
+    return parser
+
+
+def parts_of(groups: Sequence[Group]) -> dict[str, Measure]:
+    """Return the parts of all groups by name."""
+    return {name: part for group in groups for name, part in group.parts.items()}
+
+
+def matching(wanted: str, names: Iterable[str]) -> list[str]:
+    """Return the part of this name, or those whose names begin so."""
+    every = list(names)
+    return [wanted] if wanted in every else [n for n in every if n.startswith(f"{wanted}-")]
+
+
+def main(description: str | None, groups: Sequence[Group]) -> None:
+    """Run the parts of a benchmark as the command line says, print and write their figures.
+
+    Raises SystemExit with status 1 if a part misses its bar.
+    """
+    parts, parser = parts_of(groups), parser_of(description, groups)
+    options = parser.parse_args()
+    chosen = []
+    for wanted in options.only:
+        chosen += matching(wanted, parts)
+        if not matching(wanted, parts):
+            parser.error(f"no part {wanted}; there are: {', '.join(parts)}")
+    use_one_thread()
+    figures, failures = Figures(), []
+    for name in chosen:
+        print(f"{name}:", flush=True)
+        try:
+            found = parts[name](options)
+        except BenchmarkFailed as failure:
+            found = failure.figures
+            failures.append(f"{name}: {failure}")
+        print_figures(found)
+        figures |= found
+    write_json(options.json, figures)
+    if failures:
+        raise SystemExit("\n".join(failures))
+
+
+def _purpose(part: Measure) -> str:
+    """Return the first sentence of a part's docstring."""
+    text = inspect.getdoc(part) or ""
+    return " ".join(text.split("\n\n")[0].split()).partition(". ")[0].rstrip(".")
+
+
+def seeds_of(options: Options, number: int, quick: int) -> range:
+    """Return the seeds to fly: those of ``--first`` and ``--flights``, or ``number`` of them, or
+    ``quick`` with ``--quick``.
+    """
+    count = options.flights or (quick if options.quick else number)
+    return range(options.first, options.first + count)
+
 
 def use_one_thread() -> None:
     """Compute in one thread, as the processes of a flight do: others of BLAS and OpenCV wait for
@@ -36,37 +186,79 @@ def use_one_thread() -> None:
     threadpool_limits(1)
 
 
-def make_parser(description: str | None, parts: Iterable[str] = ()) -> argparse.ArgumentParser:
-    """Return a parser with the options of all benchmarks, and ``--only`` if there are parts to
-    choose from.
-    """
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--quick", action="store_true", help="fewer or shorter runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
-    if names := tuple(parts):
-        parser.add_argument(
-            "--only",
-            nargs="+",
-            choices=names,
-            default=names,
-            metavar="PART",
-            help=f"parts: {', '.join(names)}",
-        )
-    return parser
+# -- Results ---------------------------------------------------------------------------------------
+
+T = TypeVar("T")
 
 
-def run_parts(options: argparse.Namespace, parts: Mapping[str, Callable[[], Figures]]) -> None:
-    """Run the parts that ``--only`` chooses, print the figures of each, and write all of them to
-    ``--json``.
+@dataclass(frozen=True)
+class Results(Generic[T]):
+    """Outcomes of type ``kind`` by seed, which a file of JSON lines keeps.
+
+    ``key``: what was flown, beside the seed. Rows with another key are left alone.
     """
-    figures: Figures = {}
-    for name in options.only:
-        print(f"{name}:", flush=True)
-        figures |= (part := parts[name]())
-        print_figures(part)
-    write_json(options.json, figures)
+
+    path: Path | None
+    key: Mapping[str, Any]
+    kind: type[T]
+
+    def of(
+        self,
+        seeds: Iterable[int],
+        fly: Callable[[int], T],
+        line: Callable[[T], str] | None = None,
+        jobs: int = 1,
+    ) -> list[T]:
+        """Return the outcome of each seed, from the file or flown now; print the ``line`` of each
+        that is flown.
+        """
+        wanted, key = list(seeds), dict(self.key)
+        done = {
+            row["seed"]: msgspec.convert(row["outcome"], self.kind)
+            for row in read_lines(self.path)
+            if row["key"] == key
+        }
+        todo = [seed for seed in wanted if seed not in done]
+        for seed, outcome in zip(todo, map_jobs(fly, todo, jobs), strict=True):
+            done[seed] = outcome
+            row = {"key": key, "seed": seed, "commit": commit()}
+            append_line(self.path, row | {"outcome": msgspec.to_builtins(outcome)})
+            if line is not None:
+                print(f"  {seed}: {line(outcome)}", file=sys.stderr, flush=True)
+        return [done[seed] for seed in wanted]
+
+
+U = TypeVar("U")
+
+
+def map_jobs(call: Callable[[U], T], values: Sequence[U], jobs: int) -> Iterator[T]:
+    """Yield the results in order, of so many processes; in this process if it is one."""
+    if jobs == 1:
+        yield from map(call, values)
+        return
+    with ProcessPoolExecutor(jobs) as pool:
+        yield from pool.map(call, values)
+
+
+def read_lines(path: Path | None) -> Iterator[dict[str, Any]]:
+    """Yield the objects of a file of JSON lines; none if there is no file. Lines of an interrupted
+    write are skipped.
+    """
+    if path is None or not path.exists():
+        return
+    for line in path.read_text(encoding="utf-8").splitlines():
+        with suppress(json.JSONDecodeError):
+            yield json.loads(line)
+
+
+def append_line(path: Path | None, value: Mapping[str, Any]) -> None:
+    """Append an object to a file of JSON lines; nothing without a path."""
+    if path is not None:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(value) + "\n")
+
+
+# -- Figures ---------------------------------------------------------------------------------------
 
 
 def print_figures(figures: Mapping[str, float]) -> None:
@@ -91,7 +283,7 @@ def write_json(path: Path | None, figures: Mapping[str, float]) -> None:
         "machine": f"{platform.machine()} {platform.platform()}",
         "date": f"{datetime.now():%Y-%m-%d}",
     }
-    path.write_text(json.dumps({**values, **about}, indent=2) + "\n")
+    path.write_text(json.dumps({**values, **about}, indent=2) + "\n", encoding="utf-8")
 
 
 def commit() -> str:
@@ -115,22 +307,18 @@ def percentiles(
     }
 
 
-def read_lines(path: Path | None) -> Iterator[dict[str, Any]]:
-    """Yield the objects of a file of JSON lines; none if there is no file. Lines of an interrupted
-    write are skipped.
+def summaries(name: str, columns: Iterable[tuple[str, str, Sequence[float | None]]]) -> Figures:
+    """Return median and maximum of each column (quantity, unit, values), without those that are
+    None; nothing of an empty column.
     """
-    for line in (
-        path.read_text(encoding="utf-8").splitlines() if path is not None and path.exists() else []
-    ):
-        with suppress(json.JSONDecodeError):
-            yield json.loads(line)
+    out: Figures = {}
+    for quantity, unit, values in columns:
+        if known := [value for value in values if value is not None]:
+            out |= percentiles(known, f"{name}_{quantity}", unit, "median", "max")
+    return out
 
 
-def append_line(path: Path | None, value: Mapping[str, Any]) -> None:
-    """Append an object to a file of JSON lines; nothing without a path."""
-    if path is not None:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(value) + "\n")
+# -- Processes -------------------------------------------------------------------------------------
 
 
 def chaserdock_command(*arguments: str | Path) -> list[str]:

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of simulated missions: ``python benchmarks/simulate.py [--quick] [--json FILE] [--only
-nominal swarm]``.
+"""Speed of simulated missions: ``python benchmarks/simulate.py [--only PART ...]``.
 
-``nominal``: ``fault-drill`` without faults, in lock-step and in real time, with statistical
-perception and with images; ``swarm``: random seeds. All on one core, with logs in memory; seconds
-are those of the processor. ``--only instructions``: instructions per tick of 4 s in lock-step with
-statistical perception, without those of the start, which do not depend on the load of the machine,
-by valgrind.
+All processes of a mission in one, on one core, with logs in memory; seconds are those of the
+processor.
 """
 
 from __future__ import annotations
@@ -21,18 +17,21 @@ from collections import Counter
 from pathlib import Path
 
 from chaserdock_protocol.shipped_scenarios import find_scenario
-from common import Figures, make_parser, run_parts
+from common import Figures, Group, Options, main
 
-from chaserdock.simulation.campaign import Swarm, fly_seed
+from chaserdock.simulation.flight import memory_folder
 from chaserdock.simulation.mission import simulate
-from chaserdock.simulation.swarm import memory_folder
+from chaserdock.simulation.seeds import SeedOptions, fly_seed
 
 SCENARIO = "fault-drill"
 STATISTICAL = 'perception.name="statistical"'
 
 
-def nominal(flights: int) -> Figures:
-    """Fly without faults; the shortest time of several flights each."""
+def nominal(options: Options) -> Figures:
+    """Fly ``fault-drill`` without faults, in lock-step and in real time, with statistical
+    perception and with images: the shortest time of three flights (``--quick``: one) each.
+    """
+    flights = 1 if options.quick else 3
     figures: Figures = {}
     for perception, overrides in (("statistical", (STATISTICAL,)), ("images", ())):
         for mode in ("lockstep", "realtime"):
@@ -47,11 +46,12 @@ def nominal(flights: int) -> Figures:
     return figures
 
 
-def swarm(seeds: int) -> Figures:
-    """Fly random seeds."""
+def swarm(options: Options) -> Figures:
+    """Fly 50 random seeds (``--quick``: 3)."""
+    seeds = 3 if options.quick else 50
     begin_s, outcomes, simulated_s = time.process_time(), Counter(), 0.0
     for seed in range(1, seeds + 1):
-        result = fly_seed(Swarm(SCENARIO), seed)
+        result = fly_seed(SeedOptions(SCENARIO), seed)
         outcomes[result.outcome] += 1
         simulated_s += result.sim_time_s
     elapsed_s = time.process_time() - begin_s
@@ -66,24 +66,30 @@ def swarm(seeds: int) -> Figures:
 
 
 _TICKS, _SHORT_TICKS = 40, 20
+"""Ticks that are counted, and ticks before them."""
 _FLIGHTS = """
 import sys, tempfile
 from pathlib import Path
 from chaserdock_models.native import KernelLibrary
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock.simulation.mission import simulate
-from chaserdock.simulation.swarm import memory_folder
-KernelLibrary.level = property(lambda self: 2)  # valgrind does not know all instructions of the other one
+from chaserdock.simulation.flight import memory_folder
+# valgrind does not know all instructions of the other kernels
+KernelLibrary.level = property(lambda self: 2)
+statistical = 'perception.name="statistical"'
+short = ("timeline=[]", "settling_s=0.0", "steady_until_s=1.0", "success.docked=[]", statistical)
 for duration in sys.argv[2:]:
-    short = ("timeline=[]", "settling_s=0.0", "steady_until_s=1.0", "success.docked=[]", f"duration_s={duration}")
     with tempfile.TemporaryDirectory() as folder:
-        simulate(find_scenario(sys.argv[1]), Path(folder) / "run", ('perception.name="statistical"', *short))
+        overrides = (*short, f"duration_s={duration}")
+        simulate(find_scenario(sys.argv[1]), Path(folder) / "run", overrides)
 """
 
 
-def instructions() -> Figures:
-    """Count the instructions by which a second flight exceeds a shorter one: neither start nor
-    imports count.
+def instructions(_: Options) -> Figures:
+    """Count the instructions of a tick in lock-step with statistical perception, by valgrind.
+
+    Those by which a second flight of 4 s exceeds one of 2 s, so that neither start nor imports
+    count; they do not depend on the load of the machine.
     """
     short, long = (str(ticks / 10.0) for ticks in (_SHORT_TICKS, _SHORT_TICKS + _TICKS))
     return {"instructions_per_tick": (_count(short, long) - _count(short, short)) / _TICKS}
@@ -108,17 +114,12 @@ def _count(*durations_s: str) -> int:
     return int(found[1].replace(",", ""))
 
 
-def main() -> None:
-    parser = make_parser(__doc__, ("nominal", "swarm", "instructions"))
-    parser.set_defaults(only=("nominal", "swarm"))
-    options = parser.parse_args()
-    parts = {
-        "nominal": lambda: nominal(1 if options.quick else 3),
-        "swarm": lambda: swarm(3 if options.quick else 50),
-        "instructions": instructions,
-    }
-    run_parts(options, parts)
-
+GROUPS = (
+    Group(
+        {"nominal": nominal, "swarm": swarm, "instructions": instructions},
+        on_request=("instructions",),
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, GROUPS)

@@ -39,7 +39,6 @@ SUN = "camera.sun_direction=[1.0, -0.12, 0.22]"
 IMAGES: dict[str, tuple[str, ...]] = {
     "camera-plain": (),
     "camera-paper": ("target.model='paper'",),
-    "camera-pybullet": ("camera.renderer='pybullet'",),
     "camera-distortion": ("camera.intrinsics.distortion=[-0.35, 0.12, 0.001, -0.001, 0.0]",),
     "camera-motion-blur": ("camera.effects.exposure_s=0.2",),
     "camera-noise": (

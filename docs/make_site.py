@@ -17,7 +17,6 @@ import base64
 import json
 import posixpath
 import re
-import runpy
 import shutil
 import subprocess
 import sys
@@ -170,9 +169,9 @@ def configuration(stage: Path) -> str:
     if wrong:
         raise SiteError(f"site.toml: nav: missing or listed twice: {', '.join(wrong)}")
     more = [
-        f'    {{ "{page.read_text(encoding="utf-8").partition(chr(10))[0].lstrip("# ")}" = "{page.name}" }},'
-        for page in sorted(DOCS.glob("*.md"))
-        if page.name not in named
+        f'    {{ "{page.read_text(encoding="utf-8").partition(chr(10))[0].lstrip("# ")}" = "{page.relative_to(DOCS).as_posix()}" }},'
+        for page in sorted(DOCS.rglob("*.md"))
+        if page.relative_to(DOCS).as_posix() not in named
     ]
     if "# MORE" not in text:
         raise SiteError("site.toml: nav: the line # MORE is missing")
@@ -181,7 +180,9 @@ def configuration(stage: Path) -> str:
 
 def version() -> str:
     """Return the version that the pages describe."""
-    return runpy.run_path(str(ROOT / "release" / "version.py"))["version"]()
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "version"
+    ]
 
 
 def build_releases(out: Path) -> list[str]:
@@ -230,7 +231,7 @@ def build(out: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="chaserdock-docs-") as name:
         work = Path(name)
         stage = Stage(work / "pages")
-        for page in sorted(DOCS.glob("*.md")):
+        for page in sorted(DOCS.rglob("*.md")):
             stage.add(page)
         for notebook in sorted((ROOT / "examples").glob("*.ipynb")):
             stage.add(notebook)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build what a package index receives, and inspect it: ``python release/build_wheels.py [--out
-dist]``.
+dist] [--tag vX.Y.Z]``.
 
 Makes the sdist, and from the sdist one wheel for each kind of machine, all cross-compiled with zig
 on this one. Needs Python 3.11 or later and pip; the tools (release/requirements.txt) are installed
@@ -18,13 +18,12 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import tomllib
 import venv
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-
-from version import cited, version
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGETS = ("x86_64-linux", "aarch64-linux", "arm64-macos")
@@ -125,12 +124,17 @@ def check_wheel(wheel: Path, expected: str) -> str:
     return platform
 
 
-def check_release_version(found: str, root: Path = ROOT) -> None:
-    """Raise ReleaseError if a release has another version than CITATION.cff; a development version
-    needs no entry.
-    """
-    if re.fullmatch(r"\d+\.\d+\.\d+", found) and found != cited(root):
-        raise ReleaseError(f"the tag says {found}, CITATION.cff {cited(root)}")
+def version() -> str:
+    """Return the version that pyproject.toml states."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "version"
+    ]
+
+
+def check_tag(tag: str) -> None:
+    """Raise ReleaseError unless the tag is ``v`` and the version of pyproject.toml."""
+    if tag != f"v{version()}":
+        raise ReleaseError(f"the tag is {tag}, the version in pyproject.toml {version()}")
 
 
 class Tools:
@@ -194,8 +198,6 @@ def fits(audited: str, platform: str) -> bool:
 
 def build(out: Path) -> Iterator[Path]:
     """Build and check all files into ``out`` and yield each. Raises ReleaseError."""
-    number = version()
-    check_release_version(number)
     with tempfile.TemporaryDirectory(prefix="chaserdock-release-") as name:
         tools = Tools(Path(name) / "tools")
         yield (sdist := tools.build(ROOT, out, "sdist"))
@@ -204,7 +206,7 @@ def build(out: Path) -> Iterator[Path]:
         tree = Path(name) / sdist.name.removesuffix(".tar.gz")
         for target in TARGETS:
             wheel = tools.build(tree, out, "wheel", CHASERDOCK_TARGET=target)
-            platform = check_wheel(wheel, number)
+            platform = check_wheel(wheel, version())
             if platform.startswith("manylinux"):
                 tools.audit(wheel, platform)
             yield wheel
@@ -216,7 +218,9 @@ def main() -> int:
     parser.add_argument(
         "--out", type=Path, default=ROOT / "dist", help="folder for the files (default: dist)"
     )
-    out: Path = parser.parse_args().out
+    parser.add_argument("--tag", help="fail unless the version is that of this tag, vX.Y.Z")
+    options = parser.parse_args()
+    out: Path = options.out
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
         print(
@@ -225,6 +229,8 @@ def main() -> int:
         )
         return 2
     try:
+        if options.tag is not None:
+            check_tag(options.tag)
         for file in build(out.resolve()):
             print(f"{file} ({file.stat().st_size / 1e6:.1f} MB)", flush=True)
     except (ReleaseError, ValueError) as error:

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import fcntl
 import os
+import resource
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+FAST_S = 1.0
+"""Processor time (s) that a test without the mark `slow` may take; others are reported."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the files with the longest missions first: at the end, workers share short tests, and
     none waits for another.
@@ -36,6 +41,36 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if slow := item.get_closest_marker("slow"):
             minutes[item.path] += slow.kwargs.get("minutes", 0.25)
     items.sort(key=lambda item: -minutes[item.path])
+
+
+def processor_s() -> float:
+    """Return the processor time of this process and of those that it has waited for (s)."""
+    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """Add a test's processor time to its report."""
+    start_s = processor_s()
+    try:
+        yield
+    finally:
+        item.user_properties.append(("processor_s", processor_s() - start_s))
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """List the tests that should be marked `slow`, but are not."""
+    over = {
+        report.nodeid: used_s
+        for report in terminalreporter.stats.get("passed", ())
+        for name, used_s in report.user_properties
+        if name == "processor_s" and used_s > FAST_S and "slow" not in report.keywords
+    }
+    if over:
+        terminalreporter.section(f"not marked slow, more than {FAST_S:g} s of processor time")
+    for name, used_s in sorted(over.items(), key=lambda item: -item[1]):
+        terminalreporter.line(f"{used_s:6.1f} s  {name}")
 
 
 @pytest.fixture(scope="session")

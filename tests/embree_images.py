@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's renderer
+"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's renderers
 with them.
 
 Light as of the renderer: Lambert, Blinn's highlight, hard shadows of the sun. Textures are left
@@ -8,6 +8,7 @@ out. Each pixel has ``samples`` squared rays.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -156,8 +157,23 @@ def _shade(
     return np.minimum(lit, 255.0), dark, faces & ~blocked
 
 
+def draw(mesh: TriangleMesh, camera: Camera, position: Array, q: Array, light: Light) -> Array:
+    """Return the image by the world's renderer of meshes, in floating point."""
+    return (
+        MeshRenderer(camera, mesh)
+        .render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
+        .astype(float)
+    )
+
+
 def compare(
-    mesh: TriangleMesh, camera: Camera, position: Array, q: Array, light: Light, samples: int
+    mesh: TriangleMesh,
+    camera: Camera,
+    position: Array,
+    q: Array,
+    light: Light,
+    samples: int,
+    draw: Callable[[TriangleMesh, Camera, Array, Array, Light], Array] = draw,
 ) -> tuple[float, Array, Array]:
     """Return the mean grey-level error inside surfaces, and the displacements, px, of silhouettes
     and shadow edges by block.
@@ -175,15 +191,6 @@ def compare(
     usable = traced.inside & (contrast > 15.0)
     share = np.where(usable, (image - traced.dark) / np.where(usable, contrast, 1.0), 0.0)
     return grey, silhouette, displacements(share, np.where(usable, traced.sunlit, 0.0), usable)
-
-
-def draw(mesh: TriangleMesh, camera: Camera, position: Array, q: Array, light: Light) -> Array:
-    """Return the image by the world's renderer, in floating point."""
-    return (
-        MeshRenderer(camera, mesh)
-        .render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
-        .astype(float)
-    )
 
 
 def dilated(mask: Mask) -> Mask:

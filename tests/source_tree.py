@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,6 +25,7 @@ FLYING = [p for _, p in MODULES if p.is_relative_to(PACKAGES["chaserdock_control
 ]
 
 
+@cache
 def tree_of(path: Path) -> ast.Module:
     """Parse a source file."""
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
@@ -36,13 +38,20 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported(path: Path) -> Iterator[str]:
-    """Yield the full names of the modules that a module imports, anywhere in it; relative names are
-    resolved.
+@cache
+def imported(path: Path, at_once: bool = False) -> frozenset[str]:
+    """Return the full names of the modules that a module imports; relative names are resolved.
+
+    ``at_once``: only those that are imported with it, not when a function is called.
     """
+    return frozenset(_imported(path, at_once))
+
+
+def _imported(path: Path, at_once: bool) -> Iterator[str]:
     package = next(f for f in PACKAGES.values() if path.is_relative_to(f))
     parts = (package.name, *path.relative_to(package).parts[:-1])
-    for node in ast.walk(tree_of(path)):
+    tree = tree_of(path)
+    for node in tree.body if at_once else ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -54,18 +63,8 @@ def imported(path: Path) -> Iterator[str]:
             # importlib.import_module("..."), __import__("...")
             name = node.func.attr if isinstance(node.func, ast.Attribute) else node.func.id
             if name in ("import_module", "__import__") and node.args:
-                yield from _computed(node.args[0], path, ".".join(parts))
-
-
-def _computed(argument: ast.expr, path: Path, package: str) -> Iterator[str]:
-    """Yield what ``import_module(argument)`` imports: a constant name, or with f"{__name__}.{...}"
-    in the ``__init__.py`` of a folder all modules of this folder.
-    """
-    if path.name == "__init__.py" and ast.unparse(argument).startswith("f'{__name__}."):
-        yield from (f"{package}.{p.stem}" for p in sorted(path.parent.glob("[!_]*.py")))
-    else:
-        assert isinstance(argument, ast.Constant), f"{path}: import of a computed name"
-        yield str(argument.value)
+                assert isinstance(node.args[0], ast.Constant), f"{path}: import of a computed name"
+                yield str(node.args[0].value)
 
 
 def short(item: object) -> str:

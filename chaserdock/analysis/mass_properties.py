@@ -19,6 +19,7 @@ SCALE = np.array([1.0, 1e3, 1e3, 1e3, *[1.0] * 6])
 in the order of a covariance.
 """
 _ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Row and column of the elements of an inertia tensor in the order of messages."""
 
 
 def values_of(mass: MassEstimate) -> tuple[Array, Array]:

@@ -30,8 +30,12 @@ from .summary import tracking_errors
 from .time_series import Traces
 
 _MOST_SAMPLES = 1200
+"""Most rows of a body in a report: ten a second of two minutes. Chosen, for the size of the page.
+"""
 _MOST_SHOTS = 120
+"""Most images of a chaser in a report. Chosen, for the size of the page."""
 _SHOT_WIDTH_PX = 256
+"""Width (px) of the images in a report. Chosen, for the size of the page."""
 
 
 def _numbers(values: Array, digits: int) -> list[float]:

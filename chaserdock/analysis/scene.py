@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies of a mission as coloured faces in body axes, for the 3-D replay, the video and the viewer."""
+"""Bodies of a mission as coloured faces in body axes, for 3-D replay, video and viewer."""
 
 from __future__ import annotations
 
@@ -18,11 +18,17 @@ Grey = int
 """0 black to 255 white, fully lit."""
 
 _PROBE_WIDTH_M = 0.012
-# A long thin box is divided, so that ordering faces by the depth of their centres is correct.
+"""Width (m) of the drawn probe. Chosen."""
 _LONGEST_PIECE_M = 0.06
+"""Longest piece (m) of the drawn probe: a long thin box is divided, so that ordering faces by the
+depth of their centres is correct."""
 _LONGEST_EDGE_M = 0.12
+"""Longest edge (m) of a drawn triangle, for the same reason. Chosen."""
 _PLATE_M = 0.03
+"""Thickness (m) below which a part of a mesh counts as a plate. Chosen."""
 _LIFT_M = 0.08
+"""Distance (m) by which the broad faces of a plate count as nearer: drawn after what is behind it,
+where depths of centres alone err. Chosen."""
 _FACET_M = 0.02
 """Largest deviation of the drawn facets of a satellite from its curved surfaces."""
 

@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 from .images import Pair, pairs
 
 _MARKER = (90, 220, 90)
+"""Colour (BGR, 0 to 255) of detected markers. Chosen."""
 _TEXT = (235, 235, 235)
+"""Colour (BGR, 0 to 255) of text. Chosen."""
 _AXES = ((80, 80, 255), (90, 220, 90), (255, 160, 60))
+"""Colours (BGR, 0 to 255) of the axes x, y, z: red, green, blue, as usual."""
 
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:

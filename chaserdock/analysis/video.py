@@ -33,10 +33,15 @@ ENDINGS = (".mp4", ".webp", ".gif")
 _CODECS = {".mp4": "libx264", ".webp": "libwebp_anim", ".gif": "gif"}
 _AZIMUTH_RAD, _ELEVATION_RAD = math.radians(-52.0), math.radians(26.0)
 _TRAIL_S = 25.0
+"""Time (s) of the path behind each chaser. Chosen."""
 _INK = (235, 235, 235)
+"""Colour (BGR, 0 to 255) of text. Chosen."""
 _MARGIN_PX = 8
+"""Distance (px) of insets from the edge. Chosen."""
 _DIM = (120, 120, 120)
+"""Colour (BGR, 0 to 255) of axes. Chosen."""
 _PLUME_M = 0.16
+"""Length (m) of the drawn plume of a thruster that is always open. Chosen."""
 _TITLE_SHARE = 0.12
 """Share of the video during which the description, and at the end the verdict, is shown."""
 _CLOSE_PHASES = frozenset({"approach", "final", "contact", "latched", "docked"})
@@ -223,7 +228,7 @@ class _ExternalView:
         return image
 
     def _background(self, look: Viewpoint) -> BgrImage:
-        """Return stars and Earth as the simulated cameras see them; the view's direction is fixed."""
+        """Return stars and Earth as the simulated cameras see them, in the direction of view."""
         if self._sky is None:
             disc = earth_disc(self.flight.scenario)
             space = Background(
@@ -237,7 +242,7 @@ class _ExternalView:
     def _rendered(
         self, look: Viewpoint, at: BodyPose, chasers: dict[int, BodyPose]
     ) -> RenderedBodies | None:
-        """Return the bodies as rendered; None for a target without a mesh, whose faces are drawn."""
+        """Return the rendered bodies; None for a target without a mesh, whose faces are drawn."""
         if self._mesh is None:
             return None
         size = (look.width_px, look.height_px)

@@ -39,7 +39,10 @@ from .ticks import CheckError, RecordedTick, read_turns, with_instance
 SILENT_TICKS = 3
 """Number of unanswered ticks after which the check stops."""
 _LEASE_MS = 60_000
+"""Time (ms) after which a silent process counts as lost: chosen, long, so that a slow one is
+not."""
 _END_S = 5.0
+"""Time (s) that the process has to end. Chosen."""
 
 
 @dataclass(frozen=True)

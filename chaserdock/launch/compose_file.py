@@ -62,7 +62,7 @@ services:
     entrypoint: [sh, -c]
     command:
       - >-
-        python -m chaserdock keys init /keys --renew --shared --host router --chasers {chasers}
+        python -m chaserdock deploy --keys /keys --renew --shared --host router --chasers {chasers}
         && exec python -m chaserdock.launch.container
         router -l tls/0.0.0.0:7447 --lease ${{LEASE_S:-10}} --until operator
     environment:
@@ -120,7 +120,7 @@ _OBSERVERS = """
   mission:
     <<: *writer
     mem_limit: 4g
-    command: judge /runs -e tls/router:7447 --lease ${LEASE_S:-10}
+    command: judge /runs --live -e tls/router:7447 --lease ${LEASE_S:-10}
     environment: *writer-environment
     volumes:
       - keys-operator:/keys:ro
@@ -164,7 +164,7 @@ _CHASER = """
 
 
 def default_scenario(chasers: int) -> str:
-    """Return the shipped scenario that a mission of so many chaser services flies without SCENARIO."""
+    """Return the shipped scenario that so many chaser services fly without SCENARIO."""
     return _SHIPPED[max(n for n in _SHIPPED if n <= chasers)]
 
 
@@ -177,7 +177,7 @@ def compose_file(chasers: int, *, standby: bool = False, view: bool = False) -> 
     if not 1 <= chasers <= MAX_CHASERS:
         raise ValueError(f"{chasers} chasers: must be from 1 to {MAX_CHASERS}")
     keys = ["router", *(who.common_name for who in identities(chasers))]
-    command = f"chaserdock compose --chasers {chasers}{' --standby' * standby}{' --view' * view}"
+    command = f"chaserdock deploy --chasers {chasers}{' --standby' * standby}{' --view' * view}"
     return (
         _HEAD.format(
             command=command,

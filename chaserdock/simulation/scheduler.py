@@ -30,6 +30,7 @@ class Killed(BaseException):
 Due = tuple[float, float]
 """Virtual time (s) of an event, and its place among those of the same time."""
 NEVER: Due = (0.0, 0.0)
+"""A time before all events."""
 SPREAD, WAKE_SPREAD = 32.0, 128.0
 """How many later events of the same time may come before an event, and before a task that is woken
 continues.
@@ -90,10 +91,8 @@ class Scheduler:
         after: Due = NEVER,
         args: tuple[Any, ...] = (),
     ) -> Due:
-        """Call ``call(*args)``, which must not wait, at a time and after the call of ``after``;
-        return when.
-
-        At once if the time has passed.
+        """Schedule ``call(*args)`` at a virtual time (s), at once if that has passed, and not before
+        the event ``after``. Return when it comes. The call must not wait.
         """
         self._count += 1
         now_s = self.now_s

@@ -9,30 +9,15 @@ scenario.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import random
-import tempfile
-import zlib
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, get_args
 
-from chaserdock_protocol import topics
-from chaserdock_protocol.recording.scan import LOG_NAME
-from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
-from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, LATCH_FAULTS, FaultKind, role_of
-from chaserdock_protocol.transport import RawSample
-from chaserdock_world.lockstep.tick_barrier import RECORDER_WINDOW_TICKS
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.faults import LATCH_FAULTS, FaultKind
 
-from chaserdock.toml_text import toml_document
-
-from .invariants import Invariants, Violation, settling_s
-from .mission import SimulatedFlight, simulate
+from .checks.docking import settling_s
 
 KINDS: tuple[str, ...] = tuple(kind for kind in get_args(FaultKind) if kind not in LATCH_FAULTS)
 LATCH_KINDS: tuple[str, ...] = tuple(sorted(LATCH_FAULTS))
@@ -57,25 +42,6 @@ and as long as an approach.
 
 Case = dict[str, Any]
 """Keys and values of a scenario file."""
-
-
-@dataclass(frozen=True)
-class SimulationResult:
-    """One simulated flight. ``fingerprint``: of all messages with their times; equal in equal
-    flights.
-
-    ``nees``: of the estimate, one value a second; ``honest``: no sensor lies, so that it should be
-    consistent.
-    """
-
-    seed: int
-    case: Case
-    violations: tuple[Violation, ...]
-    outcome: str
-    fingerprint: str
-    nees: tuple[float, ...]
-    honest: bool
-    sim_time_s: float
 
 
 def draw_fault(
@@ -349,167 +315,3 @@ def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, An
             entry["offset_m"] = [round(share * x, 3) for x in position_m]
         timeline.append(entry)
     return sorted(timeline, key=lambda e: e["at_s"])
-
-
-def fly_case(
-    case: Case, seed: int, folder: Path | None = None, *, to_violation: bool = False
-) -> SimulationResult:
-    """Simulate a case and check the invariants, with ``to_violation`` only until one is violated.
-
-    The log stays in ``folder`` if one is given. Raises ScenarioError.
-    """
-    with contextlib.ExitStack() as stack:
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
-        path = (folder or scratch) / "scenario.toml"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(toml_document(case), encoding="utf-8")
-        try:
-            checks, fingerprint = Invariants(load_scenario(path)), 0
-        except ScenarioError as error:
-            # The text is not to name a file that is deleted now.
-            raise ScenarioError(str(error).replace(f"{scratch / path.name}: ", "")) from None
-        published: Counter[str] = Counter()
-
-        def tap(sender: str, raw: RawSample) -> None:
-            nonlocal fingerprint
-            # The recorder listens from the first tick on, and is not asked for its own and for
-            # presence.
-            if (published or raw.key == topics.TICK.key) and sender != "recorder":
-                published[raw.key] += not raw.key.endswith("/presence")
-            fingerprint = zlib.crc32(
-                raw.payload, zlib.crc32(f"{sender}{raw.key}{raw.sent_ns}".encode(), fingerprint)
-            )
-            checks.observe(sender, raw)
-
-        def over() -> bool:
-            return to_violation and bool(checks.violations)
-
-        flight = simulate(path, path.parent / "run", tap=tap, over=over)
-        honest = _is_honest(checks.scenario)
-        if not over():
-            checks.check_end(flight.crashes, flight.stalled)
-            _check_recording(checks, flight, published)
-            check_queues(checks, flight, published.total())
-            if honest:
-                _check_consistency(checks)
-    return SimulationResult(
-        seed=seed,
-        case=case,
-        violations=tuple(checks.violations),
-        outcome=outcome_of(checks),
-        fingerprint=f"{fingerprint:08x}",
-        nees=tuple(checks.nees),
-        honest=honest,
-        sim_time_s=checks.time_s,
-    )
-
-
-def _is_honest(scenario: Scenario) -> bool:
-    """Return whether no sensor lies and the plant is as stated."""
-    lies = _LIES & {fault.kind for fault in scenario.fault}
-    return not (lies or scenario.thruster_failure or "truth" in scenario.model_fields_set)
-
-
-def _check_consistency(checks: Invariants) -> None:
-    """Compare the errors of the estimates of one flight with their covariances."""
-    for name, nees in (
-        ("target", checks.nees),
-        ("chasers relative to the target", checks.relative_nees),
-    ):
-        if len(nees) >= LEAST_ESTIMATES and (mean := sum(nees) / len(nees)) > FLIGHT_NEES:
-            checks.violate("covariance consistency", name, f"mean NEES {mean:.0f} in one flight")
-
-
-def memory_folder() -> str | None:
-    """Return a folder in memory for logs that are not kept, if this system has one."""
-    return "/dev/shm" if Path("/dev/shm").is_dir() else None
-
-
-def outcome_of(checks: Invariants) -> str:
-    """Return the first violated invariant, or the least final state of the chasers that are to
-    dock.
-    """
-    if checks.violations:
-        return checks.violations[0].invariant
-    states = {checks.state_at_end(i) for i in checks.to_dock}
-    return next((state for state in ("unfinished", "safe", "docked") if state in states), "safe")
-
-
-def _check_recording(checks: Invariants, flight: SimulatedFlight, published: Counter[str]) -> None:
-    """Compare the log with what reached the recorder; in lock-step also with what was published."""
-    if "recorder" in flight.stalled or flight.statuses.get("recorder") is None:
-        return
-    try:
-        with (flight.folder / LOG_NAME).open("rb") as file:
-            index = make_reader(file).get_summary()
-    except (OSError, McapError) as error:
-        checks.violate("no recorded data lost", "recorder", f"the log cannot be read: {error}")
-        return
-    if index is None or index.statistics is None:
-        checks.violate("no recorded data lost", "recorder", "the log has no index")
-        return
-    recorded: Counter[str] = Counter()
-    for channel, number in index.statistics.channel_message_counts.items():
-        recorded[index.channels[channel].topic] += number
-    expected = Counter(flight.traffic.recorded)
-    s = checks.scenario
-    unreachable = s.simulation.partition or {"cut", "kill"} & {f.kind for f in s.fault}
-    if s.simulation.mode == "lockstep" and not unreachable:
-        expected |= published
-    for key, number in expected.items():
-        if recorded.get(key, 0) != number:
-            checks.violate(
-                "no recorded data lost",
-                key,
-                f"{recorded.get(key, 0)} of {number} messages are in the log",
-            )
-
-
-def queue_limit(reader: str, published: int, ticks: int, missed_ticks: float = 0.0) -> int:
-    """Return how many messages may wait for a process in a flight with so many messages and ticks.
-
-    The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the
-    mean. ``missed_ticks``: the most ticks that a process opens or replies to at once, after it was
-    frozen or slow.
-    """
-    behind = missed_ticks + (RECORDER_WINDOW_TICKS + 2 if reader == "recorder" else 0)
-    return max(QUEUE_LIMIT, math.ceil(behind * published / max(1, ticks)))
-
-
-def _falls_behind(reader: str, s: Scenario) -> bool:
-    """Return whether the network or a fault fills the queue of a process."""
-    return (
-        any(w.process == reader for w in s.simulation.slow)
-        or any(reader in p.processes for p in s.simulation.partition)
-        or any(f.kind == "freeze" and f.process == reader for f in s.fault)
-        or any(
-            f.kind == "flood" and topics.may_read(role_of(reader), FAULTY_TOPICS[str(f.topic)])
-            for f in s.fault
-        )
-    )
-
-
-def check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
-    """Check that queues stay short, except those of readers that are slow, frozen, cut off or
-    flooded.
-    """
-    s = checks.scenario
-    behind_s = [f.duration_s or 0.0 for f in s.fault if f.kind == "freeze"]
-    behind_s += [slow.duration_s for slow in s.simulation.slow]
-    missed_ticks = sum(behind_s) * s.time.rate_hz if s.simulation.mode == "realtime" else 0.0
-    for name, items in flight.traffic.queues.items():
-        reader = name.split()[0]
-        limit = queue_limit(reader, published, checks.ticks, missed_ticks)
-        if items.most > limit and not _falls_behind(reader, s):
-            checks.violate("bounded queues", reader, f"{items.most} messages waited")
-
-
-LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
-"""Largest mean normalized squared error (6 if consistent) of at least so many estimates of one
-flight without lying sensors.
-"""
-_LIES = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
-QUEUE_LIMIT = 400
-"""Most messages that may wait for a reader which is not slow, frozen, cut off or flooded; see
-``queue_limit``.
-"""

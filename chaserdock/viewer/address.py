@@ -17,8 +17,10 @@ from chaserdock_protocol.errors import ChaserdockError
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
+"""First TCP port that is tried: the usual one of a local page."""
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _TRIES = 20
+"""Ports that are tried. Chosen."""
 TOKEN_VARIABLE = "CHASERDOCK_VIEWER_TOKEN"
 """Environment variable with the token of the page: unlike an argument, other users cannot read it.
 """
@@ -73,7 +75,9 @@ def path_below_token(path: str, token: str) -> str | None:
     """Return the path and query of a request without the token in front, or None if it has no valid
     token.
     """
-    first, rest = re.fullmatch(r"/?([^/?]*)(.*)", path, re.DOTALL).groups()  # type: ignore[union-attr]
+    found = re.fullmatch(r"/?([^/?]*)(.*)", path, re.DOTALL)
+    assert found is not None  # all parts are optional
+    first, rest = found.groups()
     if not compare_digest(first.encode(errors="replace"), token.encode()):
         return None
     return rest if rest.startswith("/") else f"/{rest}"

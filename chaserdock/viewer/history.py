@@ -35,7 +35,10 @@ from chaserdock.analysis.mass_properties import values_of
 from .snapshot import TARGET, keep_newest
 
 MOST_POINTS = 40_000
+"""Most points of a curve: an hour at 10 Hz, and thinned beyond that. Chosen, for memory."""
 _MOST_LINES = 500
+"""Most lines of the event list, and an eighth of the most points of a trail. Chosen, for memory.
+"""
 
 ChartQuantity = Literal[
     "position_error_mm",
@@ -116,7 +119,9 @@ class Trail:
 
 
 class History:
-    """Series by quantity and chaser (None: of the mission), trails by chaser, and event lines."""
+    """What the page shows of the past: ``series`` by quantity and chaser (None: of the mission),
+    ``trails`` by chaser, and ``lines`` of events.
+    """
 
     def __init__(self, chasers: int) -> None:
         self.series: dict[tuple[ChartQuantity, int | None], Series] = defaultdict(Series)

@@ -34,12 +34,20 @@ from .server import page_server
 from .snapshot import OF_CHASERS, MissionState
 
 PERIOD_S = 0.1
+"""Time (s) between two drawings: as long as a tick of 10 Hz."""
 _STATES, _EVENTS = 16, 256
+"""Messages of a state and of events that may wait for a drawing. Chosen; 16 states last
+1.6 s at 10 Hz."""
 _REPLY_TIMEOUT_S = 5.0
+"""Time (s) that a controller has to answer a command of the page. Chosen."""
 _SILENCE_S = 3.0
+"""Time (s) without messages after which a new mission is looked for. Chosen."""
 _JOIN_PERIOD_S = 2.0
+"""Time (s) between two attempts to find it. Chosen."""
 _RECONNECT_S = 10.0
+"""Time (s) without an answer after which the session is opened again. Chosen."""
 _DRAWING_NICE = 10
+"""Priority (nice) of drawing: below that of missions on the same machine, half of the range."""
 _ATTEMPT_S = 2.0
 """Longest time (s) of one attempt to connect to a router."""
 _WAITING = "no mission is running"
@@ -58,7 +66,9 @@ class ViewOptions:
 
 
 def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> int:
-    """Serve the page until stopped; return 0. Raise ViewError or TransportError if it cannot start."""
+    """Serve the page until stopped; return 0. Raise ViewError or TransportError if it cannot
+    start.
+    """
     stop, token = StopSignal(watch_parent), page_token()
     with ThreadPoolExecutor(1, "session") as opener:
         opener.submit(int).result()
@@ -75,7 +85,8 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
         with page_server(options.host, options.port, token) as server:
             print_status(
                 "viewer",
-                f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends this",
+                f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends "
+                "this",
             )
             patient, run_id = _Patience(connect, stop), ""
             with suppress(_Stopped):
@@ -125,7 +136,9 @@ def _join(node: Node) -> JoinReply | None:
 def _next_mission(
     connect: Callable[[], Node], server: viser.ViserServer, past: str, stop: StopSignal
 ) -> JoinReply | None:
-    """Wait for a mission other than ``past``; return None when stopped. The page shows the status."""
+    """Wait for a mission other than ``past``; return None when stopped. The page shows the
+    status.
+    """
     shown = None
     notice = server.gui.add_markdown("") if not past else None
     node = connect()
@@ -178,7 +191,7 @@ class _Feed:
 
 
 class _MissionView:
-    """One mission, until another one starts."""
+    """Shows one mission, until another one starts."""
 
     def __init__(
         self,
@@ -294,7 +307,11 @@ class _MissionView:
         while (item := self._commands.get()) is not None:
             what, chaser = item
             self._page.show_reply(f"{what} chaser {chaser}: sent")
-            command = OperatorCommand(command=what, chaser=chaser, operator="viewer")  # type: ignore[arg-type]
+            command = OperatorCommand(
+                command=what,  # type: ignore[arg-type]
+                chaser=chaser,
+                operator="viewer",
+            )
             try:
                 reply = self._node.query(
                     topics.OPERATE_KEY, command, CommandReply, _REPLY_TIMEOUT_S
@@ -304,7 +321,8 @@ class _MissionView:
                 continue
             if reply is None:
                 self._page.show_reply(
-                    f"⚠ {what} chaser {chaser}: no reply from the controller within {_REPLY_TIMEOUT_S:g} s"
+                    f"⚠ {what} chaser {chaser}: no reply from the controller within "
+                    f"{_REPLY_TIMEOUT_S:g} s"
                 )
             else:
                 self._page.show_reply(("✓ " if reply.accepted else "⚠ ") + reply_text(reply))

@@ -48,6 +48,8 @@ _DECODED = (
 )
 """Topics of the plots and of the event list, decoded while the log is indexed."""
 _CHUNKS_KEPT = 24
+"""Decoded chunks of a log that are kept. Chosen, for memory.
+"""
 
 
 class _Exposure(msgspec.Struct):

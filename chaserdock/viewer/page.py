@@ -30,10 +30,14 @@ ABORT = "abort"
 SendCommand = Callable[[str, int], None]
 
 _IMAGE_PX = 400
+"""Width (px) of each camera's image. Chosen."""
 _ALL = "all cameras"
 _ENLARGED_PX = 800
+"""Width (px) of one camera's image: as wide as two tiles."""
 _SLOW_S = 0.5
+"""Time (s) between two updates of text and plots. Chosen; faster ones cannot be read."""
 _IMAGES_S = 0.25
+"""Time (s) between two updates of images. Chosen, for the load of the browser."""
 _GRID = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
 
 
@@ -302,7 +306,7 @@ class Page:
                 chart.data = points_of(plot, history, 0.0, state.time_s())
 
     def _draw_image(self, state: MissionState) -> None:
-        """Draw the images that have changed, all at once, so that the tiles show the same moment."""
+        """Draw the images that have changed, all at once: the tiles show the same moment."""
         if time.monotonic() - self._images_s < _IMAGES_S:
             return
         enlarged, changed = self._enlarged, False

@@ -27,7 +27,9 @@ VIEWS: tuple[ViewFrom, ...] = get_args(ViewFrom)
 """Frame fixed on the screen: world axes at the target's position; target frame; world frame."""
 
 TRAIL_S = 60.0
+"""Time (s) of the path behind each chaser. Chosen."""
 _VIEW_M = 0.22
+"""Length (m) of the drawn field of view of a camera. Chosen."""
 _STARS_M = 100.0
 """Distance of the stars, m: far outside the scene."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))

@@ -15,14 +15,19 @@ from numpy.typing import NDArray
 
 from chaserdock.analysis.scene import Face
 
-# Offset of each painted layer above its face, so that the depth buffer separates them.
 _LAYER_M = 0.0004
+"""Offset (m) of each painted layer above its face, so that the depth buffer separates them. Chosen.
+"""
 _SIDES = 24
+"""Sides of a polygon that stands for a circle. Chosen; deviates by 1 - cos(pi / 24) = 0.9 % of the
+radius."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """``vertices_m`` (V, 3), ``triangles`` (F, 3) of their indices, ``colours`` (V, 3), 0 to 255."""
+    """Coloured triangles to draw. ``vertices_m`` (V, 3); ``triangles`` (F, 3): indices of their
+    corners; ``colours`` (V, 3): of the vertices, 0 to 255.
+    """
 
     vertices_m: Array
     triangles: NDArray[np.int32]

@@ -50,8 +50,11 @@ OF_ALL = (topics.TICK, topics.TARGET, topics.STACK, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
 
 _KEPT = 64
+"""Messages that are kept to be matched with later ones: 6 s at 10 Hz. Chosen."""
 _IMAGES_KEPT = 4
+"""Images of a chaser that are kept, to show all cameras at one moment. Chosen, for memory."""
 _RECENT_NS = 2_000_000_000
+"""Age (ns) from which on the images of a chaser count as stopped. Chosen."""
 _FIELDS = {
     Odometry: "odometry",
     Reference: "reference",
@@ -110,7 +113,7 @@ class ChaserState:
             keep_newest(self.images, message.sim_time_ns, message, _IMAGES_KEPT)
 
     def error(self) -> tuple[float, float] | None:
-        """Return distance (m) and angle (rad) from the reference, by odometry; None while unknown."""
+        """Return distance (m) and angle (rad) from the reference, by odometry; None if unknown."""
         reference = self.reference
         odometry = self._odometries.get(reference.tick) if reference is not None else None
         if reference is None or odometry is None:

@@ -123,21 +123,3 @@ def distance_between(
         return -np.inf
     line = line / apart_m
     return apart_m - reach_along(body, -line, pose[1]) - reach_along(body, line, other[1])
-
-
-def separations(one: Array, other: Array) -> Array:
-    """Return the largest gap (M,), m, of cuboids (M, 15) from others (M, 15), in one frame, along
-    the directions of the separating-axis test: positive exactly if they are disjoint, at most the
-    distance.
-
-    S. Gottschalk, M. Lin, D. Manocha, OBBTree, SIGGRAPH 1996.
-    """
-    axes, others = (t[:, 3:12].reshape(-1, 3, 3).transpose(0, 2, 1) for t in (one, other))
-    edges = np.cross(axes[:, :, None], others[:, None]).reshape(-1, 9, 3)
-    length = np.linalg.norm(edges, axis=2, keepdims=True)
-    edges = np.where(length > 1e-6, edges / np.maximum(length, 1e-6), axes[:, :1])
-    directions = np.concatenate([axes, others, edges], axis=1)
-    gaps = np.abs(np.einsum("mdk,mk->md", directions, other[:, :3] - one[:, :3]))
-    for table, own in ((one, axes), (other, others)):
-        gaps -= np.einsum("mdi,mi->md", np.abs(directions @ own.transpose(0, 2, 1)), table[:, 12:])
-    return gaps.max(axis=1)

@@ -87,10 +87,9 @@ class TargetModel:
     """A target: ``boxes`` in TRF, ``markers`` of the OpenCV ``dictionary``, overall ``size_m``.
 
     ``white_margin_m``: width of the white border printed around every marker, under its neighbours.
-    ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws instead of the boxes, scaled
-    by ``mesh_scale``; empty for none. ``satellite``: name of the mesh that is drawn; empty for
-    none. ``hulls``: whether the boxes enclose the parts of that mesh; then collisions use convex
-    pieces of these, otherwise the boxes.
+    ``satellite``: name of the mesh that is drawn instead of the boxes; empty for none. ``hulls``:
+    whether the boxes enclose the parts of that mesh; then collisions use convex pieces of these,
+    otherwise the boxes.
     """
 
     name: str
@@ -99,8 +98,6 @@ class TargetModel:
     dictionary: str
     size_m: Vector3
     white_margin_m: float
-    mesh: str = ""
-    mesh_scale: float = 1.0
     satellite: str = ""
     hulls: bool = False
 

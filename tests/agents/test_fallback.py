@@ -9,6 +9,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from chaser_cases import deliver, step
+from chaserdock_agents.chaser.core import ChaserCore
 from chaserdock_agents.chaser.fallback import (
     BRAKE_LIMIT_S,
     CLEARANCE_MARGIN_M,
@@ -22,16 +24,13 @@ from chaserdock_agents.chaser.fallback import (
     is_at_rest,
     next_state,
 )
-from chaserdock_agents.chaser.process import ChaserProcess
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.leases import longest_lease_ticks
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate, Tick, WrenchCommand
-from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.transport import ReceivedMessage
 
 ROOT = Path(__file__).resolve().parents[2]
 STEP_S, DT_S, STAGES = 0.1, 0.1, 30
@@ -264,15 +263,7 @@ def test_clearance_is_outside_of_keep_out_sphere_and_corridor() -> None:
     assert clearance_m(docking, 0) > np.linalg.norm(entry)
 
 
-# -- the chaser process ----------------------------------------------------------------------------
-
-
-def deliver(chaser: ChaserProcess, topic: Any, message: Any) -> list[tuple[Any, Any]]:
-    """Hand the process one message; return what it publishes."""
-    node: Any = chaser.node
-    node.put(ReceivedMessage(topic, None if topic is topics.TICK else "0", message, 0))
-    chaser.listen()
-    return [(t, m) for t, _, m in node.take_published()]
+# -- the chaser's core ------------------------------------------------------------------------------
 
 
 def tick_of(scenario: Scenario, tick: int, *controllers: str, revision: int = 0) -> Tick:
@@ -304,10 +295,8 @@ def command(scenario: Scenario, tick: int, commander: str, term: int) -> WrenchC
 
 
 @pytest.fixture
-def chaser(scenario: Scenario) -> ChaserProcess:
-    made = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
-    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
-    return made
+def chaser(scenario: Scenario) -> ChaserCore:
+    return ChaserCore(scenario, 0)
 
 
 def at(scenario: Scenario, tick: int) -> Odometry:
@@ -321,7 +310,7 @@ def sources(published: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
 
 
 def test_lost_controller_reports_each_fallback_mode_once(
-    chaser: ChaserProcess, scenario: Scenario
+    chaser: ChaserCore, scenario: Scenario
 ) -> None:
     plan = msgspec.structs.replace(straight(0.0), sim_time_ns=scenario.timing.effective_ns(0))
     deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller"))
@@ -359,8 +348,7 @@ def test_fallback_does_not_depend_on_order_of_arrival(
     }
 
     def replies(order: tuple[str, ...]) -> list[Any]:
-        made = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
-        made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
+        made = ChaserCore(scenario, 0)
         published = []
         for tick in (0, 1):
             deliver(made, topics.TICK, tick_of(scenario, tick, "controller"))
@@ -385,9 +373,7 @@ def test_fallback_does_not_depend_on_order_of_arrival(
     assert replies(("wrench", "target", "plan")) == expected
 
 
-def test_plan_without_its_command_is_not_executed(
-    chaser: ChaserProcess, scenario: Scenario
-) -> None:
+def test_plan_without_its_command_is_not_executed(chaser: ChaserCore, scenario: Scenario) -> None:
     deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))
     deliver(chaser, topics.PLAN, straight(0.0))
@@ -396,15 +382,14 @@ def test_plan_without_its_command_is_not_executed(
 
 
 def test_stale_terms_are_rejected_counted_and_reported_once(
-    chaser: ChaserProcess, scenario: Scenario
+    chaser: ChaserCore, scenario: Scenario
 ) -> None:
     for tick in (1, 2):
         deliver(chaser, topics.TICK, tick_of(scenario, tick, "standby"))
         deliver(chaser, topics.ODOMETRY, at(scenario, tick))
-        published = deliver(chaser, topics.WRENCH, command(scenario, tick, "controller", 1))
-        assert sources(published) == []  # waits for the leader's command
-        assert len([m for t, m in published if t is topics.EVENT]) == (1 if tick == 1 else 0)
-    assert chaser.node.counts.rejected["wrench:stale term"] == 2
+        outputs = step(chaser, topics.WRENCH, command(scenario, tick, "controller", 1))
+        assert [t for t, _, _ in outputs.messages] == ([topics.EVENT] if tick == 1 else [])
+        assert outputs.rejected == "wrench:stale term"
     published = deliver(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))
     assert sources(published) == [("command", 2)]
     ended = [m for t, m in published if t is topics.EVENT and m.what == "commands accepted again"]
@@ -417,21 +402,25 @@ def test_stale_terms_are_rejected_counted_and_reported_once(
 
 @pytest.mark.parametrize("mode", ["nmpc", "none", "yield"])
 def test_command_far_ahead_of_the_newest_tick_is_refused(
-    chaser: ChaserProcess, scenario: Scenario, mode: Any
+    chaser: ChaserCore, scenario: Scenario, mode: Any
 ) -> None:
     def deliver_tick(tick: int) -> list[tuple[Any, Any]]:
         deliver(chaser, topics.TICK, tick_of(scenario, tick, "controller"))
         return deliver(chaser, topics.ODOMETRY, at(scenario, tick))
 
     deliver_tick(3)
-    until_tick, latest = chaser.leases.until_tick, 3 + longest_lease_ticks(scenario.time.rate_hz)
+    until_tick, latest = (
+        chaser.gate.leases.until_tick,
+        3 + longest_lease_ticks(scenario.time.rate_hz),
+    )
     far = msgspec.structs.replace(command(scenario, latest + 1, "controller", 1), mode=mode)
-    published = deliver(chaser, topics.WRENCH, far)
+    outputs = step(chaser, topics.WRENCH, far)
+    published: list[Any] = [(t, m) for t, _, m in outputs.messages]
     assert sources(published) == [("hold", 0)]  # the reply that the world waits for
     events = [(m.what, m.tick) for t, m in published if t is topics.EVENT]
     assert events == [("command refused", 3), ("no command", 3), ("fallback: hold", 3)]
-    assert chaser.leases.until_tick == until_tick
-    assert chaser.node.counts.rejected["wrench:early tick"] == 1
+    assert chaser.gate.leases.until_tick == until_tick
+    assert outputs.rejected == "wrench:early tick"
     deliver_tick(4)
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == [
         ("command", 1)
@@ -442,7 +431,7 @@ def test_command_far_ahead_of_the_newest_tick_is_refused(
 
 
 def test_new_leader_within_a_tick_does_not_repeat_a_command(
-    chaser: ChaserProcess, scenario: Scenario
+    chaser: ChaserCore, scenario: Scenario
 ) -> None:
     deliver(chaser, topics.TICK, tick_of(scenario, 3, "controller", "standby"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 3))

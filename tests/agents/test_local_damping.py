@@ -9,20 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chaser_cases import deliver
+from chaserdock_agents.chaser.core import ChaserCore
 from chaserdock_agents.chaser.local_damping import LocalDamping
-from chaserdock_agents.chaser.process import ChaserProcess
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import DockingStatus, Odometry, Tick, WrenchCommand
-from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario
 from chaserdock_protocol.scenario.mounting import plume_free_thrusters
-from chaserdock_protocol.transport import ReceivedMessage
-
-from chaserdock.evaluation.transfers import load_shipped
+from flights import load_shipped
 
 
 def scenario_of(*changes: str) -> FlightScenario:
@@ -83,21 +81,12 @@ def test_the_same_odometry_gives_the_same_thrusts() -> None:
     np.testing.assert_array_equal(damping.thrusts_N(odometry(scenario, 1, rates)), first)
 
 
-def deliver(chaser: ChaserProcess, topic: Any, message: Any) -> list[tuple[Any, Any]]:
-    """Hand the process one message; return what it publishes."""
-    node: Any = chaser.node
-    node.put(ReceivedMessage(topic, None if topic is topics.TICK else "0", message, 0))
-    chaser.listen()
-    return [(t, m) for t, _, m in node.take_published()]
-
-
 @pytest.mark.parametrize(("mode", "fires"), [("detumble", True), ("coast", False)])
 def test_a_latched_chaser_left_by_its_controller_damps_only_if_it_was_detumbling(
     mode: Any, fires: bool
 ) -> None:
     scenario = scenario_of()
-    chaser = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
-    chaser.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
+    chaser = ChaserCore(scenario, 0)
     rates = np.array([-0.03, 0.01, 0.02, 0.05, -0.1, 0.02])
     last = WrenchCommand(
         tick=0,

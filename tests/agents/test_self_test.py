@@ -14,10 +14,10 @@ from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.self_test import ThrusterSelfTest
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario.thrusters import thrusts_max
+from flights.measured_poses import measurement_model
 from thruster_cases import at_rest, mission, wrench
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perception import measurement_model
+from chaserdock.experiments.flight_record import record_flight
 
 PERIOD_S, S = 0.1, 1_000_000_000
 

@@ -2,7 +2,7 @@
 """The C kernels under sanitizers: arbitrary floating-point input, and that the sanitizers and
 checks find faults.
 
-`python benchmarks/fuzz_kernels.py` does the same for longer.
+`python benchmarks/fuzz.py` does the same for longer.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def type_names(path: Path) -> Iterator[str]:
 def test_no_name_of_a_class_or_type_is_used_for_two_things() -> None:
     """In the packages and the benchmarks, so that a search for a name finds one thing."""
     places: dict[str, list[str]] = defaultdict(list)
-    paths = [path for _, path in MODULES] + sorted((ROOT / "benchmarks").glob("*.py"))
+    paths = [path for _, path in MODULES] + sorted((ROOT / "benchmarks").rglob("*.py"))
     for path in paths:
         for name in type_names(path):
             places[name].append(str(path.relative_to(ROOT)))

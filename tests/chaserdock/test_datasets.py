@@ -229,14 +229,14 @@ def test_evaluate_scores_markers_in_both_layouts(
     )
     assert "4 images of servicer, bop and speed+, seed 2" in capsys.readouterr().out
     for folder in (made / "bop", made / "speedplus"):
-        app(["evaluate", "perception", str(folder), "--json"], standalone_mode=False)
+        app(["dataset", str(folder), "--json"], standalone_mode=False)
         figures = json.loads(capsys.readouterr().out)
         assert (figures["images"], figures["with_pose"]) == (3, 3)
         assert figures["perception"] == "default"
         assert figures["speed_score_2019"] < 0.01
         assert figures["add_m_p95"] < 0.005
         assert figures["add_right_share"] == 1.0
-    app(["evaluate", "perception", str(made), "--quiet"], standalone_mode=False)
+    app(["dataset", str(made), "--quiet"], standalone_mode=False)
     assert "images 3, with a pose 3 (100.0%)" in capsys.readouterr().out
 
 
@@ -250,7 +250,7 @@ def test_evaluate_scores_shapes_without_memory(
     export_dataset(
         scenario("seed=1"), folder, 3, ViewLimits((1.0, 2.0), 0.2, (20.0, 60.0)), ("speed+",), 1.0
     )
-    app(["evaluate", "perception", str(folder), "--json"], standalone_mode=False)
+    app(["dataset", str(folder), "--json"], standalone_mode=False)
     figures = json.loads(capsys.readouterr().out)
     assert figures["perception"] == "model"
     assert (figures["images"], figures["with_pose"]) == (3, 3)
@@ -336,7 +336,7 @@ def test_bad_dataset_is_one_line(
     monkeypatch.setitem(sys.modules, "blind", blind)
     with pytest.raises(ChaserdockError) as caught:
         app(
-            ["evaluate", "perception", str(root), "--perception", "blind:Blind"],
+            ["dataset", str(root), "--perception", "blind:Blind"],
             standalone_mode=False,
         )
     assert text in str(caught.value)
@@ -376,6 +376,6 @@ def test_export_refuses_what_it_cannot_label(tmp_path: Path) -> None:
 )
 def test_unusable_perception_is_one_line(name: str, text: str, exported: Path) -> None:
     with pytest.raises(ChaserdockError) as caught:
-        app(["evaluate", "perception", str(exported), "--perception", name], standalone_mode=False)
+        app(["dataset", str(exported), "--perception", name], standalone_mode=False)
     assert text in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1

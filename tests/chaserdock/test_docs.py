@@ -19,9 +19,27 @@ from urllib.parse import unquote
 import pytest
 from chaserdock_protocol.scenario import parse_scenario
 from harness import ROOT
+from source_tree import MODULES
 
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
+EVIDENCE = sorted((DOCS / "evidence").glob("*.md"))
+GENERATED = {
+    "api.md",
+    "cli.md",
+    "invariants.md",
+    "phases.md",
+    "protocol.md",
+    "reproduction.md",
+    "scenario.md",
+}
+GUIDES = [page for page in PAGES if page.name not in GENERATED | {"results.md"}]
+WRITTEN = [
+    *(page for page in (*PAGES, *EVIDENCE) if page.name not in GENERATED),
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
+    ROOT / "examples" / "README.md",
+]
+"""Markdown that people write."""
 
 
 def _module(name: str) -> ModuleType:
@@ -74,8 +92,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_page_exists_and_loads_nothing_from_elsewhere(site: Path) -> None:
-    for page in PAGES:
-        assert (site / page.with_suffix(".html").name).is_file()
+    for page in (*PAGES, *EVIDENCE):
+        assert (site / page.relative_to(DOCS).with_suffix(".html")).is_file()
     for page in site.rglob("*.html"):
         seen = Requests()
         seen.feed(page.read_text(encoding="utf-8"))
@@ -171,18 +189,65 @@ def test_navigation_names_pages_that_are_there(tmp_path: Path) -> None:
         make_site.configuration(tmp_path)
 
 
-def test_the_readmes_links_lead_somewhere() -> None:
-    for page in (ROOT / "README.md", ROOT / "examples" / "README.md"):
+def test_links_of_pages_outside_the_site_lead_somewhere() -> None:
+    for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "examples/README.md"):
+        page = ROOT / name
         links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
         assert links
-        for link in links:
-            assert (page.parent / link).exists(), (page.name, link)
+        assert [link for link in links if not (page.parent / link).exists()] == [], name
+
+
+def test_pages_that_sources_name_exist() -> None:
+    """Also their headings: ``docs/controller.md#far-range``."""
+    named = set[str]()
+    for _, file in MODULES:
+        named |= set(re.findall(r"docs/[\w/-]+\.md(?:#[\w-]+)?", file.read_text("utf-8")))
+    assert len(named) > 10
+    for name in named:
+        place, _, heading = name.partition("#")
+        assert (ROOT / place).is_file(), name
+        titles = re.findall(r"^#+ (.*)", (ROOT / place).read_text(encoding="utf-8"), re.M)
+        anchors = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+        assert not heading or heading in anchors, name
+
+
+def test_texts_are_short_enough_to_be_read() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 600
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_lines_have_at_most_120_characters() -> None:
+    """Except rows of tables, and the two commands of the README that .ci/run executes."""
+    long = [
+        f"{page.relative_to(ROOT)}:{number}"
+        for page in WRITTEN
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        if len(line) > 120 and not line.startswith(("|", "python3.11 -m venv"))
+    ]
+    assert long == []
+
+
+def test_every_guide_has_a_picture_that_names_the_command_that_made_it() -> None:
+    for page in GUIDES:
+        text = page.read_text(encoding="utf-8")
+        pictures = re.findall(r"^!\[[^\]]+\]\(([^)]+)\)\n\n\*(.*?)\*$", text, re.M | re.S)
+        assert pictures, page.name
+        for picture, caption in pictures:
+            assert "Made" in caption, (page.name, picture)
+            assert "by `" in " ".join(caption.split()), (page.name, picture)
+
+
+def test_guides_contain_no_measurements() -> None:
+    """A measurement carries the date or the commit at which it was made, and is evidence."""
+    dated = re.compile(r"\b20\d\d-\d\d-\d\d\b|\b(?=[0-9a-f]*\d)(?=[0-9a-f]*[a-f])[0-9a-f]{7,8}\b")
+    for page in GUIDES:
+        assert dated.findall(page.read_text(encoding="utf-8")) == [], page.name
 
 
 def fences(language: str) -> list[tuple[str, str]]:
     """Page and text of every fenced block of a language."""
     found = []
-    for page in PAGES:
+    for page in (*PAGES, ROOT / "README.md", ROOT / "examples" / "README.md"):
         for block in re.findall(
             rf"^ *```{language}\n(.*?)^ *```", page.read_text(encoding="utf-8"), re.M | re.S
         ):
@@ -190,13 +255,15 @@ def fences(language: str) -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_page_starts_with_something_to_do(page: Path) -> None:
+def test_every_page_starts_with_something_to_do() -> None:
     """A command, a program or a numbered step stands within the first lines."""
-    lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line][1:14]
     to_do = r" *```(sh|python|toml)|.*`(chaserdock|python|pip) |    (chaserdock|python) |1\. "
-    # The page of the reproduction is the output of a command.
-    assert page.name == "reproduction.md" or any(re.match(to_do, line) for line in lines)
+    for page in PAGES:
+        lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line][1:14]
+        # The page of the reproduction is the output of a command.
+        assert page.name == "reproduction.md" or any(re.match(to_do, line) for line in lines), (
+            page.name
+        )
 
 
 @pytest.mark.parametrize("page", ["frames.md", "flight_scenario.md"])
@@ -246,19 +313,7 @@ def test_commands_in_the_docs_exist() -> None:
             assert used <= options[verb] | {"--help"}, (page, command, used - options[verb])
             tried += 1
     assert tried > 30
-
-
-def test_benchmark_commands_in_the_docs_exist() -> None:
-    """Every ``python benchmarks/NAME.py --option`` names a script that defines the option."""
-    shared = (ROOT / "benchmarks" / "common.py").read_text(encoding="utf-8")
-    tried = 0
-    for page in (*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"):
-        text = page.read_text(encoding="utf-8")
-        for folder, name, arguments in re.findall(
-            r"python (benchmarks|docs)/([a-z]\w+)\.py([^`\n#]*)", text
-        ):
-            source = (ROOT / folder / f"{name}.py").read_text(encoding="utf-8") + shared
-            for option in re.findall(r"--[a-z][a-z-]*", arguments):
-                assert f'"{option}"' in source, (page.name, name, option)
-            tried += 1
-    assert tried > 30
+    verbs = {name.split()[0] for name in options}
+    for page in WRITTEN:
+        named = re.findall(r"`chaserdock ([a-z][a-z-]*)\b", page.read_text(encoding="utf-8"))
+        assert set(named) <= verbs, page.name

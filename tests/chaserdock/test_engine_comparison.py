@@ -11,8 +11,7 @@ import math
 import numpy as np
 import pytest
 from engine_cases import ENGINES
-
-from chaserdock.evaluation.engine_comparison import CASES, EngineFlight, difference, fly_case
+from flights.engine_comparison import CASES, EngineFlight, difference, fly_case
 
 NANO, MICRO = 1e-9, 1e-6
 

@@ -295,21 +295,19 @@ def test_recovery_skips_nothing_where_only_the_summary_is_damaged(tmp_path: Path
 def test_log_commands(tmp_path: Path) -> None:
     log, cut = tmp_path / "a.mcap", tmp_path / "cut.mcap"
     shutil.copy(GOLDEN, log)
-    status, said = finished("log", "info", str(log))
+    status, said = finished("log", str(log))
     assert status == 0, said
     assert "two-chaser-tracking, seed 0" in said
     cut.write_bytes(log.read_bytes()[:600_000])  # within the last of three chunks
-    status, said = finished("log", "info", str(cut))
+    status, said = finished("log", str(cut))
     assert status == 1, said
     assert "cut off" in said
-    assert "chaserdock log recover" in said
-    status, said = finished("log", "recover", str(cut), "--out", str(tmp_path / "whole.mcap"))
+    assert "chaserdock log --recover" in said
+    status, said = finished("log", str(cut), "--recover", str(tmp_path / "whole.mcap"))
     assert status == 0, said
-    status, said = finished("log", "recover", str(cut), "--out", str(log))
+    status, said = finished("log", str(cut), "--recover", str(log))
     assert (status, "already exists; a log is never overwritten" in said) == (2, True)
-    status, said = finished(
-        "log", "export", str(tmp_path / "none.mcap"), "--out", str(tmp_path / "x")
-    )
+    status, said = finished("log", str(tmp_path / "none.mcap"), "--export", str(tmp_path / "x"))
     assert (status, "Traceback" in said) == (2, False)
 
 

@@ -10,7 +10,7 @@ import pytest
 from chaserdock_agents.chaser.perception.detect import detect, dictionary_of
 from chaserdock_models.targets import target_model
 
-from chaserdock.calibration.marker_sheets import SHEETS_MM, lay_out, write_sheets
+from chaserdock.targets.marker_sheets import SHEETS_MM, lay_out, write_sheets
 
 POINTS_PER_MM = 72.0 / 25.4
 

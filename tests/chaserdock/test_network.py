@@ -121,7 +121,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
         start("chaser-0", "chaser", "0", *reach)
         start("chaser-1", "chaser", "1", *reach)
         start("recorder", "record", "--out", str(runs), "--by-run", *reach)
-        start("operator", "judge", str(runs), *reach)
+        start("operator", "judge", str(runs), "--live", *reach)
         start_router()  # the last, as order must not matter
         deadline = time.monotonic() + 60
         while not (logs := list(runs.glob("two-chaser-tracking-*/mission.mcap"))):
@@ -191,7 +191,7 @@ def test_run_with_missing_keys_is_rejected(tmp_path: Path) -> None:
     keys = ["--keys", str(tmp_path / "none")]
     status, said = run("two-chaser-tracking", tmp_path / "out", arguments=keys)
     assert status == 2
-    assert "it contains no keys; make a mission's keys with `chaserdock keys init" in said
+    assert "it contains no keys; make a mission's keys with `chaserdock deploy --keys" in said
     assert len(said.strip().splitlines()) == 1
     four = make_keys(tmp_path / "three")  # of three chasers
     status, said = finished(
@@ -265,7 +265,7 @@ def test_world_gets_overrides_and_too_many_chasers_are_rejected() -> None:
     assert container.too_many_chasers("four-chaser-docking", "", 4) is None
     reason = container.too_many_chasers("four-chaser-docking", "", 3) or ""
     assert "has 4 chasers" in reason
-    assert "chaserdock compose --chasers 4 > compose.yaml" in reason
+    assert "chaserdock deploy --chasers 4 > compose.yaml" in reason
 
 
 def test_container_forwards_signals_and_leaves_no_process(tmp_path: Path) -> None:

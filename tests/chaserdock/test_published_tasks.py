@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from chaserdock.evaluation import published_tasks as tasks
+from flights import published_tasks as tasks
 
 
 def test_deputies_dock_below_the_speed_limit() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from chaserdock.simulation.swarm import fly_case
+from chaserdock.simulation.flight import fly_case
 
 CASES = sorted((Path(__file__).parents[1] / "regressions").glob("*.toml"))
 

@@ -8,9 +8,9 @@ import math
 import numpy as np
 from chaserdock_protocol.messages import Sighting
 from chaserdock_world.rendering.cameras import States
-
-from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario
-from chaserdock.evaluation.rigid_stack import RigidStack, fly_silent
+from flights.detumble_flights import StackMission, stack_scenario
+from flights.rigid_control import FlightEvents, fly_controlled
+from flights.rigid_stack import RigidStack
 
 
 def no_sight(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
@@ -28,7 +28,8 @@ def no_sight(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
 
 
 def test_four_chasers_stop_the_stack_without_a_controller() -> None:
-    outcome = fly_silent(stack_scenario(0, (0, 1, 2, 3)), rest_s=5.0)
+    scenario = stack_scenario(0, (0, 1, 2, 3))
+    outcome = fly_controlled(scenario, 120.0, events=FlightEvents(silent_from_s=0.0))
     assert outcome.time_s is not None
     assert outcome.time_s < 60.0
     assert outcome.final_rate_deg_s < 0.05

@@ -18,16 +18,19 @@ from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, chaserdock, finished
 
 from chaserdock.cli.simulate import simulate
-from chaserdock.simulation.campaign import (
-    Swarm,
+from chaserdock.simulation.checks import flight_checks
+from chaserdock.simulation.checks.check import Check
+from chaserdock.simulation.checks.reader import reads
+from chaserdock.simulation.flight import fly_case
+from chaserdock.simulation.seeds import (
+    SeedOptions,
     UnflownSeed,
     fly_seed,
     fly_seeds,
     shrink_result,
     write_case,
 )
-from chaserdock.simulation.invariants import Invariants
-from chaserdock.simulation.swarm import draw_case, fly_case
+from chaserdock.simulation.swarm import draw_case
 
 SHORT = """
 extends = "single"
@@ -132,13 +135,13 @@ def test_a_flight_without_seeds_keeps_its_log_once(good: Path, tmp_path: Path) -
 
 
 def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_path: Path) -> None:
-    seed = next(s for s in range(1, 50) if fly_seed(Swarm(str(bad)), s).violations)
-    result = fly_seed(Swarm(str(bad)), seed)
+    seed = next(s for s in range(1, 50) if fly_seed(SeedOptions(str(bad)), s).violations)
+    result = fly_seed(SeedOptions(str(bad)), seed)
     arguments = ("simulate", str(bad), "--seeds", f"{seed}:{seed + 5}", "--no-shrink", "--stop")
     status, text = finished(*arguments)
     assert status == 1
     assert "\n1 seeds in" in text
-    assert fly_seed(Swarm(str(bad)), seed).fingerprint == result.fingerprint
+    assert fly_seed(SeedOptions(str(bad)), seed).fingerprint == result.fingerprint
     *_, simplest = shrink_result(result, attempts=60)
     path = write_case(simplest, tmp_path / "out")
     case = simplest.case
@@ -179,12 +182,15 @@ def test_a_case_inherits_thruster_failures() -> None:
 def test_a_flight_may_end_at_the_first_violation(
     good: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(checks: Invariants, tick: Tick) -> None:
-        checks._tick = tick.tick
-        if tick.tick == 3:
-            checks.violate("no contact", "test", "third tick")
+    class ThirdTick(Check):
+        name = "no third tick"
 
-    monkeypatch.setattr(Invariants, "_on_tick", fail)
+        @reads(Tick)
+        def judge(self, tick: Tick) -> None:
+            if tick.tick == 3:
+                self.violate("test", "third tick")
+
+    monkeypatch.setattr(flight_checks, "CHECKS", (*flight_checks.CHECKS, ThirdTick))
     rate_hz = load_scenario(good).time.rate_hz
     for to_violation, end_s in ((True, 3 / rate_hz), (False, 1.0)):
         result = fly_case({"extends": str(good)}, 0, to_violation=to_violation)
@@ -195,14 +201,14 @@ def test_a_flight_may_end_at_the_first_violation(
 def test_cases_of_two_scenarios_have_files_of_their_own(
     good: Path, bad: Path, tmp_path: Path
 ) -> None:
-    results = [fly_seed(Swarm(str(path)), 2) for path in (good, bad)]
+    results = [fly_seed(SeedOptions(str(path)), 2) for path in (good, bad)]
     paths = [write_case(result, tmp_path / "out") for result in results]
     assert [path.name for path in paths] == ["good-seed-2.toml", "bad-seed-2.toml"]
     assert [load_scenario(path).success.docked for path in paths] == [(), (0,)]
 
 
 def test_a_killed_process_costs_one_seed(good: Path) -> None:
-    flights = fly_seeds(Swarm(str(good)), range(1, 7), jobs=2)
+    flights = fly_seeds(SeedOptions(str(good)), range(1, 7), jobs=2)
     results = [next(flights)]
     os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
     results += flights
@@ -248,5 +254,5 @@ def test_ctrl_c_while_shrinking_writes_the_simplest_case_so_far(bad: Path, tmp_p
 
 def test_regressions_are_scenarios_that_run_accepts() -> None:
     for path in (ROOT / "tests" / "regressions").glob("*.toml"):
-        status, text = finished("scenario", "validate", str(path))
+        status, text = finished("scenario", str(path))
         assert status == 0, text

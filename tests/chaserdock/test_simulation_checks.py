@@ -7,10 +7,13 @@ import copy
 import itertools
 import random
 import re
+import subprocess
+import sys
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -46,22 +49,25 @@ from harness import ROOT
 from message_samples import BY_TYPE
 from pydantic import ValidationError
 
-from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency, shrink_result
-from chaserdock.simulation.invariants import Invariants, Violation
-from chaserdock.simulation.message_checks import covariance_defect, defects_of
+from chaserdock.simulation.checks.check import Violation
+from chaserdock.simulation.checks.commands import ThrustersOpen
+from chaserdock.simulation.checks.docking import DockedOrSafe
+from chaserdock.simulation.checks.estimates import MOST_MEAN_NEES
+from chaserdock.simulation.checks.flight_checks import CHECKS, FlightChecks
+from chaserdock.simulation.checks.messages import covariance_defect, defects_of
+from chaserdock.simulation.checks.processes import BoundedQueues, queue_limit
+from chaserdock.simulation.flight import SimulationResult
+from chaserdock.simulation.links import Traffic
 from chaserdock.simulation.mission import SimulatedFlight
-from chaserdock.simulation.network import EPOCH_NS, Traffic
+from chaserdock.simulation.network import EPOCH_NS
+from chaserdock.simulation.seeds import inconsistency, shrink_result
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import (
     KINDS,
     LATCH_KINDS,
     Case,
-    SimulationResult,
-    check_queues,
     draw_case,
     draw_fault,
-    outcome_of,
-    queue_limit,
 )
 from chaserdock.toml_text import toml_document
 
@@ -107,6 +113,14 @@ def test_messages_of_ticks_that_are_opened_at_once_may_wait() -> None:
     assert queue_limit("controller", 30_000, 250, missed_ticks=30) == 3600
 
 
+def judge_queues(log: Log, most: dict[str, int]) -> None:
+    """Judge the most messages that have waited in each queue, of a flight of 5,000."""
+    log.checks.view.published = Counter({"messages": 5000})
+    queues: Any = {name: SimpleNamespace(most=number) for name, number in most.items()}
+    flight = SimulatedFlight(Path(), {}, {}, (), "", 25.0, Traffic(queues=queues))
+    log.checks.find(BoundedQueues).end(flight)
+
+
 @pytest.mark.parametrize(
     ("keys", "readers"),
     [
@@ -145,12 +159,7 @@ def test_queues_grow_for_a_reader_that_falls_behind_only(
     log = Log(variant(tmp_path, **keys))
     log.tick(249)
     names = ("world", "controller", "chaser/0", "chaser/1", "recorder")
-    traffic = Traffic(
-        queues={
-            f"{name} {k}": cast(Any, SimpleNamespace(most=1000)) for k, name in enumerate(names)
-        }
-    )
-    check_queues(log.checks, SimulatedFlight(tmp_path, {}, {}, (), "", 25.0, traffic), 5000)
+    judge_queues(log, {f"{name} {k}": 1000 for k, name in enumerate(names)})
     assert {v.text.split(":")[0] for v in log.checks.violations} == readers
 
 
@@ -171,8 +180,7 @@ def test_queue_of_the_recorder_grows_while_a_process_catches_up(
     simulation = {"mode": "realtime"} | keys.get("simulation", {})
     log = Log(variant(tmp_path, **keys | {"simulation": simulation}))
     log.tick(249)
-    traffic = Traffic(queues={"recorder 0": cast(Any, SimpleNamespace(most=469))})
-    check_queues(log.checks, SimulatedFlight(tmp_path, {}, {}, (), "", 25.0, traffic), 5000)
+    judge_queues(log, {"recorder 0": 469})
     assert log.found == found
 
 
@@ -320,11 +328,24 @@ def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> N
 # -- invariants ------------------------------------------------------------------------------------
 
 
+def test_documentation_is_that_of_the_checks() -> None:
+    command = [sys.executable, str(ROOT / "docs" / "make_invariants.py"), "--print"]
+    made = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    committed = (ROOT / "docs" / "invariants.md").read_text(encoding="utf-8")
+    assert committed == made, "run: python docs/make_invariants.py"
+
+
+def test_few_rules_have_more_than_three_exceptions() -> None:
+    """Where one would need a fourth, ask first whether the rule or the flight software is wrong."""
+    many = {check.__name__ for check in CHECKS if len(check.exceptions) > 3}
+    assert many == {"KeepOutZone", "ThrustersAsExpected"}
+
+
 class Log:
     """Publishes messages to the invariants of a scenario."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.checks = Invariants(scenario)
+        self.checks = FlightChecks(scenario)
         self.now_s = 0.0
 
     def publish(
@@ -364,6 +385,13 @@ class Log:
         self.publish(
             topics.EVENT, Event(process=process, level=level, what=what, detail=detail), process
         )
+
+    def end(self, crashes: dict[str, str] | None = None, stalled: tuple[str, ...] = ()) -> None:
+        flight = SimulatedFlight(Path(), {}, crashes or {}, stalled, "", 25.0, Traffic())
+        self.checks.end(flight)
+
+    def state(self, chaser: int) -> str:
+        return self.checks.find(DockedOrSafe).state_of(chaser)
 
     @property
     def found(self) -> list[str]:
@@ -689,7 +717,7 @@ def test_a_controller_names_damaged_sightings(
             for _ in range(2):  # a copy of a flood counts once
                 log.publish(topics.SIGHTING, sighting, chaser)
     log.event(event, "", "controller")
-    ended(log).checks.check_end({}, ())
+    ended(log).end()
     assert [name for name in log.found if name != "liveness"] == found
 
 
@@ -740,10 +768,11 @@ def test_commanded_force_opens_thrusters(every: int, found: list[str]) -> None:
         ACTUATORS, chaser=0, force_N=(1.5, 0.0, 0.0), torque_N_m=(0.0,) * 3
     )
     pulse = ThrusterPulse(thruster=0, open_ns=0, close_ns=100_000_000)
+    thrusters_open = log.checks.find(ThrustersOpen)
     for tick in range(30):
         pulses = () if tick % every else (pulse,)
         for _ in range(3):  # copies of a flood count once
-            log.checks._check_pulses(msgspec.structs.replace(push, tick=tick, pulses=pulses))
+            thrusters_open.judge(msgspec.structs.replace(push, tick=tick, pulses=pulses))
     assert log.found == found
 
 
@@ -1004,7 +1033,7 @@ def at_end(log: Log, phase: str) -> None:
 def test_a_complete_mission_lasts_as_long_as_the_scenario(log: Log) -> None:
     log.publish(topics.END, MissionEnd(tick=249, reason="completed", complete=True))
     at_end(log, "docked")
-    log.checks.check_end({}, ())
+    log.end()
     assert [str(v) for v in log.checks.violations] == [
         "liveness at 0.00 s: world: complete after 249 of 250 ticks"
     ]
@@ -1026,23 +1055,23 @@ def test_a_docked_chaser_is_at_its_docking_place(
     at_end(log, "docked")
     log.bodies(249, body("target", 0.0), body("chaser/0", x_m))
     log.flies(0, 249, source=source)
-    ended(log).checks.check_end({}, ())
+    ended(log).end()
     assert log.found == found
 
 
 def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -> None:
     at_end(log, "docked")
-    ended(log).checks.check_end({}, ())
+    ended(log).end()
     assert log.found == []
     without = Log(killed)
     at_end(without, "hold")
-    ended(without).checks.check_end({}, ())
+    ended(without).end()
     assert without.found == ["liveness", "liveness"]
     with_reason = Log(killed)
     at_end(with_reason, "hold")
     with_reason.event("no command", "for 2 s", "chaser/0")
     with_reason.event("no command", "for 2 s", "chaser/3")
-    ended(with_reason).checks.check_end({}, ())
+    ended(with_reason).end()
     assert with_reason.found == []
 
 
@@ -1071,7 +1100,7 @@ def test_a_reason_counts_for_the_chasers_that_it_concerns(
     log = Log(killed)
     at_end(log, "hold")
     log.event(what, "", process, level)
-    ended(log).checks.check_end({}, ())
+    ended(log).end()
     assert [v.text for v in log.checks.violations] == [
         f"chaser/{i}: ends in phase hold without a named reason" for i in without
     ]
@@ -1089,8 +1118,8 @@ def test_a_mission_has_the_time_of_an_approach_after_a_reason(
     log.tick(100)
     log.event("process lost", "controller")
     log.tick(end_tick)
-    ended(log).checks.check_end({}, ())
-    assert log.checks.state_at_end(0) == state
+    ended(log).end()
+    assert log.state(0) == state
     assert log.found == found
 
 
@@ -1108,7 +1137,7 @@ def test_a_lost_chaser_in_the_way_keeps_others_from_docking(
     log.bodies(1, body("target", 0.0), body("chaser/0", -0.8), body("chaser/2", x_m))
     log.event("process lost", "chaser/2")
     log.tick(400, (0, 1, 2, 3) if back else (0, 1, 3))
-    assert log.checks.state_at_end(0) == state
+    assert log.state(0) == state
 
 
 def test_a_chaser_that_falls_back_is_safe(killed: Scenario) -> None:
@@ -1120,13 +1149,13 @@ def test_a_chaser_that_falls_back_is_safe(killed: Scenario) -> None:
         log.event("no command", "for 2 s", f"chaser/{chaser}")
         log.tick(400)
         log.flies(chaser, 400, source=source)
-    ended(log).checks.check_end({}, ())
-    assert [log.checks.state_at_end(i) for i in (0, 3)] == ["safe", "unfinished"]
-    assert outcome_of(log.checks) == "unfinished"
+    ended(log).end()
+    assert [log.state(i) for i in (0, 3)] == ["safe", "unfinished"]
+    assert log.checks.outcome == "unfinished"
     at_end(log, "docked")
-    assert outcome_of(log.checks) == "safe"
+    assert log.checks.outcome == "safe"
     log.flies(0, 401)
-    assert outcome_of(log.checks) == "docked"
+    assert log.checks.outcome == "docked"
 
 
 def test_a_chaser_that_is_not_commanded_to_approach_may_hold(tmp_path: Path) -> None:
@@ -1138,19 +1167,19 @@ def test_a_chaser_that_is_not_commanded_to_approach_may_hold(tmp_path: Path) -> 
         )
     )
     at_end(log, "hold")
-    ended(log).checks.check_end({}, ())
+    ended(log).end()
     assert {v.text.partition(":")[0] for v in log.checks.violations} == {"chaser/0"}
     none = Log(variant(tmp_path, timeline=[]))
     at_end(none, "hold")
-    ended(none).checks.check_end({}, ())
+    ended(none).end()
     assert none.found == []
-    assert outcome_of(none.checks) == "safe"
+    assert none.checks.outcome == "safe"
 
 
 def test_an_undisturbed_mission_docks(log: Log) -> None:
     at_end(log, "hold")
     log.event("no command", "for 2 s", "chaser/0")
-    ended(log).checks.check_end({}, ())
+    ended(log).end()
     assert [str(v) for v in log.checks.violations] == [
         f"liveness at 0.00 s: chaser/{i}: ends in phase hold, although nothing disturbed it"
         for i in (0, 3)
@@ -1159,12 +1188,12 @@ def test_an_undisturbed_mission_docks(log: Log) -> None:
 
 def test_crashes_stalls_and_early_ends_are_violations(scenario: Scenario) -> None:
     log = Log(scenario)
-    log.checks.check_end({"controller": "Traceback\nValueError: x"}, ("chaser/0",))
+    log.end({"controller": "Traceback\nValueError: x"}, ("chaser/0",))
     assert log.found == ["no crash", "liveness", "liveness"]
     assert "ValueError: x" in log.checks.violations[0].text
     early = ended(Log(scenario), complete=False)
     at_end(early, "docked")
-    early.checks.check_end({}, ())
+    early.end()
     assert early.found == ["liveness"]
 
 
@@ -1173,7 +1202,7 @@ def result(nees: float, honest: bool = True) -> SimulationResult:
 
 
 def test_covariance_is_judged_over_honest_flights_only() -> None:
-    high = NEES_LIMITS[1] + 1.0
+    high = MOST_MEAN_NEES + 1.0
     assert inconsistency([result(6.0)] * 30 + [result(1e3, honest=False)] * 30) is None
     assert inconsistency([result(high)] * 3) is None
     assert "mean NEES 13.00 over 30 flights" in str(inconsistency([result(high)] * 30))
@@ -1305,7 +1334,7 @@ def test_shrinking_keeps_the_violation_not_only_its_invariant(
         cut = [NOT_DOCKED] if wanted and case.get("duration_s", 25.0) < 20.0 else []
         return a_result(case, *([STALL] if case["fault"] else cut))
 
-    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    monkeypatch.setattr("chaserdock.simulation.seeds.fly_case", flown)
     case: Case = {"extends": "fault-drill", "fault": [FLOOD]}
     small = shrunk(a_result(case, STALL))
     assert [fault["kind"] for fault in small["fault"]] == ["flood"]
@@ -1321,7 +1350,7 @@ def test_shrinking_keeps_the_commands_to_approach_of_a_chaser_that_does_not_dock
         docks = "approach" in commands and not case["fault"]
         return a_result(case, *([] if docks else [NOT_DOCKED]))
 
-    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    monkeypatch.setattr("chaserdock.simulation.seeds.fly_case", flown)
     timeline = [
         {"at_s": 5.0, "command": "approach", "chasers": [0]},
         {"at_s": 9.0, "command": "hold", "chasers": [1]},
@@ -1341,7 +1370,7 @@ def test_shrinking_takes_violations_that_differ_in_numbers_only_as_equal(
             case, Violation("no contact", 1.0, f"chaser/{chaser}: {len(case['fault'])}e-05 m")
         )
 
-    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    monkeypatch.setattr("chaserdock.simulation.seeds.fly_case", flown)
     case: Case = {"extends": "fault-drill", "fault": [FLOOD], "seed": 3}
     small = shrunk(flown(case, 1))
     assert (small["fault"], small["seed"]) == ([], 3)

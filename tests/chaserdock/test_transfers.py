@@ -8,9 +8,8 @@ import math
 import numpy as np
 import pytest
 from chaserdock_models import rotations
-
-from chaserdock.evaluation.perception import measurement_model
-from chaserdock.evaluation.transfers import SYMMETRIC_EVERY, avoidance, fly_transfer, swap
+from flights.measured_poses import measurement_model
+from flights.transfers import SYMMETRIC_EVERY, avoidance, fly_transfer, swap
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -12,11 +12,11 @@ from chaserdock_protocol.scenario import ScenarioError, parse_scenario
 from chaserdock_world.physics.latch import LatchFault
 from chaserdock_world.physics.simulation import TARGET
 from docking_cases import PORTS, values
+from flights import load_shipped
+from flights.docking_flights import ConservationMission, dock, docking_scenario
+from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.docking_flights import ConservationMission, dock, docking_scenario
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import measurement_model
-from chaserdock.evaluation.transfers import load_shipped
+from chaserdock.experiments.in_process import InProcessMission
 
 
 def test_docking_meets_its_tolerances_and_backs_out_again() -> None:

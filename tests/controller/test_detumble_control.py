@@ -14,18 +14,18 @@ from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.control import observed_motion
-from chaserdock_controller.guidance.detumble.stack import stack_motion
 from chaserdock_models import rotations
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CommandReply, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, ScenarioError
+from flights import load_shipped
+from flights.detumble_flights import StackMission, stack_scenario
+from flights.latched_stack import moving_with, stack_motion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.detumble_flights import StackMission, moving_with, stack_scenario
-from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.transfers import load_shipped
+from chaserdock.experiments.perception import RenderedImages
 
 SETTLED_S = 2.0
 

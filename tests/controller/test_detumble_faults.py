@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.guidance.activities.detumble import detumbling_of
 from chaserdock_controller.guidance.detumble.control import StackTask
 from chaserdock_controller.guidance.detumble.stack import StackMotion
 from chaserdock_controller.guidance.stage import GuidanceStage
@@ -19,15 +20,15 @@ from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointEr
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import flight_scenario
-
-from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario, with_load_limits
-from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import (
+from flights.detumble_flights import StackMission, stack_scenario, with_load_limits
+from flights.rigid_control import (
     ControlledStack,
     FlightEvents,
     fly_controlled,
     wrong_knowledge,
 )
+
+from chaserdock.experiments.perception import RenderedImages
 
 
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:
@@ -110,7 +111,7 @@ def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same(joins
         mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(2)))
         while mission.time_s < joins_s:
             mission.step()
-        planner = mission.controller.guidance.detumble.planner
+        planner = detumbling_of(mission.controller.guidance.activities).control.planner
         assert planner.active is not None
         assert planner.search is not None
         assert bool(planner.active.plan.thrusts_N.any()) == (joins_s > 2.5)
@@ -138,8 +139,9 @@ def test_a_thruster_that_an_operator_restores_fires_again() -> None:
     stage = GuidanceStage(flight)
     state = ControlledStack(stack_scenario(1, (0, 3), wrong_knowledge(1))).state()
     failed = replace(state, failed={0: (2, 3), 1: (7,)})
-    stage.thrusters.command(OperatorCommand(command="restore", chaser=0, thruster=3), 0.0)
-    found = stage.with_trusted(failed)
+    restore = OperatorCommand(command="restore", chaser=0, thruster=3)
+    stage.chasers[0].thrusters.command(restore, 0.0)
+    found = detumbling_of(stage.activities).with_trusted(failed)
     assert found is not None
     assert found.failed == {0: (2,), 1: (7,)}
 

@@ -14,11 +14,12 @@ from chaserdock_controller.guidance.detumble.allocation import (
     minimum_time,
     spans_all_directions,
 )
-from chaserdock_controller.guidance.detumble.stack import stack_motion, thruster_wrenches
+from chaserdock_controller.guidance.detumble.stack import thruster_wrenches
 from chaserdock_models import rotations
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.wrench_set import wrench_matrix
 from detumble_cases import BODY, mounted, stack_of, stack_thrusters, target_alone, tumble
+from flights.latched_stack import stack_motion
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog

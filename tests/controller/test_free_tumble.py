@@ -20,10 +20,9 @@ from chaserdock_controller.parameters import estimator_of
 from chaserdock_controller.redundancy.serialization import decode, encode
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from detumble_cases import target_alone
-
-from chaserdock.evaluation.detumble_flights import stack_scenario
-from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, watch_tumble
-from chaserdock.evaluation.rigid_control import wrong_knowledge
+from flights.detumble_flights import stack_scenario
+from flights.free_tumble_flights import TumbleOutcome, watch_tumble
+from flights.rigid_control import wrong_knowledge
 
 
 def scenario_of(omega_deg_s: list[float], *more: str) -> Scenario:

@@ -29,7 +29,7 @@ from chaserdock_protocol.messages import Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from nmpc_cases import PARAMS
 
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 ROOT = Path(__file__).resolve().parents[2]
 Q = (1.0, 0.0, 0.0, 0.0)

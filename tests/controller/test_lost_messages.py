@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lost messages: chaser and controller complete the tick without them."""
+"""Lost messages: the controller completes the tick without them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import msgspec
 import pytest
-from chaserdock_agents.chaser.process import ChaserProcess
+from chaser_cases import ZERO, docking, lost, odometry, tick_of
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.ingest.tick_inputs import TickInputCollector
@@ -17,16 +17,10 @@ from chaserdock_controller.process import ControllerProcess
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage
 from chaserdock_protocol.messages import (
-    DockingStatus,
-    Image,
     Lease,
     Message,
-    Odometry,
-    Plan,
     Sighting,
-    TargetEstimate,
     ThrusterReport,
-    Tick,
     WrenchCommand,
 )
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
@@ -35,35 +29,11 @@ from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import ReceivedMessage
 
 ROOT = Path(__file__).resolve().parents[2]
-ZERO = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
     return load_scenario(ROOT / "scenarios" / "fault-drill.toml")
-
-
-def odometry(scenario: Scenario, i: int, tick: int) -> Odometry:
-    position, q = scenario.start_pose(i)
-    return Odometry(
-        tick=tick,
-        sim_time_ns=scenario.timing.tick_time_ns(tick),
-        chaser=i,
-        position_m=tuple(position.tolist()),
-        q_wxyz=tuple(q.tolist()),
-        velocity_m_s=ZERO,
-        omega_rad_s=ZERO,
-    )
-
-
-def tick_of(scenario: Scenario, tick: int, chasers: tuple[int, ...]) -> Tick:
-    return Tick(
-        tick=tick,
-        sim_time_ns=scenario.timing.tick_time_ns(tick),
-        images=True,
-        chasers=chasers,
-        controllers={"controller": "c"},
-    )
 
 
 def deliver(process: Any, topic: Topic, place: int | None, message: Any) -> list[tuple[Topic, Any]]:
@@ -73,234 +43,9 @@ def deliver(process: Any, topic: Topic, place: int | None, message: Any) -> list
     return [(t, m) for t, _, m in process.node.take_published()]
 
 
-def lost(scenario: Scenario, tick: int) -> LostMessage:
-    return LostMessage(tick, scenario.timing.tick_time_ns(tick))
-
-
-# -- chaser ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def chaser(scenario: Scenario) -> ChaserProcess:
-    made = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
-    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
-    return made
-
-
-def wrench(scenario: Scenario, tick: int, **values: Any) -> WrenchCommand:
-    now_ns = scenario.timing.tick_time_ns(tick)
-    given = {
-        "commander": "controller",
-        "instance": "c",
-        "term": 1,
-        "mode": "nmpc",
-        "force_N": (0.1, 0.0, 0.0),
-        "torque_N_m": ZERO,
-    } | values
-    return WrenchCommand(
-        tick=tick,
-        sim_time_ns=now_ns,
-        chaser=0,
-        effective_time_ns=scenario.timing.effective_ns(tick),
-        expires_ns=now_ns + 500_000_000,
-        **given,
-    )
-
-
-def actuated(published: list[tuple[Topic, Any]]) -> list[tuple[int, str]]:
-    return [(m.tick, m.source) for t, m in published if t is topics.ACTUATORS]
-
-
-@pytest.mark.parametrize(
-    ("how", "order"),
-    [
-        # A controller commands a tick after the chaser has stated its lease, and so has received
-        # the tick.
-        *(
-            (how, order)
-            for how in ("lost", "none", "expired")
-            for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2))
-        ),
-        *(("lost", order) for order in ((1, 2, 0), (2, 0, 1), (2, 1, 0))),
-    ],
-)
-def test_chaser_without_command_actuates_once_per_tick(
-    chaser: ChaserProcess, scenario: Scenario, order: tuple[int, ...], how: str
-) -> None:
-    """Tick, odometry and the lost command arrive in any order."""
-    commands = {
-        "lost": lost(scenario, 1),
-        "none": wrench(scenario, 1, mode="none"),
-        "expired": msgspec.structs.replace(wrench(scenario, 1), expires_ns=0),
-    }
-    arrivals = [
-        (topics.TICK, None, tick_of(scenario, 1, (0,))),
-        (topics.ODOMETRY, 0, odometry(scenario, 0, 1)),
-        (topics.WRENCH, 0, commands[how]),
-    ]
-    published = [s for k in order for s in deliver(chaser, *arrivals[k])]
-    assert [tick for tick, source in actuated(published)] == [1]
-    assert [source for tick, source in actuated(published)] != ["command"]
-    assert any(t is topics.EVENT for t, _ in published)
-
-
-@pytest.mark.parametrize(
-    ("ahead_s", "source"), [(0.3, "command"), (-0.3, "command"), (36.0, "hold")]
-)
-def test_wrong_clock_of_a_controller_delays_no_command(
-    chaser: ChaserProcess, scenario: Scenario, ahead_s: float, source: str
-) -> None:
-    """Commands act at the time of their tick; the thrusters of a chaser that took 36 s for it did
-    not open until then.
-    """
-    sent = wrench(scenario, 1)
-    ahead_ns = round(ahead_s * 1e9)
-    stamps = ("sim_time_ns", "effective_time_ns", "expires_ns")
-    sent = msgspec.structs.replace(
-        sent, **{name: getattr(sent, name) + ahead_ns for name in stamps}
-    )
-    published = deliver(chaser, topics.TICK, None, tick_of(scenario, 1, (0,)))
-    published += deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
-    published += deliver(chaser, topics.WRENCH, 0, sent)
-    effective_ns = scenario.timing.effective_ns(1)
-    found = [(m.source, m.effective_time_ns) for t, m in published if t is topics.ACTUATORS]
-    assert found == [(source, effective_ns)]
-
-
-def test_older_tick_changes_no_lease(chaser: ChaserProcess, scenario: Scenario) -> None:
-    deliver(chaser, topics.TICK, None, tick_of(scenario, 9, (0,)))
-    repeated = msgspec.structs.replace(tick_of(scenario, 9, (0,)), revision=1)
-    assert [
-        m.revision for t, m in deliver(chaser, topics.TICK, None, repeated) if t is topics.LEASE
-    ] == [1]
-    others = {"controllers": {"standby": "s"}}
-    for older in (tick_of(scenario, 8, (0,)), tick_of(scenario, 9, (0,))):
-        assert deliver(chaser, topics.TICK, None, msgspec.structs.replace(older, **others)) == []
-    assert (chaser.tick, chaser.leases.holder) == (repeated, "controller")
-
-
-def test_lost_image_gives_empty_sighting(chaser: ChaserProcess, scenario: Scenario) -> None:
-    ((topic, sighting),) = deliver(chaser, topics.IMAGE, 0, lost(scenario, 4))
-    assert topic is topics.SIGHTING
-    assert (sighting.tick, sighting.status, sighting.solutions) == (4, "bad_image", ())
-
-
-def test_duplicate_image_is_ignored(chaser: ChaserProcess, scenario: Scenario) -> None:
-    image = Image(tick=3, chaser=0, width_px=8, height_px=8, encoding="mono8", data=bytes(64))
-    first = [m for t, m in deliver(chaser, topics.IMAGE, 0, image) if t is topics.SIGHTING]
-    assert len(first) == 1
-    assert deliver(chaser, topics.IMAGE, 0, image) == []
-    assert chaser.node.counts.stale == 1
-
-
-def test_lost_odometry_is_extrapolated_and_braking_ends(
-    chaser: ChaserProcess, scenario: Scenario
-) -> None:
-    moving = msgspec.structs.replace(odometry(scenario, 0, 0), velocity_m_s=(0.5, 0.0, 0.0))
-    deliver(chaser, topics.ODOMETRY, 0, moving)
-    forces = {}
-    for tick in range(1, 9):
-        deliver(chaser, topics.TICK, None, tick_of(scenario, tick, (0,)))
-        published = deliver(chaser, topics.ODOMETRY, 0, lost(scenario, tick))
-        published += deliver(chaser, topics.WRENCH, 0, lost(scenario, tick))
-        (command,) = [m for t, m in published if t is topics.ACTUATORS]
-        forces[tick] = command.force_N
-        assert chaser.odometry is not None
-        assert chaser.odometry.tick == tick
-    extrapolated = chaser.odometry
-    assert extrapolated is not None
-    assert abs(extrapolated.position_m[0] - moving.position_m[0] - 0.5 * 0.8) < 1e-9
-    assert any(forces[3])
-    assert not any(forces[8])  # 0.8 s without odometry: no force
-
-
-def test_older_odometry_does_not_replace_newer(chaser: ChaserProcess, scenario: Scenario) -> None:
-    for tick in (2, 1):
-        deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, tick))
-    assert chaser.odometry is not None
-    assert chaser.odometry.tick == 2
-
-
-def target_estimate(scenario: Scenario, tick: int) -> TargetEstimate:
-    return TargetEstimate(
-        tick=tick,
-        sim_time_ns=scenario.timing.tick_time_ns(tick),
-        status="tracking",
-        position_m=ZERO,
-        velocity_m_s=ZERO,
-        q_wxyz=(1.0, 0.0, 0.0, 0.0),
-        omega_rad_s=ZERO,
-        covariance=(0.0,) * 144,
-        accepted=(),
-        rejected=(),
-    )
-
-
-def plan(scenario: Scenario, tick: int) -> Plan:
-    now_ns = scenario.timing.tick_time_ns(tick)
-    empty: Any = {"positions_m": (), "quaternions_wxyz": (), "inputs": ()}
-    return Plan(tick=tick, sim_time_ns=now_ns, chaser=0, step_s=0.1, **empty)
-
-
-def test_older_plan_and_target_do_not_replace_newer(
-    chaser: ChaserProcess, scenario: Scenario
-) -> None:
-    """The command that they came with is flown with them, and the fallback goes on from there."""
-    deliver(chaser, topics.TICK, None, tick_of(scenario, 2, (0,)))
-    deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, 2))
-    for tick in (2, 1):
-        deliver(chaser, topics.PLAN, 0, plan(scenario, tick))
-        deliver(chaser, topics.TARGET, None, target_estimate(scenario, tick))
-    deliver(chaser, topics.WRENCH, 0, wrench(scenario, 2))
-    assert chaser._last.plan is not None
-    assert chaser._last.target is not None
-    assert (chaser._last.plan.tick, chaser._last.target.tick) == (2, 2)
-    assert chaser.node.counts.stale == 2
-
-
-# -- docking sensors and thrusters -----------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def capture() -> Scenario:
     return load_scenario(ROOT / "scenarios" / "docking-contact.toml")
-
-
-def docking(scenario: Scenario, tick: int, latched: bool = False) -> DockingStatus:
-    now_ns = scenario.timing.tick_time_ns(tick)
-    return DockingStatus(
-        tick=tick, sim_time_ns=now_ns, chaser=0, contact=latched, armed=latched, latched=latched
-    )
-
-
-def at_port(capture: Scenario) -> ChaserProcess:
-    made = ChaserProcess(ReplayNode("chaser/0"), capture, 0)  # type: ignore[arg-type]
-    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
-    return made
-
-
-def test_older_docking_status_does_not_replace_newer(capture: Scenario) -> None:
-    """The report of the tick needs the status of that tick."""
-    chaser = at_port(capture)
-    deliver(chaser, topics.TICK, None, tick_of(capture, 2, (0,)))
-    for tick, latched in ((2, True), (1, False)):
-        deliver(chaser, topics.DOCKING, 0, docking(capture, tick, latched))
-    published = deliver(chaser, topics.ODOMETRY, 0, odometry(capture, 0, 2))
-    assert [m.tick for t, m in published if t is topics.THRUSTERS] == [2]
-    assert chaser.docking is not None
-    assert chaser.docking.latched
-    assert chaser.node.counts.stale == 1
-
-
-def test_late_docking_status_replaces_an_assumed_one(capture: Scenario) -> None:
-    """In lock-step a late status arrives after the loss of newer ones."""
-    chaser = at_port(capture)
-    deliver(chaser, topics.DOCKING, 0, docking(capture, 1))
-    deliver(chaser, topics.DOCKING, 0, lost(capture, 3))
-    deliver(chaser, topics.DOCKING, 0, docking(capture, 2, latched=True))
-    assert chaser.docking == msgspec.structs.replace(
-        docking(capture, 3, latched=True), contact=False
-    )
 
 
 def test_controller_keeps_the_newest_docking_status_and_thruster_report(capture: Scenario) -> None:
@@ -324,9 +69,6 @@ def test_controller_keeps_the_newest_docking_status_and_thruster_report(capture:
     taken = inputs.take(tick, ())
     assert taken.docking[0].latched
     assert taken.thrusters[0].tick == 2
-
-
-# -- controller ------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from chaserdock_controller.nmpc.types import NmpcInput, NmpcPlan, NmpcSolver
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
 
 DRIFT_M_S = (-0.034, 0.0, 0.0)
 """Towards chaser 0."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.nmpc import NmpcInput
 from chaserdock_controller.nmpc.kernels import plan_violation
 from chaserdock_controller.nmpc.problem import check_input, native_problem
@@ -24,13 +23,14 @@ from chaserdock_models.shape_distance import (
     distance_from_cuboids,
     moved,
     reach_along,
-    separations,
     signed_distance,
 )
 from chaserdock_models.targets import Box
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import ScenarioError, parse_scenario
 from chaserdock_protocol.scenario.checks import shape_distance_m
+from flight_cases import fleet_of, order
+from flights.shape_gaps import separations
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh, with_settings
 from nmpc_kernels import build_rows
 
@@ -237,11 +237,10 @@ def with_shape(**limits: Any) -> dict[str, Any]:
 
 def test_goto_into_a_panel_is_refused_and_places_that_the_sphere_forbade_are_not() -> None:
     scenario = parse_scenario(with_shape(), "test")
-    machine = PhaseMachine(scenario)
-    machine.target_acquired(0.0)
+    machine = fleet_of(scenario, acquired_s=0.0)
     box = max(scenario.target.shape().boxes, key=lambda b: float(np.linalg.norm(b.position_m)))
-    refused = machine.command(
-        OperatorCommand(command="goto", chaser=0, offset_m=box.position_m), 0.0
+    refused = order(
+        machine, OperatorCommand(command="goto", chaser=0, offset_m=box.position_m), 0.0
     )
     assert not refused.accepted
     assert "from the target's shape; allowed are at least 0.05 m" in refused.reason
@@ -253,7 +252,7 @@ def test_goto_into_a_panel_is_refused_and_places_that_the_sphere_forbade_are_not
     assert 0.05 < shape_distance_m(scenario, 0, beside) <= room_m
     assert np.linalg.norm(beside) < np.linalg.norm(box.position_m) + 0.3
     offset = tuple(beside.tolist())
-    assert machine.command(OperatorCommand(command="goto", chaser=0, offset_m=offset), 0.1).accepted
+    assert order(machine, OperatorCommand(command="goto", chaser=0, offset_m=offset), 0.1).accepted
 
 
 def test_places_inside_the_shape_and_other_solvers_are_refused() -> None:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from chaserdock.evaluation.transfers import CLUTTER, DENSE_CLUTTER, clutter, fly_transfer
+from flights.transfers import CLUTTER, DENSE_CLUTTER, clutter, fly_transfer
 
 
 @pytest.mark.parametrize("places_m", [CLUTTER, DENSE_CLUTTER])

@@ -14,10 +14,11 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.messages import Sighting
 from chaserdock_protocol.scenario import load_scenario, parse_scenario
 from chaserdock_world.rendering.cameras import States
+from flights.measured_poses import measurement_model
 from harness import ROOT, SHORT
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages, measurement_model
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 from chaserdock.logs import open_log
 
 SMALL = (

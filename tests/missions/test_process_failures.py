@@ -74,7 +74,7 @@ def test_world_reports_port_in_use() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("log", "play", str(GOLDEN), "-m", "client"),
+        ("play", str(GOLDEN), "-m", "client"),
         ("ros2", "-m", "client"),
         ("world", "single", "-m", "client"),
     ],

@@ -9,8 +9,8 @@ import numpy as np
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 PATH = ROOT / "scenarios" / "sixteen-chasers.toml"
 

@@ -183,8 +183,22 @@ def test_scenario_and_versions_lie_in_the_log(tmp_path: Path) -> None:
     assert scenario == SCENARIO
     assert data["run_id"] == "r1"
     assert data["mode"] == "lockstep"
-    assert data["version.chaserdock"]
+    assert data["version.chaserdock"] == version("chaserdock")
+    assert data.get("commit") == provenance.commit_of()
     assert data["version.numpy"].count(".") >= 1
+
+
+def test_commit_of_a_checkout_tells_changed_files(tmp_path: Path) -> None:
+    assert provenance.commit_of.__wrapped__(tmp_path) is None
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    (tmp_path / "a").write_text("1")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for command in (["add", "a"], ["commit", "-qm", "a"]):
+        subprocess.run([*git, *command], check=True)
+    clean = provenance.commit_of.__wrapped__(tmp_path)
+    assert re.fullmatch("[0-9a-f]{12}", clean)
+    (tmp_path / "a").write_text("2")
+    assert provenance.commit_of.__wrapped__(tmp_path) == f"{clean}-dirty"
 
 
 # -- other people's readers ------------------------------------------------------------------------

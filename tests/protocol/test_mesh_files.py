@@ -20,8 +20,10 @@ from chaserdock_protocol.scenario import (
     parse_scenario,
     scenario_from_json,
 )
-from chaserdock_protocol.scenario.mesh_files import read_mesh, write_mesh
+from chaserdock_protocol.scenario.mesh_files import read_mesh
 from scenario_samples import good
+
+from chaserdock.targets.mesh_writer import write_mesh
 
 MODEL = 'perception.name="model"'
 
@@ -220,11 +222,7 @@ def test_invalid_geometry_is_one_line(override: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_renderer_and_centre_of_mass_are_checked(servicer_file: Path) -> None:
-    with pytest.raises(
-        ScenarioError, match=r'camera.renderer = "pybullet" draws OBJ and STL files'
-    ):
-        with_file(servicer_file, 'camera.renderer="pybullet"')
+def test_centre_of_mass_is_checked(servicer_file: Path) -> None:
     free = 'target.motion="torque_free"'
     with_file(servicer_file, free)
     with pytest.raises(

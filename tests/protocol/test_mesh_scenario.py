@@ -57,10 +57,6 @@ def test_inertia_is_that_of_the_mesh() -> None:
         ("target.knowledge.simplification_m=0.0", "target.knowledge.simplification_m"),
         ("target.knowledge.scale_share=-0.1", "target.knowledge.scale_share"),
         (
-            'camera.renderer="pybullet"',
-            "target.model: only camera.renderer = \"exact\" draws the mesh 'geo_servicer'",
-        ),
-        (
             'perception.name="default"',
             "'default' needs markers; the target 'geo_servicer' has none",
         ),

@@ -16,7 +16,12 @@ from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.recording import schema_migrations
 from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
 from chaserdock_protocol.recording.schema_migrations import UPGRADES, current_key, decode_logged
-from chaserdock_protocol.scenario.migrations import FORMAT, migrated, old_keys
+from chaserdock_protocol.scenario.migrations import (
+    FORMAT,
+    drop_removed_keys,
+    migrated,
+    old_keys,
+)
 from message_samples import BY_TYPE
 
 PRESENT: dict[str, msgspec.Struct] = {
@@ -177,6 +182,19 @@ def test_scenario_of_format_1_is_migrated() -> None:
     assert json.loads(migrated(json.dumps(FORMAT_1))) == FORMAT_3
 
 
+def test_key_of_the_renderer_is_dropped() -> None:
+    """Logs state it; in files only the value that is left is accepted."""
+    camera: dict[str, Any] = {"renderer": "pybullet", "width_px": 640}
+    text = json.dumps({"format": FORMAT, "camera": camera})
+    assert json.loads(migrated(text))["camera"] == {"width_px": 640}
+    (line,) = old_keys({"camera": camera})
+    assert line.startswith("camera.renderer: PyBullet's renderer")
+    exact = {"camera": camera | {"renderer": "exact"}}
+    drop_removed_keys(exact)
+    assert old_keys(exact) == []
+    assert "renderer" not in exact["camera"]
+
+
 def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
     text = json.dumps(
         {
@@ -216,6 +234,19 @@ def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
 def test_scenario_of_the_present_format_stays_as_it_is() -> None:
     for text in (json.dumps(FORMAT_3), "no JSON", "[1, 2]"):
         assert migrated(text) == text
+
+
+def test_removed_keys_are_accepted_with_the_value_that_holds_now() -> None:
+    tables = {"docking": {"settle_s": 2.0, "pull_N": 0.4}, "detumble": {"response_s": 0.7}}
+    values = json.loads(json.dumps(tables))
+    drop_removed_keys(values)
+    assert values == {"docking": {"pull_N": 0.4}, "detumble": {"response_s": 0.7}}
+    assert old_keys(values) == [
+        "detumble.response_s: it is 0.5 in every flight now; remove the key"
+    ]
+    assert json.loads(migrated(json.dumps({"format": FORMAT, **tables}))) == {
+        "format": FORMAT, "docking": {"pull_N": 0.4}, "detumble": {},
+    }  # fmt: skip
 
 
 def test_old_keys_are_named_with_their_present_names() -> None:

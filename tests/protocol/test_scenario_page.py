@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every scenario key is documented, and the generated page and JSON schema are up to date."""
+"""Every scenario key is documented, and the generated page is up to date."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import json
 import subprocess
 import sys
 
-import pytest
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.json_schema import (
     description_of,
+    editor_schema_text,
     key_paths,
     node_at,
     resolved,
@@ -28,14 +28,18 @@ def printed(option: str) -> str:
     ).stdout
 
 
-@pytest.mark.parametrize("path", list(key_paths(SCHEMA)))
-def test_every_key_has_a_description(path: str) -> None:
+def description(path: str) -> str:
+    """Description of a key by its dotted path."""
     *above, key = [0 if part == "N" else part for part in path.split(".")]
     table = node_at(SCHEMA, above)
-    assert table is not None
-    text = description_of(resolved(table, SCHEMA)["properties"][key], SCHEMA)
-    assert len(text) > 8
-    assert text.endswith(".")
+    assert table is not None, path
+    return description_of(resolved(table, SCHEMA)["properties"][key], SCHEMA)
+
+
+def test_every_key_has_a_description() -> None:
+    texts = {path: description(path) for path in key_paths(SCHEMA)}
+    assert len(texts) > 200
+    assert [path for path, text in texts.items() if len(text) < 9 or text[-1] != "."] == []
 
 
 def test_the_committed_page_is_up_to_date() -> None:
@@ -45,13 +49,8 @@ def test_the_committed_page_is_up_to_date() -> None:
         assert f"| `{path.rpartition('.')[2]}` |" in committed
 
 
-def test_the_committed_json_schema_is_up_to_date() -> None:
-    text = (ROOT / "scenarios" / "scenario.schema.json").read_text(encoding="utf-8")
-    assert text == printed("--print-schema"), "run: python docs/make_scenario.py"
-
-
 def test_the_json_schema_has_no_dangling_reference_and_describes_every_key() -> None:
-    schema = json.loads((ROOT / "scenarios" / "scenario.schema.json").read_text(encoding="utf-8"))
+    schema = json.loads(editor_schema_text(Scenario))
     assert schema["$id"].startswith("urn:chaserdock:scenario")
     names = set()
 
@@ -68,10 +67,3 @@ def test_the_json_schema_has_no_dangling_reference_and_describes_every_key() -> 
     walk(schema)
     assert names
     assert names <= {f"#/definitions/{name}" for name in schema["definitions"]}
-
-
-def test_shipped_scenarios_name_the_schema_for_editors() -> None:
-    for path in (ROOT / "scenarios").glob("*.toml"):
-        assert path.read_text(encoding="utf-8").startswith("#:schema ./scenario.schema.json\n"), (
-            path.name
-        )

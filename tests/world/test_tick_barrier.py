@@ -11,6 +11,7 @@ from chaserdock_protocol.messages import ActuatorCommand, Tick
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import ReceivedMessage
 from chaserdock_protocol.transport.node import TrafficCounters
+from chaserdock_world.lockstep.command_intake import CommandIntake
 from chaserdock_world.lockstep.tick_barrier import _MOST_REPEATS, TickBarrier
 from harness import ROOT
 
@@ -34,6 +35,13 @@ class Network:
             self.ticks.append(message)
 
 
+def barrier_of(network: Network, membership: Any, actuators: Any) -> TickBarrier:
+    """Return the barrier of a mission with one chaser."""
+    commands = CommandIntake(TIMING, {"chaser/0": actuators}, lambda: 0, Mock())
+    node: Any = network
+    return TickBarrier(node, membership, Mock(), TIMING, commands, recorder_expected=False)
+
+
 def test_first_tick_after_a_return_is_repeated_until_it_is_answered() -> None:
     """The chasers state their leases again, which the network may have lost. Later ticks are not
     repeated.
@@ -41,16 +49,7 @@ def test_first_tick_after_a_return_is_repeated_until_it_is_answered() -> None:
     network, connected = Network(), set[str]()
     membership: Any = Mock(realtime=False, connected=lambda heard: connected, take_departed=list)
     membership.progress = dict
-    arguments: list[Any] = [
-        network,
-        membership,
-        Mock(),
-        TIMING,
-        {"chaser/0": Mock()},
-        lambda: 0,
-        Mock(),
-    ]
-    barrier = TickBarrier(*arguments, recorder_expected=False)
+    barrier = barrier_of(network, membership, Mock())
     barrier.open_tick(0, images=False)
     assert barrier.chasers == ()
 
@@ -76,16 +75,7 @@ def test_commands_of_a_replaced_chaser_are_rejected() -> None:
     network, chaser = Network(), Mock()
     membership: Any = Mock(realtime=True, connected=lambda heard: {"chaser/0"}, take_departed=list)
     membership.instance_of = lambda name: "second"
-    arguments: list[Any] = [
-        network,
-        membership,
-        Mock(),
-        TIMING,
-        {"chaser/0": chaser},
-        lambda: 0,
-        Mock(),
-    ]
-    barrier = TickBarrier(*arguments, recorder_expected=False)
+    barrier = barrier_of(network, membership, chaser)
     barrier.open_tick(0, images=False)
     assert network.ticks[-1].chaser_instances == {"chaser/0": "second"}
     for instance in ("first", "second"):

@@ -297,7 +297,7 @@ def test_a_latched_pair_keeps_its_relative_pose() -> None:
         target.q_wxyz, np.cross(omega, [-0.56, 0.0, -0.05])
     )
     physics.place("chaser/0", BodyState(at, velocity, target.q_wxyz, omega))
-    physics._add_joint("chaser/0")
+    physics.close_latch(0)
     physics.advance(2 * HZ, {"chaser/0": np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])})
     a, b = physics.state(TARGET), physics.state("chaser/0")
     physics.close()

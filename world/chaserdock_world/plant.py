@@ -23,6 +23,9 @@ from .random_draws import TARGET_KEY, Stream, generator
 
 Moments = tuple[float, float, float]
 _LARGEST_SIGMA = 3.0
+"""Draws are limited to so many standard deviations, so that shares stay positive; 0.3 % of a normal
+distribution lie beyond.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,22 @@ class Plant:
         """Inertia tensor (3, 3) about the centre of mass, body axes."""
         turn = np.eye(3) if self.frame is None else rotations.to_matrix(self.frame.q_wxyz)
         return turn @ np.diag(self.moments_kg_m2) @ turn.T
+
+    def to_engine(self, state: BodyState) -> BodyState:
+        """Return the state of the frame that an engine integrates from that of the body's frame."""
+        return state if self.frame is None else self.frame.from_body(state)
+
+    def from_engine(self, state: BodyState) -> BodyState:
+        """Return the state of the body's frame from that of the frame that an engine integrates."""
+        return state if self.frame is None else self.frame.to_body(state)
+
+    def part_in_engine(self, position_m: Array, q_wxyz: Array) -> tuple[Array, Array]:
+        """Return the pose of a part in the engine's frame from that in the body's frame."""
+        return (position_m, q_wxyz) if self.frame is None else self.frame.place(position_m, q_wxyz)
+
+    def wrench_in_engine(self, wrench: Array) -> Array:
+        """Return a wrench (6,) at the body's origin in the engine's frame."""
+        return wrench if self.frame is None else self.frame.wrench(wrench)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,7 @@ from chaserdock_protocol.transport.session import Heartbeat, ask_as_world
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
 from chaserdock_world.actuators.thrusters import make_actuators
+from chaserdock_world.lockstep.command_intake import CommandIntake
 from chaserdock_world.lockstep.membership import Membership
 from chaserdock_world.lockstep.tick_barrier import TickBarrier
 from chaserdock_world.physics.simulation import Physics
@@ -53,6 +54,9 @@ from chaserdock_world.sensors.publish import (
 )
 
 _REALTIME_SLICES_HZ = 240
+"""Rate at which physics follows the wall clock: a command acts within 4 ms of its arrival, and a
+slice is still several steps of physics.
+"""
 
 
 def main(options: ProcessOptions) -> int:
@@ -155,16 +159,20 @@ class World:
         heartbeat = Heartbeat(node, membership.instance)
         node.declare_liveliness()
         node.declare_queryable(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
+        commands = CommandIntake(
+            self._timing,
+            self._actuators,
+            lambda: self._physics.step_count,
+            self._physics.command_latch,
+            scenario.controller.command_lifetime_s,
+        )
         return TickBarrier(
             node,
             membership,
             heartbeat,
             self._timing,
-            self._actuators,
-            lambda: self._physics.step_count,
-            self._physics.command_latch,
+            commands,
             options.recorder_expected,
-            scenario.controller.command_lifetime_s,
             scenario.controller.standby,
         )
 

@@ -17,8 +17,6 @@ def require_packages(scenario: Scenario) -> None:
         require_extra("mujoco", "mujoco")
     else:
         require_pybullet()
-    if scenario.camera.renderer == "pybullet" and scenario.perception.name != "statistical":
-        require_pybullet('camera.renderer = "pybullet"', 'use the renderer "exact"')
 
 
 def require_pybullet(

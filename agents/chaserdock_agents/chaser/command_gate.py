@@ -1,19 +1,137 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation of wrench commands by a chaser, and construction of actuator commands. Pure functions."""
+"""Which wrench commands a chaser executes, and construction of actuator commands. No I/O."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import msgspec
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
 from chaserdock_models.wrench_set import wrench_matrix
+from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
+from chaserdock_protocol.leases import longest_lease_ticks
+from chaserdock_protocol.messages import ActuatorCommand, Odometry, Tick, WrenchCommand
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.bodies import Body
 
+from .lease_grantor import LeaseGrantor
 from .local_damping import LocalDamping
+from .outbox import Outbox
+
+
+class Decision(NamedTuple):
+    """What follows from a wrench command. ``execute``: the command to fly.
+
+    ``uncommanded_tick``: lock-step: the tick for which its sender gives no valid command.
+    """
+
+    execute: WrenchCommand | None = None
+    uncommanded_tick: int | None = None
+
+
+class CommandGate:
+    """Accepts the commands of the controller that holds the chaser's lease, and refuses others.
+
+    ``leases``: to whom this chaser has promised which ticks. ``executed_tick``: tick of the last
+    actuator command that answers its tick; older commands are refused.
+    """
+
+    def __init__(
+        self, scenario: FlightScenario, number: int, realtime: bool, outbox: Outbox
+    ) -> None:
+        self._scenario, self._number, self._realtime = scenario, number, realtime
+        self._outbox = outbox
+        self.leases = LeaseGrantor(number, scenario.time.rate_hz)
+        self.executed_tick = -1
+        self._term = 0
+        self._refused = 0  # commands since the last one that was executed
+        # Whether the current series of stale or otherwise refused commands has been reported.
+        self._reported_stale = self._reported_refusal = False
+
+    def begin_tick(self, tick: Tick) -> None:
+        """Keep the lease, or grant it to the next controller, and state it."""
+        if (lease := self.leases.update(tick)) is not None:
+            self._outbox.publish(topics.LEASE, lease)
+
+    def decide(self, command: WrenchCommand, tick: Tick | None, now_ns: int) -> Decision:
+        """Decide on a command. ``tick``: the newest; ``now_ns``: the simulated time."""
+        newest = -1 if tick is None else tick.tick
+        # It would count as newer than all commands to come, and extend the lease.
+        early = command.tick > newest + longest_lease_ticks(self._scenario.time.rate_hz)
+        stale = (
+            f"for tick {command.tick}, the newest is {newest}"
+            if early
+            else self.leases.refusal(command)
+        )
+        if stale:
+            self._outbox.count_rejected("wrench:early tick" if early else "wrench:stale term")
+            return self._refuse_stale(command, stale, newest if early else command.tick, now_ns)
+        if command.mode in ("none", "wait", "yield"):
+            return self._without_command(command, tick)
+        if command.tick == self.executed_tick and command.term > self._term:
+            self._renew_lease(command, tick)
+            return Decision()  # repeated by a controller that became commander within the tick
+        due_ns = self._scenario.timing.effective_ns(command.tick)
+        reason = refusal(
+            command, self._number, self._scenario.chaser, self.executed_tick, now_ns, due_ns
+        )
+        if reason is not None:
+            return self._refuse(command, reason, now_ns)
+        self._renew_lease(command, tick)
+        self._accept(command)
+        # Ticks are the clock that all share: that of the controller may be wrong.
+        return Decision(execute=msgspec.structs.replace(command, effective_time_ns=due_ns))
+
+    def _refuse_stale(
+        self, command: WrenchCommand, reason: str, tick: int, now_ns: int
+    ) -> Decision:
+        """Refuse a command that its sender may not give in this tick."""
+        self._refused += 1
+        if not self._reported_stale:
+            self._outbox.warn("command refused", reason, tick, now_ns)
+        self._reported_stale = True
+        # A holder that does not know its term sends nothing else in this tick.
+        return self._without(tick) if self.leases.is_of_holder(command) else Decision()
+
+    def _refuse(self, command: WrenchCommand, reason: str, now_ns: int) -> Decision:
+        """Refuse a command that cannot be executed; the world waits for a safe one instead."""
+        self._outbox.count_stale()
+        self._refused += 1
+        if not self._reported_refusal:
+            self._outbox.warn("command refused", reason, command.tick, now_ns)
+        self._reported_refusal = True
+        return Decision(uncommanded_tick=command.tick)
+
+    def _without_command(self, command: WrenchCommand, tick: Tick | None) -> Decision:
+        """Go on without a command of the lease's holder, which sends none in this tick."""
+        if command.mode == "yield":
+            self.leases.give_back(command)
+        elif command.mode == "none":
+            self._renew_lease(command, tick)
+        return self._without(command.tick)
+
+    def _without(self, tick: int) -> Decision:
+        # In real time the last command remains valid for its lifetime.
+        return Decision() if self._realtime else Decision(uncommanded_tick=tick)
+
+    def _accept(self, command: WrenchCommand) -> None:
+        self._term = command.term
+        if self._refused:
+            detail = f"{self._refused} refused"
+            self._outbox.event(
+                "info", "commands accepted again", detail, command.tick, command.sim_time_ns
+            )
+        self._refused = 0
+        self._reported_refusal = self._reported_stale = False
+
+    def _renew_lease(self, command: WrenchCommand, tick: Tick | None) -> None:
+        self.leases.renew(command)
+        if self._realtime and tick is not None:
+            # The holder may need it before this process receives the next tick.
+            self._outbox.publish(topics.LEASE, self.leases.stated(tick))
 
 
 def refusal(

@@ -52,7 +52,7 @@ class LeaseGrantor:
         this chaser takes no part.
 
         An older tick than the last would give the lease to a controller that it lists; see
-        ``ChaserProcess``, which ignores it.
+        ``ChaserInbox.is_outdated``.
         """
         if self.chaser not in tick.chasers:
             return None

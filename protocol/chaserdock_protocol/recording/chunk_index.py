@@ -7,7 +7,7 @@ The package keeps one object per chunk until the file is closed. With 60 channel
 as bytes it is 0.7 kB. The file is the same to the byte (``tests/protocol/test_log.py``).
 
 A message record and its index are written by one ``struct.pack`` each, as messages are most of a
-log (measured in docs/simulation.md).
+log (measured in docs/evidence/simulation.md).
 """
 
 from __future__ import annotations

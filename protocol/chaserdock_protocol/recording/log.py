@@ -46,6 +46,8 @@ from .scan import (
 from .schema_migrations import decode_logged
 
 _FLUSH_S = 0.5
+"""Longest time (wall or simulated, s) between writes to disk: a killed recorder loses less than a
+second (tests/protocol/test_record_again.py)."""
 SCENARIO_ATTACHMENT = "scenario.json"
 LOCK_ATTACHMENT = "uv.lock.gz"
 VERSIONS_ATTACHMENT = "versions.json"
@@ -162,8 +164,8 @@ class LogWriter:
         return self._sink.size
 
     def describe(self, scenario_json: str, run: dict[str, str]) -> None:
-        """Write the resolved scenario, the run's data, the lock file, the package versions and the
-        BLAS in use.
+        """Write the resolved scenario, the run's data, the lock file, the package versions, the
+        commit where there is one, and the BLAS in use.
         """
         now = time.time_ns()
         attached = [
@@ -172,13 +174,14 @@ class LogWriter:
             (LOCK_ATTACHMENT, "application/gzip", provenance.lock_file_gz()),
         ]
         versions = {f"version.{name}": provenance.version(name) for name in _PACKAGES}
+        commit = provenance.commit_of()
+        source = {} if commit is None else {"commit": commit}
+        about = {"blas": provenance.blas_in_use(), **source, **run, **versions}
         with self._writing():
             for name, kind, data in attached:
                 if data is not None:
                     self._writer.add_attachment(now, now, name, kind, data)
-            self._writer.add_metadata(
-                METADATA, with_checksum({"blas": provenance.blas_in_use(), **run, **versions})
-            )
+            self._writer.add_metadata(METADATA, with_checksum(about))
 
     def note(self, name: str, data: dict[str, str]) -> None:
         """Write a metadata record."""

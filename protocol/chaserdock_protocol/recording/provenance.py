@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Provenance of a log: versions of all installed packages, the lock file, and the BLAS in use."""
+"""Provenance of a log: commit, versions of all installed packages, lock file, BLAS in use."""
 
 from __future__ import annotations
 
 import gzip
 import json
+import subprocess
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy  # noqa: F401 - loads its BLAS
 from threadpoolctl import threadpool_info
 
+_FOLDER = Path(__file__).resolve().parent
 # Only in a source tree.
 _LOCK_FILE = Path(__file__).resolve().parents[3] / "uv.lock"
 
@@ -29,6 +31,26 @@ def installed_versions() -> dict[str, str]:
 def version(package: str) -> str:
     """Return the version of an installed package."""
     return metadata.version(package)
+
+
+@lru_cache
+def commit_of(folder: Path = _FOLDER) -> str | None:
+    """Return the commit of the checkout that tracks ``folder``, by default that of this package.
+
+    Ends with ``-dirty`` where tracked files are changed. None outside a checkout or without git.
+    """
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        except OSError:  # git is not installed
+            return ""
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    if not git("ls-files", "."):
+        return None
+    return git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*") or None
 
 
 def versions_json() -> bytes:

@@ -17,7 +17,7 @@ from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, shipped_scen
 from .camera import REPLACED_BY_INTRINSICS
 from .errors import ScenarioError, explain, invalid, value_text
 from .files import read_toml, resolve_files
-from .migrations import old_format, old_keys
+from .migrations import drop_removed_keys, old_format, old_keys
 from .mission import Scenario
 from .overrides import Values, merge, with_override
 from .schema import ESTIMATORS, PERCEPTIONS, SOLVERS
@@ -131,12 +131,15 @@ def _check_camera(before: Values, after: Values, source: str) -> None:
     for key in REPLACED_BY_INTRINSICS if now.get("intrinsics") else ():
         if now.get(key) != was.get(key):
             raise ScenarioError(
-                f"{source}: camera.{key}: not used with camera.intrinsics; change camera.intrinsics instead"
+                f"{source}: camera.{key}: not used with camera.intrinsics; change "
+                "camera.intrinsics instead"
             )
         now.pop(key, None)
 
 
 def _check_format(values: Values, source: str) -> None:
+    """Raise ScenarioError for keys of older formats; drop those that have no effect any more."""
+    drop_removed_keys(values)
     if lines := old_format(values) or old_keys(values):
         raise ScenarioError("\n".join(f"{source}: {line}" for line in lines))
 

@@ -55,6 +55,29 @@ _MOVED_KEYS: dict[tuple[str, ...], str] = {
 }
 """Path of a key in format 2 -> its present path."""
 
+_REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
+    ("camera", "renderer"): ("exact", "PyBullet's renderer is not a part of chaserdock any more"),
+    **{
+        path: (value, f"it is {value:g} in every flight now")
+        for path, value in {
+            ("docking", "overdrive_m"): 0.03,
+            ("docking", "approach_timeout_s"): 60.0,
+            ("docking", "final_timeout_s"): 30.0,
+            ("docking", "contact_timeout_s"): 5.0,
+            ("docking", "settle_s"): 2.0,
+            ("docking", "pull_s"): 1.0,
+            ("docking", "verify_position_m"): 0.005,
+            ("docking", "verify_angle_deg"): 0.5,
+            ("detumble", "response_s"): 0.5,
+            ("chaser", "modulation", "schmitt_on"): 0.75,
+            ("chaser", "modulation", "schmitt_off"): 0.25,
+        }.items()
+    },
+}
+"""Path of a removed key of format 3 -> the value that every flight has now, which is accepted, and
+why no other is.
+"""
+
 
 def _holders(
     values: Any, path: tuple[str, ...], at: tuple[str, ...] = ()
@@ -70,6 +93,14 @@ def _holders(
             yield from _holders(item, path[1:], (*at, str(i)))
 
 
+def drop_removed_keys(values: dict[str, Any]) -> None:
+    """Delete, in place, removed keys that state what every flight does now."""
+    for path, (value, _) in _REMOVED_KEYS.items():
+        for table, _ in _holders(values, path):
+            if table[path[-1]] == value:
+                del table[path[-1]]
+
+
 def old_keys(values: dict[str, Any]) -> list[str]:
     """Return one line per key, or value, of an older format, naming its present name."""
     lines = []
@@ -80,6 +111,8 @@ def old_keys(values: dict[str, Any]) -> list[str]:
             )
     for old, new in _MOVED_KEYS.items():
         lines += [f"{path}: is now called {new}" for _, path in _holders(values, old)]
+    for old, (_, reason) in _REMOVED_KEYS.items():
+        lines += [f"{path}: {reason}; remove the key" for _, path in _holders(values, old)]
     for table, path in _holders(values, ("fault", "*", "topic")):
         if table["topic"] == "jets":
             lines.append(f"{path}: 'jets' is now called 'thrusters'")
@@ -95,30 +128,39 @@ def old_format(values: dict[str, Any]) -> list[str]:
         lines = old_keys(values)
         if "navigation" not in values and "odometry" not in values:
             lines.append(
-                'odometry and cameras are not exact by default any more (navigation.grade = "exact")'
+                "odometry and cameras are not exact by default any more (navigation.grade = "
+                '"exact")'
             )
         changes = "; ".join(lines) or "no key of this file has another name"
         return [
-            f"format: {stated} is not supported any more; set format = {FORMAT} and change: {changes}"
+            f"format: {stated} is not supported any more; set format = {FORMAT} and change: "
+            f"{changes}"
         ]
     return [
-        f"format: must be {FORMAT}, the format that this version of chaserdock reads (got {stated!r})"
+        f"format: must be {FORMAT}, the format that this version of chaserdock reads (got "
+        f"{stated!r})"
     ]
 
 
 def migrated(text: str) -> str:
-    """Return a resolved scenario (JSON) in the present format. Text that is not JSON is returned
-    unchanged.
+    """Return a resolved scenario (JSON) in the present format, without removed keys. Text that is
+    not JSON is returned unchanged.
     """
     try:
         values = json.loads(text)
     except (json.JSONDecodeError, RecursionError):
         return text
-    if not isinstance(values, dict) or values.get("format", 1) not in (1, 2):
+    if not isinstance(values, dict) or values.get("format", 1) not in (1, 2, FORMAT):
         return text
     if values.get("format", 1) == 1:
         _rename_keys(values)
-    _state_navigation(values)
+    if values.get("format", 1) != FORMAT:
+        _state_navigation(values)
+    elif not any(True for path in _REMOVED_KEYS for _ in _holders(values, path)):
+        return text
+    for path in _REMOVED_KEYS:
+        for table, _ in _holders(values, path):
+            del table[path[-1]]
     return json.dumps({**values, "format": FORMAT})
 
 

@@ -23,6 +23,7 @@ from chaserdock_protocol.topics import Role, Topic
 
 from .bounded_queue import BoundedQueue
 from .config import Link, ReceivedMessage, TransportError
+from .foreign_publishers import ForeignPublishers
 from .network import Network, Query, RawSample, T, Undo
 from .zenoh_network import ZenohNetwork
 
@@ -36,10 +37,6 @@ class TrafficCounters:
     stale: int = 0
 
 
-_MOST_REPORTED = 16
-"""Sessions of foreign publishers that are reported; whoever forges an identity per message fills no
-log.
-"""
 _Arrival = tuple[Topic, str | None, RawSample, float]
 """Topic, place and sample of a message, and the time (s) when it arrived."""
 
@@ -84,12 +81,7 @@ class Node:
         self._last_seq: dict[tuple[str, str], int] = {}
         self._queryables: dict[str, Undo] = {}
         self._close_callbacks: list[Callable[[], None]] = []
-        self._world_source = ""
-        self._on_foreign: Callable[[str, str, Message | None], None] = lambda key, source, newest: (
-            None
-        )
-        self._foreign_sources: set[str] = set()
-        self._foreign: deque[tuple[str, str]] = deque()
+        self._foreign = ForeignPublishers()
         self._newest: Message | None = None
         network: Network = ZenohNetwork(link) if link.network is None else link.network
         self._connection, self.host = network.open(name)
@@ -103,7 +95,7 @@ class Node:
     @property
     def world_source(self) -> str:
         """Identity of the session of the mission's world, empty if unknown."""
-        return self.source if self.role == "world" else self._world_source
+        return self.source if self.role == "world" else self._foreign.world_source
 
     def expect_world(
         self, source: str, on_foreign: Callable[[str, str, Message | None], None]
@@ -114,21 +106,16 @@ class Node:
         ``on_foreign(key, source, newest)`` runs on the reader's thread for the first of each
         session, up to a number of sessions; ``newest``: the last valid message.
         """
-        self._world_source, self._on_foreign = source, on_foreign
+        self._foreign.expect(source, on_foreign)
 
     def _is_foreign(self, raw: RawSample) -> bool:
         """Count a message on the world's keys that is not the world's. Runs on the network's or the
         reader's thread.
         """
-        if raw.source == self._world_source or not self._world_source:
-            return False
-        if not raw.key.startswith(topics.WORLD_BRANCHES):
-            return False
-        self.counts.rejected[f"{raw.key}:foreign publisher"] += 1
-        if raw.source not in self._foreign_sources and len(self._foreign_sources) < _MOST_REPORTED:
-            self._foreign_sources.add(raw.source)
-            self._foreign.append((raw.key, raw.source))
-        return True
+        foreign = self._foreign.sent(raw)
+        if foreign:
+            self.counts.rejected[f"{raw.key}:foreign publisher"] += 1
+        return foreign
 
     # -- publishing --------------------------------------------------------------------------------
 
@@ -160,7 +147,9 @@ class Node:
             send(payload)
 
     def publish_raw(self, raw: RawSample) -> None:
-        """Send a recorded message unchanged, with a new time stamp. Only for the role ``analysis``."""
+        """Send a recorded message unchanged, with a new time stamp. Only for the role
+        ``analysis``.
+        """
         if self.role != "analysis":
             raise PermissionError(f"{self.role} may not write raw samples ({raw.key})")
         self._connection.put(raw)
@@ -192,7 +181,7 @@ class Node:
 
         def arrived(raw: RawSample) -> None:
             key = raw.key
-            if raw.source != self._world_source and self._is_foreign(raw):
+            if self._is_foreign(raw):
                 return
             found = topics.topic_of_key(key)
             if found is None or found[0] is not topic:
@@ -229,7 +218,7 @@ class Node:
                 )
                 if received is not None:
                     out.append(received)
-            self._report_foreign()
+            self._foreign.report_next(self._newest)
             return out
 
         return drain
@@ -252,7 +241,7 @@ class Node:
             raise PermissionError(f"{self.role} may not read {expression}")
 
         def own_mission(raw: RawSample) -> None:
-            if raw.source == self._world_source or not self._is_foreign(raw):
+            if not self._is_foreign(raw):
                 arrived(raw)
 
         self._connection.subscribe(expression, own_mission)
@@ -263,7 +252,7 @@ class Node:
         Counts invalid messages in ``counts.rejected`` by topic and reason, and gaps in ``seq`` in
         ``counts.lost``.
         """
-        self._report_foreign()
+        self._foreign.report_next(self._newest)
         if self._ready:
             return self._ready.popleft()
         if timeout_s == 0 and self._inbox.empty():
@@ -277,10 +266,6 @@ class Node:
                 key = next(iter(self._latest))
                 item = self._latest.pop(key)
         return self._filter(*item)
-
-    def _report_foreign(self) -> None:
-        if self._foreign:
-            self._on_foreign(*self._foreign.popleft(), self._newest)
 
     def _filter(
         self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float

@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lock-step barrier: collects the replies that a tick expects, and applies the actuator commands
-among them.
-"""
+"""Lock-step barrier: opens ticks, and waits for the replies that they expect."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import FaultLayer, LostMessage
-from chaserdock_protocol.messages import ActuatorCommand, Event, Latch, Presence, RecorderAck, Tick
+from chaserdock_protocol.messages import ActuatorCommand, Event, Presence, RecorderAck
 from chaserdock_protocol.process import print_status
 from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.session import Heartbeat, create_health
 
-from chaserdock_world.actuators.ideal import Actuators
-
+from .command_intake import CommandIntake
 from .membership import Membership
-from .observed_commander import ObservedCommander
+from .open_tick import OpenTick
 from .stall import explain_stall
 
 RECORDER_WINDOW_TICKS = 8
@@ -31,19 +28,19 @@ LONGEST_STEP_S = 5.0
 were gone.
 """
 _STATUS_INTERVAL_S = 5.0
+"""Wall time after which the world prints again what it waits for, s."""
 _POLL_S = 0.02
+"""Longest wait for one message, s: as soon is a departed process noticed."""
 _REPEAT_S, _MOST_REPEATS = 2.0, 3
 """The first tick after all processes have returned is repeated after this wall time without a
 reply: chasers then state their leases again, which the network may have lost while it came up."""
-_MAX_CLOCK_ERROR_NS = 1_000_000_000
-"""A command whose effective time differs from its tick's by more comes from a wrong clock."""
 
 
 class TickBarrier:
     """Opens ticks, collects the replies to them and decides when a tick is complete.
 
-    ``chasers``: ids of the chasers whose reply the open tick expects. Who commands is decided by
-    the chasers, which grant leases; this process sees it in the commands that they execute.
+    ``commands``: takes the actuator commands. Who commands is decided by the chasers, which grant
+    leases; this process sees it in the commands that they execute.
     """
 
     def __init__(
@@ -52,47 +49,36 @@ class TickBarrier:
         membership: Membership,
         heartbeat: Heartbeat,
         timing: Timing,
-        actuators: Mapping[str, Actuators],
-        current_step: Callable[[], int],
-        command_latch: Callable[[int, Latch, int], None],
+        commands: CommandIntake,
         recorder_expected: bool,
-        watchdog_s: float = 0.5,
         standby_expected: bool = False,
     ) -> None:
-        self.chasers: tuple[int, ...] = ()
         self.faults: FaultLayer | None = None
-        self._commander = ObservedCommander()
-        self._controllers: dict[str, str] = {}
-        self._since: dict[str, int] = {}
-        self._instances: dict[str, str] = {}
-        self._standby_expected = standby_expected
         self._node = node
         self._membership = membership
         self._heartbeat = heartbeat
         self._timing = timing
-        self._actuators = actuators
-        self._current_step = current_step
-        self._command_latch = command_latch
+        self._commands = commands
+        self._standby_expected = standby_expected
         self._recorder_expected = self._recorder_configured = recorder_expected
         self._recorded_tick = -1
-        self._tick = -1
-        self._images = False
-        self._revision = self._repeats = 0
-        # At least two ticks, as a command acts until that of the next tick arrives.
-        self._watchdog_ns = round(max(watchdog_s, 2.0 / timing.rate_hz) * 1e9)
-        self._commanded_ns: dict[str, int] = {}
-        self._executed_tick: dict[int, int] = {}
-        self._replied: set[int] = set()
+        self._open = OpenTick()
+        self._repeats = 0
         self._no_chaser_since_s: float | None = None
         self._polled_s = node.host.now_s()
         heartbeat.hangs = lambda: node.host.now_s() - self._polled_s > LONGEST_STEP_S
+
+    @property
+    def chasers(self) -> tuple[int, ...]:
+        """Return the chasers whose reply the open tick expects."""
+        return self._open.chasers
 
     # -- before, between and after ticks -----------------------------------------------------------
 
     def missing_processes(self) -> list[str]:
         """Return the expected processes that are not connected yet."""
         expected = [
-            *self._actuators,
+            *self._commands.names,
             "controller",
             *(["standby"] if self._standby_expected else []),
         ]
@@ -110,39 +96,32 @@ class TickBarrier:
     def open_tick(self, tick: int, images: bool) -> None:
         """Open a tick: determine who takes part in it, and publish it."""
         self._remove_departed()
-        connected = self._connected()
-        self.chasers = self._chasers_among(connected)
-        self._controllers = {
-            name: self._membership.instance_of(name)
-            for name in topics.CONTROLLERS
-            if name in connected
-        }
-        self._instances = {
-            f"chaser/{i}": self._membership.instance_of(f"chaser/{i}") for i in self.chasers
-        }
-        present = [*self._instances, *self._controllers]
-        self._since = {name: self._since.get(name, tick) for name in present}
+        connected, instance_of = self._connected(), self._membership.instance_of
+        chasers = self._chasers_among(connected)
+        controllers = {n: instance_of(n) for n in topics.CONTROLLERS if n in connected}
+        instances = {f"chaser/{i}": instance_of(f"chaser/{i}") for i in chasers}
+        since = {n: self._open.since.get(n, tick) for n in (*instances, *controllers)}
         # A recorder that returns paces the flight again.
         self._recorder_expected |= self._recorder_configured and "recorder" in connected
-        self._tick, self._images, self._revision = tick, images, 0
-        self._replied.clear()
+        self._open = OpenTick(tick, images, chasers, controllers, instances, since)
         if self.faults is not None:
             for what, detail in self.faults.transitions_at(tick):
                 self.publish_warning(what, detail)
-        self._check_watchdogs()
+        now_ns = self._timing.tick_time_ns(tick)
+        for detail in self._commands.stop_uncommanded(now_ns):
+            self.publish_warning("actuators stopped", detail)
         self._publish_tick()
         if tick > 0 and tick % self._timing.rate_hz == 0:
-            health = create_health(self._node, tick, self._timing.tick_time_ns(tick))
+            health = create_health(self._node, tick, now_ns)
             self._node.publish(topics.HEALTH, health, "world")
 
     def is_complete(self) -> bool:
         """Return whether all expected replies to the open tick have arrived and the recorder keeps
         up.
         """
-        keeps_up = (
-            not self._recorder_expected or self._recorded_tick >= self._tick - RECORDER_WINDOW_TICKS
-        )
-        return keeps_up and self._replied.issuperset(self.chasers)
+        recorded_tick = self._open.tick - RECORDER_WINDOW_TICKS
+        keeps_up = not self._recorder_expected or self._recorded_tick >= recorded_tick
+        return keeps_up and not self._open.missing
 
     def await_replies(self, stopped: Callable[[], bool], stall_s: float) -> str:
         """Process messages until the open tick is complete or ``stopped``; return why it never will
@@ -154,14 +133,13 @@ class TickBarrier:
 
         def over() -> bool:
             nonlocal progress
-            now = (len(self._replied), self._recorded_tick, self._revision)
+            now = (len(self._open.replied), self._recorded_tick, self._open.revision)
             if now != progress:
                 progress = now
                 timer.reset()
             elif self._repeats and timer.update() >= _REPEAT_S:
                 self._repeats -= 1
-                self._revision += 1
-                self._publish_tick()
+                self._revise_tick()
             return self.is_complete() or timer.update() >= stall_s
 
         self.wait_until(over, stopped, lambda: ", ".join(self._owed()))
@@ -169,18 +147,16 @@ class TickBarrier:
         if stopped() or self.is_complete():
             return ""
         owed = self._owed()
-        leader = self._commander.name or next(iter(self._controllers), "")
+        leader = self._commands.commander.name or next(iter(self._open.controllers), "")
         explained = explain_stall(owed, leader, self._membership.progress())
-        return f"stalled: no progress for {stall_s:g} s in tick {self._tick}: {explained}"
+        return f"stalled: no progress for {stall_s:g} s in tick {self._open.tick}: {explained}"
 
     def _owed(self) -> dict[str, str]:
         """Return the keys of the messages that the open tick waits for, by the process that owes
         them.
         """
-        late = [i for i in self.chasers if i not in self._replied]
-        return {f"chaser/{i}": topics.ACTUATORS.key_of(i) for i in late} or {
-            "recorder": topics.ACK.key_of()
-        }
+        late = {f"chaser/{i}": topics.ACTUATORS.key_of(i) for i in self._open.missing}
+        return late or {"recorder": topics.ACK.key_of()}
 
     def lost_all_chasers(self, rejoin_s: float, stopped: Callable[[], bool]) -> bool:
         """Return whether no chaser is left and none returns within ``rejoin_s`` of wall time.
@@ -216,9 +192,9 @@ class TickBarrier:
 
     def publish_warning(self, what: str, detail: str) -> None:
         """Publish an event of level warning, and print it."""
-        time_ns = self._timing.tick_time_ns(max(self._tick, 0))
+        time_ns = self._timing.tick_time_ns(max(self._open.tick, 0))
         event = Event(
-            tick=self._tick,
+            tick=self._open.tick,
             sim_time_ns=time_ns,
             process="world",
             level="warning",
@@ -267,50 +243,22 @@ class TickBarrier:
             case Presence() as presence:
                 if self._membership.update_presence(presence):
                     self._heartbeat.take(presence)
-            case LostMessage(tick=tick) if received is not None and tick == self._tick:
-                self._replied.add(int(received.place or 0))  # its actuators keep their last command
+            case LostMessage(tick=tick) if received is not None and tick == self._open.tick:
+                # Its actuators keep their last command.
+                self._open.replied.add(int(received.place or 0))
         if self._remove_departed():
-            self._revision += 1
-            self._publish_tick()
+            self._revise_tick()
 
     def _apply_command(self, command: ActuatorCommand) -> None:
-        """Hand a command to the actuators and the latch, or count why it is rejected."""
-        if rejection := self._check_command(command):
-            self._node.counts.rejected[f"actuators:{rejection}"] += 1
-            return
-        name = f"chaser/{command.chaser}"
-        self._commanded_ns[name] = max(
-            self._timing.tick_time_ns(command.tick), self._commanded_ns.get(name, 0)
-        )
-        effective_step = self._timing.step_of_time(command.effective_time_ns)
-        self._actuators[name].command(command, effective_step, self._current_step())
-        self._command_latch(command.chaser, command.latch, effective_step)
-
-    def _check_command(self, command: ActuatorCommand) -> str:
-        """Note who commands and record the reply; return why the command is rejected, empty if it
-        is not.
-        """
-        if f"chaser/{command.chaser}" not in self._actuators or command.tick > self._tick:
-            return "unexpected"
-        listed = self._instances.get(f"chaser/{command.chaser}", "")
-        if listed and command.instance and command.instance != listed:
-            return (
-                "replaced"  # by another process of this chaser, while this one was taken for lost
-            )
-        if command.tick < self._executed_tick.get(command.chaser, -1):
-            return "overtaken"  # by a command that the same chaser has executed later
-        if command.source == "command":
-            self._executed_tick[command.chaser] = command.tick
-            if reason := self._commander.update(command, self._controllers, self._now_s()):
-                self.publish_warning("hand-over", reason)
-        if command.tick == self._tick:
-            # In real time a chaser may brake before its command arrives: the later reply replaces
-            # the first.
-            if command.chaser in self._replied and not self._membership.realtime:
-                return "twice"
-            self._replied.add(command.chaser)
-        due_ns = self._timing.effective_ns(command.tick)
-        return "time" if abs(command.effective_time_ns - due_ns) > _MAX_CLOCK_ERROR_NS else ""
+        """Let a command act, or count why it is rejected."""
+        # In real time a chaser may brake before its command arrives: the later reply replaces the
+        # first.
+        once = not self._membership.realtime
+        taken = self._commands.take(command, self._open, self._now_s(), once)
+        if taken.hand_over:
+            self.publish_warning("hand-over", taken.hand_over)
+        if taken.rejected:
+            self._node.counts.rejected[f"actuators:{taken.rejected}"] += 1
 
     # -- processes ---------------------------------------------------------------------------------
 
@@ -318,25 +266,13 @@ class TickBarrier:
         return self._membership.connected(self._heartbeat.heard())
 
     def _chasers_among(self, connected: set[str]) -> tuple[int, ...]:
-        return tuple(i for i in range(len(self._actuators)) if f"chaser/{i}" in connected)
+        return tuple(i for i, name in enumerate(self._commands.names) if name in connected)
 
     def _now_s(self) -> float:
         """Return the wall time in real time, the simulated time in lock-step."""
         if self._membership.realtime:
             return self._node.host.now_s()
-        return self._timing.tick_time_ns(max(self._tick, 0)) / 1e9
-
-    def _check_watchdogs(self) -> None:
-        """Stop actuators that no longer receive commands, as the watchdog of a valve driver does."""
-        now_ns = self._timing.tick_time_ns(self._tick)
-        for name in [
-            n for n, since in self._commanded_ns.items() if now_ns - since > self._watchdog_ns
-        ]:
-            self._actuators[name].stop(self._current_step())
-            del self._commanded_ns[name]
-            self.publish_warning(
-                "actuators stopped", f"{name}: no command for {self._watchdog_ns / 1e9:g} s"
-            )
+        return self._timing.tick_time_ns(max(self._open.tick, 0)) / 1e9
 
     def _remove_departed(self) -> bool:
         """Remove processes that were lost; return whether this changes whose reply the open tick
@@ -346,30 +282,17 @@ class TickBarrier:
         for name in self._membership.take_departed():
             self._heartbeat.forget(name)
             self.publish_warning("process lost", name)
-            self._since.pop(name, None)
             if name == "recorder":
                 self._recorder_expected = False
-            elif name in self._controllers:
-                del self._controllers[name]
-                changed = True
-            elif name in self._actuators:
-                self._actuators[name].stop(self._current_step())
-                self._commanded_ns.pop(name, None)
-                changed |= any(f"chaser/{i}" == name for i in self.chasers)
-                self.chasers = tuple(i for i in self.chasers if f"chaser/{i}" != name)
-        return changed and self._tick >= 0
+            elif name in self._commands.names:
+                self._commands.stop(name)
+            changed |= self._open.remove(name)
+        return changed and self._open.tick >= 0
+
+    def _revise_tick(self) -> None:
+        """Publish the open tick again, as it has changed or was lost."""
+        self._open.revision += 1
+        self._publish_tick()
 
     def _publish_tick(self) -> None:
-        message = Tick(
-            tick=self._tick,
-            sim_time_ns=self._timing.tick_time_ns(self._tick),
-            revision=self._revision,
-            images=self._images,
-            chasers=self.chasers,
-            controllers=self._controllers,
-            chaser_instances={
-                name: self._instances[name] for name in map("chaser/{}".format, self.chasers)
-            },
-            since=self._since,
-        )
-        self._node.publish(topics.TICK, message)
+        self._node.publish(topics.TICK, self._open.message(self._timing))

@@ -33,6 +33,11 @@ class LatchFault:
     grip: Grip = field(default_factory=Grip)
 
 
+def capture_ports(scenario: Scenario) -> tuple[Port, ...]:
+    """Return the ports at which chasers latch; none for docking at a distance."""
+    return scenario.docking.ports if scenario.docking.kind == "capture" else ()
+
+
 def latch_faults(scenario: Scenario, chaser: int) -> tuple[LatchFault, ...]:
     """Return the faults of a chaser's latch."""
     timing, faults = scenario.timing, []

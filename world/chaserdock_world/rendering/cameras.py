@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -35,20 +34,10 @@ from .mesh_renderer import MeshRenderer
 from .rasterizer import Renderer
 from .scene_geometry import Obstacle
 
-if TYPE_CHECKING:
-    from .tinyrenderer import TinyRenderer
-
 # Motion blur: one sample of the exposure per this many pixels of motion, and at most so many.
 _BLUR_STEP_PX, _BLUR_SAMPLES_MAX = 0.5, 16
 
 States = dict[str, BodyState]
-
-
-def _tiny_renderer() -> type[TinyRenderer]:
-    """Return PyBullet's renderer, which needs a package that not every platform has."""
-    from .tinyrenderer import TinyRenderer
-
-    return TinyRenderer
 
 
 class Cameras:
@@ -72,14 +61,12 @@ class Cameras:
             substitutes[body] = moved(shape, np.zeros(3), np.array(body.size_m) / (high - low))
 
         @cache
-        def renderer(camera: Camera) -> Renderer | MeshRenderer | TinyRenderer:
+        def renderer(camera: Camera) -> Renderer | MeshRenderer:
+            spread_px = effects.point_spread_px
             try:
-                if mesh is not None and section.renderer == "exact":
-                    return MeshRenderer(
-                        camera, mesh, background, effects.point_spread_px, substitutes
-                    )
-                kind = Renderer if section.renderer == "exact" else _tiny_renderer()
-                return kind(camera, self._target, background, effects.point_spread_px)
+                if mesh is not None:
+                    return MeshRenderer(camera, mesh, background, spread_px, substitutes)
+                return Renderer(camera, self._target, background, spread_px)
             except ValueError as error:
                 raise ScenarioError(f"camera: {error}") from None
 
@@ -96,17 +83,12 @@ class Cameras:
         self._night = Light(section.sun_direction, 0.0, night, section.lamp)
         # A chaser's own body is behind its lens, its probe is not.
         self._own, self._others = (probe,), (body, probe)
-        # PyBullet's renderer is shared by all cameras and not thread-safe.
-        self._second_thread = (
-            ThreadPoolExecutor(1, "images") if section.renderer == "exact" else None
-        )
+        self._second_thread = ThreadPoolExecutor(1, "images")
 
     def images(
         self, chasers: Sequence[int], number: int, tick: int, time_ns: int, states: States
     ) -> list[Image]:
         """Return ``image`` of several chasers at one time, in their order, rendered on two threads."""
-        if self._second_thread is None:
-            return [self.image(i, number, tick, time_ns, states) for i in chasers]
         exposure = (number, tick, time_ns, states)
         futures = {i: self._second_thread.submit(self.image, i, *exposure) for i in chasers[1::2]}
         images = {i: self.image(i, *exposure) for i in chasers[::2]}

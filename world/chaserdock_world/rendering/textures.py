@@ -17,6 +17,9 @@ from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, fac
 from numpy.typing import NDArray
 
 FINEST_TEXEL_M = 0.00025
+"""Width of a texel of a face: half a pixel of the default camera at 0.5 m; nearer, texels are
+interpolated.
+"""
 # Reflectance of the printed white and black.
 WHITE, BLACK = 0.95, 0.05
 
@@ -91,17 +94,6 @@ def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.
     finished = np.rint(texture * np.float32(255.0)).astype(np.uint8)
     finished.setflags(write=False)
     return finished
-
-
-def label_texture(model: TargetModel, marker: Marker) -> NDArray[np.uint8]:
-    """Return reflectance times 255 (n, n) of one marker with its white border, as a label on a
-    surface.
-    """
-    side = marker.side_m + 2.0 * model.white_margin_m
-    texture = np.full((max(2, round(side / FINEST_TEXEL_M)),) * 2, WHITE, dtype=np.float32)
-    cells = np.where(marker_cells(model.dictionary, marker.id) > 0, WHITE, BLACK)
-    _print(texture, cells, np.zeros(2), marker.side_m / 2.0, side, side)
-    return np.rint(texture * np.float32(255.0)).astype(np.uint8)
 
 
 def _print(

@@ -36,7 +36,7 @@ pixels of a small one in proportion to what they show of the target."""
 _GRID_SHARE_PX, _LIGHT_SHARE = 0.2, 0.013
 """Standard deviation of the centroid by pixel grid and compression (at a radius of 1 px; falls with
 its square root), and by markers and light (as a share of the radius). Measured:
-``benchmarks/vision.py --only bearing``."""
+``benchmarks/perception.py --only markers-bearing``."""
 _SIZE_SHARE, _SIZE_SIGMAS = 0.25, 5.0
 """A spot's radius may differ from the expected one by this share and so many standard deviations by
 noise.
@@ -56,6 +56,9 @@ the optical axis.
 _NEAREST, _FARTHEST = 2.0, 1e4
 """Least and greatest range, in radii of the target."""
 _RASTER = 256
+"""Side, px, of the raster that a silhouette is drawn on: its radius is exact to half a raster pixel
+of some 100, far below the share by which a spot's radius may differ (``_SIZE_SHARE``).
+"""
 
 
 class BearingError(Exception):

@@ -63,6 +63,7 @@ class _Settings(Structure):
     ]  # fmt: skip
 
 
+# Chosen by the corner errors in rendered images (benchmarks/vision.py, part ``accuracy``).
 SETTINGS = _Settings(
     0.45, 1.25,
     8.0, 0.4, 4.0,
@@ -75,6 +76,7 @@ SETTINGS = _Settings(
     2.0, 120.0,
 )  # fmt: skip
 
+# Corners of a unit square, as those of a marker.
 _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 
 

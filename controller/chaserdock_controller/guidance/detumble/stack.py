@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.wrench_set import ThrusterMount, wrench_matrix
@@ -37,18 +36,6 @@ class StackMotion:
         """Return the speed of the centre of mass (m/s) and the angular rate (rad/s)."""
         omega = np.linalg.solve(body.inertia_kg_m2, self.angular_N_m_s)
         return float(np.linalg.norm(self.linear_N_s)) / body.mass_kg, float(np.linalg.norm(omega))
-
-
-def stack_motion(
-    body: TargetBody, velocity_m_s: Array, q_wxyz: Array, omega_rad_s: Array
-) -> StackMotion:
-    """Return the momentum of a stack with velocity (3,) of TRF's origin in WRF, attitude (4,) and
-    rate (3,) in TRF.
-    """
-    own = rotations.rotate_inverse(q_wxyz, velocity_m_s) + rotations.cross(
-        omega_rad_s, body.centre_trf_m
-    )
-    return StackMotion(body.mass_kg * own, body.inertia_kg_m2 @ omega_rad_s)
 
 
 def thruster_wrenches(

@@ -42,6 +42,3 @@ class AttitudeCost(CostTerm):
 
         error = multiply(stage.x[6:10], conjugate(stage.reference[3:7]))[1:4]
         return weights * ca.sumsqr(error)
-
-
-TERM = AttitudeCost

@@ -93,6 +93,3 @@ def coast_rows(safety: CoastSafety, states: Array, targets: Array, horizon_s: fl
         scale = np.maximum(np.linalg.norm(planes[..., :3], axis=2), by_velocity)
         rows[i, 1:] = planes / np.where(scale > 0.0, scale, 1.0)[..., None]
     return rows
-
-
-TERM = PassiveCoasts

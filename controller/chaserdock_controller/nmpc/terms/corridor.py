@@ -80,6 +80,3 @@ class CorridorCone(ChaserConstraint):
         along = ca.dot(axis, r)
         aside = norm(r - along * axis)
         return ca.sin(half_angle) * (along - apex) - ca.cos(half_angle) * aside
-
-
-TERM = CorridorCone

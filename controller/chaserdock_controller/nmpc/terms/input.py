@@ -37,6 +37,3 @@ class InputCost(CostTerm):
         import casadi as ca
 
         return ca.dot(weights, (stage.u_ref - stage.u) ** 2)
-
-
-TERM = InputCost

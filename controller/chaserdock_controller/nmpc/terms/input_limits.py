@@ -39,6 +39,3 @@ class InputLimits(Constraint):
     def native(self, problem: NmpcInput) -> Sequence[Any]:
         """Return the address of the limits."""
         return (address_of(problem.input_max),)
-
-
-TERM = InputLimits

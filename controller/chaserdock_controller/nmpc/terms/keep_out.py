@@ -56,6 +56,3 @@ class KeepOut(ChaserConstraint):
         from chaserdock_controller.nmpc.casadi_vectors import norm
 
         return norm(stage.x[0:3] - stage.target) - data
-
-
-TERM = KeepOut

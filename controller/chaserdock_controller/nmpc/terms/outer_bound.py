@@ -35,6 +35,3 @@ class OuterBound(ChaserConstraint):
         from chaserdock_controller.nmpc.casadi_vectors import norm
 
         return self.max_reference_distance_m - norm(stage.x[0:3] - stage.reference[0:3])
-
-
-TERM = OuterBound

@@ -38,6 +38,3 @@ class PositionCost(CostTerm):
     def final_slope(self, distance_m: Array) -> Array:
         """Return the slope (1/m) of the cost of the last stage at distances from the reference."""
         return 2.0 * (self.weight_final_position + self.weight_position) * distance_m
-
-
-TERM = PositionCost

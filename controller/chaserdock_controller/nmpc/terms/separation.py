@@ -80,6 +80,3 @@ def _extended(distances_m: Array | float, n: int, margins_m: Sequence[float]) ->
     for row, margin in enumerate(margins_m, start=n):
         out[row, :n] = out[:n, row] = float(np.max(distances_m)) + margin
     return out
-
-
-TERM = Separation

@@ -46,6 +46,3 @@ class ShapeClearance(Constraint):
         boxes = problem.boxes
         assert boxes is not None
         return boxes.shape[1], address_of(boxes), address_of(problem.box_clearance_m)
-
-
-TERM = ShapeClearance

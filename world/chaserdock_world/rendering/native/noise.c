@@ -9,7 +9,7 @@ typedef uint64_t word __attribute__((aligned(1), may_alias));
 
 /* Adding 1.5 * 2^23 rounds a float of less than 2^22 to the nearest integer, ties to even, in the low bits of the sum. */
 #define WHOLE 12582912.0f
-#define WHOLE_BITS 0x4b400000
+#define WHOLE_BITS 0x4b400000 /* WHOLE as an integer */
 
 /* The level that all pixels of a block have, or -1. */
 static inline int level_of_block(const uint8_t *pixels) {

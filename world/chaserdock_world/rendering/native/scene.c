@@ -2,7 +2,7 @@
 /* Scene geometry: visible faces of boxes, their painting order, and the placement of textures. */
 #include "base.h"
 
-#define OUTLINE_MOST 10
+#define OUTLINE_MOST 10 /* a rectangle that is cut by five planes has at most nine corners */
 
 /* View frustum of a canvas (chaserdock_world.rendering.scene_geometry.Frustum): planes n x + d >= 0 of points in front and on
  * the canvas, inward unit normals of its borders, the lens, the canvas' first pixel. */

@@ -7,11 +7,11 @@
  * SE(3) with Tukey's biweight, as in C. Harris, C. Stennett, "RAPID", BMVC 1990, and later model-based trackers. */
 #include "base.h"
 
-#define HALF 4
-#define PROFILE (2 * HALF + 1)
-#define REACH_MOST 24
-#define TAPS_OF_REACH (2 * (REACH_MOST + HALF) + 1)
-#define PER_CELL_MOST 4
+#define HALF 4 /* samples to either side of a control point, a pixel apart: an edge, its spread, and some of both surfaces */
+#define PROFILE (2 * HALF + 1) /* samples of a profile */
+#define REACH_MOST 24 /* capacity: pixels to either side in which a profile is searched; callers ask for at most 10 */
+#define TAPS_OF_REACH (2 * (REACH_MOST + HALF) + 1) /* samples across the largest search */
+#define PER_CELL_MOST 4 /* capacity: control points of a cell; callers ask for 2 */
 /* Standard deviation of a match that contrast does not explain. */
 #define FLOOR_PX 0.1
 

@@ -2,13 +2,18 @@
 /* Refines marker corners as intersections of lines fitted to the sides. Method: chaserdock_agents.chaser.perception.corners. */
 #include "base.h"
 
+/* Capacities: lines across a side and samples on each (settings: 8 and 11), lines of pixels across a side (48), and pixels
+ * beside it: 48 lines of 42. */
 #define ROWS_MOST 20
+/* See above. */
 #define TAPS_MOST 15
+/* See above. */
 #define COLUMNS_MOST 64
+/* See above. */
 #define PIXELS_MOST 2048
 /* Tabulated normal distribution: steps of 1 / STEPS up to LAST sigma on either side. */
 #define STEPS 32
-#define LAST 5
+#define LAST 5 /* beyond, the distribution is 0 or 1 to 3e-7 */
 
 typedef struct {
     const uint8_t *image;

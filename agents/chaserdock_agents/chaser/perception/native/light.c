@@ -6,8 +6,8 @@
  * reweighted least squares with Cauchy's weights. */
 #include "base.h"
 
-#define LIGHT_ROUNDS 3
-#define POINT_DOUBLES 14
+#define LIGHT_ROUNDS 3 /* rounds of reweighting (chosen): each costs as much as the first */
+#define POINT_DOUBLES 14 /* size of a LitPoint */
 
 /* A point: position, unit normal, unit vector to the camera, all in TRF; reflectance, gloss, Blinn's exponent; grey level and its
  * standard deviation. */

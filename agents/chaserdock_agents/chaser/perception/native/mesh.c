@@ -2,9 +2,9 @@
 /* Synthetic views of a triangle mesh: z-buffer rasterization, Lambert shading with Blinn's gloss, cast shadows. */
 #include "base.h"
 
-#define CLIPPED_MOST 4
-#define NEAR_M 0.02
-#define GLOSS_MOST 1023
+#define CLIPPED_MOST 4 /* corners of a triangle that is cut by one plane */
+#define NEAR_M 0.02 /* m: what is nearer to the lens is not drawn; a docked port is several times farther */
+#define GLOSS_MOST 1023 /* largest exponent of a highlight: ten squarings */
 
 /* A vertex on the sample grid: position, depth (linear on the grid, larger is nearer) and Lambert factor. */
 typedef struct {

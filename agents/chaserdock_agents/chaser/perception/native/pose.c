@@ -4,8 +4,8 @@
 
 /* Iteration ends when a step lowers the squared error by at most the first share of it, or the linear model predicts at most
  * the second. */
-#define MIN_GAIN 1e-5
-#define MIN_PREDICTED_GAIN 2e-6
+#define MIN_GAIN 1e-5 /* chosen: of 32 coordinates, a pose off by 0.02 standard deviations */
+#define MIN_PREDICTED_GAIN 2e-6 /* chosen, below MIN_GAIN: saves the last step where it would change nothing */
 
 typedef struct {
     double cost, gradient[6], information[36];

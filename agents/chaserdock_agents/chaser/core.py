@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One chaser without I/O: images to sightings, wrench commands to actuator commands. It has no
+access to ground truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import msgspec
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol import topics
+from chaserdock_protocol.fault_injection import LostMessage
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    DockingStatus,
+    Image,
+    Message,
+    Odometry,
+    Plan,
+    Sighting,
+    TargetEstimate,
+    Tick,
+    WrenchCommand,
+)
+from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.thrusters import ThrusterFailure
+from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.transport import ReceivedMessage
+
+from .command_gate import CommandGate, passed_on
+from .fallback_control import FallbackControl
+from .inbox import ChaserInbox
+from .outbox import ChaserOutputs, Outbox
+from .perception import make_perception
+from .thrusters.controller import ThrusterController
+from .thrusters.failure_reports import FailureReports
+from .vision import Vision
+
+
+class ChaserCore:
+    """The parts of one chaser, which keep its state from message to message.
+
+    ``realtime``: the world waits for no reply, and a command stays valid for its lifetime.
+    ``instance``: identity of the process, which its actuator commands state. ``failures``: those
+    that the test bed reports in place of the thrusters' hardware.
+    """
+
+    def __init__(
+        self,
+        scenario: FlightScenario,
+        number: int,
+        realtime: bool = False,
+        instance: str = "",
+        failures: Iterable[ThrusterFailure] = (),
+    ) -> None:
+        self.scenario, self.number = scenario, number
+        self.realtime, self.instance = realtime, instance
+        self.outbox = Outbox(number)
+        self.inbox = ChaserInbox()
+        self.vision = Vision(make_perception(scenario))
+        self.gate = CommandGate(scenario, number, realtime, self.outbox)
+        self.fallback = FallbackControl(scenario, number, self.outbox)
+        has_thrusters = scenario.chaser.actuation == "thrusters"
+        self.thrusters = ThrusterController(scenario, number) if has_thrusters else None
+        self._reports = FailureReports(failures)
+        self._has_port = scenario.docking.port_of(number) is not None
+        self._observed_tick = self._uncommanded_tick = -1
+
+    def step(self, received: ReceivedMessage, now_s: float = 0.0) -> ChaserOutputs:
+        """Handle one message. ``now_s``: the clock of ``received.arrived_s``, for real time.
+
+        In lock-step, a ``LostMessage`` stands for one that will not arrive.
+        """
+        inbox, message = self.inbox, received.message
+        match message:
+            case Tick():
+                self._begin_tick(message)
+            case Odometry():
+                if self._is_new(inbox.add_odometry(message, received.arrived_s)):
+                    self._continue_tick(message)
+            case DockingStatus():
+                if self._is_new(inbox.add_docking(message)):
+                    self._observe_thrusters()
+            case Image():
+                self._look(message)
+            case Plan():
+                self._is_new(self.fallback.add_plan(message))
+            case TargetEstimate():
+                self._is_new(self.fallback.add_target(message))
+            case WrenchCommand():
+                self._take_command(message, inbox.time_ns(now_s if self.realtime else None))
+            case LostMessage():
+                self._replace_lost(received.topic, message)
+        return self.outbox.take()
+
+    def missing_keys(self) -> tuple[str, ...]:
+        """Return the keys of the messages that this chaser needs to reply to the open tick, or to
+        get the next one.
+        """
+        tick = self.inbox.tick
+        if tick is None or tick.tick <= self.gate.executed_tick or self.number not in tick.chasers:
+            return (topics.TICK.key_of(),)
+        latest: dict[Topic, Message | None] = {topics.ODOMETRY: self.inbox.odometry}
+        if self._has_port:
+            latest[topics.DOCKING] = self.inbox.docking
+        missing = [topic for topic, last in latest.items() if last is None or last.tick < tick.tick]
+        if tick.images and not self.vision.has_processed(tick.tick):
+            missing.append(topics.IMAGE)
+        return tuple(topic.key_of(self.number) for topic in missing or [topics.WRENCH])
+
+    # -- messages of the world ---------------------------------------------------------------------
+
+    def _is_new(self, new: bool) -> bool:
+        """Return ``new``; count the message as stale if it is not."""
+        if not new:
+            self.outbox.count_stale()
+        return new
+
+    def _begin_tick(self, tick: Tick) -> None:
+        if self.inbox.is_outdated(tick):
+            return
+        self.inbox.tick = tick
+        self.gate.begin_tick(tick)
+        self._observe_thrusters()
+        self._reply_without_command()
+
+    def _continue_tick(self, odometry: Odometry) -> None:
+        """Do what waits for the chaser's own state."""
+        self._observe_thrusters()
+        self._reply_without_command()
+        if self.realtime:
+            self._check_command_timeout(odometry)
+
+    def _replace_lost(self, topic: Topic, lost: LostMessage) -> None:
+        """Lock-step: handle the loss of a message, so that the tick is still replied to."""
+        inbox = self.inbox
+        if topic is topics.IMAGE:
+            no_image = Sighting(
+                tick=lost.tick,
+                sim_time_ns=lost.sim_time_ns,
+                chaser=self.number,
+                status="bad_image",
+                solutions=(),
+                marker_ids=(),
+                corners_px=(),
+                rejected_ids=(),
+                detail="image lost",
+            )
+            self.outbox.publish(topics.SIGHTING, no_image)
+        elif topic is topics.ODOMETRY and inbox.odometry is not None:
+            if self._is_new(inbox.extrapolate_odometry(lost)):
+                self._continue_tick(inbox.odometry)
+        elif topic is topics.DOCKING and inbox.assume_docking(lost, self.number):
+            self._observe_thrusters()
+        elif topic is topics.WRENCH and lost.sender in ("", self.gate.leases.holder):
+            self._mark_uncommanded(lost.tick)
+
+    def _look(self, image: Image) -> None:
+        before = self.vision.sighting
+        sighting = self.vision.look(image)
+        if sighting is None:
+            self.outbox.count_stale()
+            return
+        if sighting.status == "bad_image" and (before is None or before.status != "bad_image"):
+            self.outbox.warn("bad image", sighting.detail, image.tick, image.sim_time_ns)
+        self.outbox.publish(topics.SIGHTING, sighting)
+
+    def _observe_thrusters(self) -> None:
+        """Publish the thrusters' capability and the events of fault detection.
+
+        Runs once per open tick, when its odometry and, with a docking sensor, the sensor's status
+        have arrived in any order. The last odometry belongs to no open tick and may arrive before
+        or after the mission's end.
+        """
+        tick, odometry, docking = self.inbox.tick, self.inbox.odometry, self.inbox.docking
+        if self.thrusters is None or tick is None or odometry is None:
+            return
+        if odometry.tick != tick.tick or self._observed_tick >= tick.tick:
+            return
+        if self._has_port and (docking is None or docking.tick != tick.tick):
+            return
+        self._observed_tick = tick.tick
+        self._reports.deliver(self.thrusters, odometry.sim_time_ns)
+        touched = docking is not None and (docking.contact or docking.latched)
+        self.outbox.publish(topics.THRUSTERS, self.thrusters.observe(odometry, touched))
+        for level, what, detail in self.thrusters.drain_events():
+            self.outbox.event(level, what, detail, odometry.tick, odometry.sim_time_ns)
+
+    # -- commands ----------------------------------------------------------------------------------
+
+    def _take_command(self, command: WrenchCommand, now_ns: int) -> None:
+        decision = self.gate.decide(command, self.inbox.tick, now_ns)
+        if decision.execute is not None:
+            self._execute(decision.execute)
+        elif decision.uncommanded_tick is not None:
+            self._mark_uncommanded(decision.uncommanded_tick)
+
+    def _execute(self, command: WrenchCommand) -> None:
+        # The estimate of the command before: that of this one may arrive later.
+        known = self.fallback.last.target
+        self.fallback.end(command)
+        # Before the reply, so that the next image is seen with it in lock-step.
+        if (refused := self.vision.inform(command)) is not None:
+            self.outbox.warn("geometry refused", refused, command.tick, command.sim_time_ns)
+        if self.thrusters is not None:
+            self.thrusters.avoid_plumes(known)
+            self.thrusters.apply_command(command)
+        self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
+
+    def _mark_uncommanded(self, tick: int) -> None:
+        """Record that no command arrives for a tick; the chaser replies itself once it knows its
+        state.
+        """
+        self._uncommanded_tick = max(tick, self._uncommanded_tick)
+        self._reply_without_command()
+
+    def _reply_without_command(self) -> None:
+        """Reply to the open tick with a fallback command if there is no controller or no command
+        for the tick.
+        """
+        tick, odometry = self.inbox.tick, self.inbox.odometry
+        if tick is None or odometry is None or odometry.tick != tick.tick:
+            return
+        commanded = self.gate.leases.is_held_at(tick)
+        if commanded and self._uncommanded_tick < tick.tick:
+            return
+        if self.number in tick.chasers and tick.tick > self.gate.executed_tick:
+            if commanded:
+                self.fallback.report_missing("lost or refused", odometry)
+            self._reply(*self._fallback_command(odometry))
+
+    def _check_command_timeout(self, odometry: Odometry) -> None:
+        """Real time: start the fallback when no command has arrived for its lifetime."""
+        silent_ns = self.fallback.silence_ns(odometry)
+        if silent_ns <= self.scenario.controller.command_lifetime_s * 1e9:
+            return
+        self.fallback.report_missing(f"for {silent_ns / 1e9:.2f} s", odometry)
+        # Not recorded as the reply to this tick: a command that still arrives takes precedence.
+        self._actuate(*self._fallback_command(odometry))
+
+    def _fallback_command(self, odometry: Odometry) -> tuple[ActuatorCommand, Array | None]:
+        age_ns = self.inbox.odometry_age_ns(odometry.sim_time_ns)
+        return self.fallback.command(odometry, self.inbox.latched, age_ns)
+
+    def _reply(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> None:
+        """Publish the actuator command that is the reply to its tick."""
+        self.gate.executed_tick = command.tick
+        self._actuate(command, thrusts_N)
+
+    def _actuate(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> None:
+        if self.thrusters is not None:
+            command = self.thrusters.add_pulses(command, thrusts_N)
+        own = msgspec.structs.replace(command, instance=self.instance)
+        self.outbox.publish(topics.ACTUATORS, own)

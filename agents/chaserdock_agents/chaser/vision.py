@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A chaser's perception, with what it remembers from image to image. No I/O."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from chaserdock_protocol.messages import ExpectedPose, Image, Sighting, WrenchCommand
+
+from .perception import PerceptionMethod
+from .sighting import apply_geometry, look, prediction_from
+
+REMEMBERED_IMAGES = 64
+"""Ticks of processed images that are remembered to recognize repeated ones. Messages are delayed
+by a few ticks at most; the number only bounds the memory.
+"""
+
+
+class Vision:
+    """Turns the images of one chaser into sightings; each is searched near the last ``sighting``
+    or where the controller expects the target.
+    """
+
+    def __init__(self, perception: PerceptionMethod) -> None:
+        self.perception = perception
+        self.sighting: Sighting | None = None
+        self._expected: ExpectedPose | None = None
+        self._processed: deque[int] = deque(maxlen=REMEMBERED_IMAGES)
+
+    def look(self, image: Image) -> Sighting | None:
+        """Return the sighting in an image; None if the image of its tick was processed before."""
+        if self.has_processed(image.tick):
+            return None
+        self._processed.append(image.tick)
+        predicted = prediction_from(self.sighting, self._expected, image.sim_time_ns)
+        self.sighting = look(self.perception, image, predicted)
+        return self.sighting
+
+    def has_processed(self, tick: int) -> bool:
+        """Return whether the image of a tick was processed."""
+        return tick in self._processed
+
+    def inform(self, command: WrenchCommand) -> str | None:
+        """Pass on what a command states about the target: its geometry, and where it is expected in
+        the next image. Return why the geometry was refused, if it was.
+        """
+        self._expected = command.expected
+        return apply_geometry(self.perception, command.geometry)

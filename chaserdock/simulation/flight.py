@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fly a case and check the invariants meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from chaserdock_protocol.scenario import ScenarioError, load_scenario
+from chaserdock_protocol.transport import RawSample
+
+from chaserdock.toml_text import toml_document
+
+from .checks.check import Violation
+from .checks.estimates import CovarianceConsistency
+from .checks.flight_checks import FlightChecks
+from .mission import simulate
+from .swarm import Case
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """A simulated flight and its verdict. ``outcome``: the first violated invariant, or the least
+    final state of the chasers that are to dock. ``fingerprint``: of all messages and their times,
+    equal in equal flights.
+
+    ``nees``: normalized squared errors of the estimate, one a second. ``honest``: no sensor lies
+    and the plant is as stated, so that they should be consistent.
+    """
+
+    seed: int
+    case: Case
+    violations: tuple[Violation, ...]
+    outcome: str
+    fingerprint: str
+    nees: tuple[float, ...]
+    honest: bool
+    sim_time_s: float
+
+
+def fly_case(
+    case: Case, seed: int, folder: Path | None = None, *, to_violation: bool = False
+) -> SimulationResult:
+    """Simulate a case and check the invariants. Raises ScenarioError.
+
+    ``folder``: keep the log there. ``to_violation``: end the flight at the first violation.
+    """
+    with contextlib.ExitStack() as stack:
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
+        path = (folder or scratch) / "scenario.toml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(toml_document(case), encoding="utf-8")
+        try:
+            checks, fingerprint = FlightChecks(load_scenario(path)), 0
+        except ScenarioError as error:
+            # The text is not to name a file that is deleted now.
+            raise ScenarioError(str(error).replace(f"{scratch / path.name}: ", "")) from None
+
+        def tap(sender: str, raw: RawSample) -> None:
+            nonlocal fingerprint
+            fingerprint = zlib.crc32(
+                raw.payload, zlib.crc32(f"{sender}{raw.key}{raw.sent_ns}".encode(), fingerprint)
+            )
+            checks.observe(sender, raw)
+
+        def over() -> bool:
+            return to_violation and bool(checks.violations)
+
+        flight = simulate(path, path.parent / "run", tap=tap, over=over)
+        if not over():
+            checks.end(flight)
+    return SimulationResult(
+        seed=seed,
+        case=case,
+        violations=tuple(checks.violations),
+        outcome=checks.outcome,
+        fingerprint=f"{fingerprint:08x}",
+        nees=tuple(checks.find(CovarianceConsistency).nees),
+        honest=checks.view.causes.honest,
+        sim_time_s=checks.view.time_s,
+    )
+
+
+def memory_folder() -> str | None:
+    """Return a folder in memory for logs that are not kept, if this system has one."""
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None

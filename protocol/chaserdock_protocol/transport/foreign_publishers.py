@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions that publish on the world's keys without being the mission's world."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import Message
+
+from .network import RawSample
+
+MOST_REPORTED = 16
+"""Sessions of foreign publishers that are reported; whoever forges an identity per message fills no
+log.
+"""
+
+
+class ForeignPublishers:
+    """Recognizes samples of other sessions than ``world_source`` (empty: accepts all), and reports
+    each session once. Samples are checked on any thread, reports are made on the reader's.
+    """
+
+    def __init__(self) -> None:
+        self.world_source = ""
+        self._report: Callable[[str, str, Message | None], None] = lambda key, source, newest: None
+        self._known: set[str] = set()
+        self._unreported: deque[tuple[str, str]] = deque()
+
+    def expect(self, source: str, report: Callable[[str, str, Message | None], None]) -> None:
+        """Accept only what the session ``source`` publishes on the world's keys; see
+        ``Node.expect_world``.
+        """
+        self.world_source, self._report = source, report
+
+    def sent(self, raw: RawSample) -> bool:
+        """Return whether a foreign session has sent a sample on a key of the world."""
+        if raw.source == self.world_source or not self.world_source:
+            return False
+        if not raw.key.startswith(topics.WORLD_BRANCHES):
+            return False
+        if raw.source not in self._known and len(self._known) < MOST_REPORTED:
+            self._known.add(raw.source)
+            self._unreported.append((raw.key, raw.source))
+        return True
+
+    def report_next(self, newest: Message | None) -> None:
+        """Report one session that is not reported yet. ``newest``: the last valid message."""
+        if self._unreported:
+            self._report(*self._unreported.popleft(), newest)

@@ -15,8 +15,9 @@ from chaserdock_controller.guidance.reference import (
     reference_trajectory,
 )
 from chaserdock_controller.nmpc import NmpcParameters
-from chaserdock_controller.nmpc.kernels import model_of, roll
-from chaserdock_controller.nmpc.problem import derivative, dynamics
+from chaserdock_controller.nmpc.casadi_model import derivative, dynamics
+from chaserdock_controller.nmpc.kernels import roll
+from chaserdock_controller.nmpc.problem import model_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from hypothesis import given, settings

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcPlan, make_solver
-from chaserdock_controller.nmpc.checks import check_input, shift_inputs, warm_start
+from chaserdock_controller.nmpc.problem import check_input
+from chaserdock_controller.nmpc.warm_start import shift_inputs, warm_start
 from chaserdock_models import rotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,6 +24,7 @@ from nmpc_cases import (
     fresh,
     swap,
     tumbling,
+    with_settings,
 )
 
 
@@ -125,7 +127,7 @@ def test_chasers_that_start_too_close_move_apart() -> None:
 
 def test_outer_bound_is_respected() -> None:
     """A chaser that coasts away is bounded by the tangent plane, as far as its thrust can."""
-    params = replace(
+    params = with_settings(
         PARAMS, max_reference_distance_m=1.0, weight_position=0.0, weight_final_position=0.0
     )
     state = at_rest(np.array([0.8, 1.0, 0.0]))

@@ -5,6 +5,7 @@ no code in common but the mesh.
 
 from __future__ import annotations
 
+import pytest
 from dataclasses import replace
 
 import numpy as np
@@ -114,6 +115,7 @@ def looking_at_origin(position: Array) -> Array:
     return rotations.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
 
 
+@pytest.mark.slow
 def test_images_equal_those_of_a_ray_tracer() -> None:
     """Grey levels inside surfaces, and the whole image with its silhouettes and shadow edges."""
     mesh = satellite("cubesat_12u", 2e-2)

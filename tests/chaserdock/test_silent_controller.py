@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import pytest
 import math
 
 import numpy as np
+import pytest
 from chaserdock_protocol.messages import Sighting
 from chaserdock_world.rendering.cameras import States
 from flights.detumble_flights import StackMission, stack_scenario

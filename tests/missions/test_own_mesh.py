@@ -5,10 +5,10 @@ shape and approaches it.
 
 from __future__ import annotations
 
-import pytest
 from pathlib import Path
 
 import numpy as np
+import pytest
 from chaserdock_models.satellites import satellite
 from harness import run, summary
 

@@ -5,8 +5,8 @@ the limit.
 
 from __future__ import annotations
 
-import pytest
 import numpy as np
+import pytest
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
 

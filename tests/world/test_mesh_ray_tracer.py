@@ -5,10 +5,10 @@ no code in common but the mesh.
 
 from __future__ import annotations
 
-import pytest
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.camera import Camera

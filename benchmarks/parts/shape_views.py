@@ -37,7 +37,7 @@ from chaserdock_models.satellites import satellite
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light
 from chaserdock_world.rendering.effects import CameraEffects
-from common import Figures, Group, Options, Results, described
+from common import Figures, Group, KeptResults, Options, described
 from markerless_cases import backlit_view, perturbed, random_view
 from numpy.typing import NDArray
 
@@ -105,7 +105,7 @@ class Cells:
         or that of the cell ``like``.
         """
         stream = zlib.crc32((like or cell).encode())
-        return Results(self.path, {"cell": cell}, ViewRow).of(
+        return KeptResults(self.path, {"cell": cell}, ViewRow).of(
             range(views), lambda number: view(np.random.default_rng([stream, number]), number)
         )
 

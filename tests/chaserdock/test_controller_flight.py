@@ -206,6 +206,7 @@ def test_delay_counts_missed_ticks() -> None:
     assert len(record_flight(s, solve_delay_s=lambda _: 0.1).solve_s) == 30
 
 
+@pytest.mark.slow
 def test_collision_avoidance_keeps_away_from_the_target() -> None:
     """From exact symmetry: the straight way leads through the centre."""
     trace = record_flight(scenario("collision-avoidance"))

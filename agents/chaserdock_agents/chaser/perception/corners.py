@@ -24,11 +24,12 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 from numpy.typing import NDArray
 
-from .native import function
+from .native import LIBRARY, function
 
 
+@LIBRARY.structure("Settings")
 class _Settings(Structure):
-    """native/corners.c: fields in the order of the C struct."""
+    """`Settings` of native/corners.c."""
 
     _fields_ = [
         (name, c_double) for name in (

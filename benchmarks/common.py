@@ -326,14 +326,12 @@ def chaserdock_command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "chaserdock", *map(str, arguments)]
 
 
-def run_chaserdock(*arguments: str | Path, expected: Sequence[int] = (0,)) -> None:
-    """Run ``chaserdock`` from the clone. Raise SystemExit with its output for another status than
-    expected.
-    """
+def run_chaserdock(*arguments: str | Path) -> None:
+    """Run ``chaserdock`` from the clone. Raise SystemExit with its output if it fails."""
     done = subprocess.run(
         chaserdock_command(*arguments), cwd=ROOT, capture_output=True, text=True, check=False
     )
-    if done.returncode not in expected:
+    if done.returncode:
         raise SystemExit(
             f"chaserdock {arguments[0]}: status {done.returncode}\n{done.stdout}{done.stderr}"
         )

@@ -108,7 +108,7 @@ class StackMission(InProcessMission):
         self._damping: dict[int, LocalDamping] = {}
         if math.isfinite(silent_from_s):
             flight = flight_scenario(scenario)
-            self._damping = {i: LocalDamping(flight, i) for i in self.thrusters}
+            self._damping = {i: LocalDamping(flight, i) for i in self.chasers}
         target = self.physics.state(TARGET)
         for i in self.chasers:
             own = with_port_error(scenario, i, nominal_mounting(scenario, i))
@@ -131,7 +131,9 @@ class StackMission(InProcessMission):
             command, thrusts_N = damping_command(
                 damping, odometry[i], effective_ns, self.scenario.chaser
             )
-            commands[i] = self.thrusters[i].add_pulses(command, thrusts_N)
+            thrusters = self.cores[i].thrusters
+            assert thrusters is not None
+            commands[i] = thrusters.add_pulses(command, thrusts_N)
         return commands
 
     def truth(self, states: States) -> tuple[TargetBody, dict[int, MountedChaser], StackMotion]:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mission in one process: physics, sensors and actuators of the world, the chasers' code, and the
-controller core.
+"""A mission in one process: physics, sensors and actuators of the world, and the cores of chasers
+and controller.
 
 They are called in the order and with the latencies of a lock-step mission, so that the bodies of a
 scenario move exactly as with ``chaserdock run`` (tests/missions/test_in_process.py). All sensor and
 actuator errors of the scenario apply. Left out is what a network and separate processes add:
-injected message faults, process failures, leases, access control.
+injected message faults, process failures, access control.
 """
 
 from __future__ import annotations
@@ -17,24 +17,32 @@ from typing import Self
 
 import msgspec
 import numpy as np
-from chaserdock_agents.chaser.command_gate import passed_on
-from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
+from chaserdock_agents.chaser.core import ChaserCore
+from chaserdock_agents.chaser.outbox import ChaserOutputs
+from chaserdock_agents.chaser.vision import Vision
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
+from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    DockingStatus,
+    Event,
+    Message,
     Odometry,
     OperatorCommand,
     ProbeTouch,
     Sighting,
-    TargetEstimate,
+    ThrusterReport,
+    Tick,
+    WrenchCommand,
 )
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_protocol.scenario.faults import faults_of
+from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.transport import ReceivedMessage
 from chaserdock_world.actuators.ideal import ActuatorOutput, fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.port_loads import IntervalLoads
@@ -106,11 +114,16 @@ class InProcessMission:
         self.controller = ControllerCore(flight, time.perf_counter, estimator)
         self.physics = Physics(scenario)
         self.actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in self.chasers}
-        self.thrusters = {} if ideal else {i: ThrusterController(flight, i) for i in self.chasers}
-        self._reports = {
-            i: FailureReports(faults_of(scenario, f"chaser/{i}").reported_failures)
+        rendered = perception.visions if isinstance(perception, RenderedImages) else None
+        self.cores = [
+            ChaserCore(
+                flight,
+                i,
+                failures=faults_of(scenario, f"chaser/{i}").reported_failures,
+                vision=rendered[i] if rendered else Vision(None),
+            )
             for i in self.chasers
-        }
+        ]
         self.tick = 0
         self.contacts: set[tuple[str, str]] = set()
         self.touches: list[ProbeTouch] = []
@@ -119,7 +132,6 @@ class InProcessMission:
         self.propellant_kg = 0.0
         self._gain, self._solve_delay_s = actuator_gain, solve_delay_s
         self._busy_until_ns = 0
-        self._known_target: TargetEstimate | None = None
         self._odometry_sensor = OdometrySensor(scenario)
         self._validation = OdometryValidation(flight)
 
@@ -174,11 +186,9 @@ class InProcessMission:
         }
         odometry = {i: self.measure(i, time_ns, states) for i in self.chasers}
         reports = {}
-        for i, thrusters in self.thrusters.items():
-            touched = i in docking and (docking[i].contact or docking[i].latched)
-            self._reports[i].deliver(thrusters, time_ns)
-            reports[i] = thrusters.observe(odometry[i], touched)
-            self._note_thruster_events(i, time_ns)
+        for i in self.chasers:
+            if (report := self._sense(odometry[i], docking.get(i))) is not None:
+                reports[i] = report
         sightings = ()
         if self.perception is not None and timing.has_images(self.tick):
             sightings = tuple(self.perception(i, self.tick, time_ns, states) for i in self.chasers)
@@ -218,9 +228,31 @@ class InProcessMission:
         self.events += [(odometry.sim_time_ns / 1e9, level, text) for level, text in events]
         return validated
 
-    def _note_thruster_events(self, chaser: int, time_ns: int) -> None:
-        for _, what, detail in self.thrusters[chaser].drain_events():
-            self.thruster_events.append((time_ns / 1e9, chaser, f"{what}: {detail}"))
+    def _deliver(self, chaser: int, topic: Topic, message: Message) -> ChaserOutputs:
+        return self.cores[chaser].step(ReceivedMessage(topic, str(chaser), message, 0))
+
+    def _sense(self, odometry: Odometry, docking: DockingStatus | None) -> ThrusterReport | None:
+        """Begin a chaser's tick with what its sensors state; return the report of its thrusters, if
+        it has any.
+        """
+        chaser, time_ns, report = odometry.chaser, odometry.sim_time_ns, None
+        tick = Tick(
+            tick=self.tick,
+            sim_time_ns=time_ns,
+            images=self.scenario.timing.has_images(self.tick),
+            chasers=tuple(self.chasers),
+            controllers={topics.CONTROLLERS[0]: ""},
+        )
+        self._deliver(chaser, topics.TICK, tick)
+        if docking is not None:
+            self._deliver(chaser, topics.DOCKING, docking)
+        for _, _, message in self._deliver(chaser, topics.ODOMETRY, odometry).messages:
+            match message:
+                case ThrusterReport():
+                    report = message
+                case Event(what=what, detail=detail):
+                    self.thruster_events.append((time_ns / 1e9, chaser, f"{what}: {detail}"))
+        return report
 
     def _control(self, inputs: TickInputs) -> TickOutputs | None:
         """Return the controller's outputs; to be overridden where it is silent."""
@@ -261,14 +293,7 @@ class InProcessMission:
     def _actuator_commands(self, outputs: TickOutputs, time_ns: int) -> dict[int, ActuatorCommand]:
         commands = {}
         for i, wrench in outputs.wrenches.items():
-            if isinstance(self.perception, RenderedImages):
-                self.perception.inform(i, wrench)
-            command = passed_on(wrench)
-            if i in self.thrusters:
-                self.thrusters[i].avoid_plumes(self._known_target)
-                self.thrusters[i].apply_command(wrench)
-                thrusts_N = np.array(wrench.thrusts_N) if wrench.thrusts_N else None
-                command = self.thrusters[i].add_pulses(command, thrusts_N)
+            command = self._executed(wrench, outputs)
             if self._gain != 1.0:
                 command = msgspec.structs.replace(
                     command,
@@ -276,13 +301,29 @@ class InProcessMission:
                     torque_N_m=vector(self._gain * np.array(command.torque_N_m)),
                 )
             commands[i] = command
-        self._known_target = outputs.target
         if self._solve_delay_s is None:
             return commands
         took_s = 0.0 if outputs.solver is None else outputs.solver.wall_solve_s
         self._busy_until_ns = time_ns + round(self._solve_delay_s(took_s) * 1e9)
         late = {"effective_time_ns": self._busy_until_ns}
         return {i: msgspec.structs.replace(command, **late) for i, command in commands.items()}
+
+    def _executed(self, wrench: WrenchCommand, outputs: TickOutputs) -> ActuatorCommand:
+        """Return what a chaser makes of its command. Raises RuntimeError if it refuses it."""
+        i = wrench.chaser
+        lease = self.cores[i].gate.leases
+        head = {"term": lease.term, "commander": lease.holder, "instance": lease.instance}
+        self._deliver(i, topics.TARGET, outputs.target)
+        if i in outputs.plans:
+            self._deliver(i, topics.PLAN, outputs.plans[i])
+        done = self._deliver(i, topics.WRENCH, msgspec.structs.replace(wrench, **head))
+        for _, _, message in done.messages:
+            match message:
+                case ActuatorCommand(source="command"):
+                    return message
+                case Event(level="warning", what=what, detail=detail):
+                    raise RuntimeError(f"chaser {i}: {what}: {detail}")
+        raise RuntimeError(f"chaser {i} refuses a command: {done.rejected or wrench.mode}")
 
     def advance(self, step: int) -> None:
         """Move the bodies to a physics step; to be overridden where single steps are measured."""

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from chaserdock_agents.chaser.perception import make_perception
-from chaserdock_agents.chaser.sighting import apply_geometry, look, prediction_from
-from chaserdock_protocol.messages import ExpectedPose, Image, Sighting, WrenchCommand
+from chaserdock_agents.chaser.vision import Vision
+from chaserdock_protocol.messages import Image, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.rendering.pose_cameras import make_cameras
@@ -21,7 +21,7 @@ class RenderedImages:
     perception on it.
 
     With statistical perception no image is rendered. ``on_image`` sees every image, and returns the
-    one that perception gets.
+    one that perception gets. ``visions``: of the chasers, which commands inform.
     """
 
     def __init__(
@@ -29,9 +29,7 @@ class RenderedImages:
     ) -> None:
         self._ticks_per_image = scenario.timing.ticks_per_image
         self._cameras = make_cameras(scenario)
-        self._perceptions = [make_perception(scenario) for _ in scenario.chasers]
-        self._last: dict[int, Sighting] = {}
-        self._expected: dict[int, ExpectedPose | None] = {}
+        self.visions = [Vision(make_perception(scenario)) for _ in scenario.chasers]
         self._on_image = on_image
 
     def __call__(self, chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
@@ -42,18 +40,8 @@ class RenderedImages:
         return self._cameras.image(chaser, tick // self._ticks_per_image, tick, time_ns, states)
 
     def see(self, chaser: int, image: Image) -> Sighting:
-        """Return the sighting in a chaser's image."""
-        predicted = prediction_from(
-            self._last.get(chaser), self._expected.get(chaser), image.sim_time_ns
-        )
-        self._last[chaser] = look(self._perceptions[chaser], self._on_image(image), predicted)
-        return self._last[chaser]
-
-    def inform(self, chaser: int, command: WrenchCommand) -> None:
-        """Pass on what a command tells about the target, as the chaser's process does.
-
-        Raises RuntimeError for geometry that the perception refuses.
-        """
-        self._expected[chaser] = command.expected
-        if refused := apply_geometry(self._perceptions[chaser], command.geometry):
-            raise RuntimeError(refused)
+        """Return the sighting in a chaser's image. Raises ValueError for a second one of a tick."""
+        sighting = self.visions[chaser].look(self._on_image(image))
+        if sighting is None:
+            raise ValueError(f"chaser {chaser} has seen the image of tick {image.tick} before")
+        return sighting

@@ -182,7 +182,9 @@ def geometry_message(found: GeometryInformation) -> GeometryMeasurement:
     )
 
 
-def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | None) -> str | None:
+def apply_geometry(
+    perception: PerceptionMethod | None, estimate: GeometryEstimate | None
+) -> str | None:
     """Correct what a perception knows of the target's geometry, if it uses it; return why that was
     refused.
     """

@@ -64,10 +64,10 @@ class AcquisitionParameters:
     # poses.
     template_suns: int = 100
     # Weight of the mean squared residual of grey levels against twice the share of the silhouette
-    # that differs. @BLW@
+    # that differs. Half and twice: the same poses.
     by_light_weight: float = 0.1
     # Finest level of the pyramid at which appearances are compared: half resolution, at which noise
-    # hardly counts. @AL@
+    # hardly counts.
     appearance_level: int = 1
     # Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over
     # bright parts of the Earth.
@@ -79,14 +79,17 @@ class AcquisitionParameters:
     cut_sizes: tuple[float, ...] = (1.0, 1.2, 1.4, 1.6)
     # Common share of two regions of which only one is searched.
     same_region: float = 0.8
-    # Least area of a region, px: below it, silhouettes of ``side_px`` cannot be told apart. @MA@
+    # Least area of a region, px: below it, silhouettes of ``side_px`` cannot be told apart. Half
+    # and twice: the same poses.
     min_area_px: int = 60
     # Grey levels by which a target is brighter than the median of the image: twice the noise of
-    # dark pixels. @MC@
+    # dark pixels. Half and twice: 5 acquired.
     min_contrast: float = 5.0
-    # Poses whose scores differ by less explain the image about equally well. @AS@
+    # Poses whose scores differ by less explain the image about equally well. Half and twice: the
+    # same poses.
     ambiguous_score: float = 0.04
-    # Turn below which two poses are one: half the distance of the templates. @DR@
+    # Turn below which two poses are one: half the distance of the templates. Half and twice: the
+    # same poses.
     distinct_rad: float = math.radians(8.0)
     # Once a pose has been found, coarse poses with a score lower than its own by this much are not
     # refined.
@@ -95,7 +98,8 @@ class AcquisitionParameters:
     rated_at_once: int = 25
     # they fill the CPU times below.
     fitted_at_once: int = 9
-    # Pixels of a region by which its place is computed; more change it by less than a pixel. @RP@
+    # Pixels of a region by which its place is computed; more change it by less than a pixel. Half
+    # and twice: 5 acquired, in the same time.
     region_points: int = 10_000
     # Expected CPU times of steps, ms, measured: to find the region of the target,
     region_ms: float = 10.0

@@ -29,7 +29,7 @@ from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 
 @dataclass(frozen=True)
 class AlignmentParameters:
-    """Numbers of control points and their alignment, chosen by benchmarks/perception.py (``shape``).
+    """Numbers of the alignment of control points, chosen by benchmarks/perception.py (``shape``).
 
     Half and twice: median error of twelve views at 0.9 to 4 m from a prior 1 % and 1.5 degrees off,
     0.106 % of the range with these.
@@ -39,28 +39,29 @@ class AlignmentParameters:
     profile: int = 9
     # and PER_CELL_MOST in native/align.c.
     per_cell_most: int = 4
-    # Control points are spread over cells of this side, px: about a profile. @CP@
+    # Control points are spread over cells of this side, px: about a profile. Half: 0.109; twice:
+    # 0.106 %.
     cell_px: int = 8
-    # Most control points of a cell, so that two edges in it count. @PC@
+    # Most control points of a cell, so that two edges in it count. Half: 0.133; twice: 0.102 %.
     per_cell: int = 2
     # Least gradient of control points, grey levels per pixel, in light from everywhere and in
     # estimated light. In a dim image, noise hides weaker edges, which would count as outliers.
     least_gradient: tuple[float, float] = (0.5, 1.5)
     # Border of a window around the target, px: reach of the search and half a profile.
     margin_px: int = 14
-    # Least correlation of a profile with the image. @MCO@
+    # Least correlation of a profile with the image. Half: 0.107 %.
     min_correlation: float = 0.6
     # Standard deviation of a grey level by noise and by texture that the mesh does not have.
     noise: float = 2.0
     # The same as ``INLIER_PX`` while errors of the geometry are not estimated yet: they displace
-    # points by pixels. @DI@
+    # points by pixels. Half: 0.106 %; twice: the same.
     displaced_inlier_px: float = 5.0
-    # Reach of the search, px, after they are: twice ``INLIER_PX``. @RR@
+    # Reach of the search, px, after they are: twice ``INLIER_PX``. A third: 0.101; twice: 0.103 %.
     refined_reach_px: int = 3
     # Distance from an edge, px, at which the surfaces beside it are looked up.
     beside_px: float = 3.0
     # Number of neighbouring control points that err together, so that their information counts
-    # once: fitted to the errors of poses (NEES, docs/markerless.md).
+    # once: fitted to the errors of poses (NEES, docs/evidence/markerless.md).
     correlated_points: float = 5.5
     # Largest number of points that count: shading and facets that the mesh does not have do not
     # become more accurate with more pixels.
@@ -76,10 +77,13 @@ _MATCH = AlignmentParameters()
 
 INLIER_PX = 1.5
 """Largest distance of a match from the pose, pixels of the level, at which it counts (Tukey's
-cut-off): half the width of an edge with its spread. @IN@
+cut-off): half the width of an edge with its spread. Of twelve views half loses two, twice errs by
+0.120 instead of 0.106 % of the range.
 """
 MIN_POINTS = 24
-"""Least number of control points, and of those that count: four for each unknown of a pose. @MP@"""
+"""Least number of control points, and of those that count: four for each unknown of a pose. Half
+and twice: the same poses.
+"""
 NEAR_PX = 1300.0
 """Diameter of the target in the image, in pixels of level 0, beyond which it shows texture that the
 mesh does not have.

@@ -31,20 +31,22 @@ from .steps import LIGHT_MS, LIKELY_MS, SUNS_MS, VIEWS_MS, Steps, compared_ms
 class LightParameters:
     """Numbers of the search for the light, chosen by benchmarks/perception.py (``shape``)."""
 
-    # Points by which the light is estimated: the time grows with them. @LMP@
+    # Points by which the light is estimated: the time grows with them.
     most_points: int = 600
-    # A target with fewer points away from edges has no estimate of its light. @LFP@
+    # A target with fewer points away from edges has no estimate of its light. Half and twice: the
+    # same poses.
     fewest_points: int = 40
     # One of so many points rates directions all around.
     every_point: int = 3
     # Least ambient level as a share of the directed one.
     least_ambient: float = 0.02
-    # Standard deviation of a grey level by noise and by facets, beside the texture's. @LGN@
+    # Standard deviation of a grey level by noise and by facets, beside the texture's. Half: poses
+    # err by 0.098, twice: by 0.114 instead of 0.106 % of the range.
     grey_noise: float = 3.0
     # A direction is refined among eight at these angles, rad: two thirds and a quarter of the
-    # distance of the directions all around. @LNR@
+    # distance of the directions all around. Half: 0.124; twice: 0.102 %.
     neighbours_rad: tuple[float, ...] = (0.12, 0.05)
-    # Side of the shadow maps of these, texels. @LFT@
+    # Side of the shadow maps of these, texels. Half: 0.102; twice: 0.091 %.
     fine_texels: int = 96
     # Number of directions that are compared by synthetic views,
     compared: int = 8

@@ -192,7 +192,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Results(Generic[T]):
+class KeptResults(Generic[T]):
     """Outcomes of type ``kind`` by seed, which a file of JSON lines keeps.
 
     ``key``: what was flown, beside the seed. Rows with another key are left alone.

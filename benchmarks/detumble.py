@@ -25,7 +25,7 @@ from typing import TypeVar
 
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from common import Figures, Group, Options, Results, described, main, seeds_of, summaries
+from common import Figures, Group, KeptResults, Options, described, main, seeds_of, summaries
 from flights.detumble_flights import (
     DetumbleOutcome,
     fly_stack,
@@ -188,7 +188,7 @@ def fly_sets(
     for chasers in options.sets[:1] if options.quick else options.sets:
         key = {"part": part, "chasers": chasers, "set": sorted(options.set)}
         key |= {"limits": options.limits, "duration_s": options.duration_s}
-        outcomes = Results(options.results, key, kind).of(
+        outcomes = KeptResults(options.results, key, kind).of(
             seeds_of(options, 50, 1), partial(fly, options, chasers), line, options.jobs
         )
         found |= figures(f"{part}_{chasers}", outcomes)

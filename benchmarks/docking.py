@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from common import Figures, Group, Options, Results, described, main, seeds_of, summaries
+from common import Figures, Group, KeptResults, Options, described, main, seeds_of, summaries
 from flights.docking_flights import (
     APPROACH_AT_S,
     DockingOutcome,
@@ -118,7 +118,7 @@ def fly_part(
         "failed_at_s": options.failed_at_s,
         "set": sorted(options.set),
     }
-    outcomes = Results(options.results, settings, DockingOutcome).of(
+    outcomes = KeptResults(options.results, settings, DockingOutcome).of(
         seeds, fly, DockingOutcome.line
     )
     print_causes(name, outcomes)

@@ -32,8 +32,8 @@ from chaserdock_protocol.scenario.navigation import GRADES
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import (
     Figures,
+    KeptResults,
     Options,
-    Results,
     add_shared,
     make_parser,
     map_jobs,
@@ -194,7 +194,7 @@ def fly_grades(names: list[str], options: Options) -> Figures:
         cells = []
         for grade in options.grades:
             key = {"scenario": name, "grade": grade, "set": options.set}
-            results = Results(
+            results = KeptResults(
                 options.results, key | {"statistical": options.statistical}, ShippedOutcome
             )
             outcomes = results.of(

@@ -20,7 +20,7 @@ from chaserdock.experiments.in_process import InProcessMission
 from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
-from .momentum import Momentum, momentum_of
+from .momentum import GroupMomentum, momentum_of
 
 APPROACH_AT_S = 4.0
 """The estimator has settled by then."""
@@ -96,7 +96,7 @@ class ConservationMission(InProcessMission):
         super().__init__(scenario, perception)
         self.linear_error: float | None = None
         self.angular_error: float | None = None
-        self._initial: Momentum | None = None
+        self._initial: GroupMomentum | None = None
         self._impulse, self._angular_impulse = np.zeros(3), np.zeros(3)
         self._steps_left: int | None = None
 
@@ -152,10 +152,10 @@ class ConservationMission(InProcessMission):
 class DockingOutcome:
     """How one docking flight ended.
 
-    ``cause``: outcome in a few words. ``touch``: the one at which the latch closed. ``contacts``: pairs of bodies that collided.
-    ``peak_m``: the largest distance from the reference on the true target between the thruster's
-    ``failure`` and capture. ``thruster_events``: (time in s, text). ``verified_again``: whether a
-    second approach after an abort was.
+    ``cause``: outcome in a few words. ``touch``: the one at which the latch closed. ``contacts``:
+    pairs of bodies that collided. ``peak_m``: the largest distance from the reference on the true
+    target between the thruster's ``failure`` and capture. ``thruster_events``: (time in s, text).
+    ``verified_again``: whether a second approach after an abort was.
     """
 
     seed: int

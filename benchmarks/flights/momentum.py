@@ -13,7 +13,7 @@ from chaserdock_world.physics.simulation import Physics
 
 
 @dataclass(frozen=True, eq=False)
-class Momentum:
+class GroupMomentum:
     """Of a group of bodies in WRF axes: common centre of mass (3,), m, momentum (3,), N s, and
     angular momentum (3,) about that centre, N m s.
     """
@@ -23,7 +23,7 @@ class Momentum:
     angular_N_m_s: Array
 
 
-def momentum_of(physics: Physics, names: Iterable[str]) -> Momentum:
+def momentum_of(physics: Physics, names: Iterable[str]) -> GroupMomentum:
     """Return the momentum of the named bodies now, with their true mass properties."""
     masses, places, velocities, spins = [], [], [], []
     for name in names:
@@ -38,4 +38,4 @@ def momentum_of(physics: Physics, names: Iterable[str]) -> Momentum:
     momentum = mass * np.array(velocities)
     centre = (mass * place).sum(axis=0) / mass.sum()
     angular = np.array(spins) + np.cross(place - centre, momentum)
-    return Momentum(centre, momentum.sum(axis=0), angular.sum(axis=0))
+    return GroupMomentum(centre, momentum.sum(axis=0), angular.sum(axis=0))

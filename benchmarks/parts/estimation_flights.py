@@ -24,7 +24,7 @@ from chaserdock_protocol.messages import Image, Sighting, TargetEstimate
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.sensors.errors import true_camera
-from common import Figures, Group, Options, Results, described, seeds_of
+from common import Figures, Group, KeptResults, Options, described, seeds_of
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
 from chaserdock.experiments.in_process import InProcessMission, TickRecord
@@ -444,7 +444,7 @@ def flights_of(
     def fly_kinds(options: Options) -> Figures:
         out: Figures = {}
         for kind, flight in kinds.items():
-            results = Results(options.results, {"estimation": f"{part} {kind}"}, dict[str, Any])
+            results = KeptResults(options.results, {"estimation": f"{part} {kind}"}, dict[str, Any])
             rows = results.of(seeds_of(options, number, quick), flight, shown)
             key = f"{part} {kind}".strip().replace(" ", "_")
             out[f"{key}_flights"] = len(rows)

@@ -23,8 +23,8 @@ from common import (
     BenchmarkFailed,
     Figures,
     Group,
+    KeptResults,
     Options,
-    Results,
     chaserdock_command,
     seeds_of,
 )
@@ -147,7 +147,7 @@ def faults(options: Options) -> Figures:
     complete log.
     """
     numbers = seeds_of(options, 200, len(KINDS))
-    results = Results(options.results, {"faults": options.mode}, FaultResult)
+    results = KeptResults(options.results, {"faults": options.mode}, FaultResult)
     flown = results.of(numbers, lambda number: fly(number, options.mode), line_of)
     print(table(flown))
     bad = [r for r in flown if r.outcome not in GOOD or not r.log_complete]

@@ -28,7 +28,7 @@ from chaserdock_protocol.messages import Odometry, Sighting
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.navigation import GRADES
 from chaserdock_world.rendering.cameras import States
-from common import ROOT, Figures, Group, Options, Results, map_jobs, print_figures, seeds_of
+from common import ROOT, Figures, Group, KeptResults, Options, map_jobs, print_figures, seeds_of
 from flights.measured_poses import measurement_model
 from flights.rendezvous import estimate_error
 
@@ -53,7 +53,7 @@ CALIBRATED_S = 65.0
 
 
 @dataclass(frozen=True)
-class Flight:
+class ErrorFlight:
     """A flight to evaluate from ``settled_s`` on."""
 
     label: str
@@ -96,7 +96,7 @@ def relative_error(tick: TickRecord, chaser: int) -> tuple[Array, float]:
     return pose_error(*truth, *relative_pose(*own_pose, *target_pose)), math.nan
 
 
-def fly(flight: Flight) -> Array:
+def fly(flight: ErrorFlight) -> Array:
     """Fly a mission; return its figures (7,): estimate m, rad, tracking m, rad, NEES, gated share,
     re-initializations.
     """
@@ -136,7 +136,7 @@ def fly(flight: Flight) -> Array:
     return np.array([*np.sqrt(np.mean(rows, axis=0)), np.mean(nees), share, restarts])
 
 
-def fly_all(flights: Sequence[Flight], jobs: int) -> Figures:
+def fly_all(flights: Sequence[ErrorFlight], jobs: int) -> Figures:
     """Return the mean figures of each label, and print them as they come."""
     figures: Figures = {}
     results = zip(flights, map_jobs(fly, flights, jobs), strict=True)
@@ -178,7 +178,7 @@ def grades(options: Options) -> Figures:
                     overrides = (f'navigation.grade="{grade}"', *truth)
                     scenario = scenario_of(name, estimator, seed, duration_s, *overrides)
                     flights.append(
-                        Flight(f"{grade}_{number}_{estimator}", scenario, settled_s, True)
+                        ErrorFlight(f"{grade}_{number}_{estimator}", scenario, settled_s, True)
                     )
             if estimator != "joint":
                 continue
@@ -189,12 +189,14 @@ def grades(options: Options) -> Figures:
                 overrides = ('navigation.grade="orbit"', *truth, calibrate)
                 scenario = scenario_of(name, estimator, seed, CALIBRATED_S + 12.0, *overrides)
                 flights.append(
-                    Flight(f"orbit_calibrated_{number}_{estimator}", scenario, CALIBRATED_S, True)
+                    ErrorFlight(
+                        f"orbit_calibrated_{number}_{estimator}", scenario, CALIBRATED_S, True
+                    )
                 )
         for seed in seeds:
             overrides = ('navigation.grade="lab"', *truth)
             scenario = scenario_of("harsh-light", estimator, seed, duration_s, *overrides)
-            flights.append(Flight(f"harsh_light_lab_2_{estimator}", scenario, settled_s, True))
+            flights.append(ErrorFlight(f"harsh_light_lab_2_{estimator}", scenario, settled_s, True))
     return fly_all([f for f in flights if f.label.startswith(tuple(options.rows))], options.jobs)
 
 
@@ -215,7 +217,7 @@ def sources(options: Options) -> Figures:
                         "four-chaser-docking", estimator, seed, duration_s, *overrides
                     )
                     flights.append(
-                        Flight(f"{source}_{factor:g}_{estimator}", scenario, 20.0, False)
+                        ErrorFlight(f"{source}_{factor:g}_{estimator}", scenario, 20.0, False)
                     )
     figures = fly_all(flights, options.jobs)
     if options.figure is not None:
@@ -343,7 +345,7 @@ def failures(options: Options) -> Figures:
     """
     figures: Figures = {}
     for kind in ("blind", *ODOMETRY_FAILURES):
-        results = Results(options.results, {"failure": kind}, list[float])
+        results = KeptResults(options.results, {"failure": kind}, list[float])
         flown = results.of(seeds_of(options, 20, 1), partial(fly_failure, kind), jobs=options.jobs)
         rows = np.array(flown)
         figures |= {

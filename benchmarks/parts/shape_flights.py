@@ -33,7 +33,7 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import true_camera
-from common import Figures, Group, Options, Results, described, seeds_of
+from common import Figures, Group, KeptResults, Options, described, seeds_of
 from flights import load_shipped
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
@@ -373,7 +373,9 @@ def line_of(o: MarkerlessOutcome) -> str:
 def fly_part(part: str, options: Options) -> Figures:
     """Fly five seeds of a mission (``--quick``: one, 20 s, which cannot dock)."""
     changes = (*options.set, *(QUICK if options.quick else ()))
-    results = Results(options.results, {"flight": part, "set": list(changes)}, MarkerlessOutcome)
+    results = KeptResults(
+        options.results, {"flight": part, "set": list(changes)}, MarkerlessOutcome
+    )
     outcomes = results.of(
         seeds_of(options, 5, 1),
         lambda seed: fly(seed, load_shipped(SCENARIOS[part], f"seed={seed}", *changes)),

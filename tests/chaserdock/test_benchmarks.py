@@ -16,8 +16,8 @@ from common import (
     BenchmarkFailed,
     Figures,
     Group,
+    KeptResults,
     Options,
-    Results,
     main,
     matching,
     parser_of,
@@ -113,9 +113,9 @@ def test_results_are_kept_and_not_flown_again(tmp_path: Path) -> None:
         return Flown(seed, ("late",) * seed)
 
     path = tmp_path / "results.jsonl"
-    first = Results(path, {"part": "a", "set": []}, Flown).of(range(2), fly)
-    again = Results(path, {"part": "a", "set": []}, Flown).of(range(3), fly)
-    Results(path, {"part": "b", "set": []}, Flown).of(range(1), fly)
+    first = KeptResults(path, {"part": "a", "set": []}, Flown).of(range(2), fly)
+    again = KeptResults(path, {"part": "a", "set": []}, Flown).of(range(3), fly)
+    KeptResults(path, {"part": "b", "set": []}, Flown).of(range(1), fly)
     assert again[:2] == first == [Flown(0, ()), Flown(1, ("late",))]
     assert flown == [0, 1, 2, 0]
 

@@ -176,6 +176,7 @@ def test_derivative_equals_an_independent_one(seed: int) -> None:
     np.testing.assert_allclose(value, newton_euler(x, u), rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_rk4_is_of_fourth_and_euler_of_first_order(seed: int) -> None:
     x, u = random_point(seed, rate=0.5)

@@ -185,6 +185,7 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
     return near_m, events
 
 
+@pytest.mark.slow
 def test_other_chasers_avoid_the_lost_chaser() -> None:
     scenario = load_scenario(
         ROOT / "scenarios" / "two-chaser-tracking.toml", (*STILL, "timeline=[]")

@@ -41,6 +41,7 @@ def test_steady_error_with_feed_forward(control_s: float) -> None:
             assert error > 5e-4  # the bias of u_ref = 0, which the feed-forward removes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["N=1 saturated", "N=1 obstacle", "N=2 swap"])
 def test_closed_loop_cost_against_ipopt(case: str) -> None:
     if case == "N=1 saturated":

@@ -63,7 +63,7 @@ class _Settings(Structure):
     ]  # fmt: skip
 
 
-# Chosen by the corner errors in rendered images (benchmarks/vision.py, part ``accuracy``).
+# Chosen by the corner errors in rendered images (benchmarks/perception.py, ``markers``).
 SETTINGS = _Settings(
     0.45, 1.25,
     8.0, 0.4, 4.0,

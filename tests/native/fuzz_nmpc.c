@@ -91,12 +91,14 @@ static void sign_of(void) {
 
 static void shift_inputs(void) {
     const int64_t n = whole(0, 3), d = whole(1, 6), shift = whole(0, d + 2);
-    double *inputs = doubles(6 * n * d, -3.0, 3.0), *out = outputs(6 * n * d), part = uniform(0.0, 1.0);
+    double *inputs = doubles(6 * n * d, -3.0, 3.0), *out = outputs(6 * n * d),
+           part = uniform(0.0, 1.0);
     NAME(shift_inputs)(n, d, shift, part, inputs, out);
     if (all_finite(inputs, 6 * n * d)) CHECK(all_finite(out, 6 * n * d));
     for (int64_t i = 0; i < 6 * n && shift >= d; i++) /* the last value is held */
         CHECK(any_nan(out, 6 * n * d) || special_drawn ||
-              abs_of(out[6 * d * (i / 6) + i % 6] - inputs[6 * d * (i / 6) + 6 * (d - 1) + i % 6]) < 1e-12);
+              abs_of(out[6 * d * (i / 6) + i % 6] - inputs[6 * d * (i / 6) + 6 * (d - 1) + i % 6]) <
+                  1e-12);
 }
 
 static void check_rolled(const double *x, const double *given, int64_t n, int64_t d) {
@@ -114,7 +116,8 @@ static void check_rolled(const double *x, const double *given, int64_t n, int64_
 
 static void roll(void) {
     const int64_t n = whole(0, 2), d = whole(1, 5);
-    double *u = doubles(6 * n * d, -3.0, 3.0), *x = states(n * (d + 1)), *given = copy_of(x, 13 * n * (d + 1));
+    double *u = doubles(6 * n * d, -3.0, 3.0), *x = states(n * (d + 1)),
+           *given = copy_of(x, 13 * n * (d + 1));
     NAME(roll)(model(), n, d, u, x);
     check_rolled(x, given, n, d);
 }
@@ -122,7 +125,8 @@ static void roll(void) {
 static void roll_linearized(void) {
     const int64_t n = whole(0, 2), d = whole(1, 3);
     const Model *m = model();
-    double *u = doubles(6 * n * d, -3.0, 3.0), *x = states(n * (d + 1)), *given = copy_of(x, 13 * n * (d + 1));
+    double *u = doubles(6 * n * d, -3.0, 3.0), *x = states(n * (d + 1)),
+           *given = copy_of(x, 13 * n * (d + 1));
     double *limits = doubles(6 * n, 0.0, 3.0), *mats = outputs(144 * n * d);
     NAME(roll_linearized)(m, n, d, u, limits, x, mats);
     check_rolled(x, given, n, d);
@@ -223,9 +227,16 @@ static void solve_tick(void) {
 }
 
 static const Target TARGETS[] = {
-    {"normalize_rows", normalize_rows},   {"sign_of", sign_of},       {"shift_inputs", shift_inputs},
-    {"roll", roll},                       {"roll_linearized", roll_linearized},
-    {"quadratic_model", quadratic_model}, {"plan_cost", plan_cost},   {"plan_violation", plan_violation},
-    {"build_rows", build_rows},           {"solve_qp", solve_qp},     {"solve_tick", solve_tick},
+    {"normalize_rows", normalize_rows},
+    {"sign_of", sign_of},
+    {"shift_inputs", shift_inputs},
+    {"roll", roll},
+    {"roll_linearized", roll_linearized},
+    {"quadratic_model", quadratic_model},
+    {"plan_cost", plan_cost},
+    {"plan_violation", plan_violation},
+    {"build_rows", build_rows},
+    {"solve_qp", solve_qp},
+    {"solve_tick", solve_tick},
 };
 FUZZ_MAIN(TARGETS)

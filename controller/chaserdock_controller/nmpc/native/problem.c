@@ -73,8 +73,8 @@ static inline void attitude_error(const double *q, const double *q_ref, double *
     }
 }
 
-/* Weight |vec(q (x) q_ref*)|^2, which is |vec(q_ref* (x) q)|^2: the vectors differ by a rotation.
- */
+/* Weight |vec(q (x) q_ref*)|^2, which is |vec(q_ref* (x) q)|^2: the vectors differ by a
+ * rotation. */
 static inline double attitude_value(const Problem *problem, int64_t i, int64_t k, const double *x) {
     double e[4];
     attitude_error(x + 6, problem->references + 7 * ((problem->stages + 1) * i + k) + 3, e);

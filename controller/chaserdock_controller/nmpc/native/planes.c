@@ -17,7 +17,8 @@
 /* Additional margin of the plan, m: linearization can lose 2 mm of a distance. */
 #define MARGIN_M 5e-3
 /* For a chaser that heads for the centre within 10 degrees (its cosine) the passing side is
- * undetermined. Half and twice the angle: a plan in 150 of one flight ends at its limit of iterations. */
+ * undetermined. Half and twice the angle: a plan in 150 of one flight ends at its limit of
+ * iterations. */
 #define COS_HEAD_ON 0.984807753012208
 /* Tangent by which the normal is tilted then; without it a symmetric approach goes straight
  * through. 0.1 and 0.4 pass obstacles as well. */

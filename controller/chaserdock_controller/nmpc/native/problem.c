@@ -8,8 +8,8 @@
 #include "base.h"
 
 /* Cosine of half of 150 degrees. An attitude error beyond is treated as one of this angle about the
- * same axis: the gradient of sin^2(angle / 2) vanishes at 180 degrees, where the cost would not act.
- * 120 and 165 degrees turn as fast. */
+ * same axis: the gradient of sin^2(angle / 2) vanishes at 180 degrees, where the cost would not
+ * act. 120 and 165 degrees turn as fast. */
 #define ETA_MIN 0.25881904510252074
 /* Sine of the same angle. */
 #define EPS_MAX 0.9659258262890683

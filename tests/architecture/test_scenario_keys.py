@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import ast
+import re
 from typing import Any, get_args
 
 from chaserdock_protocol.scenario import Scenario
 from pydantic import BaseModel
-from source_tree import MODULES, tree_of
+from source_tree import MODULES
 
 
 def add_sections(annotation: Any, found: set[type[BaseModel]]) -> None:
@@ -23,15 +23,9 @@ def add_sections(annotation: Any, found: set[type[BaseModel]]) -> None:
 
 
 def names_read() -> set[str]:
-    """Return all attributes that our modules read, and all texts, by which `getattr` may."""
-    found: set[str] = set()
-    for _, path in MODULES:
-        for node in ast.walk(tree_of(path)):
-            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
-                found.add(node.attr)
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                found.add(node.value)
-    return found
+    """Return what may be an attribute in our modules, or its name in quotes, for `getattr`."""
+    texts = (path.read_text(encoding="utf-8") for _, path in MODULES)
+    return {name for text in texts for name in re.findall(r"[.\"'](\w+)\b", text)}
 
 
 def test_every_key_is_read() -> None:

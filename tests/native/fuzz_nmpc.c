@@ -214,7 +214,7 @@ static void solve_tick(void) {
     double *given = copy_of(inputs, 6 * n * d);
     int64_t *code = block((size_t)n * 8), *iterations = block((size_t)n * 8), left = budget;
     Tick tick = {model(), stated, states(n), doubles(d + 1, 0.0, 1.0), doubles(n, 1.0, 1e4), inputs,
-                 value(0.0, 1e4), budget, code, iterations};
+                 value(0.0, 1e4), budget, whole(0, 40), code, iterations};
     NAME(solve_tick)(&tick, outputs(NAME(tick_workspace)(n, d, boxes + coasts)));
     for (int64_t i = 0; i < n; i++, left -= iterations[i - 1]) {
         check_answer(code[i], iterations[i], left);

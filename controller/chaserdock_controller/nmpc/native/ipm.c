@@ -17,19 +17,31 @@
  */
 #include "base.h"
 
+/* Numbers of the method. "Flights": seven closed loops, varied one number at a time
+ * (docs/evidence/controller.md). */
+
 /* Complementarity at which to stop, in units of cost. 1e-2 to 1e-4 fly the same closed loop. */
 #define MU_STOP 1e-3
-/* Complementarity at the start, relative to the largest slope there, and its upper end. */
+/* Complementarity at the start, relative to the largest slope there. With half or twice of it, a
+ * plan in 150 of one flight ends at its limit of iterations. */
 #define MU_START 0.1
+/* Upper end of the complementarity at the start, units of cost: without it, or with 1e3, a plan for
+ * a reference 2 km away ends at its limit of iterations; with 1e5 it takes 17 iterations. */
 #define MU_START_MAX 1e5
-/* Stationarity at which to stop, relative to the gradient at the start. */
+/* Stationarity at which to stop, relative to the gradient at the start. Half takes up to 1 % more
+ * iterations; with twice, one plan ends at its limit. */
 #define GRADIENT_STOP 1e-6
+/* Share of the step to the boundary: below 1, so that all values stay positive. With 0.9 flights
+ * take 20 to 45 % more iterations, with 0.999 up to 4 % fewer, but one plan ends at its limit. */
 #define STEP_TO_BOUNDARY 0.995
-/* Tolerance for rows and bounds of the unconstrained solution (m, or fraction of a limit). */
+/* Tolerance for rows and bounds of the unconstrained solution (m, or fraction of a limit): its
+ * rounding. Half and twice change no bit of the flights. */
 #define FREE_TOLERANCE 1e-9
-/* Initial inputs are limited to this fraction of the box. */
+/* Initial inputs are limited to this fraction of the box, away from the boundary. With 0.99 flights
+ * take up to 56 % more iterations, with 0.8 up to 14 % fewer. */
 #define START_WITHIN 0.9
-/* Rows with less margin than this are active, m. */
+/* Rows with less margin than this are active, m. The solution does not depend on it, as rows that
+ * come near are added; half and twice take up to 2 % more iterations. */
 #define NEAR_M 0.1
 
 enum { FREE, CONVERGED, LIMIT, BROKEN };

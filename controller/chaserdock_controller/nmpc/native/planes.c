@@ -14,20 +14,24 @@
  */
 #include "base.h"
 
-/* Linearization can lose 2 mm of a distance; additional margin of the plan. */
+/* Additional margin of the plan, m: linearization can lose 2 mm of a distance. */
 #define MARGIN_M 5e-3
-/* For a chaser heading for the centre within 10 degrees the passing side is undetermined; the
- * normal is tilted by TILT. */
+/* For a chaser that heads for the centre within 10 degrees (its cosine) the passing side is
+ * undetermined. Half and twice the angle: a plan in 150 of one flight ends at its limit of
+ * iterations. */
 #define COS_HEAD_ON 0.984807753012208
+/* Tangent by which the normal is tilted then; without it a symmetric approach goes straight
+ * through. 0.1 and 0.4 pass obstacles as well. */
 #define TILT 0.2
 /* Closer than this fraction of the distance the rollout counts as inside and the last normal is
- * kept, so that a crossing rollout does not get the normal of the far side. */
+ * kept, so that a crossing rollout does not get the normal of the far side. 0.4 and 0.95 keep the
+ * same distances. */
 #define INSIDE 0.8
-/* A tilted normal sees 1 / sqrt(1 + TILT^2) of the gap: bound for `out_of_reach`, with a small
- * margin. */
+/* Bound for `out_of_reach`: a tilted normal sees 1 / sqrt(1 + TILT^2) = 0.9806 of the gap. */
 #define TILTED_SHARE 0.98
 /* Most by which the planes between chasers move in favour of one that cannot keep its own
- * distances, m. */
+ * distances, m: so much a neighbour comes nearer to the common plane, and no more than a small part
+ * of the distance (0.35 m). Half and twice change no flight without shapes. */
 #define RELIEF_MAX_M 0.02
 
 /* The rows of all chasers, capacity `width` each; reach (N, D+1): how far admissible inputs can

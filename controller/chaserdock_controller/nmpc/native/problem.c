@@ -7,10 +7,11 @@
  */
 #include "base.h"
 
-/* An attitude error beyond 150 degrees is treated as one of this angle about the same axis: the
- * gradient of sin^2(angle / 2) vanishes at 180 degrees, where the cost would not act. Cosine and
- * sine of 75 degrees. */
+/* Cosine of half of 150 degrees. An attitude error beyond is treated as one of this angle about the
+ * same axis: the gradient of sin^2(angle / 2) vanishes at 180 degrees, where the cost would not
+ * act. 120 and 165 degrees turn as fast. */
 #define ETA_MIN 0.25881904510252074
+/* Sine of the same angle. */
 #define EPS_MAX 0.9659258262890683
 
 /* The problem of N chasers over D stages: what all terms use (as in `NmpcInput`, all expanded), and

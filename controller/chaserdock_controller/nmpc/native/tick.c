@@ -3,11 +3,9 @@
  * per chaser. */
 #include "base.h"
 
-#define MAX_ITERATIONS 40
-
 /* inputs (N, D, 6): initial plan, replaced by the solution; states (N, 13); reach (D+1,):
  * displacement by each stage for 1 N on each axis, m; w1 (N,): slack weights. `budget`: total
- * iterations; each chaser may use an even share of the remaining ones, at most MAX_ITERATIONS. code
+ * iterations; each chaser may use an even share of the remaining ones, at most `most`. code
  * and iterations (N,) are outputs; a chaser whose inputs would not be finite keeps those given,
  * with code BROKEN. */
 typedef struct {
@@ -16,9 +14,9 @@ typedef struct {
     const double *states, *reach, *w1;
     double *inputs;
     double w2;
-    int64_t budget, *code, *iterations;
+    int64_t budget, most, *code, *iterations;
 } Tick;
-LAYOUT(Tick, model, problem, states, reach, w1, inputs, w2, budget, code, iterations)
+LAYOUT(Tick, model, problem, states, reach, w1, inputs, w2, budget, most, code, iterations)
 
 /* Rows of a chaser; `extra`: cuboids and coasts. */
 static int64_t tick_width(int64_t n, int64_t d, int64_t extra) { return d * (n + 2 + extra); }
@@ -59,7 +57,7 @@ EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
         const double *limits = problem->limits + 6 * i;
         const int64_t share = (left + n - i - 1) / (n - i);
         NAME(quadratic_model)(problem, i, x + 13 * (d + 1) * i, u, q, qx, r_diag, r, w_bar);
-        Qp qp = {d, rows.n_rows[i], share < MAX_ITERATIONS ? share : MAX_ITERATIONS,
+        Qp qp = {d, rows.n_rows[i], share < tick->most ? share : tick->most,
                  tick->model->step_s, tick->w1[i], tick->w2, mats + 144 * d * i, q, qx, r_diag, r,
                  w_bar, rows.stage + width * i, rows.a + 6 * width * i, rows.c + width * i};
         tick->code[i] = solve_one(&qp, &answer, work);

@@ -39,7 +39,7 @@ _MAP_TEXELS = 2_000_000
 """Texels of a shadow map, at which its resolution is limited: 8 MB a body."""
 _TEXEL_PX = 0.7
 """Width of a texel in pixels at the nearest point of a body: with it shadow edges are displaced by
-0.2 px (docs/cameras.md).
+0.2 px (docs/evidence/cameras.md).
 """
 _BAND_ROWS, _SAMPLES, _GROUP = 8, 8, 32  # native/mesh.c
 _WRINKLES = 256

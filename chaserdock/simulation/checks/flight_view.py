@@ -56,7 +56,7 @@ class FreeStep:
         q, omega = np.array(self.before.q_wxyz), np.array(self.before.omega_rad_s)
         return rotations.integrate(q, omega, 0.5 * self.dt_s)
 
-    @cached_property
+    @property
     def turned_rad(self) -> float:
         """Angle (rad) by which the body turns in a tick, at its rate after it."""
         return math.hypot(*self.after.omega_rad_s) * self.dt_s

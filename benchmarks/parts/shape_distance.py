@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from chaserdock_controller.nmpc import NmpcInput, NmpcParameters
-from chaserdock_controller.nmpc.checks import check_input
 from chaserdock_controller.nmpc.kernels import plan_violation
+from chaserdock_controller.nmpc.problem import check_input, native_problem
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -74,11 +74,11 @@ def kernel_s(params: NmpcParameters, table: Array, states: Array, repeats: int) 
     )
     boxes, clearance = np.repeat(table[None], d + 1, axis=0), np.array([0.02])
     both = [problem, replace(problem, boxes=boxes, box_clearance_m=clearance)]
-    with_boxes = replace(params, boxes=CUBOIDS)
     took = []
     for one in both:
-        checked, plan = check_input(one, with_boxes, 1), states[None, : d + 1].copy()
-        took.append(best_of(partial(plan_violation, checked, plan, 1e6), repeats))
+        checked, plan = check_input(one, params, 1), states[None, : d + 1].copy()
+        call = partial(plan_violation, native_problem(checked, params), plan)
+        took.append(best_of(call, repeats))
     return (took[1] - took[0]) / (CUBOIDS * (d + 1))
 
 

@@ -54,7 +54,7 @@ class ProgramHelp(TyperGroup):
                 formatter.write_dl([(name, first_sentence(c.help)) for name, c in commands.items()])
 
 
-def panels_of(program: TyperGroup) -> dict[str, dict[str, Any]]:
+def panels_of(program: Any) -> dict[str, dict[str, Any]]:
     """Return the commands of the program by panel, in the order of the help."""
     panels: dict[str, dict[str, Any]] = {}
     for name, command in program.commands.items():

@@ -145,7 +145,7 @@ def _facts_of_boxes(model: TargetModel) -> dict[str, Any]:
     return {
         "cuboids": len(model.boxes),
         "size_m": list(model.size_m),
-        "mesh": model.satellite or model.mesh,
+        "mesh": model.satellite,
         "dictionary": model.dictionary,
         "markers": [{"id": m.id, "side_m": m.side_m} for m in model.markers],
     }
@@ -153,11 +153,14 @@ def _facts_of_boxes(model: TargetModel) -> dict[str, Any]:
 
 def _lines_of_boxes(name: str, model: TargetModel) -> list[str]:
     x, y, z = model.size_m
-    drawn = f", drawn as {model.satellite or model.mesh}" if model.satellite or model.mesh else ""
+    drawn = f", drawn as {model.satellite}" if model.satellite else ""
+    ids: dict[float, list[str]] = {}
+    for marker in model.markers:
+        ids.setdefault(marker.side_m, []).append(str(marker.id))
     return [
-        f"{name}: {len(model.boxes)} cuboids, {x:.3f} x {y:.3f} x {z:.3f} m{drawn}",
+        f"{name}: {len(model.boxes)} cuboid(s), {x:.3f} x {y:.3f} x {z:.3f} m{drawn}",
         f"{len(model.markers)} markers of {model.dictionary}",
-        *(f"  id {m.id:3}  {1e3 * m.side_m:6.1f} mm" for m in model.markers),
+        *(f"  {1e3 * side_m:6.1f} mm: id {', '.join(those)}" for side_m, those in ids.items()),
     ]
 
 

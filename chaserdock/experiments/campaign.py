@@ -14,9 +14,9 @@ from chaserdock.launch.signals import stop_on_signals
 from .campaign_file import load_campaign
 from .campaign_report import sections
 from .page import html
-from .plan import ExperimentError, Plan
+from .plan import ExperimentError, ExperimentPlan
 from .results import repeat_command, rows_of, wilson, write_table
-from .worker import Progress, Workers, fly, fly_plan
+from .worker import ExperimentProgress, Workers, fly, fly_plan
 
 
 def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | None) -> int:
@@ -33,7 +33,7 @@ def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | Non
         errors_of_writing(folder, ExperimentError),
         stop_on_signals("stopping after the active runs") as stop,
     ):
-        outcomes = fly_plan(plan, folder, workers, Progress(), stop)
+        outcomes = fly_plan(plan, folder, workers, ExperimentProgress(), stop)
     if not outcomes:
         print("chaserdock: stopped before any run ended", file=sys.stderr)
         return STOPPED
@@ -56,7 +56,7 @@ def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | Non
     return DONE
 
 
-def _fly_one(plan: Plan, folder: Path, only: int) -> int:
+def _fly_one(plan: ExperimentPlan, folder: Path, only: int) -> int:
     if not 0 <= only < len(plan.flights):
         raise ExperimentError(f"--only {only}: the runs are 0 to {len(plan.flights) - 1}")
     flight = plan.flights[only]

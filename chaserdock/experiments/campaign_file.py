@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from chaserdock.toml_text import toml_value
 
-from .plan import Alone, Flight, Plan, plan_flight
+from .plan import Alone, ExperimentPlan, PlannedFlight, plan_flight
 
 MAX_RUNS = 100_000
 """Runs of a campaign: all are checked before the first one flies, 10 ms each."""
@@ -90,7 +90,7 @@ class CampaignFile(Section):
         return self
 
 
-def load_campaign(path: Path) -> Plan:
+def load_campaign(path: Path) -> ExperimentPlan:
     """Read a campaign file and validate every run's scenario; raise ScenarioError with one line per
     fault.
     """
@@ -108,7 +108,7 @@ def load_campaign(path: Path) -> Plan:
         scenario = local if local.is_file() else find_scenario(file.scenario)
     except ScenarioNotFound as error:
         raise ScenarioError(f"{path}: scenario: {error}") from None
-    return Plan(file.name, _flights(file, scenario, path), tuple(file.vary))
+    return ExperimentPlan(file.name, _flights(file, scenario, path), tuple(file.vary))
 
 
 def _combinations(file: CampaignFile) -> list[dict[str, Any]]:
@@ -130,7 +130,7 @@ def _draw(v: Variation, rng: np.random.Generator) -> Any:
     return values[int(rng.integers(len(values)))]
 
 
-def _flights(file: CampaignFile, scenario: Path, path: Path) -> tuple[Flight, ...]:
+def _flights(file: CampaignFile, scenario: Path, path: Path) -> tuple[PlannedFlight, ...]:
     seeds = tuple(range(file.seeds)) if isinstance(file.seeds, int) else file.seeds
     combinations = _combinations(file)
     if len(combinations) * len(seeds) > MAX_RUNS:
@@ -140,7 +140,7 @@ def _flights(file: CampaignFile, scenario: Path, path: Path) -> tuple[Flight, ..
         )
     alone = None if file.alone is None else Alone(file.alone.delay_s, file.alone.floor)
     shared = _overrides(file.set)
-    flights: list[Flight] = []
+    flights: list[PlannedFlight] = []
     for varied in combinations:
         own = _overrides(varied)
         for seed in seeds:
@@ -160,7 +160,7 @@ def _overrides(values: dict[str, Any]) -> tuple[str, ...]:
     return tuple(f"{key}={toml_value(value)}" for key, value in values.items())
 
 
-def _reject_duplicates(flights: list[Flight], path: Path) -> None:
+def _reject_duplicates(flights: list[PlannedFlight], path: Path) -> None:
     seen: dict[str, str] = {}
     for flight in flights:
         if flight.name in seen:

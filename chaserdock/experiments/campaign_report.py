@@ -12,8 +12,16 @@ from typing import Any
 from chaserdock.html_page import Markup
 
 from .page import PageSection, Table
-from .plan import Flight, Plan
-from .results import Row, causes, metrics_of, numbers_of, rank_correlation, repeat_command, wilson
+from .plan import ExperimentPlan, PlannedFlight
+from .results import (
+    ResultRow,
+    causes,
+    metrics_of,
+    numbers_of,
+    rank_correlation,
+    repeat_command,
+    wilson,
+)
 
 _SHOWN = (
     ("steady_position_mse_m2", "steady position RMS, mm", lambda v: math.sqrt(v) * 1e3),
@@ -26,7 +34,7 @@ _SHOWN = (
 )
 
 
-def sections(plan: Plan, rows: list[Row], folder: Path) -> list[PageSection]:
+def sections(plan: ExperimentPlan, rows: list[ResultRow], folder: Path) -> list[PageSection]:
     """Return the report; links to logs are relative to ``folder``. Raise ValueError without any
     row.
     """
@@ -48,13 +56,13 @@ def sections(plan: Plan, rows: list[Row], folder: Path) -> list[PageSection]:
     ]
 
 
-def _causes(rows: list[Row]) -> list[PageSection]:
+def _causes(rows: list[ResultRow]) -> list[PageSection]:
     counted = tuple((str(n), cause) for cause, n in causes(rows))
     head = ("runs", "first failure (# stands for a number)")
     return [PageSection("Outcomes by cause", (Table(head, counted, text=True),))] if counted else []
 
 
-def _sensitivities(plan: Plan, rows: list[Row]) -> list[PageSection]:
+def _sensitivities(plan: ExperimentPlan, rows: list[ResultRow]) -> list[PageSection]:
     numeric = [p for p in plan.parameters if numbers_of(rows, f"vary.{p}") is not None]
     parts: list[str | Table] = []
     if numeric and len(rows) > 1:
@@ -67,7 +75,7 @@ def _sensitivities(plan: Plan, rows: list[Row]) -> list[PageSection]:
     return [PageSection("Sensitivity", tuple(parts))] if parts else []
 
 
-def _figure(parameters: list[str], rows: list[Row]) -> str:
+def _figure(parameters: list[str], rows: list[ResultRow]) -> str:
     from matplotlib.figure import Figure
 
     from chaserdock.analysis.plots import LIMIT, SERIES, styled, to_inline_svg
@@ -97,7 +105,7 @@ def _figure(parameters: list[str], rows: list[Row]) -> str:
     return to_inline_svg(figure, "sensitivity", "results by parameter")
 
 
-def _correlations(parameters: list[str], rows: list[Row]) -> Table:
+def _correlations(parameters: list[str], rows: list[ResultRow]) -> Table:
     body: list[tuple[str, ...]] = []
     for metric in ["success", *metrics_of(rows)]:
         values = [float(r[metric]) for r in rows]
@@ -107,8 +115,8 @@ def _correlations(parameters: list[str], rows: list[Row]) -> Table:
     return Table(("", *parameters), tuple(body))
 
 
-def _by_value(parameter: str, rows: list[Row]) -> Table:
-    groups: dict[str, list[Row]] = {}
+def _by_value(parameter: str, rows: list[ResultRow]) -> Table:
+    groups: dict[str, list[ResultRow]] = {}
     for r in rows:
         groups.setdefault(str(r[f"vary.{parameter}"]), []).append(r)
     body: list[tuple[str, ...]] = []
@@ -119,11 +127,11 @@ def _by_value(parameter: str, rows: list[Row]) -> Table:
     return Table(("value", "passed", "95 %"), tuple(body))
 
 
-def _failures(plan: Plan, rows: list[Row], folder: Path) -> list[PageSection]:
+def _failures(plan: ExperimentPlan, rows: list[ResultRow], folder: Path) -> list[PageSection]:
     """Return the runs that failed, each with its cause, a link to its log, and the command that
     repeats it.
     """
-    flights: dict[str, Flight] = {flight.name: flight for flight in plan.flights}
+    flights: dict[str, PlannedFlight] = {flight.name: flight for flight in plan.flights}
     body: list[tuple[str, str]] = []
     for r in rows:
         if r["success"]:

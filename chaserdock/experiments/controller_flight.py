@@ -24,7 +24,7 @@ from chaserdock.exit_codes import BAD_INPUT, DONE
 from .flight_record import FlightRecord, record_flight
 from .least_transient import gauss_times, least_square_integral
 from .perfect_knowledge import PerfectEstimator
-from .plan import Alone, Flight
+from .plan import Alone, PlannedFlight
 
 _FLOOR_S = 15.0
 """The lower bound covers this time, s, and is zero after it: twice what 2 N need to bring 30 kg
@@ -35,7 +35,7 @@ over the paper's 0.85 m to rest, 2 sqrt(0.85 m / (2 N / 30 kg)) = 7.1 s.
 def main() -> int:
     """Fly the flight on standard input; return the exit status."""
     try:
-        flight = msgspec.json.decode(sys.stdin.read(), type=Flight)
+        flight = msgspec.json.decode(sys.stdin.read(), type=PlannedFlight)
         summary = fly_alone(load_scenario(Path(flight.scenario), flight.overrides), flight.alone)
     except ChaserdockError as error:
         print(f"chaserdock: {error}", file=sys.stderr)

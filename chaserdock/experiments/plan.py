@@ -31,7 +31,7 @@ class Alone(Struct, frozen=True):
     floor: bool = False
 
 
-class Flight(Struct, frozen=True, kw_only=True):
+class PlannedFlight(Struct, frozen=True, kw_only=True):
     """One flight: all processes of a mission, recorded and judged, or the controller ``alone``.
 
     ``name``: a digest of all that is flown. ``label``: what the experiment calls the flight.
@@ -47,11 +47,11 @@ class Flight(Struct, frozen=True, kw_only=True):
     alone: Alone | None = None
 
 
-class Plan(Struct, frozen=True):
+class ExperimentPlan(Struct, frozen=True):
     """All flights of an experiment, and the names of what varies."""
 
     name: str
-    flights: tuple[Flight, ...]
+    flights: tuple[PlannedFlight, ...]
     parameters: tuple[str, ...] = ()
 
 
@@ -63,7 +63,7 @@ def plan_flight(
     varied: dict[str, Any] | None = None,
     alone: Alone | None = None,
     salt: str = "",
-) -> Flight:
+) -> PlannedFlight:
     """Return a flight, named by the resolved scenario, ``alone`` and ``salt``. Raise
     ScenarioError.
     """
@@ -72,7 +72,7 @@ def plan_flight(
     if alone is not None:
         _check_alone(resolved, alone)
         flown += json.dumps(msgspec.to_builtins(alone))
-    return Flight(
+    return PlannedFlight(
         name=hashlib.sha256(flown.encode()).hexdigest()[:12],
         label=label,
         scenario=str(scenario),

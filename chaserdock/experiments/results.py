@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from .plan import Flight, Plan
-from .worker import Outcome
+from .plan import ExperimentPlan, PlannedFlight
+from .worker import FlightOutcome
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 _FIXED = ("run", "index", "seed", "success", "cause", "failures", "digest", "log")
 
 _OF_CHASERS: tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]], ...] = (
@@ -30,7 +30,7 @@ _OF_CHASERS: tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]], 
 """Columns of results by chaser: name, place in a chaser's summary, and how chasers are combined."""
 
 
-def row_of(index: int, flight: Flight, outcome: Outcome) -> Row:
+def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultRow:
     """Return a flight as a row of plain values: varied values (``vary.NAME``), outcome, and results
     in SI units.
 
@@ -40,7 +40,7 @@ def row_of(index: int, flight: Flight, outcome: Outcome) -> Row:
     failures = list(s.get("failures", [])) or (
         [outcome.last_words or "ended without output"] if outcome.status else []
     )
-    row: Row = {
+    row: ResultRow = {
         "run": flight.name,
         "index": index,
         "seed": flight.seed,
@@ -85,7 +85,7 @@ def cause_of(failure: str) -> str:
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", failure)
 
 
-def rows_of(plan: Plan, outcomes: Mapping[str, Outcome]) -> list[Row]:
+def rows_of(plan: ExperimentPlan, outcomes: Mapping[str, FlightOutcome]) -> list[ResultRow]:
     """Return the table in the plan's order, as far as flown; all rows have the same columns."""
     rows = [
         row_of(index, flight, outcomes[flight.name])
@@ -96,7 +96,7 @@ def rows_of(plan: Plan, outcomes: Mapping[str, Outcome]) -> list[Row]:
     return [{c: row.get(c, math.nan) for c in columns} for row in rows]
 
 
-def metrics_of(rows: list[Row]) -> list[str]:
+def metrics_of(rows: list[ResultRow]) -> list[str]:
     """Return the names of the columns with numerical results."""
     names = [c for c in (rows[0] if rows else {}) if c not in _FIXED and not c.startswith("vary.")]
     return [
@@ -116,7 +116,7 @@ def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, fl
     return float(interval.low), float(interval.high)
 
 
-def causes(rows: list[Row]) -> list[tuple[str, int]]:
+def causes(rows: list[ResultRow]) -> list[tuple[str, int]]:
     """Return the causes of failures and their numbers of flights, most frequent first."""
     return sorted(
         Counter(r["cause"] for r in rows if not r["success"]).items(),
@@ -140,7 +140,7 @@ def rank_correlation(x: list[float], y: list[float]) -> float:
     return float(result.statistic)
 
 
-def numbers_of(rows: list[Row], column: str) -> list[float] | None:
+def numbers_of(rows: list[ResultRow], column: str) -> list[float] | None:
     """Return a column as numbers, or None when it contains text."""
     values = [r[column] for r in rows]
     if any(isinstance(v, str) for v in values):
@@ -148,7 +148,7 @@ def numbers_of(rows: list[Row], column: str) -> list[float] | None:
     return [float(v) for v in values]
 
 
-def repeat_command(flight: Flight) -> str:
+def repeat_command(flight: PlannedFlight) -> str:
     """Return the command that flies one flight of a campaign again."""
     if flight.alone is not None:
         return f"chaserdock campaign FILE --only {flight.label.removeprefix('run ')}"
@@ -156,7 +156,7 @@ def repeat_command(flight: Flight) -> str:
     return f"chaserdock run {flight.scenario} {sets}"
 
 
-def write_table(rows: list[Row], path: Path) -> None:
+def write_table(rows: list[ResultRow], path: Path) -> None:
     """Write the table as Parquet; column names include units."""
     import pyarrow as pa
     import pyarrow.parquet as pq

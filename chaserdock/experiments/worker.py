@@ -28,12 +28,12 @@ from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.scan import LOG_NAME
 from msgspec import Struct
 
-from .plan import ExperimentError, Flight, Plan
+from .plan import ExperimentError, ExperimentPlan, PlannedFlight
 
 Keep = Literal["failures", "all", "none"]
 
 
-class Outcome(Struct, frozen=True):
+class FlightOutcome(Struct, frozen=True):
     """Outcome of a flight: exit status, summary (None after a crash), last line of output, and the
     path of a log that was kept.
     """
@@ -45,7 +45,7 @@ class Outcome(Struct, frozen=True):
     log: str | None = None
 
 
-Report = Callable[[int, int, Flight, Outcome], None]
+ReportProgress = Callable[[int, int, PlannedFlight, FlightOutcome], None]
 """Receives the number of flights that have ended, of all flights, and the one that just ended."""
 
 
@@ -61,8 +61,12 @@ class Workers:
 
 
 def fly_plan(
-    plan: Plan, folder: Path, workers: Workers, report: Report, stop: threading.Event
-) -> dict[str, Outcome]:
+    plan: ExperimentPlan,
+    folder: Path,
+    workers: Workers,
+    report: ReportProgress,
+    stop: threading.Event,
+) -> dict[str, FlightOutcome]:
     """Fly what has no result in ``folder`` yet, until ``stop``; return the outcomes by flight name,
     in the plan's order.
 
@@ -79,7 +83,7 @@ def fly_plan(
     return {f.name: outcomes[f.name] for f in plan.flights if f.name in outcomes}
 
 
-def results_of(plan: Plan, folder: Path) -> dict[str, Outcome]:
+def results_of(plan: ExperimentPlan, folder: Path) -> dict[str, FlightOutcome]:
     """Return the results of a plan so far, by flight name. Raise ExperimentError for a damaged
     one.
     """
@@ -92,11 +96,11 @@ def result_path(folder: Path, name: str) -> Path:
     return folder / "runs" / name / "result.json"
 
 
-def read_result(folder: Path, name: str) -> Outcome | None:
+def read_result(folder: Path, name: str) -> FlightOutcome | None:
     """Return the result of an earlier flight, or None. Raise ExperimentError for a damaged file."""
     path = result_path(folder, name)
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Outcome)
+        return msgspec.json.decode(path.read_bytes(), type=FlightOutcome)
     except FileNotFoundError:
         return None
     except (OSError, msgspec.DecodeError) as error:
@@ -105,7 +109,7 @@ def read_result(folder: Path, name: str) -> Outcome | None:
         ) from None
 
 
-def write_result(folder: Path, outcome: Outcome) -> None:
+def write_result(folder: Path, outcome: FlightOutcome) -> None:
     """Write a result atomically; of a flight that crashed, none."""
     if outcome.summary is None:
         return
@@ -119,7 +123,7 @@ def write_result(folder: Path, outcome: Outcome) -> None:
     temporary.replace(path)
 
 
-def fly(flight: Flight, keep: Keep, logs: Path) -> Outcome:
+def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
     """Fly one flight in a temporary folder; move its log to ``logs`` if ``keep`` says so.
 
     Also runs on Dask workers, so that arguments and result are plain values. Where ``logs`` is not
@@ -147,12 +151,12 @@ def fly(flight: Flight, keep: Keep, logs: Path) -> Outcome:
         log = out / LOG_NAME
         kept = _move_log(log, logs / flight.name) if keep_log and log.is_file() else None
         last_words = output[-1].removeprefix("chaserdock: ") if output else ""
-        return Outcome(flight.name, done.returncode, summary, last_words, kept)
+        return FlightOutcome(flight.name, done.returncode, summary, last_words, kept)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _program(flight: Flight, out: Path) -> list[str]:
+def _program(flight: PlannedFlight, out: Path) -> list[str]:
     """Return module and arguments that fly a flight and write ``out/summary.json``."""
     if flight.alone is not None:
         return ["chaserdock.experiments.controller_flight", str(out)]
@@ -172,12 +176,12 @@ def _move_log(log: Path, folder: Path) -> str:
 
 
 def _fly_here(
-    flights: Sequence[Flight], logs: Path, workers: Workers, stop: threading.Event
-) -> Iterator[tuple[Flight, Outcome]]:
+    flights: Sequence[PlannedFlight], logs: Path, workers: Workers, stop: threading.Event
+) -> Iterator[tuple[PlannedFlight, FlightOutcome]]:
     """Yield each flight as it ends. Start none after ``stop``."""
     waiting = iter(flights)
     with ThreadPoolExecutor(workers.jobs) as pool:
-        active: dict[Any, Flight] = {}
+        active: dict[Any, PlannedFlight] = {}
         while True:
             while (
                 len(active) < workers.jobs
@@ -192,8 +196,8 @@ def _fly_here(
 
 
 def _fly_on_cluster(
-    flights: Sequence[Flight], logs: Path, workers: Workers, stop: threading.Event
-) -> Iterator[tuple[Flight, Outcome]]:
+    flights: Sequence[PlannedFlight], logs: Path, workers: Workers, stop: threading.Event
+) -> Iterator[tuple[PlannedFlight, FlightOutcome]]:
     """Yield each flight as it ends. Raise ExperimentError, and MissingPackageError without Dask."""
     require_extra("distributed", "cluster")
     from distributed import Client, as_completed
@@ -222,14 +226,16 @@ def _fly_on_cluster(
                 return
 
 
-class Progress:
+class ExperimentProgress:
     """Prints one line per flight that has ended: its outcome, and an estimate of the time left."""
 
     def __init__(self) -> None:
         self._start_s = time.monotonic()
         self._ended_before: int | None = None
 
-    def __call__(self, ended: int, total: int, flight: Flight, outcome: Outcome) -> None:
+    def __call__(
+        self, ended: int, total: int, flight: PlannedFlight, outcome: FlightOutcome
+    ) -> None:
         if self._ended_before is None:
             self._ended_before = ended - 1
         each_s = (time.monotonic() - self._start_s) / (ended - self._ended_before)

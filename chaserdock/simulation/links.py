@@ -53,7 +53,7 @@ class MessageLink:
 
 
 class Links:
-    """All links of a mission, under its conditions. ``first_tick_s``: virtual time (s) from which on
+    """All links of a mission, under its conditions. ``first_tick_s``: virtual time (s) from which
     the conditions apply, None before.
 
     ``lockstep``: nothing is lost, duplicated or reordered on one link, as TCP guarantees;

@@ -91,7 +91,7 @@ class Scheduler:
         after: Due = NEVER,
         args: tuple[Any, ...] = (),
     ) -> Due:
-        """Schedule ``call(*args)`` at a virtual time (s), at once if that has passed, and not before
+        """Schedule ``call(*args)`` at a virtual time (s), at once if it has passed, and not before
         the event ``after``. Return when it comes. The call must not wait.
         """
         self._count += 1

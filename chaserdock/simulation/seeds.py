@@ -63,7 +63,7 @@ class UnflownSeed:
 
 
 def _load(options: SeedOptions) -> tuple[str, Scenario]:
-    """Return the scenario and what cases extend it by. Raises ScenarioError if no seed can fly it."""
+    """Return what cases extend, and the scenario. Raises ScenarioError if no seed can fly it."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path)
     if not (options.images or scenario.target_model().markers):

@@ -52,7 +52,7 @@ def test_there_are_modules_to_check() -> None:
 
 def test_relative_imports_are_resolved() -> None:
     """The checks below depend on it."""
-    chaser = own_imports(PACKAGES["chaserdock_agents"] / "chaser" / "process.py")
+    chaser = own_imports(PACKAGES["chaserdock_agents"] / "chaser" / "core.py")
     assert {"chaserdock_agents.chaser.command_gate", "chaserdock_protocol.scenario"} <= chaser
 
 

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from chaserdock.experiments.campaign_file import load_campaign
 from chaserdock.experiments.campaign_report import sections
 from chaserdock.experiments.page import html as html_of
-from chaserdock.experiments.plan import Alone, ExperimentError, Plan
+from chaserdock.experiments.plan import Alone, ExperimentError, ExperimentPlan
 from chaserdock.experiments.results import (
     cause_of,
     causes,
@@ -36,7 +36,7 @@ from chaserdock.experiments.results import (
     wilson,
 )
 from chaserdock.experiments.worker import (
-    Outcome,
+    FlightOutcome,
     Workers,
     fly_plan,
     read_result,
@@ -84,7 +84,7 @@ values = [-0.02, -0.04, -0.06, -0.08]
 """
 
 
-def campaign_of(text: str, folder: Path) -> Plan:
+def campaign_of(text: str, folder: Path) -> ExperimentPlan:
     file = folder / "campaign.toml"
     file.write_text(text)
     return load_campaign(file)
@@ -210,12 +210,12 @@ def summary(failures: list[str]) -> dict[str, Any]:
     }
 
 
-def outcomes_of(campaign: Plan) -> dict[str, Outcome]:
+def outcomes_of(campaign: ExperimentPlan) -> dict[str, FlightOutcome]:
     out = {}
     for k, flight in enumerate(campaign.flights):
         bad = [f"chaser 0: steady RMS: 0.0{k} m"] if k % 2 else []
         log = f"/logs/{k}.mcap" if bad else None
-        out[flight.name] = Outcome(flight.name, 1 if bad else 0, summary(bad), "", log)
+        out[flight.name] = FlightOutcome(flight.name, 1 if bad else 0, summary(bad), "", log)
     return out
 
 
@@ -230,7 +230,7 @@ def test_row_holds_the_worst_chaser_and_no_wall_clock_values(tmp_path: Path) -> 
     assert math.isnan(rows[0]["estimate_max_position_error_m"])
     assert causes(rows) == [(cause_of("chaser 0: steady RMS: 0.01 m"), 4)]
     first = campaign.flights[0]
-    crashed = row_of(0, first, Outcome(first.name, 2, None, "no port"))
+    crashed = row_of(0, first, FlightOutcome(first.name, 2, None, "no port"))
     assert not crashed["success"]
     assert crashed["cause"] == "no port"
 
@@ -267,14 +267,14 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     campaign = campaign_of(GRID, tmp_path)
     flown: list[str] = []
 
-    def fly(flight: Any, *_: Any) -> Outcome:
+    def fly(flight: Any, *_: Any) -> FlightOutcome:
         flown.append(flight.name)
-        return Outcome(flight.name, 0, summary([]), "")
+        return FlightOutcome(flight.name, 0, summary([]), "")
 
     monkeypatch.setattr("chaserdock.experiments.worker.fly", fly)
     earlier, crashed = campaign.flights[2:4]
-    write_result(tmp_path, Outcome(earlier.name, 1, summary(["far"]), "earlier"))
-    write_result(tmp_path, Outcome(crashed.name, 2, None, "no port"))
+    write_result(tmp_path, FlightOutcome(earlier.name, 1, summary(["far"]), "earlier"))
+    write_result(tmp_path, FlightOutcome(crashed.name, 2, None, "no port"))
     progress: list[int] = []
     outcomes = fly_plan(
         campaign,
@@ -291,7 +291,7 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_damaged_result_raises_an_error(tmp_path: Path) -> None:
     assert read_result(tmp_path, "a") is None
-    write_result(tmp_path, Outcome("a", 0, summary([]), ""))
+    write_result(tmp_path, FlightOutcome("a", 0, summary([]), ""))
     path = result_path(tmp_path, "a")
     path.write_text(path.read_text()[:-9])
     with pytest.raises(ExperimentError, match="delete it"):

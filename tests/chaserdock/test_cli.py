@@ -22,7 +22,7 @@ from harness import ROOT, SHORT, chaserdock, finished, sets
 from typer.main import get_command
 
 from chaserdock.cli.main import app
-from chaserdock.cli.renamed import RENAMED
+from chaserdock.cli.renamed import RENAMED, renamed
 from chaserdock.launch.json_events import (
     CommandNotice,
     EventNotice,
@@ -53,7 +53,6 @@ HEAVY = (
 _LOADED_BY_HELP = """
 import contextlib, io, json, sys
 from chaserdock.cli.main import app
-from chaserdock.cli.renamed import RENAMED
 printed = {}
 for path in json.loads(sys.argv[1]):
     out = io.StringIO()
@@ -108,8 +107,12 @@ def test_there_are_at_most_thirty_commands() -> None:
     for old, new in RENAMED.items():
         assert new.split()[0] in COMMANDS
         assert old not in COMMANDS
-        status, said = finished(*old.split(), "anything", "--out", "x")
-        assert (status, said) == (2, f"chaserdock: `chaserdock {old}` is now `chaserdock {new}`\n")
+        assert (
+            renamed([*old.split(), "anything"]) == f"`chaserdock {old}` is now `chaserdock {new}`"
+        )
+    assert renamed(["log", "runs/first"]) is None
+    status, said = finished("summary", "anything", "--json")
+    assert (status, said) == (2, "chaserdock: `chaserdock summary` is now `chaserdock judge LOG`\n")
 
 
 def test_version() -> None:

@@ -176,6 +176,7 @@ def test_perfect_estimate_refuses_a_free_target() -> None:
         PerfectEstimator(scenario("single", "target.motion='torque_free'").target)
 
 
+@pytest.mark.slow
 def test_no_flight_is_better_than_the_floor() -> None:
     """And the paper's settings come near it: the table is about this transient."""
     summary = fly_alone(scenario("paper-single", "duration_s=25.0"), Alone(floor=True))
@@ -184,6 +185,7 @@ def test_no_flight_is_better_than_the_floor() -> None:
     assert summary["solver"]["failures"] == 0
 
 
+@pytest.mark.slow
 def test_delay_makes_long_horizons_fail_first() -> None:
     """With a delay of half a second T = 10 diverges, T = 3 does not."""
 
@@ -204,6 +206,7 @@ def test_delay_counts_missed_ticks() -> None:
     assert len(record_flight(s, solve_delay_s=lambda _: 0.1).solve_s) == 30
 
 
+@pytest.mark.slow
 def test_collision_avoidance_keeps_away_from_the_target() -> None:
     """From exact symmetry: the straight way leads through the centre."""
     trace = record_flight(scenario("collision-avoidance"))

@@ -77,6 +77,7 @@ def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
+@pytest.mark.slow
 def test_bop_layout_read_by_other_code_agrees_with_its_masks(exported: Path) -> None:
     """Files as in the documentation of BOP, read with json, OpenCV and trimesh alone; the model
     projected by OpenCV.
@@ -130,6 +131,7 @@ def test_both_layouts_hold_the_same_images_and_labels(exported: Path) -> None:
         assert rotations.angle_between(a.label.q_irf_trf_wxyz, b.label.q_irf_trf_wxyz) < 1e-7
 
 
+@pytest.mark.slow
 def test_speed_plus_labels_and_distortion_agree_with_the_mask(tmp_path: Path) -> None:
     """The convention of SPEED+: x_camera = R(q) x_target + r, then OpenCV's distortion."""
     export_dataset(scenario(DISTORTED), tmp_path / "d", 2, LIMITS, ("speed+",), 0.0)
@@ -149,6 +151,7 @@ def test_speed_plus_labels_and_distortion_agree_with_the_mask(tmp_path: Path) ->
         assert image[mask].mean() > 3.0 * image[~mask].mean()
 
 
+@pytest.mark.slow
 def test_equal_arguments_make_equal_datasets_and_another_seed_another(
     exported: Path, tmp_path: Path
 ) -> None:
@@ -240,6 +243,7 @@ def test_evaluate_scores_markers_in_both_layouts(
     assert "images 3, with a pose 3 (100.0%)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_evaluate_scores_shapes_without_memory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

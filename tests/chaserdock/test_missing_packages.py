@@ -34,6 +34,7 @@ def without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [("world", "single"), ("simulate", "single"), ("run", "single", "--out", "never-made")],
@@ -59,6 +60,7 @@ engine = "mujoco"
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [("--seeds", "1"), ("--seeds", "1", "--images")], ids=["statistical", "images"]
 )
@@ -69,6 +71,7 @@ def test_a_mission_on_mujoco_needs_no_pybullet(tmp_path: Path, options: tuple[st
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.slow
 def test_other_commands_need_no_pybullet() -> None:
     for command in (("scenario",), ("log", GOLDEN)):
         done = without("pybullet", *command)

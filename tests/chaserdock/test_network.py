@@ -93,6 +93,7 @@ def test_invalid_network_options_are_one_line(
 # -- a mission -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     """Every process has only its own keys; the router restarts in flight; the flight is a success."""
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
@@ -171,6 +172,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     assert "controller" in ticks[-1].controllers
 
 
+@pytest.mark.slow
 def test_run_with_keys_equals_run_without(short_flight: Path, tmp_path: Path) -> None:
     """The digests are equal; the router enforced access rights and denied nothing."""
     keys = ["--keys", str(make_keys(tmp_path / "keys"))]
@@ -187,6 +189,7 @@ def test_run_with_keys_equals_run_without(short_flight: Path, tmp_path: Path) ->
     assert not (short_flight / "processes" / "router.txt").exists()
 
 
+@pytest.mark.slow
 def test_run_with_missing_keys_is_rejected(tmp_path: Path) -> None:
     keys = ["--keys", str(tmp_path / "none")]
     status, said = run("two-chaser-tracking", tmp_path / "out", arguments=keys)

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chaserdock.experiments.page import PageSection, Table, html, markdown
-from chaserdock.experiments.plan import Alone, Flight, Plan
+from chaserdock.experiments.plan import Alone, ExperimentPlan, PlannedFlight
 from chaserdock.experiments.reproduction import reproduce as reproduction
 from chaserdock.experiments.reproduction.content import pitch_rad, sections
 from chaserdock.experiments.reproduction.paper import BASELINE, PAPER_S, ROWS
@@ -48,7 +48,7 @@ from chaserdock.experiments.reproduction.plan import (
 from chaserdock.experiments.reproduction.provenance import Provenance
 from chaserdock.experiments.reproduction.reproduce import fly_and_report
 from chaserdock.experiments.reproduction.tables import (
-    Results,
+    Summaries,
     changes,
     comes_out,
     errors_of,
@@ -64,11 +64,11 @@ PATH = find_scenario(SCENARIO)
 plan = cache(make_plan)
 
 
-def scenario_of(flight: Flight) -> Scenario:
+def scenario_of(flight: PlannedFlight) -> Scenario:
     return load_scenario(Path(flight.scenario), flight.overrides)
 
 
-def table_flights(p: Plan) -> list[Flight]:
+def table_flights(p: ExperimentPlan) -> list[PlannedFlight]:
     return [f for f in p.flights if f.alone is None and f not in missions_of(p)]
 
 
@@ -236,14 +236,14 @@ def mission_result() -> dict[str, Any]:
     }
 
 
-def complete(p: Plan) -> Results:
+def complete(p: ExperimentPlan) -> Summaries:
     """Results with the errors of the paper's baseline everywhere."""
     errors = BASELINE.position_mse_m2, BASELINE.orientation_mse_rad2
     missions = missions_of(p)
     return {f.label: mission_result() if f in missions else result_of(*errors) for f in p.flights}
 
 
-def scale(results: Results, label: str, factor: float) -> None:
+def scale(results: Summaries, label: str, factor: float) -> None:
     """Multiply the errors of a flight."""
     own = results[label]["chasers"]["0"]
     own["position_mse_m2"] *= factor
@@ -340,7 +340,7 @@ def test_changes_compare_equal_starts() -> None:
     assert shown[1:3] == ("-13.4 %; -1.3 %", "-13.4 % yes; -13.4 % no")
 
 
-def explanations(results: Results) -> dict[str, str]:
+def explanations(results: Summaries) -> dict[str, str]:
     return {row[0]: row[-1] for row in trend_rows(results)}
 
 
@@ -474,7 +474,7 @@ def test_missing_solver_is_one_error_and_a_failed_status(
     flight = flight_of("alone/baseline", SCENARIO, ("controller.solver='open'",), Alone())
     assert needs_open(flight)
     monkeypatch.setattr(reproduction, "missing_part", lambda: "solver 'open' needs cargo")
-    assert fly_and_report(Plan("x", (flight,)), tmp_path) == 1
+    assert fly_and_report(ExperimentPlan("x", (flight,)), tmp_path) == 1
     errors = [
         line for line in capsys.readouterr().err.splitlines() if line.startswith("chaserdock:")
     ]
@@ -495,9 +495,9 @@ def test_result_with_other_settings_counts_as_not_flown() -> None:
 def test_flight_that_crashes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flight = flight_of(table_name(DEFAULT, BASELINE, 0), SCENARIO, ())
     broken = msgspec.structs.replace(flight, overrides=("controller.dt_s=-1",))
-    assert fly_and_report(Plan("x", (broken,)), tmp_path) == 1
+    assert fly_and_report(ExperimentPlan("x", (broken,)), tmp_path) == 1
     assert f"chaserdock: {flight.label}: " in capsys.readouterr().err
-    assert results_of(Plan("x", (broken,)), tmp_path) == {}
+    assert results_of(ExperimentPlan("x", (broken,)), tmp_path) == {}
 
 
 def test_bad_input_prints_one_line_error(tmp_path: Path) -> None:
@@ -507,6 +507,7 @@ def test_bad_input_prints_one_line_error(tmp_path: Path) -> None:
     assert said.strip() == f"chaserdock: {tmp_path / 'file'}: cannot be written: File exists"
 
 
+@pytest.mark.slow
 def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A flight with small images, its lower bound, and a mission; a second call flies nothing and
     writes an equal page.
@@ -519,7 +520,7 @@ def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[
         flight_of("floor/0", SCENARIO, short, Alone(floor=True)),
         mission(TRACKING, DEFAULT, (*small, "duration_s=3.0", "settling_s=2.0")),
     )
-    cut = Plan("cut", flights)
+    cut = ExperimentPlan("cut", flights)
     assert fly_and_report(cut, tmp_path) == 0
     assert f"3/3 {TRACKING}, ours (" in capsys.readouterr().out
     results = results_by_label(cut, results_of(cut, tmp_path))

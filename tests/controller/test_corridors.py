@@ -198,6 +198,7 @@ def test_in_flight_the_plan_stays_in_the_corridor(order: Any) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_chaser_docks_nearer_than_the_others_may_come() -> None:
     """The docking distance lies within the ball that everybody keeps; only the way in along the
     corridor leads there.

@@ -42,6 +42,7 @@ def at_command(scenario: Scenario, *chasers: int) -> tuple[StackMission, list[Co
     return mission, out.replies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chasers", [(0, 1, 2, 3), (0, 3)])
 def test_a_tumbling_stack_stops_and_holds_without_propellant(chasers: tuple[int, ...]) -> None:
     mission, replies = at_command(stack_scenario(2, chasers), *range(len(chasers)))
@@ -64,6 +65,7 @@ def test_a_tumbling_stack_stops_and_holds_without_propellant(chasers: tuple[int,
     mission.close()
 
 
+@pytest.mark.slow
 def test_no_thruster_fires_at_the_target() -> None:
     mission, _ = at_command(stack_scenario(1, (0, 3)), 0, 1)
     thrusters, fired = mission.scenario.chaser.thrusters, set()

@@ -47,6 +47,7 @@ from hypothesis import strategies as st
 # --- consistency and accuracy ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chasers", [1, 2, 4])
 def test_filter_is_consistent_when_noise_matches_the_model(chasers: int) -> None:
     """Truth with the filter's own process noise and white measurements: the mean NEES is 12."""
@@ -87,6 +88,7 @@ def test_filter_is_consistent_when_noise_matches_the_model(chasers: int) -> None
     assert 12 - 3 * math.sqrt(2) < np.mean(values) < 12 + 3 * math.sqrt(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chasers", [1, 2, 4])
 def test_flown_parameters_are_conservative(chasers: int) -> None:
     """With the parameters of a scenario, constant true rates and white measurements, the mean NEES
@@ -106,6 +108,7 @@ def test_flown_parameters_are_conservative(chasers: int) -> None:
     assert 0.55 < np.mean(values) < 2.55
 
 
+@pytest.mark.slow
 def test_steady_accuracy_with_two_chasers() -> None:
     d = np.array([errors(e) for seed in range(2) for e in fly(Mekf(), 2, 30.0, seed)[15 * HZ :]])
     rms = np.sqrt((d.reshape(-1, 4, 3) ** 2).sum(axis=2).mean(axis=0))
@@ -125,6 +128,7 @@ def test_covariance_shrinks_with_more_cameras() -> None:
     assert four.sightings == 4
 
 
+@pytest.mark.slow
 def test_disagreeing_calibrations_do_not_lock_each_other_out() -> None:
     """Biases drawn as the parameters say: no camera is gated out and the covariance is consistent.
     The same without bias states and with a white floor of their size is overconfident."""
@@ -187,6 +191,7 @@ def test_order_within_a_call_does_not_matter(make: type) -> None:
     assert a.drain_events() == b.drain_events()
 
 
+@pytest.mark.slow
 @deterministic
 @given(st.randoms(use_true_random=False))
 def test_late_measurements_end_in_the_same_state(shuffle: random.Random) -> None:

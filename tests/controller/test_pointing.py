@@ -232,6 +232,7 @@ def test_calibrate_is_rejected_without_target_without_bias_states_and_outside_ho
     assert "hold first" in reply(guidance, 3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_mounting_rotation_is_observable_with_calibration_manoeuvre_only(seed: int) -> None:
     """One camera, white noise of 1 mm and 0.2 degrees per image, mounting error of 0.3 degrees (one

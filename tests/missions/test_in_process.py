@@ -41,6 +41,7 @@ ERRORS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overrides", [SHORT, ERRORS], ids=["ideal", "errors"])
 def test_truth_equals_lockstep_mission(
     overrides: tuple[str, ...], shared_flight: Callable[..., Path]

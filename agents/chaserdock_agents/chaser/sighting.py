@@ -35,7 +35,9 @@ Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Predicted pose of the target: position (3,) in IRF and rotation (4,) TRF to IRF."""
 
 _EXPECTED_FOR_NS = 300_000_000
-"""Age at which an expected pose is not used any more."""
+"""Age at which an expected pose is not used any more, ns (chosen): four images at 15 Hz, in which a
+target that turns by 10 degrees/s has turned by 3, the reach of a start (``tracking``).
+"""
 
 
 class BadImage(Exception):

@@ -14,7 +14,7 @@ from chaserdock_models import rotations
 from chaserdock_protocol.scenario.bodies import Target
 
 from chaserdock.experiments.page import PageSection, Table
-from chaserdock.experiments.plan import Plan
+from chaserdock.experiments.plan import ExperimentPlan
 
 from .paper import BASELINE, PAPER_S, ROWS
 from .plan import (
@@ -41,7 +41,7 @@ from .tables import (
     MIN_DISTANCE_M,
     QUANTITIES,
     Quantity,
-    Results,
+    Summaries,
     cell,
     errors_by_label,
     paper_value,
@@ -58,7 +58,9 @@ UNITS: dict[Quantity, tuple[float, str]] = {
 """Factor and name of the paper's units."""
 
 
-def sections(plan: Plan, results: Results, about: Provenance, quick: bool) -> list[PageSection]:
+def sections(
+    plan: ExperimentPlan, results: Summaries, about: Provenance, quick: bool
+) -> list[PageSection]:
     """Return the whole page; ``quick``: of the quick plan."""
     return [
         _result(plan, results, about, quick),
@@ -70,7 +72,9 @@ def sections(plan: Plan, results: Results, about: Provenance, quick: bool) -> li
     ]
 
 
-def _result(plan: Plan, results: Results, about: Provenance, quick: bool) -> PageSection:
+def _result(
+    plan: ExperimentPlan, results: Summaries, about: Provenance, quick: bool
+) -> PageSection:
     """Return provenance, and the number of figures met by column."""
     rows = []
     for column in COLUMNS:
@@ -108,7 +112,7 @@ def _result(plan: Plan, results: Results, about: Provenance, quick: bool) -> Pag
     return PageSection("Result", tuple(parts))
 
 
-def _met(results: Results, column: str, quantity: Quantity) -> str:
+def _met(results: Summaries, column: str, quantity: Quantity) -> str:
     verdicts = [
         verdict(spread(ratios).median)
         for row in ROWS
@@ -117,12 +121,12 @@ def _met(results: Results, column: str, quantity: Quantity) -> str:
     return f"{verdicts.count('met')} of {len(verdicts)}" if verdicts else NONE
 
 
-def _ratios(results: Results, column: str, row, quantity: Quantity) -> list[float]:
+def _ratios(results: Summaries, column: str, row, quantity: Quantity) -> list[float]:
     paper = paper_value(row, quantity)
     return [e.of(quantity) / paper for e in cell(results, column, row).values()]
 
 
-def _table(results: Results, quantity: Quantity) -> PageSection:
+def _table(results: Summaries, quantity: Quantity) -> PageSection:
     """Return the nine rows of one error: ratios to the paper's, with spread and verdict."""
     factor, unit = UNITS[quantity]
     rows = []
@@ -152,7 +156,7 @@ def _spread_text(values: Sequence[float]) -> str:
     )
 
 
-def _trends(results: Results) -> PageSection:
+def _trends(results: Summaries) -> PageSection:
     """Return the changes from the baseline row and the spike, with explanations."""
     spike = [_spike_text(results.get(mission_name(TRACKING, column))) for column in (CODE, DEFAULT)]
     written = _spike_text(results.get(mission_name(TRACKING, WRITTEN)))
@@ -205,7 +209,7 @@ def _spike_explanation(written: str) -> str:
     )
 
 
-def _missions(plan: Plan, results: Results) -> PageSection:
+def _missions(plan: ExperimentPlan, results: Summaries) -> PageSection:
     """Return the paper's missions of several chasers."""
     rows = []
     for flight in missions_of(plan):
@@ -262,7 +266,7 @@ def _worst(mean_squares: Sequence[float | None]) -> float | None:
     return max(known) if len(known) == len(mean_squares) else None
 
 
-def _start(results: Results) -> PageSection:
+def _start(results: Summaries) -> PageSection:
     """Return what the start contributes: other starts, and the lower bound."""
     nominal = errors_by_label(results, f"alone/{BASELINE.name}")
     rows = []

@@ -15,7 +15,13 @@ from chaserdock_models import rotations
 from chaserdock_protocol.scenario.bodies import Target
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
-from chaserdock.experiments.plan import Alone, ExperimentError, Flight, Plan, plan_flight
+from chaserdock.experiments.plan import (
+    Alone,
+    ExperimentError,
+    ExperimentPlan,
+    PlannedFlight,
+    plan_flight,
+)
 
 from .paper import BASELINE, PAPER_S, ROWS, PaperRow
 
@@ -39,10 +45,10 @@ OFFSET_BOUND_M = 0.05  # m
 ROTATION_BOUND_RAD = 0.05  # rad
 ATTITUDE_BOUND_RAD = 0.2  # rad
 RATE_BOUND = 0.2  # share
-"""Bounds of the dispersed starts, assumed, because the paper does not state how well its starts were
-repeated; uniform about the nominal one: each component of the chaser's
+"""Bounds of the dispersed starts, uniform about the nominal one: each component of the chaser's
 offset and of its rotation vector; each component of the rotation vector of the target's initial
-attitude; each component of the target's velocity and angular velocity, as a share of its value."""
+attitude; each component of the target's velocity and angular velocity, as a share of its value.
+They are assumed: the paper does not state how well its starts were repeated."""
 
 OPEN = "controller.solver='open'"
 WRITTEN, CODE, DEFAULT = "as written", "as in the authors' code", "ours"
@@ -81,7 +87,7 @@ def dispersed_start(draw: int) -> tuple[str, ...]:
     )
 
 
-def needs_open(flight: Flight) -> bool:
+def needs_open(flight: PlannedFlight) -> bool:
     """Return whether a flight uses OpEn, the paper's solver."""
     return OPEN in flight.overrides
 
@@ -161,14 +167,14 @@ def code_digest() -> str:
 
 def flight_of(
     label: str, scenario: str, overrides: tuple[str, ...], alone: Alone | None = None, **varied: str
-) -> Flight:
+) -> PlannedFlight:
     """Return a flight of a shipped scenario, with this version of the code."""
     path = find_scenario(scenario)
     salt = code_digest()
     return plan_flight(label, path, overrides, varied=varied, alone=alone, salt=salt)
 
 
-def _table(quick: bool, length: str) -> list[Flight]:
+def _table(quick: bool, length: str) -> list[PlannedFlight]:
     """Return the flights of the paper's table; first one of each row."""
     out = []
     for draw in DRAWS:
@@ -180,7 +186,7 @@ def _table(quick: bool, length: str) -> list[Flight]:
     return out
 
 
-def _explanations(length: str) -> list[Flight]:
+def _explanations(length: str) -> list[PlannedFlight]:
     """Return the flights of the paper's controller alone, from the nominal start, and those that
     give lower bounds.
     """
@@ -222,18 +228,18 @@ def mission_name(scenario: str, column: str) -> str:
     return f"{scenario}, {column}"
 
 
-def mission(scenario: str, column: str, overrides: tuple[str, ...] = ()) -> Flight:
+def mission(scenario: str, column: str, overrides: tuple[str, ...] = ()) -> PlannedFlight:
     """Return a mission of several chasers, in the settings of a column."""
     label = mission_name(scenario, column)
     return flight_of(label, scenario, overrides, mission=scenario, chain=column)
 
 
-def missions_of(plan: Plan) -> list[Flight]:
+def missions_of(plan: ExperimentPlan) -> list[PlannedFlight]:
     """Return the missions of several chasers of a plan."""
     return [flight for flight in plan.flights if "mission" in flight.varied]
 
 
-def _missions() -> list[Flight]:
+def _missions() -> list[PlannedFlight]:
     """Return the paper's missions of several chasers: ours as shipped; EPnP only where the paper
     reports a spike.
     """
@@ -244,8 +250,10 @@ def _missions() -> list[Flight]:
     return out
 
 
-def make_plan(quick: bool) -> Plan:
+def make_plan(quick: bool) -> ExperimentPlan:
     """Return the whole plan; a quick one has one short flight per row, and no missions."""
     length = f"duration_s={QUICK_S if quick else PAPER_S}"
     missions = [] if quick else _missions()
-    return Plan("reproduction", (*_explanations(length), *_table(quick, length), *missions))
+    return ExperimentPlan(
+        "reproduction", (*_explanations(length), *_table(quick, length), *missions)
+    )

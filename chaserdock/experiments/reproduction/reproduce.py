@@ -12,8 +12,8 @@ from chaserdock_protocol.errors import errors_of_writing
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from chaserdock.experiments.page import html, markdown
-from chaserdock.experiments.plan import ExperimentError, Plan
-from chaserdock.experiments.worker import Progress, Workers, fly_plan
+from chaserdock.experiments.plan import ExperimentError, ExperimentPlan
+from chaserdock.experiments.worker import ExperimentProgress, Workers, fly_plan
 from chaserdock.launch.signals import stop_on_signals
 
 from .content import sections
@@ -34,7 +34,7 @@ def reproduce(quick: bool, out: Path, jobs: int) -> int:
     return fly_and_report(make_plan(quick), out.absolute(), quick, jobs)
 
 
-def fly_and_report(plan: Plan, out: Path, quick: bool = False, jobs: int = 1) -> int:
+def fly_and_report(plan: ExperimentPlan, out: Path, quick: bool = False, jobs: int = 1) -> int:
     """Fly any plan of the reproduction; return the exit status."""
     missing = missing_part()
     flights = tuple(f for f in plan.flights if missing is None or not needs_open(f))
@@ -42,8 +42,8 @@ def fly_and_report(plan: Plan, out: Path, quick: bool = False, jobs: int = 1) ->
         out.mkdir(parents=True, exist_ok=True)
         about = begun(out)
         with stop_on_signals("stopping after the active flights") as stop:
-            flyable = Plan(plan.name, flights)
-            outcomes = fly_plan(flyable, out, Workers(jobs), Progress(), stop)
+            flyable = ExperimentPlan(plan.name, flights)
+            outcomes = fly_plan(flyable, out, Workers(jobs), ExperimentProgress(), stop)
         parts = sections(plan, results_by_label(plan, outcomes), about, quick)
         for name, text in (
             ("reproduction.md", markdown(TITLE, parts)),

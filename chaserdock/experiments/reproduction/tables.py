@@ -12,13 +12,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from chaserdock.experiments.plan import Plan
-from chaserdock.experiments.worker import Outcome
+from chaserdock.experiments.plan import ExperimentPlan
+from chaserdock.experiments.worker import FlightOutcome
 
 from .paper import BASELINE, PAPER_S, PaperRow
 from .plan import DRAWS, NOMINAL_OFFSET_M, table_name
 
-Results = dict[str, dict[str, Any]]
+Summaries = dict[str, dict[str, Any]]
 """Summaries of flights by their label."""
 
 BAND = (1.0 / 1.35, 1.35)
@@ -96,7 +96,7 @@ def over_two_minutes(whole: float, steady: float, flown_s: float) -> float:
     return (whole * flown_s + steady * (PAPER_S - flown_s)) / PAPER_S
 
 
-def results_by_label(plan: Plan, outcomes: Mapping[str, Outcome]) -> Results:
+def results_by_label(plan: ExperimentPlan, outcomes: Mapping[str, FlightOutcome]) -> Summaries:
     """Return the summaries of the flights that have one."""
     ended = ((f.label, outcomes[f.name].summary) for f in plan.flights if f.name in outcomes)
     return {label: summary for label, summary in ended if summary is not None}
@@ -119,12 +119,12 @@ def errors_of(summary: Mapping[str, Any]) -> Errors:
     )
 
 
-def errors_by_label(results: Results, label: str) -> Errors | None:
+def errors_by_label(results: Summaries, label: str) -> Errors | None:
     """Return the errors of a flight; None without a result."""
     return errors_of(results[label]) if label in results else None
 
 
-def cell(results: Results, column: str, row: PaperRow) -> dict[int, Errors]:
+def cell(results: Summaries, column: str, row: PaperRow) -> dict[int, Errors]:
     """Return the errors of a table cell by draw, as far as flown."""
     found = {draw: errors_by_label(results, table_name(column, row, draw)) for draw in DRAWS}
     return {draw: errors for draw, errors in found.items() if errors is not None}
@@ -140,7 +140,7 @@ def paper_change(row: PaperRow, quantity: Quantity) -> float:
     return paper_value(row, quantity) / paper_value(BASELINE, quantity) - 1.0
 
 
-def changes(results: Results, column: str, row: PaperRow, quantity: Quantity) -> list[float]:
+def changes(results: Summaries, column: str, row: PaperRow, quantity: Quantity) -> list[float]:
     """Return the changes of a row from the baseline row of the same start, as shares."""
     runs, base = cell(results, column, row), cell(results, column, BASELINE)
     return [runs[d].of(quantity) / base[d].of(quantity) - 1.0 for d in runs if d in base]

@@ -10,7 +10,7 @@ from .plan import CODE, DEFAULT, DELAYS_S, STAGE_WEIGHTS
 from .tables import (
     QUANTITIES,
     Quantity,
-    Results,
+    Summaries,
     cell,
     changes,
     comes_out,
@@ -23,7 +23,7 @@ from .tables import (
 NONE = "-"
 
 
-def trend_rows(results: Results) -> list[tuple[str, ...]]:
+def trend_rows(results: Summaries) -> list[tuple[str, ...]]:
     """Return a row for every row of the paper's table but the baseline: paper, chains, controller
     alone, explanation.
     """
@@ -48,7 +48,7 @@ def change_text(change: float) -> str:
     return f"{100 * change:+.1f} %" if abs(change) < 1.0 else f"x {1 + change:.3g}"
 
 
-def _chain_text(results: Results, column: str, row: PaperRow) -> str:
+def _chain_text(results: Summaries, column: str, row: PaperRow) -> str:
     texts = []
     for q in QUANTITIES:
         values = changes(results, column, row, q)
@@ -59,7 +59,7 @@ def _chain_text(results: Results, column: str, row: PaperRow) -> str:
     return "; ".join(texts)
 
 
-def _alone_change(results: Results, name: str, quantity: Quantity) -> float | None:
+def _alone_change(results: Summaries, name: str, quantity: Quantity) -> float | None:
     """Return the change of a flight on perfect knowledge from the baseline's; None without
     results.
     """
@@ -67,7 +67,7 @@ def _alone_change(results: Results, name: str, quantity: Quantity) -> float | No
     return None if one is None or base is None else one.of(quantity) / base.of(quantity) - 1.0
 
 
-def explanation(results: Results, row: PaperRow) -> str:
+def explanation(results: Summaries, row: PaperRow) -> str:
     """Return what was measured about a trend that does not come out in both errors of the paper's
     chain.
     """
@@ -86,7 +86,7 @@ def explanation(results: Results, row: PaperRow) -> str:
     return " ".join(filter(None, texts)) or "Unexplained."
 
 
-def _by_delay(results: Results, row: PaperRow) -> str:
+def _by_delay(results: Summaries, row: PaperRow) -> str:
     """Find the delay of the command that brings the position error of the controller alone to the
     paper's.
     """
@@ -111,7 +111,7 @@ def _error_text(position_mse_m2: float) -> str:
     return f"{position_mse_m2:.3g}" if position_mse_m2 < 10.0 else "divergence"
 
 
-def _by_stage_weights(results: Results, row: PaperRow) -> str:
+def _by_stage_weights(results: Summaries, row: PaperRow) -> str:
     """Compare with the same dt at stage weights that keep the sum of the stage costs."""
     before = _alone_change(results, f"alone/{row.name}", "position")
     after = _alone_change(results, f"weights/{row.name}", "position")
@@ -129,7 +129,7 @@ def _by_stage_weights(results: Results, row: PaperRow) -> str:
     )
 
 
-def _by_spread(results: Results, row: PaperRow) -> str:
+def _by_spread(results: Summaries, row: PaperRow) -> str:
     """Compare the paper's changes with the spread of the baseline over the dispersed starts."""
     runs = list(cell(results, CODE, BASELINE).values())
     if len(runs) < 2:

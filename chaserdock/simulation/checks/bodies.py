@@ -216,7 +216,7 @@ def _judged(step: FreeStep, view: FlightView) -> DrawnBody | None:
 
 
 @dataclass
-class Momentum(_OfChasers, Check):
+class LinearMomentum(_OfChasers, Check):
     """The momentum of a chaser changes by the impulses of its actuators, disturbances and orbit."""
 
     name = "momentum"

@@ -25,7 +25,7 @@ CHECKS: tuple[type[Check], ...] = (
     bodies.KeepOutZone,
     bodies.InitialState,
     bodies.Displacement,
-    bodies.Momentum,
+    bodies.LinearMomentum,
     bodies.AngularMomentum,
     bodies.TargetMotion,
     bodies.TumbleFalls,

@@ -45,7 +45,9 @@ class ChaserFleet:
 
     def drain_events(self) -> tuple[LogEntry, ...]:
         """Return what has happened since the last call."""
-        events = [(c.level, f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in self.changes]
+        events: list[LogEntry] = [
+            (c.level, f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in self.changes
+        ]
         events += self.notes
         self.changes.clear()
         self.notes.clear()

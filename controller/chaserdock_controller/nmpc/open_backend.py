@@ -27,8 +27,9 @@ import casadi as ca
 import numpy as np
 
 from .casadi_nlp import SingleShootingSolver
-from .problem import Nlp, build_nlp
-from .types import Array, NmpcParameters
+from .casadi_problem import Nlp, build_nlp
+from .problem import NmpcParameters
+from .types import Array
 
 MAX_INNER = 500
 TOLERANCE = 1e-3

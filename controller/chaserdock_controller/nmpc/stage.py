@@ -26,11 +26,12 @@ from chaserdock_controller.interfaces import (
 
 from . import make_solver
 from .budget import Bounded, SolveBudget
-from .checks import check_plan
 from .lost_chasers import with_lost_chasers
 from .passive_safety import PassiveSafetyMonitor
 from .plan_monitor import PlanMonitor, PlanningFailure
-from .types import NmpcInput, NmpcParameters, NmpcPlan
+from .problem import NmpcParameters
+from .types import NmpcInput, NmpcPlan
+from .warm_start import check_plan
 
 _ATTACHED_FACTOR, _ATTACHED_MARGIN = 1.2, 1e-3
 _CANCELLED_SHARE = 0.5
@@ -106,7 +107,7 @@ class PlanningStage:
         left = {i: limits[i] - np.abs(disturbances[i]) for i in horizon.chasers}
         problem = self.problem(horizon, estimation.own_at_effect, left)
         problem = with_lost_chasers(
-            problem, observation.lost, observation.effective_ns, self._parameters.dt_s
+            problem, self._parameters, observation.lost, observation.effective_ns
         )
         if self._passive_safety is not None and guidance.abort_margins:
             safety = self._passive_safety.restriction(

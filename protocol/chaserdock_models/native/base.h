@@ -13,6 +13,7 @@
 #ifndef CHASERDOCK_BASE_H
 #define CHASERDOCK_BASE_H
 
+#include <stddef.h>
 #include <stdint.h>
 
 #define PASTE_(a, b) a##b
@@ -20,6 +21,31 @@
 /* LEVEL: prefix of the exported names for the instruction set of this copy, e.g. v3_. */
 #define NAME(name) PASTE(LEVEL, name)
 #define EXPORT __attribute__((visibility("default")))
+
+/* Layout of a structure that Python fills: export a table that `KernelLibrary.structure` compares with
+ * the ctypes structure when the library is loaded. First the structure's size, then each member's
+ * name, size and offset, in order; a name of NULL ends it. LAYOUT(Point, x, y) stands after Point. */
+typedef struct {
+    const char *name;
+    int64_t size, offset;
+} Member;
+#define LAYOUT(type, ...)                                                                  \
+    EXPORT const Member *NAME(layout_##type)(void) {                                       \
+        static const Member members[] = {                                                  \
+            {#type, sizeof(type), 0}, REPEAT(MEMBERS(type, __VA_ARGS__)){0, 0, 0}};        \
+        return members;                                                                    \
+    }
+#define MEMBERS(type, member, ...)                                            \
+    {#member, sizeof(((type *)0)->member), offsetof(type, member)},           \
+        __VA_OPT__(MEMBERS_AGAIN NOTHING(type, __VA_ARGS__))
+#define MEMBERS_AGAIN() MEMBERS
+#define NOTHING ()
+/* Expand again and again: each time MEMBERS takes the next of at most 81 members. */
+#define REPEAT(...) REPEAT_27(REPEAT_27(REPEAT_27(__VA_ARGS__)))
+#define REPEAT_27(...) REPEAT_9(REPEAT_9(REPEAT_9(__VA_ARGS__)))
+#define REPEAT_9(...) REPEAT_3(REPEAT_3(REPEAT_3(__VA_ARGS__)))
+#define REPEAT_3(...) AGAIN(AGAIN(AGAIN(__VA_ARGS__)))
+#define AGAIN(...) __VA_ARGS__
 
 typedef double v4 __attribute__((vector_size(32), aligned(8), may_alias));
 typedef double row12[12];

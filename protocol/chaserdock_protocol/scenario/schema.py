@@ -29,7 +29,7 @@ from .fields import (
 MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
 PERCEPTIONS = (*MARKER_PERCEPTIONS, "model")
 ESTIMATORS = ("joint", "mekf", "paper")
-SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
+SOLVERS = ("rti", "ipopt", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see
 ``plugins``).
 """
@@ -109,10 +109,8 @@ class PerceptionSection(Section):
     )
 
 
-class Controller(Section):
-    """The NMPC: solver, horizon and weights ([controller.md](controller.md) relates them to the
-    paper's symbols).
-    """
+class ControllerOptions(Section):
+    """Keys of `Controller` that are no part of the NMPC's problem."""
 
     standby: bool = Field(
         default=False,
@@ -133,6 +131,23 @@ class Controller(Section):
         description="Wall time per solve, s: in real time, limits the iterations to what fits. "
         "Only with the solver `rti`.",
     )
+    feed_forward: bool = Field(
+        default=True,
+        description="Count the input cost from the force and torque that the reference motion needs. Otherwise from zero, "
+        "as in the paper.",
+    )
+    command_lifetime_s: Positive = Field(
+        default=0.5, description="Age at which a chaser rejects a command and uses its fallback, s."
+    )
+
+
+class Controller(ControllerOptions):
+    """The NMPC: solver, horizon and weights ([controller.md](controller.md) relates them to the
+    paper's symbols).
+    """
+
+    # Each of these reaches the solver: a parameter of the problem, or a setting of one of its terms
+    # (controller/chaserdock_controller/nmpc/terms), under the same name. Any other is an error.
     horizon_s: Positive = Field(
         default=3.0,
         description=f"Prediction horizon, s: at least one and at most {MAX_STAGES} steps `dt_s`.",
@@ -162,14 +177,6 @@ class Controller(Section):
     )
     integrator: Literal["rk4", "euler"] = Field(
         default="rk4", description="Integrator of the prediction."
-    )
-    feed_forward: bool = Field(
-        default=True,
-        description="Count the input cost from the force and torque that the reference motion needs. Otherwise from zero, "
-        "as in the paper.",
-    )
-    command_lifetime_s: Positive = Field(
-        default=0.5, description="Age at which a chaser rejects a command and uses its fallback, s."
     )
 
     @model_validator(mode="after")

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 from chaserdock_protocol.messages import OperatorCommand
@@ -95,7 +95,7 @@ class DetumbleActivity(Activity):
         """Return the numbers of the chasers in some phases."""
         return frozenset(c.number for c in self._fleet.chasers if c.phase in phases)
 
-    def _why_not(self, chasers: frozenset[int], observation: Observation) -> str:
+    def _why_not(self, chasers: Set[int], observation: Observation) -> str:
         return self.control.why_not(self._state, chasers, observation.isolated)
 
     def _follow_motion(self, observation: Observation) -> None:

@@ -68,6 +68,7 @@ typedef struct {
     int64_t body, next, every;
     const double *motion;
 } Path;
+LAYOUT(Path, body, next, every, motion)
 
 /* Torque (3), body axes, to add to ``torque`` for a step of ``step_s``: ``midpoint_torque`` of gyroscopic.py, to the bit.
  * ``q``: attitude x, y, z, w; ``omega``: rate in world axes. */

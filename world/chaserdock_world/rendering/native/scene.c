@@ -9,6 +9,7 @@
 typedef struct {
     double planes[5][4], borders[4][3], fx, fy, cx, cy, origin[2], near_m;
 } Frustum;
+LAYOUT(Frustum, planes, borders, fx, fy, cx, cy, origin, near_m)
 
 /* A box in its body's axes, metres. */
 typedef struct {

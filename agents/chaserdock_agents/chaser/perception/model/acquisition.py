@@ -31,12 +31,12 @@ from .tracking import is_valid, levels_of, pose_steps, rough_prior_steps, turn_b
 
 @dataclass(frozen=True)
 class AcquisitionParameters:
-    """Numbers of a search without a prior, chosen by benchmarks/markerless.py (part ``acquisition``).
+    """Numbers of a search without a prior, chosen by benchmarks/perception.py (``shape``).
 
     Half and twice: what happens to the five views of five that are acquired with these.
     """
 
-    # Silhouettes at each distance, spread over all attitudes: about 15 degrees apart. Half, twice:
+    # Silhouettes at each distance, spread over all attitudes: about 17 degrees apart. Half, twice:
     # 5 and 5 acquired; half takes twice the time, as more starts fail; twice takes 3.4 instead of
     # 1.6 s to prepare.
     templates: int = 3000

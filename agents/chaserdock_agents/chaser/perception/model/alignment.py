@@ -29,7 +29,7 @@ from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 
 @dataclass(frozen=True)
 class AlignmentParameters:
-    """Numbers of control points and their alignment, chosen by benchmarks/markerless.py (part ``exact``).
+    """Numbers of control points and their alignment, chosen by benchmarks/perception.py (``shape``).
 
     Half and twice: median error of twelve views at 0.9 to 4 m from a prior 1 % and 1.5 degrees off,
     0.106 % of the range with these.

@@ -29,7 +29,7 @@ from .steps import LIGHT_MS, LIKELY_MS, SUNS_MS, VIEWS_MS, Steps, compared_ms
 
 @dataclass(frozen=True)
 class LightParameters:
-    """Numbers of the search for the light, chosen by benchmarks/markerless.py."""
+    """Numbers of the search for the light, chosen by benchmarks/perception.py (``shape``)."""
 
     # Points by which the light is estimated: the time grows with them. @LMP@
     most_points: int = 600
@@ -41,8 +41,8 @@ class LightParameters:
     least_ambient: float = 0.02
     # Standard deviation of a grey level by noise and by facets, beside the texture's. @LGN@
     grey_noise: float = 3.0
-    # A direction is refined among eight at these angles: half and a fifth of the distance of the
-    # directions all around. @LNR@
+    # A direction is refined among eight at these angles, rad: two thirds and a quarter of the
+    # distance of the directions all around. @LNR@
     neighbours_rad: tuple[float, ...] = (0.12, 0.05)
     # Side of the shadow maps of these, texels. @LFT@
     fine_texels: int = 96

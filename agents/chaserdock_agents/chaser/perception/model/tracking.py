@@ -43,7 +43,7 @@ a pose.
 
 @dataclass(frozen=True)
 class TrackingParameters:
-    """Numbers of the way from a prior to a pose, chosen by benchmarks/markerless.py."""
+    """Numbers of the way from a prior to a pose, chosen by benchmarks/perception.py (``shape``)."""
 
     # The finest level shows the target on at most so many pixels: 36 ms of CPU
     # (``steps.level_ms``). @TF@

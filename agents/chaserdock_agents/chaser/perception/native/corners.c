@@ -34,6 +34,10 @@ typedef struct {
     double log_edge_sigma, edge_sigma_spread, rounds, iterations, strip_iterations;
     double uncertain_px, uncertain_level;
 } Settings;
+LAYOUT(Settings, reach_cells, reach_least_px, min_contrast, min_rows_share, max_move_px, first, last,
+       rows, taps, coarse_reach_px, border_share, columns, end_px, end_share, reach_px, clear_px,
+       beyond_px, strip_px, partial_px, least_fall, agreement_px, log_edge_sigma, edge_sigma_spread,
+       rounds, iterations, strip_iterations, uncertain_px, uncertain_level)
 
 typedef struct {
     double start[2], vector[2], normal[2], extent;

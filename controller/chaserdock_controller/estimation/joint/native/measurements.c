@@ -10,6 +10,8 @@ typedef struct {
     const double *lens, *axes, *camera, *odometry, *odometry_noise, *sighting, *stated, *view;
     double white_ratio, view_ratio;
 } Measurement;
+LAYOUT(Measurement, n, i, lens, axes, camera, odometry, odometry_noise, sighting, stated, view,
+       white_ratio, view_ratio)
 
 static int rows_of(const Measurement *z) { return (z->sighting ? SIGHTING_ROWS : 0) + (z->odometry ? ODOMETRY_ROWS : 0); }
 

@@ -9,6 +9,9 @@ typedef struct {
     double control_force_share, control_torque_share, control_arm, force_max, torque_max, disturbance_force,
         disturbance_torque, latched_acceleration, latched_angular_acceleration;
 } Motion;
+LAYOUT(Motion, dt, mass, inertia, mean_motion, fade_position, fade_attitude, unknown_s,
+       control_force_share, control_torque_share, control_arm, force_max, torque_max,
+       disturbance_force, disturbance_torque, latched_acceleration, latched_angular_acceleration)
 
 static void angular_acceleration(const double *torque, const double *omega, const double *inertia, double *alpha) {
     const double momentum[3] = {inertia[0] * omega[0], inertia[1] * omega[1], inertia[2] * omega[2]};

@@ -9,6 +9,7 @@ typedef struct {
     double *residual, *jacobian, *noise, *s, *cross, *white, *correction, *values;
     int64_t stride, size;
 } Innovation;
+LAYOUT(Innovation, residual, jacobian, noise, s, cross, white, correction, values, stride, size)
 
 static void body_difference(const double *a, const double *b, double *error) {
     for (int i = 0; i < 3; i++) {

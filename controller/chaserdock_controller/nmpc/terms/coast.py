@@ -10,14 +10,17 @@ sufficient at that moment. Only chasers whose plans without these rows are not s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from ctypes import c_int64
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.passive_safety import CoastCertificate
 
-from .types import CoastSafety, NmpcParameters
+from chaserdock_controller.nmpc.term import Constraint, address_of, pointer
+from chaserdock_controller.nmpc.types import CoastSafety, NmpcInput
 
 COASTS = 3
 """Number of approaches of a coast that are restricted."""
@@ -25,6 +28,20 @@ SPARE_SHARE = 0.05
 """Share of the required margin that plans keep in addition: the approaches, and with them the
 planes, move as a plan is bent.
 """
+
+
+@dataclass(frozen=True)
+class PassiveCoasts(Constraint):
+    """The coast from every stage stays outside of the keep-out, as half-spaces of position and
+    velocity that `rti` asks for where a plan without them is not safe. Only `rti` keeps it.
+    """
+
+    MEMBERS = (("n_coasts", c_int64), pointer("coasts"))
+
+    def native(self, problem: NmpcInput) -> Sequence[Any]:
+        """Return the number of coasts at a stage, and their address."""
+        coasts = problem.coasts
+        return (0, None) if coasts is None else (coasts.shape[2], address_of(coasts))
 
 
 def certify(safety: CoastSafety, states: Array, targets: Array) -> dict[int, CoastCertificate]:
@@ -56,7 +73,7 @@ def _origin(safety: CoastSafety, targets: Array) -> Array:
     return np.concatenate([targets, np.tile(safety.target_velocity_m_s, (len(targets), 1))], axis=1)
 
 
-def coast_rows(safety: CoastSafety, states: Array, targets: Array, params: NmpcParameters) -> Array:
+def coast_rows(safety: CoastSafety, states: Array, targets: Array, horizon_s: float) -> Array:
     """Return half-spaces (N, D+1, C, 7) as in `NmpcInput` about plans ``states`` (N, D+1, 13).
 
     ``targets`` (D+1, 3): positions of the target. Rows are scaled so that a displacement by 1 m, or
@@ -64,15 +81,15 @@ def coast_rows(safety: CoastSafety, states: Array, targets: Array, params: NmpcP
     are priced as the distances are.
     """
     n, nodes, _ = states.shape
-    rows = np.zeros((n, nodes, params.coasts, 7))
+    rows = np.zeros((n, nodes, COASTS, 7))
     origin, sigmas = _origin(safety, targets[1:]), _planned_sigmas(safety)
     for i, covariance in safety.covariances.items():
         relative = states[i, 1:, :6] - origin
         planes = safety.coast.tangent_planes(
-            relative, covariance, safety.keep_out_m, sigmas, params.coasts
+            relative, covariance, safety.keep_out_m, sigmas, COASTS
         )
         planes[..., 6] += np.einsum("kcj,kj->kc", planes[..., :6], origin)
-        by_velocity = np.linalg.norm(planes[..., 3:6], axis=2) / (params.stages * params.dt_s)
+        by_velocity = np.linalg.norm(planes[..., 3:6], axis=2) / horizon_s
         scale = np.maximum(np.linalg.norm(planes[..., :3], axis=2), by_velocity)
         rows[i, 1:] = planes / np.where(scale > 0.0, scale, 1.0)[..., None]
     return rows

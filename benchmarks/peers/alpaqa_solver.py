@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Back end `alpaqa`: PANOC with an augmented Lagrangian, the solver family of the paper, from the
-wheel `alpaqa`.
+"""alpaqa on the problem of the NMPC, for comparison: PANOC with an augmented Lagrangian, the solver
+family of the paper.
 
-Single shooting of `problem.build_nlp`: states are eliminated, and the augmented Lagrangian handles
-the distances; its largest penalty corresponds to the slack. CasADi's alpaqa plugin has fixed
-settings (tolerance 1e-10, L-BFGS memory 2) and prints at each call, so the wheel `alpaqa` is used
-(extra ``chaserdock[alpaqa]``). Limited by iterations, never by time.
+Single shooting of `build_nlp`: states are eliminated, and the augmented Lagrangian handles the
+distances; its largest penalty corresponds to the slack. CasADi's alpaqa plugin has fixed settings
+(tolerance 1e-10, L-BFGS memory 2) and prints at each call, so the wheel `alpaqa` is used (``pip
+install alpaqa``). Limited by iterations, never by time.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-
-from .casadi_nlp import SingleShootingSolver
-from .problem import Nlp, build_nlp
-from .types import Array, NmpcParameters
+from chaserdock_controller.nmpc import NmpcParameters
+from chaserdock_controller.nmpc.casadi_nlp import SingleShootingSolver
+from chaserdock_controller.nmpc.casadi_problem import Nlp, build_nlp
+from chaserdock_models.arrays import Array
 
 MAX_OUTER, MAX_INNER = 10, 100
 # For inputs scaled by their limits: gradient in units of cost (initially about 1e3), and metres.
@@ -35,11 +35,9 @@ class AlpaqaSolver(SingleShootingSolver):
         self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
     ) -> None:
         try:
-            import alpaqa  # pyright: ignore[reportMissingImports] (an extra)
+            import alpaqa  # pyright: ignore[reportMissingImports] (not a dependency)
         except ImportError:
-            raise ValueError(
-                "solver 'alpaqa' needs the package alpaqa: pip install 'chaserdock[alpaqa]'"
-            ) from None
+            raise ValueError("'alpaqa' needs the package alpaqa: pip install alpaqa") from None
         inner = MAX_INNER if max_iterations is None else max_iterations
         inner_solver: Any = alpaqa.PANOCSolver({"max_iter": inner}, {"memory": 30})
         self._solver: Any = alpaqa.ALMSolver(

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""acados on the problem of `nmpc/problem.py`, for comparison in `nmpc.py`: SQP-RTI, HPIPM and
-compiled code.
+"""acados on the problem of the NMPC, for comparison: SQP-RTI, HPIPM and compiled code.
 
 "coupled" is one optimal control problem of all chasers; "decoupled" is one for each chaser, solved
 in sequence in one thread, with the others' last plans as moving obstacles. Needs acados_template
@@ -19,9 +18,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from chaserdock_controller.nmpc.problem import dynamics, multiply
+from chaserdock_controller.nmpc import NmpcInput, NmpcParameters, NmpcPlan
+from chaserdock_controller.nmpc.casadi_model import dynamics
+from chaserdock_controller.nmpc.casadi_vectors import multiply
 from chaserdock_controller.nmpc.slack import SLACK_L2, slack_l1_weight
-from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan
+from chaserdock_controller.nmpc.terms.attitude import AttitudeCost
+from chaserdock_controller.nmpc.terms.input import InputCost
+from chaserdock_controller.nmpc.terms.position import PositionCost
 from chaserdock_controller.nmpc.warm_start import Frame, PreparedProblem, status_of
 from chaserdock_models.arrays import Array
 
@@ -90,10 +93,14 @@ def _ocp(name: str, own: int, others: int, params: NmpcParameters, folder: str) 
     ocp.parameter_values = np.ones(ocp.model.p.numel())
 
     # Every residual is linear in x and u once q_ref is known; Vx is set with it.
-    position, orientation = params.stage_weights()
+    position, orientation, inputs = (
+        params.weights[term]
+        for kind in (PositionCost, AttitudeCost, InputCost)
+        for term in params.of_kind(kind)
+    )
     ocp.cost.cost_type = ocp.cost.cost_type_0 = ocp.cost.cost_type_e = "LINEAR_LS"
-    inputs = [params.weight_force] * 3 + [params.weight_torque] * 3
-    ocp.cost.W = 2.0 * np.diag([position[0]] * 3 * own + [orientation[0]] * 3 * own + inputs * own)
+    squares = [position[0]] * 3 * own + [orientation[0]] * 3 * own + [*inputs[0]] * own
+    ocp.cost.W = 2.0 * np.diag(squares)
     ocp.cost.W_e = 2.0 * np.diag([position[-1]] * 3 * own + [orientation[-1]] * 3 * own)
     ocp.cost.Vx, ocp.cost.Vx_e = np.zeros((12 * own, nx)), np.zeros((6 * own, nx))
     ocp.cost.Vu = np.vstack([np.zeros((nu, nu)), np.eye(nu)])
@@ -181,7 +188,7 @@ class AcadosSolver:
         frame = self._frame
         cold = not frame.plans
         task = frame.begin(problem, shift_s, ids)
-        if task.corridors.any() or len(task.names) != frame.n_max:
+        if np.any(task.problem.corridors) or len(task.names) != frame.n_max:
             raise ValueError(f"acados is set up for {frame.n_max} chasers without corridors")
         guess = frame.rolled(task, task.start)
         if cold:
@@ -233,8 +240,9 @@ class AcadosSolver:
                 solver.cost_set(k, "Vx", vx, api="new")
         away_m = np.linalg.norm(p.states[group, :3] - p.references[group, -1, :3], axis=-1)
         slack_weight = slack_l1_weight(params, away_m.max(keepdims=True))
-        between = task.between[np.ix_(group, group)][np.triu_indices(own, 1)]
-        clear = task.between[np.ix_(group, others)].ravel()
+        distances = np.asarray(p.min_distance_chasers_m)
+        between = distances[np.ix_(group, group)][np.triu_indices(own, 1)]
+        clear = distances[np.ix_(group, others)].ravel()
         limits = p.input_max[group].ravel()
         start = p.states[group].ravel()
         solver.set(0, "lbx", start)

@@ -8,13 +8,19 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.guidance.chaser_machine import ChaserMachine
+from chaserdock_controller.guidance.chaser_state import ChaserTick, CommandResult, TrackingErrors
+from chaserdock_controller.guidance.docking import DockingObservation
+from chaserdock_controller.guidance.fleet import ChaserFleet
+from chaserdock_controller.guidance.phases import Trigger
+from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_controller.guidance.trajectories import Motion
 from chaserdock_controller.interfaces import Observation
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import Odometry, Sighting
-from chaserdock_protocol.scenario import Scenario, parse_scenario
+from chaserdock_protocol.messages import Odometry, OperatorCommand, Sighting
+from chaserdock_protocol.scenario import FlightScenario, Scenario, parse_scenario
 from hypothesis import settings
 from hypothesis import strategies as st
 
@@ -42,9 +48,49 @@ def at(move: Motion, t: float) -> tuple[Array, Array, Array]:
     return p[0], v[0], a[0]
 
 
-def drain(guidance: PhaseMachine) -> list[tuple[int, str, str]]:
+_STILL = np.zeros(3)
+TARGET_AT_REST = TargetState(
+    0, _STILL, _STILL, np.array([1.0, 0.0, 0.0, 0.0]), _STILL, np.eye(12) * 1e-8, "tracking", 0, ()
+)
+
+
+def fleet_of(scenario: FlightScenario, acquired_s: float | None = None) -> ChaserFleet:
+    """Return the chasers of a scenario; they hold if the target is ``acquired_s``."""
+    fleet = GuidanceStage(scenario).fleet
+    if acquired_s is not None:
+        for chaser in fleet.chasers:
+            chaser.fire(Trigger.TARGET_ACQUIRED, acquired_s)
+        drain(fleet)
+    return fleet
+
+
+def order(fleet: ChaserFleet, command: OperatorCommand, now_s: float) -> CommandResult:
+    """Give one command in a tick."""
+    return fleet.apply([command], now_s)[0]
+
+
+def known(now_s: float, **changes: Any) -> ChaserTick:
+    """What guidance knows of a chaser: its target is in sight and at rest."""
+    return ChaserTick(now_s, **({"own": odometry(), "target": TARGET_AT_REST} | changes))
+
+
+def step(
+    chaser: ChaserMachine,
+    now_s: float,
+    error_m: float = 0.0,
+    error_rad: float = 0.0,
+    port: DockingObservation | None = None,
+) -> None:
+    """Let a chaser do a tick; it is where its reference is."""
+    here = known(now_s, offset_m=at(chaser.motion(now_s), now_s)[0], port=port)
+    chaser.step(here, TrackingErrors(error_m, error_rad))
+
+
+def drain(fleet: ChaserFleet) -> list[tuple[int, str, str]]:
     """Return the phase changes since the last call: chaser, phase, detail."""
-    return [(c.chaser, c.phase, c.detail) for c in guidance.drain_changes()]
+    changes = [(c.chaser, c.phase, c.detail) for c in fleet.changes]
+    fleet.drain_events()
+    return changes
 
 
 def odometry(chaser: int = 0, tick: int = 0, time_ns: int = 0, **changes: Any) -> Odometry:

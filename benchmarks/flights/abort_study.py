@@ -13,8 +13,10 @@ from typing import cast
 
 import numpy as np
 from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.guidance.chaser_state import ChaserTick, TrackingErrors
 from chaserdock_controller.guidance.escape import EscapePlanner, RelativeState
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.phases import Phase, Trigger
+from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.orbit import HillFrame, hill_frame, propagate, state_of
@@ -22,11 +24,13 @@ from chaserdock_models.relative_motion import relative_acceleration
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 
 STEP_S = 10.0
+"""Step of RK4 of a coast of two orbits (some 5,500 s each)."""
 _POSITION_SHARE, _POSITION_M = 8e-4, 2e-3
 _VELOCITY_SHARE, _VELOCITY_M_S = 3e-6, 4e-4
 """Errors by distance: those of the joint filter in `v-bar` after 30 s are 0.16 m and 0.7 to 1.6
 mm/s at 200 m, 0.08 m and 0.6 to 0.9 mm/s at 100 m, and shrink further."""
 _BURN_ERROR = 0.03
+"""Error of a burn, share, one sigma."""
 
 
 def navigation_covariance(distance_m: float) -> Array:
@@ -38,6 +42,12 @@ def navigation_covariance(distance_m: float) -> Array:
     return np.diag([position_m**2] * 3 + [velocity_m_s**2] * 3)
 
 
+def still_target(scenario: Scenario) -> TargetState:
+    """Return the target of a scenario as guidance sees one that does not turn."""
+    values = SimpleNamespace(q_wxyz=np.asarray(scenario.target.q_wxyz), omega_rad_s=np.zeros(3))
+    return cast(TargetState, values)
+
+
 def profile(scenario: Scenario) -> tuple[EscapePlanner, Array, Array]:
     """Return the guidance's planner of aborts, and the profile of chaser 0: times (K,), states (K,
     6) relative to the target, WRF.
@@ -45,31 +55,29 @@ def profile(scenario: Scenario) -> tuple[EscapePlanner, Array, Array]:
     It ends where the chaser waits at the entry of its corridor. Raises ValueError for a refused
     command.
     """
-    machine = PhaseMachine(flight_scenario(scenario))
-    target = scenario.target
-    attitude = np.asarray(target.q_wxyz)
-    still = cast(TargetState, SimpleNamespace(q_wxyz=attitude, omega_rad_s=np.zeros(3)))
-    machine.target_acquired(0.0)
+    fleet = GuidanceStage(flight_scenario(scenario)).fleet
+    chaser, planner, still = fleet.chasers[0], fleet.moves.escapes, still_target(scenario)
+    chaser.fire(Trigger.TARGET_ACQUIRED, 0.0)
     times, states = [], []
-    planner = machine.escapes
     if planner is None:
         raise ValueError('the study needs limits.passive_safety = "enforce"')
     last = max((entry.at_s for entry in scenario.timeline), default=0.0)
     for now_s in np.arange(0.0, scenario.duration_s, 1.0).tolist():
-        offsets, velocities, _ = machine.chasers[0].move.at(np.array([now_s]))
-        state = rotations.rotate(attitude, np.stack([offsets[0], velocities[0]])).ravel()
-        machine.set_position(0, offsets[0])
-        planner.relative[0] = RelativeState(
-            state, navigation_covariance(float(np.linalg.norm(offsets[0]))), still
-        )
-        for command in machine.due_commands(now_s):
-            result = machine.command(command, now_s)
+        offsets, velocities, _ = chaser.state.move.at(np.array([now_s]))
+        state = rotations.rotate(still.q_wxyz, np.stack([offsets[0], velocities[0]])).ravel()
+        covariance = navigation_covariance(float(np.linalg.norm(offsets[0])))
+        chaser.position_m = offsets[0]
+        chaser.relative = RelativeState(state, covariance, still)
+        commands = fleet.due_commands(now_s)
+        for command, result in zip(commands, fleet.apply(commands, now_s), strict=True):
             if not result.accepted:
                 raise ValueError(f"{command.command} at {now_s:g} s: {result.reason}")
         times.append(now_s)
         states.append(state)
-        machine.update_tracking(0, now_s, 0.0, 0.0)
-        if now_s > last and machine.chasers[0].move.over_at(now_s):
+        if chaser.phase is not Phase.ALIGN:  # there it would look at its port
+            here = ChaserTick(now_s, own=None, target=still, offset_m=offsets[0])
+            chaser.step(here, TrackingErrors(0.0, 0.0))
+        if now_s > last and chaser.state.move.over_at(now_s):
             break
     return planner, np.array(times), np.array(states)
 
@@ -106,12 +114,10 @@ def study(scenario: Scenario, aborts: int, seed: int) -> AbortOutcome:
     for row in rng.integers(0, len(times), aborts):
         state = states[row]
         covariance = navigation_covariance(float(np.linalg.norm(state[:3])))
-        planner.relative[0] = RelativeState(state, covariance, planner.relative[0].target)
-        found = planner.escape(0, float(times[row]))
-        assert found is not None
-        escape, margin = found
+        known = RelativeState(state, covariance, still_target(scenario))
+        escape, margin = planner.escape(known, float(times[row]))
         certified += margin >= planner.sigmas
-        impulses.append(float(np.linalg.norm(escape.acceleration_m_s2)) * escape.burn_s)
+        impulses.append(escape.impulse_m_s)
         error = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
         burn = escape.acceleration_m_s2 * (1.0 + _BURN_ERROR * rng.standard_normal())
         nearest_m = _fly(state + error, burn, escape.burn_s, frames)

@@ -15,7 +15,7 @@ from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.guidance.thruster_commands import ThrusterCommandHandler
+from chaserdock_controller.guidance.thruster_commands import ThrusterCommands
 from chaserdock_controller.ingest.latency_compensation import (
     CommandHistory,
     predict_state,
@@ -25,11 +25,11 @@ from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.faults import faults_of
-from flight_cases import odometry
+from flight_cases import fleet_of, odometry, order
 from flights.measured_poses import measurement_model
 from thruster_cases import at_rest, box, mission, wrench
 
-from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.experiments.flight_record import record_flight
 
 
 def limits(report: ThrusterReport) -> np.ndarray:
@@ -222,9 +222,7 @@ def test_commanded_force_respects_reported_limits() -> None:
 def test_operator_gets_reply_with_reason(
     command: dict[str, Any], accepted: bool, reason: str
 ) -> None:
-    answer = ThrusterCommandHandler(mission()).command(
-        OperatorCommand(command="isolate", **command), 2.0
-    )
+    answer = order(fleet_of(mission()), OperatorCommand(command="isolate", **command), 2.0)
     assert (answer.accepted, reason in answer.reason) == (accepted, True)
 
 
@@ -241,7 +239,7 @@ def test_operator_commands_reach_the_chaser_and_persist() -> None:
         "thruster 2 is already restored",
     ]
     assert (out.wrenches[0].isolated, out.wrenches[0].trusted) == ((), (2,))
-    ideal = ThrusterCommandHandler(mission(chaser={"actuation": "ideal"}))
+    ideal = ThrusterCommands(mission(chaser={"actuation": "ideal"}).chaser)
     assert not ideal.command(OperatorCommand(command="isolate", chaser=0, thruster=2), 0.0).accepted
 
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import RelativePose, TargetState
+from chaserdock_controller.guidance.activities.docking import pull_N
 from chaserdock_controller.guidance.horizon import ReferenceBuilder
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario, senses
-from flight_cases import at, drain
+from flight_cases import at, drain, fleet_of, order, step
 
 DT_S = 0.1
 
@@ -24,10 +25,11 @@ class Pilot:
 
     def __init__(self, chasers: int = 1, **changes: Any) -> None:
         self.scenario = scenario(chasers, **changes)
-        self.guidance = PhaseMachine(self.scenario)
+        self.guidance = fleet_of(self.scenario)
+        for chaser in self.guidance.chasers:
+            chaser.fire(Trigger.TARGET_ACQUIRED, 0.0)
         self.now_s = 0.0
         self.observed: dict[int, dict[str, Any]] = {}
-        self.guidance.target_acquired(0.0)
         self.fly(DT_S)
 
     def phase(self, i: int = 0) -> str:
@@ -35,18 +37,16 @@ class Pilot:
 
     def ask(self, what: str, i: int = 0, **more: Any) -> tuple[bool, str]:
         command = OperatorCommand(command=what, chaser=i, **more)  # type: ignore[arg-type]
-        answer = self.guidance.command(command, self.now_s)
+        answer = order(self.guidance, command, self.now_s)
         return answer.accepted, answer.reason
 
     def fly(self, seconds: float) -> None:
         for _ in range(round(seconds / DT_S)):
             self.now_s += DT_S
-            for i in range(len(self.scenario.chasers)):
-                position = at(self.guidance.chasers[i].move, self.now_s)[0]
-                self.guidance.update_tracking(i, self.now_s, 0.0, 0.0)
-                self.guidance.update_docking(
-                    i, self.now_s, senses(position, **self.observed.get(i, {}))
-                )
+            for i, chaser in enumerate(self.guidance.chasers):
+                position = at(chaser.state.move, self.now_s)[0]
+                port = senses(position, **self.observed.get(i, {}))
+                step(chaser, self.now_s, port=port)
 
     def fly_to(self, phase: str, i: int = 0, limit_s: float = 80.0) -> None:
         begun_s = self.now_s
@@ -61,15 +61,15 @@ class Pilot:
 
 def test_all_phases_in_order_and_the_latch_armed_only_where_it_should_be() -> None:
     pilot = Pilot()
-    seen = [(pilot.phase(), pilot.guidance.latch(0))]
+    seen = [(pilot.phase(), pilot.guidance.chasers[0].latch())]
     assert pilot.ask("approach") == (True, "phase align")
     for phase in ("align", "approach", "final", "contact"):
         pilot.fly_to(phase)
-        seen.append((pilot.phase(), pilot.guidance.latch(0)))
+        seen.append((pilot.phase(), pilot.guidance.chasers[0].latch()))
     pilot.observed[0] = {"latched": True}
     for phase in ("latched", "verified"):
         pilot.fly_to(phase)
-        seen.append((pilot.phase(), pilot.guidance.latch(0)))
+        seen.append((pilot.phase(), pilot.guidance.chasers[0].latch()))
     assert seen == [
         ("hold", "release"),
         ("align", "release"),
@@ -89,7 +89,7 @@ def test_the_approach_tapers_and_stays_on_the_axis() -> None:
     pilot.fly_to("approach")
     docking, fastest = pilot.scenario.docking, 0.0
     while pilot.phase() in ("approach", "final"):
-        position, velocity, _ = at(pilot.guidance.chasers[0].move, pilot.now_s)
+        position, velocity, _ = at(pilot.guidance.chasers[0].state.move, pilot.now_s)
         gap = -0.2 - 0.35 - position[0]
         speed = float(velocity[0])
         fastest = max(fastest, speed)
@@ -157,10 +157,10 @@ def test_a_broken_limit_leads_back_out_and_to_another_attempt(
     assert pilot.phase() == "retreat"
     (event,) = drain(pilot.guidance)
     assert why in event[2]
-    assert pilot.guidance.latch(0) == "release"
+    assert pilot.guidance.chasers[0].latch() == "release"
     pilot.observed[0] = {}
     pilot.fly_to("verified")
-    assert pilot.guidance.chasers[0].attempt == 2
+    assert pilot.guidance.chasers[0].state.attempt == 2
 
 
 def test_after_the_last_attempt_it_holds_at_its_nominal_place() -> None:
@@ -173,7 +173,7 @@ def test_after_the_last_attempt_it_holds_at_its_nominal_place() -> None:
         pilot.fly_to("retreat")
     pilot.fly_to("hold")
     np.testing.assert_allclose(
-        at(pilot.guidance.chasers[0].move, pilot.now_s)[0], (-1.0, 0.0, -0.05), atol=1e-9
+        at(pilot.guidance.chasers[0].state.move, pilot.now_s)[0], (-1.0, 0.0, -0.05), atol=1e-9
     )
 
 
@@ -199,9 +199,9 @@ def test_a_latch_that_slips_under_the_pull_is_not_verified() -> None:
     pilot.fly_to("latched")
     docking = pilot.scenario.docking
     pilot.fly(docking.settle_s + 2 * DT_S)
-    assert pilot.guidance.pull_N(0, pilot.now_s) == docking.pull_N
-    slipped = at(pilot.guidance.chasers[0].move, pilot.now_s)[0] - (0.006, 0.0, 0.0)
-    pilot.guidance.update_docking(0, pilot.now_s, senses(slipped, latched=True))
+    assert pull_N(pilot.guidance.chasers[0], pilot.now_s) == docking.pull_N
+    slipped = at(pilot.guidance.chasers[0].state.move, pilot.now_s)[0] - (0.006, 0.0, 0.0)
+    step(pilot.guidance.chasers[0], pilot.now_s, port=senses(slipped, latched=True))
     assert pilot.phase() == "retreat"
     assert "moved 6.00 mm" in drain(pilot.guidance)[-1][2]
 
@@ -214,32 +214,30 @@ def test_a_chaser_whose_latch_does_not_open_waits_at_its_port() -> None:
     pilot.ask("approach")
     pilot.fly_to("verified")
     machine = pilot.guidance
-    place = at(machine.chasers[0].move, pilot.now_s)[0]
+    place = at(machine.chasers[0].state.move, pilot.now_s)[0]
     pilot.ask("retreat")
     drain(machine)
 
     def observe(seconds: float, latched: bool, sensed: bool = True) -> list[str]:
         for _ in range(round(seconds / DT_S)):
             pilot.now_s += DT_S
-            machine.update_tracking(0, pilot.now_s, 0.0, 0.0)
-            machine.update_docking(
-                0, pilot.now_s, replace(senses(place, latched=latched), sensed=sensed)
-            )
+            port = replace(senses(place, latched=latched), sensed=sensed)
+            step(machine.chasers[0], pilot.now_s, port=port)
         return [event[2] for event in drain(machine)]
 
     assert observe(0.8, latched=True) == []
     assert observe(2.0, latched=True, sensed=False) == []  # nothing is known of the latch
-    assert not machine.chasers[0].stuck
+    assert not machine.chasers[0].state.stuck
     assert observe(20.0, latched=True) == ["the latch does not open"]
     assert pilot.phase() == "retreat"
-    assert machine.chasers[0].stuck
-    assert machine.latch(0) == "release"
-    assert machine.min_distance_target_m(0) == 0.0
-    np.testing.assert_allclose(at(machine.chasers[0].move, pilot.now_s)[0], place, atol=1e-9)
+    assert machine.chasers[0].state.stuck
+    assert machine.chasers[0].latch() == "release"
+    assert machine.chasers[0].min_distance_target_m() == 0.0
+    np.testing.assert_allclose(at(machine.chasers[0].state.move, pilot.now_s)[0], place, atol=1e-9)
     assert observe(DT_S, latched=True, sensed=False) == []
-    assert machine.chasers[0].stuck
+    assert machine.chasers[0].state.stuck
     assert observe(DT_S, latched=False) == ["the latch opened"]
-    assert not machine.chasers[0].stuck
+    assert not machine.chasers[0].state.stuck
     pilot.observed[0] = {}
     pilot.fly_to("hold")
 
@@ -248,9 +246,9 @@ def test_the_pull_gives_back_the_impulse_that_it_takes() -> None:
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to("latched")
-    since_s, given = pilot.guidance.chasers[0].since_s, []
+    since_s, given = pilot.guidance.chasers[0].state.since_s, []
     while pilot.phase() == "latched":
-        given.append(pilot.guidance.pull_N(0, pilot.now_s))
+        given.append(pull_N(pilot.guidance.chasers[0], pilot.now_s))
         pilot.fly(DT_S)
     assert max(given) == -min(given) == pilot.scenario.docking.pull_N
     assert abs(sum(given)) * DT_S <= pilot.scenario.docking.pull_N * DT_S
@@ -269,10 +267,10 @@ def test_from_every_phase_there_is_a_way_out_along_the_axis_and_in_again(
     assert pilot.ask(what) == (True, f"phase {what}")
     assert pilot.ask(what) == (True, f"already in phase {what}")
     pilot.observed[0] = {}
-    assert pilot.guidance.latch(0) == "release"
+    assert pilot.guidance.chasers[0].latch() == "release"
     gap = -1.0
     while pilot.phase() == what:
-        position = at(pilot.guidance.chasers[0].move, pilot.now_s)[0]
+        position = at(pilot.guidance.chasers[0].state.move, pilot.now_s)[0]
         assert abs(position[1]) < 1e-9
         assert -0.55 - position[0] >= gap - 1e-9 or phase == "align"
         gap = -0.55 - position[0]
@@ -339,14 +337,14 @@ def test_two_dock_at_once_and_a_chaser_in_the_way_waits() -> None:
 def test_corridor_replaces_the_keep_out_only_for_the_chaser_in_it() -> None:
     pilot = Pilot(chasers=2)
     limit = pilot.scenario.limits.min_distance_target_m
-    assert pilot.guidance.min_distance_target_m(0) == limit
+    assert pilot.guidance.chasers[0].min_distance_target_m() == limit
     pilot.ask("approach")
     pilot.fly_to("final")
-    assert 0.4 < pilot.guidance.min_distance_target_m(0) < 0.53
-    assert pilot.guidance.min_distance_target_m(1) == limit
+    assert 0.4 < pilot.guidance.chasers[0].min_distance_target_m() < 0.53
+    assert pilot.guidance.chasers[1].min_distance_target_m() == limit
     pilot.fly_to("verified")
-    assert pilot.guidance.min_distance_target_m(0) == 0.0
-    assert pilot.guidance.min_distance_target_m(1) == limit
+    assert pilot.guidance.chasers[0].min_distance_target_m() == 0.0
+    assert pilot.guidance.chasers[1].min_distance_target_m() == limit
 
 
 @pytest.mark.parametrize(("phase", "pushed"), [("final", False), ("hold", True)])
@@ -360,12 +358,14 @@ def test_uncertainty_pushes_no_chaser_out_of_its_corridor(phase: str, pushed: bo
     pilot.fly_to(phase)
     still, q = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     target = TargetState(0, still, still, q, still, np.eye(12) * 1e-8, "predicting", 0, ())
-    builder = ReferenceBuilder(pilot.scenario, pilot.guidance)
-    limit_m = pilot.guidance.min_distance_target_m(0)
+    builder, planned = ReferenceBuilder(pilot.scenario), pilot.guidance.chasers
+    limit_m = pilot.guidance.chasers[0].min_distance_target_m()
     for sigma_m, margin_m in ((0.001, 0.003), (0.03, 0.09)):
         place = RelativePose(0, np.array([-limit_m - 0.02, 0.0, 0.0]), q, np.eye(6) * sigma_m**2)
         body = TargetBody(40.0, np.eye(3), still)
-        kept_m = builder.horizon((0,), target, body, frozenset(), [place]).min_distance_target_m[0]
+        kept_m = builder.horizon(planned, target, body, frozenset(), [place]).min_distance_target_m[
+            0
+        ]
         assert kept_m == pytest.approx(limit_m + (margin_m if pushed else min(margin_m, 0.02)))
 
 
@@ -373,10 +373,10 @@ def test_when_the_target_is_lost_an_approach_is_broken_off_and_a_latch_is_not() 
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to("final")
-    pilot.guidance.target_lost(pilot.now_s)
+    pilot.guidance.chasers[0].lose_target(pilot.now_s)
     assert pilot.phase() == "retreat"
     other = Pilot()
     other.ask("approach")
     other.fly_to("verified")
-    other.guidance.target_lost(other.now_s)
+    other.guidance.chasers[0].lose_target(other.now_s)
     assert other.phase() == "verified"

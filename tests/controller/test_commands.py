@@ -14,7 +14,7 @@ from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 V = (0.0, 2.0, 0.0)
 
@@ -80,11 +80,11 @@ def test_impossible_values_are_refused(
 def test_twice_is_once(flight: InProcessMission) -> None:
     for what in ({"command": "approach"}, {"command": "isolate", "thruster": 3}):
         assert ask(flight, what)[0][0]
-        since = flight.controller.guidance.chasers[0].since_s
+        since = flight.controller.guidance.chasers[0].state.since_s
         (again,) = ask(flight, what)
         assert again[0]
         assert "already" in again[1]
-        assert flight.controller.guidance.chasers[0].since_s == since
+        assert flight.controller.guidance.chasers[0].state.since_s == since
 
 
 def test_in_a_wrong_phase(flight: InProcessMission) -> None:

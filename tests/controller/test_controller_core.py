@@ -21,8 +21,8 @@ from docking_cases import scenario as capture_scenario
 from flight_cases import odometry
 from harness import ROOT
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 
 def three_chasers() -> Scenario:
@@ -95,7 +95,7 @@ def test_latched_chaser_coasts_while_the_other_is_planned() -> None:
     mission = capture_scenario(2)
     prescribed = mission.target.model_copy(update={"motion": "constant_rates"})
     flight = ControllerCore(mission, lambda: 0.0, PerfectEstimator(prescribed))
-    contact = {"contact": True, "armed": True}
+    contact, chaser = {"contact": True, "armed": True}, flight.guidance.chasers[0]
     for tick, latched in enumerate([False, False, True, True, False]):
         now_ns = mission.timing.tick_time_ns(tick)
         docking = {
@@ -105,9 +105,9 @@ def test_latched_chaser_coasts_while_the_other_is_planned() -> None:
             ),
         }
         if latched:
-            flight.guidance.chasers[0] = replace(flight.guidance.chasers[0], phase=Phase.LATCHED)
+            chaser.state = replace(chaser.state, phase=Phase.LATCHED)
         elif tick == 4:
-            flight.guidance.chasers[0] = replace(flight.guidance.chasers[0], phase=Phase.RETREAT)
+            chaser.state = replace(chaser.state, phase=Phase.RETREAT)
         out = step(flight, tick, (0, 1), docking=docking)
         assert out.wrenches[0].mode == ("coast" if latched else "nmpc")
         assert out.wrenches[1].mode == "nmpc"
@@ -128,6 +128,7 @@ def latency_error_m() -> float:
     return float(np.sqrt(np.mean(trace.position_error_m[trace.time_s >= 40.0] ** 2)))
 
 
+@pytest.mark.slow
 def test_latency_compensation_predicts_the_state_at_actuation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -143,6 +144,7 @@ def test_latency_compensation_predicts_the_state_at_actuation(
     assert latency_error_m() > 5e-4
 
 
+@pytest.mark.slow
 def test_chasers_leave_keep_out_zones_in_which_they_start() -> None:
     """Chaser 0 starts 0.2 m from the target's centre, chasers 1 and 2 start 0.4 m apart with a
     limit of 0.6 m.

@@ -17,20 +17,20 @@ from chaserdock_controller.guidance.approach_cone import (
     cone_of,
     corridor_rows,
 )
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario as capture_scenario
 from docking_cases import senses
-from flight_cases import odometry, quick, scenario
+from flight_cases import fleet_of, odometry, order, quick, scenario
 from hypothesis import given
 from hypothesis import strategies as st
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 LIMIT_M = 0.35
 NEAR = {"approach": {"dock_distance_m": 0.25, "max_speed_m_s": 0.03}}
@@ -99,58 +99,56 @@ def test_every_way_into_a_port_lies_in_its_cone() -> None:
             assert min(cone.room_m(centre + aside), cone.room_m(centre - aside)) > 0.0
 
 
-def approaching(**changes: Any) -> PhaseMachine:
-    guidance = PhaseMachine(scenario(**NEAR | changes))
-    guidance.target_acquired(0.0)
-    assert guidance.command(OperatorCommand(command="approach", chaser=0), 1.0).accepted
+def approaching(**changes: Any) -> ChaserFleet:
+    guidance = fleet_of(scenario(**NEAR | changes), acquired_s=0.0)
+    assert order(guidance, OperatorCommand(command="approach", chaser=0), 1.0).accepted
     return guidance
 
 
 def test_approaching_chaser_has_a_corridor_and_others_the_spherical_keep_out() -> None:
     guidance = approaching()
-    assert guidance.corridor(0) is None  # nobody knows yet where it is
+    assert guidance.chasers[0].corridor() is None  # nobody knows yet where it is
     for i, place in enumerate(([-1.0, 0.0, 0.0], [0.0, -1.2, 0.0])):
-        guidance.set_position(i, np.array(place))
-    assert isinstance(guidance.corridor(0), Cone)
-    assert guidance.min_distance_target_m(0) == pytest.approx(0.25 - 0.03)
-    assert guidance.corridor(1) is None
-    assert guidance.min_distance_target_m(1) == LIMIT_M
+        guidance.chasers[i].position_m = np.array(place)
+    assert isinstance(guidance.chasers[0].corridor(), Cone)
+    assert guidance.chasers[0].min_distance_target_m() == pytest.approx(0.25 - 0.03)
+    assert guidance.chasers[1].corridor() is None
+    assert guidance.chasers[1].min_distance_target_m() == LIMIT_M
 
 
 def test_chaser_that_left_its_corridor_keeps_the_spherical_keep_out() -> None:
     guidance = approaching()
     for aside, inside in ((BESIDE_LINE_M, True), (0.35, False)):
-        guidance.set_position(0, np.array([-0.4, aside, 0.0]))
-        assert (guidance.corridor(0) is not None) == inside
-        assert (guidance.min_distance_target_m(0) < LIMIT_M) == inside
+        guidance.chasers[0].position_m = np.array([-0.4, aside, 0.0])
+        assert (guidance.chasers[0].corridor() is not None) == inside
+        assert (guidance.chasers[0].min_distance_target_m() < LIMIT_M) == inside
 
 
 @pytest.mark.parametrize("what", ["hold", "retreat", "abort"])
 def test_the_corridor_lasts_until_the_way_out_is_over(what: Any) -> None:
     guidance = approaching()
-    guidance.set_position(0, np.array([-0.3, 0.0, 0.0]))
-    assert guidance.command(OperatorCommand(command=what, chaser=0), 30.0).accepted
-    assert guidance.corridor(0) is not None
-    guidance.set_position(0, np.array([-0.36, 0.0, 0.0]))
-    assert guidance.corridor(0) is None
-    assert guidance.min_distance_target_m(0) == LIMIT_M
+    guidance.chasers[0].position_m = np.array([-0.3, 0.0, 0.0])
+    assert order(guidance, OperatorCommand(command=what, chaser=0), 30.0).accepted
+    assert guidance.chasers[0].corridor() is not None
+    guidance.chasers[0].position_m = np.array([-0.36, 0.0, 0.0])
+    assert guidance.chasers[0].corridor() is None
+    assert guidance.chasers[0].min_distance_target_m() == LIMIT_M
 
 
 def test_by_capture_the_corridor_is_there_in_the_corridor_and_gone_when_latched() -> None:
-    guidance = PhaseMachine(capture_scenario(2))
-    guidance.target_acquired(0.0)
+    guidance = fleet_of(capture_scenario(2), acquired_s=0.0)
+    chaser = guidance.chasers[0]
     place = np.array([-0.7, 0.0, -0.05])
     seen: dict[str, bool] = {}
     for phase in map(
         Phase, ("hold", "align", "approach", "final", "contact", "latched", "verified", "retreat")
     ):
-        guidance.chasers[0] = replace(guidance.chasers[0], phase=phase)
+        chaser.state = replace(chaser.state, phase=phase)
         outside = np.array([-1.0, 0.0, -0.05])
         at = outside if phase in ("hold", "align") else place
-        guidance.set_position(0, at)
-        guidance._observed[0] = senses(at)
-        seen[phase] = guidance.corridor(0) is not None
-        assert guidance.corridor(1) is None
+        chaser.position_m, chaser.seen = at, senses(at)
+        seen[phase] = chaser.corridor() is not None
+        assert guidance.chasers[1].corridor() is None
     assert [phase for phase, there in seen.items() if there] == [
         "approach",
         "final",
@@ -200,6 +198,7 @@ def test_in_flight_the_plan_stays_in_the_corridor(order: Any) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_chaser_docks_nearer_than_the_others_may_come() -> None:
     """The docking distance lies within the ball that everybody keeps; only the way in along the
     corridor leads there.

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.guidance.activities.detumble import detumbling_of
 from chaserdock_controller.guidance.detumble.control import StackTask
 from chaserdock_controller.guidance.detumble.stack import StackMotion
 from chaserdock_controller.guidance.stage import GuidanceStage
@@ -27,9 +28,10 @@ from flights.rigid_control import (
     wrong_knowledge,
 )
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 
+@pytest.mark.slow
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:
     fault = "fault=[{kind='latch_open',process='chaser/1',at_s=2.5,duration_s=1.0}]"
     changes = [*wrong_knowledge(1), "truth.values=[]", "target.mass_kg=150.0", fault]
@@ -60,6 +62,7 @@ def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() ->
     mission.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "expected"), [("stuck_off", "stuck off"), ("stuck_on", "stuck on")]
 )
@@ -97,6 +100,7 @@ class WatchedMission(StackMission):
         return own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joins_s", [1.9, 3.3])
 def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same(joins_s: float) -> None:
     """Also in the search for the first plan, while the stack coasts."""
@@ -110,7 +114,7 @@ def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same(joins
         mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(2)))
         while mission.time_s < joins_s:
             mission.step()
-        planner = mission.controller.guidance.detumble.planner
+        planner = detumbling_of(mission.controller.guidance.activities).control.planner
         assert planner.active is not None
         assert planner.search is not None
         assert bool(planner.active.plan.thrusts_N.any()) == (joins_s > 2.5)
@@ -138,12 +142,14 @@ def test_a_thruster_that_an_operator_restores_fires_again() -> None:
     stage = GuidanceStage(flight)
     state = ControlledStack(stack_scenario(1, (0, 3), wrong_knowledge(1))).state()
     failed = replace(state, failed={0: (2, 3), 1: (7,)})
-    stage.thrusters.command(OperatorCommand(command="restore", chaser=0, thruster=3), 0.0)
-    found = stage.with_trusted(failed)
+    restore = OperatorCommand(command="restore", chaser=0, thruster=3)
+    stage.chasers[0].thrusters.command(restore, 0.0)
+    found = detumbling_of(stage.activities).with_trusted(failed)
     assert found is not None
     assert found.failed == {0: (2,), 1: (7,)}
 
 
+@pytest.mark.slow
 def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
     flight = fly_controlled(
         stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)),

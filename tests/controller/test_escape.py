@@ -14,7 +14,7 @@ import pytest
 from chaserdock_controller.estimation.target_body import TargetPath
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.escape import EscapePlanner, RelativeState
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.reference import seen_from
 from chaserdock_controller.guidance.trajectories import Escape, move_to, stay
@@ -23,11 +23,12 @@ from chaserdock_models.orbit import OrbitalElements, propagate, state_of
 from chaserdock_models.relative_motion import propagate_relative
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario, flight_scenario, parse_scenario
+from flight_cases import drain, fleet_of, known, order
 from flights.measured_poses import measurement_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 GOOD = np.diag([2e-3**2] * 3 + [2e-5**2] * 3)
 KEEP_OUT_M = 2.0
@@ -61,12 +62,15 @@ def at_rest(
     return cast(TargetState, values)
 
 
-def planner(state: np.ndarray, covariance: np.ndarray = GOOD, **changes: Any) -> EscapePlanner:
-    found = EscapePlanner(flight_scenario(scenario(**changes)), 0.2)
-    found.relative[0] = RelativeState(state, covariance, at_rest())
-    return found
+def planner(**changes: Any) -> EscapePlanner:
+    return EscapePlanner(flight_scenario(scenario(**changes)), 0.2)
 
 
+def relative(state: np.ndarray, covariance: np.ndarray = GOOD) -> RelativeState:
+    return RelativeState(state, covariance, at_rest())
+
+
+@pytest.mark.slow
 @given(
     st.floats(0.0, 2.0 * math.pi),
     st.floats(-0.5, 0.5),
@@ -79,9 +83,7 @@ def test_abort_certified_as_safe_stays_out_under_the_nonlinear_motion_with_j2(
 ) -> None:
     direction = np.array([math.cos(azimuth), math.sin(azimuth), height])
     state = np.concatenate([distance * direction / np.linalg.norm(direction), velocity])
-    found = planner(state).escape(0, 5.0)
-    assert found is not None
-    escape, margin = found
+    escape, margin = planner().escape(relative(state), 5.0)
     assert margin >= 3.0  # from outside twice the keep-out there always is one
     burn_s = 5.0 + np.linspace(0.0, escape.burn_s, 20)
     assert np.linalg.norm(escape.at(burn_s)[0], axis=1).min() >= KEEP_OUT_M
@@ -97,18 +99,15 @@ def test_abort_certified_as_safe_stays_out_under_the_nonlinear_motion_with_j2(
 
 def test_small_burn_is_preferred_and_an_uncertain_state_needs_a_larger_one() -> None:
     state = np.array([0.0, -50.0, 0.0, 0.0, 0.0, 0.0])
-    small = planner(state).escape(0, 0.0)
-    rough = planner(state, np.diag([0.5**2] * 3 + [4e-2**2] * 3)).escape(0, 0.0)
-    assert small is not None
-    assert rough is not None
+    small = planner().escape(relative(state), 0.0)
+    rough = planner().escape(relative(state, np.diag([0.5**2] * 3 + [4e-2**2] * 3)), 0.0)
     assert small[0].burn_s < rough[0].burn_s
     assert small[1] >= 4.5
 
 
 def test_escape_is_a_continuous_motion_that_needs_its_acceleration_only_while_it_burns() -> None:
-    found = planner(np.array([3.0, -20.0, 1.0, 0.02, 0.01, 0.0])).escape(0, 7.0)
-    assert found is not None
-    escape, h = found[0], 1e-3
+    known = relative(np.array([3.0, -20.0, 1.0, 0.02, 0.01, 0.0]))
+    escape, h = planner().escape(known, 7.0)[0], 1e-3
     for t in (7.0, 7.0 + 0.4 * escape.burn_s, 7.0 + 2.0 * escape.burn_s, 900.0):
         p, v, a = escape.at(np.array([t, t + h]))
         np.testing.assert_allclose((p[1] - p[0]) / h, v.mean(axis=0), atol=1e-7)
@@ -125,11 +124,11 @@ def test_moves_are_as_slow_as_a_safe_coast_needs() -> None:
     means slower.
     """
     state = np.array([0.0, -30.0, 0.0, 0.0, 0.0, 0.0])
-    found = planner(state)
+    found, known = planner(), relative(state)
     speeds = []
     for goal in (-20.0, -12.0, -9.0):
         move = found.limited(
-            0, lambda v, y=goal: move_to(stay(state[:3], 0.0), (0.0, y, 0.0), 0.0, v), 0.2, 0.0
+            known, lambda v, y=goal: move_to(stay(state[:3], 0.0), (0.0, y, 0.0), 0.0, v), 0.2, 0.0
         )
         assert move is not None
         times = np.linspace(0.0, move.duration_s, 200)
@@ -141,7 +140,7 @@ def test_moves_are_as_slow_as_a_safe_coast_needs() -> None:
     def through(v: float) -> Any:
         return move_to(stay(state[:3], 0.0), (0.0, 30.0, 0.0), 0.0, v)
 
-    assert found.limited(0, through, 0.2, 0.0) is None
+    assert found.limited(known, through, 0.2, 0.0) is None
 
 
 def test_final_corridor_is_exempt() -> None:
@@ -152,40 +151,37 @@ def test_final_corridor_is_exempt() -> None:
         "max_reference_distance_m": 300.0,
         "final_corridor_m": 31.0,
     }
-    found = planner(state, limits=limits)
+    found = planner(limits=limits)
     move = found.limited(
-        0, lambda v: move_to(stay(state[:3], 0.0), (0.0, -3.0, 0.0), 0.0, v), 0.2, 0.0
+        relative(state), lambda v: move_to(stay(state[:3], 0.0), (0.0, -3.0, 0.0), 0.0, v), 0.2, 0.0
     )
     assert move is not None
     assert move.duration_s == pytest.approx(1.875 * 27.0 / 0.2, rel=1e-6)
 
 
-def holding(**changes: Any) -> PhaseMachine:
-    machine = PhaseMachine(flight_scenario(scenario(**changes)))
-    machine.target_acquired(0.0)
+def holding(**changes: Any) -> ChaserFleet:
+    machine = fleet_of(flight_scenario(scenario(**changes)), acquired_s=0.0)
     place = np.array([0.0, -30.0, 0.0])
-    machine.set_position(0, place)
-    assert machine.escapes is not None
-    machine.escapes.relative[0] = RelativeState(
-        np.concatenate([place, np.zeros(3)]), GOOD, at_rest()
-    )
-    machine.drain_changes()
+    machine.chasers[0].position_m = place
+    machine.chasers[0].relative = relative(np.concatenate([place, np.zeros(3)]))
     return machine
 
 
 def test_unsafe_chaser_aborts_onto_a_safe_coast_and_takes_commands_from_there() -> None:
     machine = holding()
-    machine.update_safety(1.0, {0: "the reason"})
+    machine.chasers[0].follow_safety(known(1.0, unsafe="the reason"))
     assert machine.chasers[0].phase is Phase.ABORT
-    assert isinstance(machine.chasers[0].move, Escape)
-    texts = [c.detail for c in machine.drain_changes()]
+    assert isinstance(machine.chasers[0].state.move, Escape)
+    texts = [detail for _, _, detail in drain(machine)]
     assert any("onto a coast with a margin of" in text for text in texts)
     assert any("the reason" in text for text in texts)
-    machine.update_safety(2.0, {0: "the reason"})  # once: it is on its way
-    assert machine.drain_changes() == []
-    machine.set_position(0, np.array([0.5, -30.0, 0.0]))
-    assert machine.command(OperatorCommand(command="hold", chaser=0), 3.0).accepted
-    np.testing.assert_allclose(machine.chasers[0].move.at(np.array([3.0]))[0][0], [0.5, -30.0, 0.0])
+    machine.chasers[0].follow_safety(known(2.0, unsafe="the reason"))  # once: it is on its way
+    assert drain(machine) == []
+    machine.chasers[0].position_m = np.array([0.5, -30.0, 0.0])
+    assert order(machine, OperatorCommand(command="hold", chaser=0), 3.0).accepted
+    np.testing.assert_allclose(
+        machine.chasers[0].state.move.at(np.array([3.0]))[0][0], [0.5, -30.0, 0.0]
+    )
 
 
 def test_unsafe_chaser_in_the_final_corridor_continues() -> None:
@@ -196,19 +192,19 @@ def test_unsafe_chaser_in_the_final_corridor_continues() -> None:
         "final_corridor_m": 40.0,
     }
     machine = holding(limits=limits)
-    machine.update_safety(1.0, {0: "the reason"})
+    machine.chasers[0].follow_safety(known(1.0, unsafe="the reason"))
     assert machine.chasers[0].phase is Phase.HOLD
 
 
 def test_goto_without_a_safe_move_is_refused() -> None:
     machine = holding()
-    refused = machine.command(
-        OperatorCommand(command="goto", chaser=0, offset_m=(0.0, 30.0, 0.0)), 1.0
+    refused = order(
+        machine, OperatorCommand(command="goto", chaser=0, offset_m=(0.0, 30.0, 0.0)), 1.0
     )
     assert not refused.accepted
     assert "no speed makes the move passively safe" in refused.reason
-    assert machine.command(
-        OperatorCommand(command="goto", chaser=0, offset_m=(0.0, -12.0, 0.0)), 2.0
+    assert order(
+        machine, OperatorCommand(command="goto", chaser=0, offset_m=(0.0, -12.0, 0.0)), 2.0
     ).accepted
 
 
@@ -226,6 +222,7 @@ def test_motion_seen_from_a_turning_target_is_the_same_motion() -> None:
     np.testing.assert_allclose((seen[1][2] - seen[1][0]) / (2 * h), seen[2][1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_flight_publishes_certificates_and_its_abort_coasts() -> None:
     """A chaser on V-bar is ordered to abort; after the burn its thrusters give next to nothing."""
     s = scenario(duration_s=14.0, navigation={"grade": "exact"})

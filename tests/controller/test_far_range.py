@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import make_perception
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.pose_image import WIDTH_PX, encode_pose
 from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario, parse_scenario
+from flight_cases import fleet_of, order
 from flights import load_shipped
 from flights.abort_study import study
 
@@ -67,13 +67,12 @@ def test_markers_replace_ranging_nearby_and_nothing_is_seen_out_of_the_image_or_
 
 
 def test_goto_keeps_the_speed_limit_by_range_all_along_its_way() -> None:
-    machine = PhaseMachine(flight_scenario(scenario()))
-    machine.target_acquired(0.0)
-    machine.set_position(0, np.array([-200.0, 0.0, 0.0]))
-    assert machine.command(
-        OperatorCommand(command="goto", chaser=0, offset_m=(-20.0, 0.0, 0.0)), 0.0
+    machine = fleet_of(flight_scenario(scenario()), acquired_s=0.0)
+    machine.chasers[0].position_m = np.array([-200.0, 0.0, 0.0])
+    assert order(
+        machine, OperatorCommand(command="goto", chaser=0, offset_m=(-20.0, 0.0, 0.0)), 0.0
     ).accepted
-    move = machine.chasers[0].move
+    move = machine.chasers[0].state.move
     positions, velocities, _ = move.at(np.linspace(0.0, move.duration_s, 500))
     share = np.linalg.norm(velocities, axis=1) / (0.06 + 0.004 * np.linalg.norm(positions, axis=1))
     assert 0.9 < share.max() < 1.001
@@ -81,10 +80,9 @@ def test_goto_keeps_the_speed_limit_by_range_all_along_its_way() -> None:
 
 
 def test_goto_out_of_the_approach_cone_is_refused() -> None:
-    machine = PhaseMachine(flight_scenario(scenario()))
-    machine.target_acquired(0.0)
-    refused = machine.command(
-        OperatorCommand(command="goto", chaser=0, offset_m=(-50.0, 20.0, 0.0)), 0.0
+    machine = fleet_of(flight_scenario(scenario()), acquired_s=0.0)
+    refused = order(
+        machine, OperatorCommand(command="goto", chaser=0, offset_m=(-50.0, 20.0, 0.0)), 0.0
     )
     assert not refused.accepted
     assert "21.8 degrees off the approach axis; the approach cone has 10 degrees" in refused.reason
@@ -137,6 +135,7 @@ def test_invalid_scenarios_are_refused_in_one_clear_line(
     assert str(caught.value).count("\n") <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["v-bar", "r-bar"])
 def test_aborts_of_the_rendezvous_stay_out_of_the_keep_out(name: str) -> None:
     found = study(load_shipped(name), 6, seed=2)

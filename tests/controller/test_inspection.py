@@ -17,7 +17,7 @@ from chaserdock_controller.estimation.target_shape import (
     ShapeFilter,
     view_cell,
 )
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import circuit
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
@@ -26,23 +26,19 @@ from chaserdock_controller.redundancy.checkpoint import Checkpoint
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import load_scenario
-from flight_cases import at, drain, scenario
+from flight_cases import at, fleet_of, scenario, step
 from harness import ROOT
 
 SECTION = {"distance_m": 1.1, "speed_m_s": 0.1, "axis": [1.0, 2.0, 2.0]}
 
 
-def machine(**changes: Any) -> PhaseMachine:
-    guidance = PhaseMachine(scenario(inspection=SECTION, **changes))
-    guidance.target_acquired(0.0)
-    drain(guidance)
-    return guidance
+def machine(**changes: Any) -> ChaserFleet:
+    return fleet_of(scenario(inspection=SECTION, **changes), acquired_s=0.0)
 
 
-def command(guidance: PhaseMachine, now_s: float, *chasers: int) -> list[Any]:
+def command(guidance: ChaserFleet, now_s: float, *chasers: int) -> list[Any]:
     commands = [OperatorCommand(command="inspect", chaser=i) for i in chasers]
-    guidance.set_pending_goals(commands)
-    return [guidance.command(c, now_s) for c in commands]
+    return guidance.apply(commands, now_s)
 
 
 def test_circuit_is_smooth_slow_and_returns_to_its_direction() -> None:
@@ -68,19 +64,19 @@ def test_chasers_inspect_together_keep_their_distance_face_the_target_and_hold_a
     guidance = machine()
     assert all(r.accepted for r in command(guidance, 10.0, 0, 1))
     assert [c.phase for c in guidance.chasers] == ["inspect", "inspect"]
-    assert all(c.faces for c in guidance.chasers)
-    end = max(c.move.start_s + c.move.duration_s for c in guidance.chasers)
+    assert all(c.state.faces for c in guidance.chasers)
+    end = max(c.state.move.start_s + c.state.move.duration_s for c in guidance.chasers)
     for t in np.linspace(10.0, end, 200):
-        a, b = (at(c.move, t)[0] for c in guidance.chasers)
+        a, b = (at(c.state.move, t)[0] for c in guidance.chasers)
         assert np.linalg.norm(a - b) > 1.0
     for i in (0, 1):
-        guidance.update_tracking(i, end - 0.1, 0.0, 0.0)
+        step(guidance.chasers[i], end - 0.1, 0.0, 0.0)
         assert guidance.chasers[i].phase == "inspect"
-        guidance.update_tracking(i, end, 0.0, 0.0)
+        step(guidance.chasers[i], end, 0.0, 0.0)
     assert [c.phase for c in guidance.chasers] == ["hold", "hold"]
-    assert not any(c.faces for c in guidance.chasers)
+    assert not any(c.state.faces for c in guidance.chasers)
     np.testing.assert_allclose(
-        at(guidance.chasers[0].move, end + 9.0)[0], [-1.1, 0.0, 0.0], atol=1e-9
+        at(guidance.chasers[0].state.move, end + 9.0)[0], [-1.1, 0.0, 0.0], atol=1e-9
     )
 
 
@@ -92,17 +88,14 @@ def test_inspection_is_refused_with_the_reason() -> None:
     assert not reply.accepted
     assert "command all of them at one time" in reply.reason
     # About the axis of symmetry of both chasers, the one passes where the other holds.
-    crossing = PhaseMachine(scenario(inspection=SECTION | {"axis": [0.0, 0.0, 1.0]}))
-    crossing.target_acquired(0.0)
+    crossing = fleet_of(scenario(inspection=SECTION | {"axis": [0.0, 0.0, 1.0]}), acquired_s=0.0)
     (reply,) = command(crossing, 10.0, 0)
     assert not reply.accepted
     assert "m of chaser 1" in reply.reason
-    near = PhaseMachine(scenario(inspection=SECTION | {"distance_m": 0.1}))
-    near.target_acquired(0.0)
+    near = fleet_of(scenario(inspection=SECTION | {"distance_m": 0.1}), acquired_s=0.0)
     (reply,) = command(near, 10.0, 0)
     assert "the offset is 0.1 m from the target" in reply.reason
-    far = PhaseMachine(scenario(inspection=SECTION | {"distance_m": 0.45}))
-    far.target_acquired(0.0)
+    far = fleet_of(scenario(inspection=SECTION | {"distance_m": 0.45}), acquired_s=0.0)
     (reply,) = command(far, 10.0, 0)
     assert "less than twice inspection.distance_m" in reply.reason
 
@@ -233,11 +226,12 @@ def test_images_count_once_guidance_has_let_their_chaser_inspect(
     assert shape is not None
     used: list[frozenset[int]] = []
     monkeypatch.setattr(shape, "update", lambda _, inspecting: used.append(inspecting))
+    chaser = flight.guidance.chasers[1]
     for tick in range(4):
         if tick == 1:
-            flight.guidance.chasers[1] = replace(flight.guidance.chasers[1], phase=Phase.INSPECT)
+            chaser.state = replace(chaser.state, phase=Phase.INSPECT)
         if tick == 3:
-            flight.guidance.chasers[1] = replace(flight.guidance.chasers[1], phase=Phase.HOLD)
+            chaser.state = replace(chaser.state, phase=Phase.HOLD)
         now_ns = flight.scenario.timing.tick_time_ns(tick)
         flight.step(TickInputs(tick, now_ns, {}, ()))
     assert used == [frozenset(), frozenset(), {1}, {1}]

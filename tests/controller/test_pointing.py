@@ -10,16 +10,18 @@ import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation.types import TargetState
-from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.chaser_state import ChaserTick
+from chaserdock_controller.guidance.fleet import ChaserFleet
+from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.guidance.pointing import (
     CALIBRATION_S,
+    SearchProgress,
     calibration_turns,
     facing,
     field_of_view,
     search_angles,
     search_wrench,
 )
-from chaserdock_controller.guidance.target_search import SearchProgress, TargetSearch
 from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
@@ -27,7 +29,7 @@ from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
 from estimation_cases import V, W
-from flight_cases import odometry, scenario
+from flight_cases import fleet_of, known, odometry, order, scenario, step
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -82,7 +84,7 @@ def test_chaser_pauses_its_search_while_it_acquires_the_target_for_8_s_at_most_a
     None
 ):
     def turned_s(acquiring: Callable[[float], bool | None]) -> float:
-        progress = SearchProgress(1.0, np.array([1.0, 0.0, 0.0, 0.0]), 1.0)
+        progress = SearchProgress(np.array([1.0, 0.0, 0.0, 0.0]), 1.0)
         for k in range(15 * 20 + 1):
             progress = progress.at(1.0 + k / 15, acquiring(k / 15))
         return 20.0 - progress.paused_s
@@ -98,14 +100,16 @@ def test_chaser_pauses_its_search_while_it_acquires_the_target_for_8_s_at_most_a
 def test_paused_search_goes_on_where_it_stopped() -> None:
     s = scenario()
     target = TargetState(0, V, V, np.array([1.0, 0.0, 0.0, 0.0]), W, np.eye(12), "none", 0, ())
-    search, q = TargetSearch(s.chaser, CAMERA), np.array([1.0, 0.0, 0.0, 0.0])
+    chaser, q = fleet_of(s).chasers[0], np.array([1.0, 0.0, 0.0, 0.0])
+    chaser.fire(Trigger.TARGET_UNKNOWN, 0.0)
     x = np.concatenate([np.zeros(6), q, np.zeros(3)])
-    for k in range(60):
-        search.wrench(_odometry(0, k, x), 0.0, target, acquiring=k <= 30)
-    wrench = search.wrench(_odometry(0, 60, x), 0.0, target, acquiring=False)
-    np.testing.assert_array_equal(
-        wrench, search_wrench(_odometry(0, 60, x), s.chaser, CAMERA, q, 2.0)
-    )
+    command = None
+    for k in range(61):
+        now = ChaserTick(k / 15, _odometry(0, k, x), target, acquiring=k <= 30)
+        command = chaser.directive(now, None).direct
+    assert command is not None
+    expected = search_wrench(_odometry(0, 60, x), s.chaser, s.camera_model(), q, 2.0)
+    np.testing.assert_array_equal(command.wrench, expected)
 
 
 def test_chaser_tracks_search_pattern_within_torque_limit() -> None:
@@ -144,21 +148,22 @@ def test_facing_uses_the_smallest_rotation(turn: list[float], direction: list[fl
 
 
 def test_unknown_target_starts_search_then_goto_facing_the_target() -> None:
-    guidance = PhaseMachine(scenario())
-    guidance.target_unknown(0.5)
+    guidance = fleet_of(scenario())
+    guidance.miss_target(0.5, lost=False)
     assert guidance.chasers[0].phase == "acquire"
-    guidance.target_unknown(1.0)
+    guidance.miss_target(1.0, lost=False)
     assert [c.phase for c in guidance.chasers] == ["searching", "searching"]
-    answer = guidance.command(OperatorCommand(command="approach", chaser=0), 2.0)
+    answer = order(guidance, OperatorCommand(command="approach", chaser=0), 2.0)
     assert not answer.accepted
-    guidance.target_acquired(3.0)
+    guidance.follow_target(3.0, [known(3.0)] * 2, seen=True, settled=False)
     assert guidance.chasers[0].phase == "searching"  # until the target motion is known
-    guidance.target_settled(0, 4.0, np.array([-1.2, 0.3, 0.1]))
-    c = guidance.chasers[0]
+    here = known(4.0, offset_m=np.array([-1.2, 0.3, 0.1]))
+    guidance.follow_target(4.0, [here, known(4.0, own=None)], seen=True, settled=True)
+    c = guidance.chasers[0].state
     assert (c.phase, c.faces) == ("goto", True)
     np.testing.assert_allclose(c.move.at([4.0])[0][0], [-1.2, 0.3, 0.1])
-    guidance.update_tracking(0, 100.0, 0.0, 0.0)
-    assert (guidance.chasers[0].phase, guidance.chasers[0].faces) == ("hold", False)
+    step(guidance.chasers[0], 100.0, 0.0, 0.0)
+    assert (guidance.chasers[0].phase, guidance.chasers[0].state.faces) == ("hold", False)
     assert guidance.chasers[1].phase == "searching"
 
 
@@ -201,14 +206,16 @@ def test_calibration_manoeuvre_starts_and_ends_at_rest_with_target_in_view() -> 
 
 
 def test_calibrate_is_rejected_without_target_without_bias_states_and_outside_hold() -> None:
-    def reply(guidance: PhaseMachine, now_s: float) -> str:
-        return guidance.command(OperatorCommand(command="calibrate", chaser=0), now_s).reason
+    def reply(guidance: ChaserFleet, now_s: float) -> str:
+        return order(guidance, OperatorCommand(command="calibrate", chaser=0), now_s).reason
 
-    exact = PhaseMachine(scenario())
+    exact = fleet_of(scenario())
     assert "not been found" in reply(exact, 0.0)
-    exact.target_acquired(1.0)
+    for chaser in exact.chasers:
+        chaser.fire(Trigger.TARGET_ACQUIRED, 1.0)
     assert "taken as exact" in reply(exact, 2.0)
-    guidance = PhaseMachine(scenario(navigation={"grade": "exact", "camera_turn_deg": 0.3}))
-    guidance.target_acquired(1.0)
-    guidance.command(OperatorCommand(command="approach", chaser=0), 2.0)
+    guidance = fleet_of(
+        scenario(navigation={"grade": "exact", "camera_turn_deg": 0.3}), acquired_s=1.0
+    )
+    order(guidance, OperatorCommand(command="approach", chaser=0), 2.0)
     assert "hold first" in reply(guidance, 3.0)

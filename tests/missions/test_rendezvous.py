@@ -10,8 +10,8 @@ import pytest
 from flights import load_shipped
 from flights.rendezvous import last_leg, rendezvous
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 
 
 def test_last_leg_starts_at_the_last_hold_point() -> None:
@@ -34,9 +34,8 @@ def test_relative_velocity_at_200_m_is_known_well_enough_for_a_passively_safe_mo
         record = flight.step()
         while record.time_s < 20.0:
             record = flight.step()
-        machine = flight.controller.guidance.machine
-        assert machine.escapes is not None
-        known = machine.escapes.relative[0]
+        known = flight.controller.guidance.chasers[0].relative
+        assert known is not None
     own, target = record.states["chaser/0"], record.states["target"]
     error = known.state[3:] - (own.velocity_m_s - target.velocity_m_s)
     sigma = np.sqrt(np.diag(known.covariance))[3:]

@@ -10,12 +10,15 @@ import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation.composite_body import target_body
 from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.guidance.reference import predict_target
 from chaserdock_controller.nmpc import kernels
+from chaserdock_controller.nmpc.problem import model_of
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_models import rotations
 from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_protocol.scenario import load_scenario
+from flight_cases import step
 from harness import ROOT
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -35,26 +38,28 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     if seed:
         omega = rotations.rotate(rotations.normalize(rng.normal(size=4)), omega)
     flight = ControllerCore(scenario, lambda: 0.0)
-    flight.guidance.machine.target_acquired(0.0)
+    for chaser in flight.guidance.chasers:
+        chaser.fire(Trigger.TARGET_ACQUIRED, 0.0)
     states = np.zeros((n, 13))
     for i in range(n):
         p, q = scenario.start_pose(i)
         states[i, :3] = p + (0.05 * rng.normal(size=3) if seed else 0.0)
         states[i, 6:10] = q
-    model = kernels.model_of(nmpc_parameters(scenario), TICK_S / 4)
+    model = model_of(nmpc_parameters(scenario), TICK_S / 4)
     least, nearest, ends = np.inf, np.inf, states[:, :3]
     at = np.zeros(3)
     for tick in range(round(time_s / TICK_S)):
         now_s = tick * TICK_S
-        due = flight.guidance.machine.due_commands(now_s)
-        flight.guidance.machine.set_pending_goals(due)
-        assert all(flight.guidance.machine.command(c, now_s).accepted for c in due)
+        due = flight.guidance.fleet.due_commands(now_s)
+        assert all(result.accepted for result in flight.guidance.fleet.apply(due, now_s))
         p, q = (a[0] for a in predict_target(at, velocity, [1.0, 0, 0, 0], omega, [now_s]))
         exact = TargetState(
             round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ()
         )
         ids = tuple(range(n))
-        horizon = flight.guidance.references.horizon(ids, exact, target_body(scenario), frozenset())
+        horizon = flight.guidance.references.horizon(
+            flight.guidance.chasers, exact, target_body(scenario), frozenset()
+        )
         limits = dict.fromkeys(ids, nmpc_parameters(scenario).input_limits())
         problem = flight.planning.problem(horizon, dict(enumerate(states)), limits)
         plan = flight.planning.solver.solve(problem, TICK_S if tick else 0.0, ids)
@@ -68,9 +73,9 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         ends = problem.references[:, 0, :3]
         least = min(least, float(gaps.min()))
         nearest = min(nearest, float(np.linalg.norm(states[:, :3] - p, axis=-1).min()))
-    for i in range(n):
-        flight.guidance.machine.update_tracking(i, time_s, 0.0, 0.0)
-        assert flight.guidance.chasers[i].phase == "hold"
+    for chaser in flight.guidance.chasers:
+        step(chaser, time_s)
+        assert chaser.phase == "hold"
     return least, nearest, float(np.linalg.norm(states[:, :3] - ends, axis=-1).max())
 
 

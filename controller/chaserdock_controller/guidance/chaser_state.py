@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance state of one chaser, and the result of a command."""
+"""What guidance keeps of one chaser, what it is told of it in a tick, and what it answers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import Level
+from chaserdock_protocol.messages import CameraCalibration, Level, Odometry
 
-from .phases import Phase
+from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
+
+from .docking import DockingObservation
+from .escape import RelativeState
+from .phases import Phase, Trigger
+from .pointing import SearchProgress
 from .trajectories import Motion
 
 
@@ -29,7 +36,8 @@ class ChaserGuidance:
     ``inside_since_s``: since when the chaser is within its tolerances. ``attempt``: number of the
     docking attempt, from 1. ``held``: position (3,) and attitude (4,) in TRF when the pull test
     began. ``faces``: the reference attitude turns with the offset so that the chaser faces the
-    target. ``stuck``: it is to back out, but its latch does not open.
+    target. ``turns``: the body flies the calibration manoeuvre. ``stuck``: it is to back out, but
+    its latch does not open. ``search``: progress along the search pattern.
     """
 
     phase: Phase
@@ -40,7 +48,61 @@ class ChaserGuidance:
     attempt: int = 1
     held: tuple[Array, Array] | None = None
     faces: bool = False
+    turns: bool = False
     stuck: bool = False
+    search: SearchProgress | None = None
+
+    def inside_since(self, inside: bool, now_s: float) -> float | None:
+        """Return since when the chaser is within its tolerances if now it is ``inside``, or not."""
+        if not inside:
+            return None
+        return now_s if self.inside_since_s is None else self.inside_since_s
+
+
+class Cause(NamedTuple):
+    """Why a phase begins. ``place_m`` (3,), TRF: where a commanded move ends, or where a search
+    ended.
+    """
+
+    trigger: Trigger
+    now_s: float
+    place_m: Array | None = None
+
+
+@dataclass(frozen=True)
+class ChaserTick:
+    """What is known of one chaser in a tick.
+
+    ``own``: its estimated state, None without odometry; ``invalid``: its odometry is not valid.
+    ``target``: the target's estimate; ``offset_m`` (3,): the chaser's centre, TRF, and ``port``: its
+    state at its port, where the target's pose and its own are known. ``latched``: its latch holds
+    the target. ``doubtful``: its odometry may be wrong. ``acquiring``: it looks for the target in an
+    earlier image; None without a sighting. ``stuck_thrusters``: found in the motion of the stack.
+    ``relative``: its state relative to the target where passive safety is enforced; ``unsafe``: why
+    its plans are not passively safe, or empty.
+    """
+
+    now_s: float
+    own: Odometry | None
+    target: TargetState
+    offset_m: Array | None = None
+    port: DockingObservation | None = None
+    relative: RelativeState | None = None
+    failure: PlanningFailure | None = None
+    camera: CameraCalibration | None = None
+    acquiring: bool | None = None
+    stuck_thrusters: tuple[int, ...] = ()
+    invalid: bool = False
+    latched: bool = False
+    doubtful: bool = False
+    unsafe: str = ""
+
+
+class TrackingErrors(NamedTuple):
+    """Estimated errors of a chaser from its reference pose."""
+
+    position_m: float
+    angle_rad: float
 
 
 @dataclass(frozen=True)
@@ -61,4 +123,3 @@ class PhaseChange:
     phase: Phase
     detail: str
     level: Level = "info"
-    calibration_complete: bool = False

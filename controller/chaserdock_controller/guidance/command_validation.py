@@ -17,6 +17,8 @@ from .approach_cone import BESIDE_LINE_M
 from .chaser_state import CommandResult
 from .phases import Phase
 
+WITHOUT_THRUSTERS = 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
+
 
 def why_stale(command: OperatorCommand, now_s: float) -> str:
     """Check a command's expiry time."""
@@ -134,5 +136,5 @@ def why_not_identify(scenario: FlightScenario) -> str:
     if not scenario.detumble.identification.enabled:
         return "detumble.identification.enabled is false"
     if not scenario.chaser.thrusters or scenario.chaser.actuation != "thrusters":
-        return 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
+        return WITHOUT_THRUSTERS
     return ""

@@ -59,7 +59,7 @@ class RelativeState:
 
 
 class EscapePlanner:
-    """Selects moves and aborts by their coasts. ``relative``: newest states, by chaser."""
+    """Selects moves and aborts by their coasts."""
 
     def __init__(self, scenario: FlightScenario, abort_speed_m_s: float) -> None:
         orbit, limits, body = scenario.orbit, scenario.limits, scenario.chaser
@@ -71,24 +71,22 @@ class EscapePlanner:
         self.sigmas = limits.estimate_margin_sigmas
         self._acceleration_m_s2 = _FORCE_SHARE * float(body.wrench_max[:3].min()) / body.mass_kg
         self._speed_m_s = abort_speed_m_s
-        self.relative: dict[int, RelativeState] = {}
-
-    def is_final(self, offset_m: Array) -> bool:
-        """Return whether a chaser at an offset (3,) is in the final corridor by its distance."""
-        return float(np.linalg.norm(offset_m)) <= self._final_m
 
     # -- moves -------------------------------------------------------------------------------------
 
     def limited(
-        self, i: int, move: Callable[[float], Motion], speed_m_s: float, now_s: float
+        self,
+        known: RelativeState | None,
+        move: Callable[[float], Motion],
+        speed_m_s: float,
+        now_s: float,
     ) -> Motion | None:
         """Return the fastest of the moves at shares of ``speed_m_s`` whose coasts are safe, or None
         if none is.
 
-        ``move``: maps a speed to the move, which must be in TRF. Without a state of the chaser the
-        first is returned.
+        ``move``: maps a speed to the move, which must be in TRF. Without a ``known`` state of the
+        chaser the first is returned.
         """
-        known = self.relative.get(i)
         for share in _SPEED_SHARES:
             found = move(speed_m_s * float(share))
             if known is None or self.move_margin(known, found, now_s) >= self.sigmas:
@@ -125,22 +123,18 @@ class EscapePlanner:
 
     # -- aborts ------------------------------------------------------------------------------------
 
-    def escape(self, i: int, now_s: float) -> tuple[Escape, float] | None:
-        """Return the abort of a chaser from its newest state, and the margin of its coast; None
-        without a state.
+    def escape(self, known: RelativeState, now_s: float) -> tuple[Escape, float]:
+        """Return the abort from the newest state of a chaser, and the margin of its coast.
 
         The smallest burn whose coast has spare margin, otherwise the one with the largest margin.
         """
-        known = self.relative.get(i)
-        if known is None:
-            return None
-        best: tuple[Escape, float] | None = None
-        for share in _IMPULSE_SHARES:
-            found = self._best_of(known, share * self._speed_m_s, now_s)
-            if best is None or found[1] > best[1]:
-                best = found
+        best = self._best_of(known, _IMPULSE_SHARES[0] * self._speed_m_s, now_s)
+        for share in _IMPULSE_SHARES[1:]:
             if best[1] >= _SPARE * self.sigmas:
                 break
+            found = self._best_of(known, share * self._speed_m_s, now_s)
+            if found[1] > best[1]:
+                best = found
         return best
 
     def _best_of(

@@ -14,11 +14,12 @@ from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.estimation.target_body import TargetBody, TargetPath, predict_path
 from chaserdock_controller.estimation.types import RelativePose, TargetState
-from chaserdock_controller.interfaces import HorizonReference, ReferencePose
+from chaserdock_controller.interfaces import HorizonReference
 
 from . import reference
 from .approach_cone import corridor_rows
-from .phase_machine import PhaseMachine
+from .chaser_machine import ChaserMachine
+from .pointing import calibration_turns
 from .trajectories import Escape
 
 _GREATEST_MARGIN_M = 0.1
@@ -42,34 +43,32 @@ def target_path(
 
 
 class ReferenceBuilder:
-    """Computes references from the moves and phases of a phase machine."""
+    """Computes references from the moves and phases of the chasers."""
 
-    def __init__(self, scenario: FlightScenario, machine: PhaseMachine) -> None:
-        self._scenario, self._machine = scenario, machine
+    def __init__(self, scenario: FlightScenario) -> None:
+        self._scenario = scenario
         self._step_s = scenario.controller.dt_s
         self._stages = round(scenario.controller.horizon_s / scenario.controller.dt_s)
         keeps = scenario.limits.min_distance_shape_m > 0.0
         self._boxes = box_table(scenario.target_model().boxes) if keeps else None
 
-    def pose(self, i: int, target: TargetState, now_s: float) -> tuple[Array, Array, Array]:
+    def pose(
+        self, chaser: ChaserMachine, target: TargetState, now_s: float
+    ) -> tuple[Array, Array, Array]:
         """Return a chaser's reference now: position (3,) and attitude (4,) in WRF, offset (3,) in
         TRF.
         """
-        move = self._machine.chasers[i].move
+        move = chaser.state.move
         offset = move.at(np.array([now_s]))[0][0]
         if isinstance(move, Escape):
             offset = rotations.rotate_inverse(target.q_wxyz, offset)
         position = target.position_m + rotations.rotate(target.q_wxyz, offset)
-        q_off = self._attitudes(i, offset[None], np.array([now_s])).reshape(4)
+        q_off = self._attitudes(chaser, offset[None], np.array([now_s])).reshape(4)
         return position, rotations.multiply(target.q_wxyz, q_off), offset
-
-    def reference(self, i: int, pose: tuple[Array, Array, Array]) -> ReferencePose:
-        """Return a reference pose with the distance that the chaser keeps from the target."""
-        return ReferencePose(*pose, self._machine.min_distance_target_m(i))
 
     def horizon(
         self,
-        chasers: tuple[int, ...],
+        chasers: Sequence[ChaserMachine],
         start: TargetState,
         body: TargetBody,
         attached: frozenset[int],
@@ -101,65 +100,62 @@ class ReferenceBuilder:
                 middles.acceleration_m_s2,
             )
         known = {r.chaser: r for r in relative}
+        numbers = tuple(c.number for c in chasers)
         margins = self._margins_m(
-            [known[i].covariance if i in known else start.covariance for i in chasers]
+            [known[i].covariance if i in known else start.covariance for i in numbers]
         )
-        distances = np.array([self._machine.min_distance_target_m(i) for i in chasers])
+        distances = np.array([c.min_distance_target_m() for c in chasers])
         # An uncertain pose pushes no chaser out of the corridor of its port, where no other place
         # is safe.
         room = [
-            length(known[i].position_m) - d
-            if i in known and self._machine.in_corridor(i)
+            length(known[c.number].position_m) - d
+            if c.number in known and c.in_corridor()
             else np.inf
-            for i, d in zip(chasers, distances.tolist(), strict=True)
+            for c, d in zip(chasers, distances.tolist(), strict=True)
         ]
         distances = distances + np.minimum(margins, np.maximum(room, 0.0))
         boxes = clearance = None
         if self._boxes is not None:
             boxes = moved(self._boxes, nodes.positions_m, nodes.q_wxyz)
-            kept = np.array([self._machine.min_distance_shape_m(i) for i in chasers])
+            kept = np.array([c.min_distance_shape_m() for c in chasers])
             clearance = np.where(kept > 0.0, kept + margins, 0.0)
         return HorizonReference(
-            chasers=chasers,
+            chasers=numbers,
             references=reference.references_on(
                 nodes.positions_m, nodes.q_wxyz, positions[:, :k], q_off[:, :k]
             ),
             u_ref=u_ref,
             target_positions=nodes.positions_m,
             min_distance_target_m=distances,
-            corridors=corridor_rows([self._machine.corridor(i) for i in chasers], nodes.q_wxyz),
+            corridors=corridor_rows([c.corridor() for c in chasers], nodes.q_wxyz),
             attached=attached,
             boxes=boxes,
             box_clearance_m=clearance,
         )
 
     def _offsets(
-        self, chasers: tuple[int, ...], times_s: Array, target: TargetPath
+        self, chasers: Sequence[ChaserMachine], times_s: Array, target: TargetPath
     ) -> tuple[tuple[Array, Array, Array], Array]:
         """Return offsets, their velocities and accelerations in TRF, each (N, K, 3), and attitudes,
         body to TRF, (N, K, 4), at times (K,), at which the target moves as ``target``."""
-        moves = [self._motion(i, times_s, target) for i in chasers]
+        moves = [_motion(c, times_s, target) for c in chasers]
         q_off = np.empty((len(chasers), len(times_s), 4))
-        for row, i in enumerate(chasers):
-            q_off[row] = rotations.normalize(self._attitudes(i, moves[row][0], times_s))
+        for row, c in enumerate(chasers):
+            q_off[row] = rotations.normalize(self._attitudes(c, moves[row][0], times_s))
         positions, velocities, accelerations = (np.array(part) for part in zip(*moves, strict=True))
         return (positions, velocities, accelerations), q_off
 
-    def _motion(self, i: int, times_s: Array, target: TargetPath) -> tuple[Array, Array, Array]:
-        """Return a chaser's offsets, velocities and accelerations (K, 3) in TRF at times (K,)."""
-        move = self._machine.chasers[i].move
-        motion = move.at(times_s)
-        return reference.seen_from(target, *motion) if isinstance(move, Escape) else motion
-
-    def _attitudes(self, i: int, offsets: Array, times_s: Array) -> Array:
+    def _attitudes(self, chaser: ChaserMachine, offsets: Array, times_s: Array) -> Array:
         """Return reference attitudes, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or
         (4,) if constant.
         """
-        c, q = self._scenario.chasers[i], np.array(self._scenario.chasers[i].q_wxyz)
-        if self._scenario.approach.face_target or self._machine.chasers[i].faces:
+        c, state = self._scenario.chasers[chaser.number], chaser.state
+        q = np.array(c.q_wxyz)
+        if self._scenario.approach.face_target or state.faces:
             q = facing_attitudes(c.position_m, c.q_wxyz, offsets)
-        turns = self._machine.body_rotations(i, times_s)
-        return q if turns is None else rotations.multiply(q, turns)
+        if not state.turns:
+            return q
+        return rotations.multiply(q, calibration_turns(times_s - state.since_s))
 
     def _margins_m(self, covariances: Sequence[Array]) -> Array:
         """Return the additions (N,) to the distance from the target for uncertain positions, the
@@ -169,3 +165,12 @@ class ReferenceBuilder:
         return np.minimum(
             self._scenario.limits.estimate_margin_sigmas * sigmas_m, _GREATEST_MARGIN_M
         )
+
+
+def _motion(
+    chaser: ChaserMachine, times_s: Array, target: TargetPath
+) -> tuple[Array, Array, Array]:
+    """Return a chaser's offsets, velocities and accelerations (K, 3) in TRF at times (K,)."""
+    move = chaser.state.move
+    motion = move.at(times_s)
+    return reference.seen_from(target, *motion) if isinstance(move, Escape) else motion

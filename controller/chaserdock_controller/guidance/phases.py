@@ -95,7 +95,9 @@ ATTACHED = (_P.LATCHED, _P.VERIFIED, _P.IDENTIFY, *DETUMBLING)
 """Phases of a chaser whose latch holds the target."""
 APPROACHING = (_P.WAIT, *CORRIDOR, *ATTACHED, _P.DOCKED)
 """Phases that an ``approach`` command leads through."""
-_MOVING = (_P.RETREAT, _P.ABORT, _P.GOTO)
+BACKING_OUT = (_P.RETREAT, _P.ABORT)
+"""Phases in which a chaser leaves its port, or the neighbourhood of the target."""
+_MOVING = (*BACKING_OUT, _P.GOTO)
 _FREE = (_P.HOLD, _P.CALIBRATE, _P.INSPECT, *_MOVING)
 
 TRANSITIONS = (

@@ -14,6 +14,8 @@ from chaserdock_models.braking import brake_wrench
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.bodies import Body
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 SEARCH_RATE_RAD_S = math.radians(15.0)
@@ -21,6 +23,10 @@ SEARCH_RATE_RAD_S = math.radians(15.0)
 _RING_SHARE = 0.9
 """Rings grow by this share of the image's height, so that each overlaps the one before."""
 _WIDEST_RAD = math.radians(170.0)
+_PAUSE_S, _BETWEEN_PAUSES_S = 8.0, 2.0
+"""Longest time for which a chaser stops turning while it searches one of its images, and least time
+of turning between two of these: an acquisition by shape takes up to 120 images, and half a field of
+view passes in 2 s."""
 
 CALIBRATION_S = 30.0
 """Duration of the calibration manoeuvre."""
@@ -113,6 +119,40 @@ def search_wrench(
     """Return force and torque (6,), body axes, of a chaser at ``time_s`` of its search."""
     now, soon = (search_attitude(q_start_wxyz, camera, time_s + dt) for dt in (0.0, _STEP_S))
     return turning_wrench(odometry, body, now, soon)
+
+
+class SearchProgress(Struct, frozen=True):
+    """Search of one chaser: the attitude at its begin, and its pauses.
+
+    ``paused_s``: of all pauses; ``pause_s``: of the present one; ``resumed_s``: when the last one
+    ended; ``updated_s``: time of this state.
+    """
+
+    q_start_wxyz: Array
+    updated_s: float
+    paused_s: float = 0.0
+    pause_s: float = 0.0
+    resumed_s: float = -math.inf
+
+    def at(self, now_s: float, acquiring: bool | None) -> SearchProgress:
+        """Return the progress at ``now_s`` of a chaser that is ``acquiring`` the target in an
+        earlier image, or is not.
+
+        None: not known, as no sighting has come; a pause goes on.
+        """
+        step_s = now_s - self.updated_s
+        if acquiring is None:
+            acquiring = self.pause_s > 0.0
+        begins = self.pause_s > 0.0 or now_s - self.resumed_s >= _BETWEEN_PAUSES_S
+        if acquiring and begins and self.pause_s < _PAUSE_S:
+            return replace(
+                self,
+                updated_s=now_s,
+                paused_s=self.paused_s + step_s,
+                pause_s=self.pause_s + step_s,
+            )
+        resumed_s = now_s if self.pause_s > 0.0 else self.resumed_s
+        return replace(self, updated_s=now_s, pause_s=0.0, resumed_s=resumed_s)
 
 
 def calibration_turns(times_s: ArrayLike) -> Array:

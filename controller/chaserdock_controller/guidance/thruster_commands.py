@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 
 from chaserdock_protocol.messages import OperatorCommand
-from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.bodies import Body
 
 from . import command_validation as validation
 from .chaser_state import CommandResult
@@ -14,49 +14,41 @@ from .chaser_state import CommandResult
 THRUSTER_COMMANDS = ("isolate", "restore")
 
 
-class ThrusterCommandHandler:
-    """Thrusters that operators have isolated or restored, by chaser."""
+class ThrusterCommands:
+    """Thrusters of one chaser that operators have isolated, or restored: these are trusted, and
+    fault detection must not isolate them.
+    """
 
-    def __init__(self, scenario: FlightScenario) -> None:
-        self._chasers = len(scenario.chasers)
-        body = scenario.chaser
+    def __init__(self, body: Body) -> None:
         self._thrusters = len(body.thrusters) if body.actuation == "thrusters" else 0
-        self._isolated: dict[int, set[int]] = {}
-        self._trusted: dict[int, set[int]] = {}
-        self._last_commands: dict[tuple[int, int], tuple[float, OperatorCommand]] = {}
+        self.isolated: set[int] = set()
+        self.trusted: set[int] = set()
+        self._last_commands: dict[int, tuple[float, OperatorCommand]] = {}
 
-    def isolated(self, chaser: int) -> tuple[int, ...]:
-        """Return the thrusters that an operator has isolated."""
-        return tuple(sorted(self._isolated.get(chaser, ())))
+    def closed(self, stuck: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the thrusters that an operator has isolated, or that are ``stuck``."""
+        return tuple(sorted({*self.isolated, *self.untrusted(stuck)}))
 
-    def trusted(self, chaser: int) -> tuple[int, ...]:
-        """Return the thrusters that an operator has restored, which fault detection must not
-        isolate.
-        """
-        return tuple(sorted(self._trusted.get(chaser, ())))
+    def untrusted(self, thrusters: tuple[int, ...]) -> tuple[int, ...]:
+        """Return those of ``thrusters`` that no operator has restored."""
+        return tuple(k for k in thrusters if k not in self.trusted)
 
     def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
         """Apply or refuse a command. Of different commands to one thruster in one tick only the
         first is accepted.
         """
-        i, thruster = command.chaser, command.thruster
-        reason = validation.why_unknown_chaser(i, self._chasers) or validation.why_stale(
-            command, now_s
-        )
-        if not reason and self._thrusters == 0:
-            reason = 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
-        if reason:
+        thruster, count = command.thruster, self._thrusters
+        if count == 0:
+            return CommandResult(False, validation.WITHOUT_THRUSTERS)
+        if thruster is None or thruster >= count:
+            reason = f"{command.command} needs a thruster; this body has 0 to {count - 1}"
             return CommandResult(False, reason)
-        if thruster is None or thruster >= self._thrusters:
-            reason = f"{command.command} needs a thruster; this body has 0 to {self._thrusters - 1}"
-            return CommandResult(False, reason)
-        done_s, done = self._last_commands.get((i, thruster), (-math.inf, command))
+        done_s, done = self._last_commands.get(thruster, (-math.inf, command))
         if done_s == now_s and done.command != command.command:
             return validation.superseded_by(done)
-        self._last_commands[i, thruster] = now_s, command
-        isolated, trusted = self._isolated.setdefault(i, set()), self._trusted.setdefault(i, set())
+        self._last_commands[thruster] = now_s, command
         isolate = command.command == "isolate"
-        chosen, other = (isolated, trusted) if isolate else (trusted, isolated)
+        chosen, other = (self.isolated, self.trusted) if isolate else (self.trusted, self.isolated)
         state = "isolated" if isolate else "restored"
         if thruster in chosen:
             return CommandResult(True, f"thruster {thruster} is already {state}")

@@ -204,6 +204,11 @@ class Escape(Struct, frozen=True, eq=False, tag=True):
         """Return whether the motion is complete."""
         return time_s >= self.start_s + self.duration_s
 
+    @property
+    def impulse_m_s(self) -> float:
+        """Return the change of velocity by the burn."""
+        return float(np.linalg.norm(self.acceleration_m_s2)) * self.burn_s
+
     def burnt_out(self) -> Array:
         """Return the state (6,) at the end of the burn."""
         p, v, _ = self.at(np.array([self.start_s + self.burn_s]))

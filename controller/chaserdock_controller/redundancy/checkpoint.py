@@ -21,13 +21,13 @@ from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.parameters import TargetParameters
 from chaserdock_controller.estimation.joint.replay import ReplayBuffer
 from chaserdock_controller.estimation.mass_properties import MassProperties
-from chaserdock_controller.estimation.paper import PaperEstimator, PaperParameters, TargetView
+from chaserdock_controller.estimation.paper import PaperEstimator, PaperParameters, SightedTarget
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.target_shape import ShapeFilter
+from chaserdock_controller.guidance.activities.detumble import detumbling_of
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.docking import DockingObservation
-from chaserdock_controller.guidance.target_search import SearchProgress
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan, PlanningFailure
 
@@ -63,34 +63,32 @@ class OutputState(Struct, forbid_unknown_fields=True):
     _without_plan: set[int]
 
 
-class GuidanceState(Struct, forbid_unknown_fields=True):
-    chasers: list[ChaserGuidance]
-    _pending_goals: dict[int, Array]
-    _observed: dict[int, DockingObservation]
-    _positions: dict[int, Array]
+class ThrusterCommandState(Struct, forbid_unknown_fields=True):
+    isolated: set[int]
+    trusted: set[int]
     _last_commands: dict[int, tuple[float, OperatorCommand]]
+
+
+class ChaserMachineState(Struct, forbid_unknown_fields=True):
+    state: ChaserGuidance
+    position_m: Array | None
+    seen: DockingObservation | None
+    failure: PlanningFailure | None
+    interrupted: bool
+    abort_margin: float | None
+    _last_command: tuple[float, OperatorCommand] | None
+
+
+class FleetState(Struct, forbid_unknown_fields=True):
     _seen_s: float | None
-    _interrupted: set[int]
-    _planning_failures: dict[int, PlanningFailure]
 
 
 class ThrusterReportState(Struct, forbid_unknown_fields=True):
     _reports: dict[int, ThrusterReport]
 
 
-class ThrusterCommandState(Struct, forbid_unknown_fields=True):
-    _isolated: dict[int, set[int]]
-    _trusted: dict[int, set[int]]
-    _last_commands: dict[tuple[int, int], tuple[float, OperatorCommand]]
-
-
-class SafetyState(Struct, forbid_unknown_fields=True):
-    """Waiting of the stack for chasers that back out, and margins of the best aborts where passive
-    safety is enforced.
-    """
-
-    _waits: bool
-    _abort_margins: dict[int, float]
+class WaitingState(Struct, forbid_unknown_fields=True):
+    waits: bool
 
 
 class StackControlState(Struct, forbid_unknown_fields=True):
@@ -117,10 +115,6 @@ class CompositeState(Struct, forbid_unknown_fields=True):
 
 class CommandHistoryState(Struct, forbid_unknown_fields=True):
     _sent: dict[int, list[tuple[int, Array]]]
-
-
-class SearchState(Struct, forbid_unknown_fields=True):
-    _progress: dict[int, SearchProgress]
 
 
 class LostChaserState(Struct, forbid_unknown_fields=True):
@@ -152,7 +146,7 @@ class JointEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
 class PaperEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
     parameters: PaperParameters
     _odometry: dict[tuple[int, int], Odometry]
-    _latest: dict[int, TargetView]
+    _latest: dict[int, SightedTarget]
     _poses: list[tuple[Array, Array]]
     _rates: list[tuple[Array, Array]]
     _mean: tuple[int, Array, Array] | None
@@ -180,17 +174,16 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     planning: PlanningState
     plan_monitor: PlanMonitorState
     output: OutputState
-    guidance: GuidanceState
+    chasers: list[tuple[ChaserMachineState, ThrusterCommandState]]
+    fleet: FleetState
     timeline_left: int
     thruster_reports: ThrusterReportState
-    thruster_commands: ThrusterCommandState
-    safety: SafetyState
+    stack: WaitingState
     stack_control: StackControlState
     stack_plan: StackPlanState
     sequencer: SequencerState
     composite: CompositeState
     history: CommandHistoryState
-    searches: SearchState
     lost_chasers: LostChaserState
     odometry: OdometryState
     consistency: ConsistencyState
@@ -211,21 +204,20 @@ class Checkpoint:
         the checkpoint.
         """
         core = self._core
+        detumble = detumbling_of(core.guidance.activities)
         parts: dict[str, tuple[Any, type[Struct]]] = {
             "core": (core, CoreState),
             "planning": (core.planning, PlanningState),
             "plan_monitor": (core.planning.monitor, PlanMonitorState),
             "output": (core.output, OutputState),
-            "guidance": (core.guidance.machine, GuidanceState),
+            "fleet": (core.guidance.fleet, FleetState),
             "thruster_reports": (core.ingest.thrusters, ThrusterReportState),
-            "thruster_commands": (core.guidance.thrusters, ThrusterCommandState),
-            "safety": (core.guidance, SafetyState),
-            "stack_control": (core.guidance.detumble, StackControlState),
-            "stack_plan": (core.guidance.detumble.planner, StackPlanState),
-            "sequencer": (core.guidance.detumble.sequencer, SequencerState),
+            "stack": (detumble, WaitingState),
+            "stack_control": (detumble.control, StackControlState),
+            "stack_plan": (detumble.control.planner, StackPlanState),
+            "sequencer": (detumble.control.sequencer, SequencerState),
             "composite": (core.estimation.composite, CompositeState),
             "history": (core.output.history, CommandHistoryState),
-            "searches": (core.guidance.search, SearchState),
             "lost_chasers": (core.ingest.lost_chasers, LostChaserState),
             "odometry": (self._odometry, OdometryState),
             "consistency": (core.estimation.consistency, ConsistencyState),
@@ -244,7 +236,11 @@ class Checkpoint:
             return encode(
                 ControllerCheckpoint(
                     **parts,
-                    timeline_left=len(vars(self._core.guidance.machine)["_timeline"]),
+                    chasers=[
+                        (_read(c, ChaserMachineState), _read(c.thrusters, ThrusterCommandState))
+                        for c in self._core.guidance.chasers
+                    ],
+                    timeline_left=len(vars(self._core.guidance.fleet)["_timeline"]),
                     identification=None if identification is None else identification.save(),
                     estimator=None if kind is None else _read(estimator, kind),
                     plans=dict(frame.plans) if frame is not None else {},
@@ -261,7 +257,7 @@ class Checkpoint:
             raise CheckpointError(str(error)) from None
         timeline = sorted(self._core.scenario.timeline, key=lambda entry: entry.at_s)
         chasers = len(self._core.scenario.chasers)
-        if len(state.guidance.chasers) != chasers or not 0 <= state.timeline_left <= len(timeline):
+        if len(state.chasers) != chasers or not 0 <= state.timeline_left <= len(timeline):
             raise CheckpointError("the state is of another mission")
         count = (
             None
@@ -273,7 +269,12 @@ class Checkpoint:
         self._restore_identification(state.identification)
         for name, (owner, _) in self._parts().items():
             _write(owner, getattr(state, name))
-        vars(self._core.guidance.machine)["_timeline"] = timeline[
+        for chaser, (guided, thrusters) in zip(
+            self._core.guidance.chasers, state.chasers, strict=True
+        ):
+            _write(chaser, guided)
+            _write(chaser.thrusters, thrusters)
+        vars(self._core.guidance.fleet)["_timeline"] = timeline[
             len(timeline) - state.timeline_left :
         ]
         kind = _ESTIMATORS.get(type(self._core.estimator))

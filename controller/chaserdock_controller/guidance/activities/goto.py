@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Goto: fly to an offset from the target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from chaserdock_protocol.messages import OperatorCommand
+
+from .. import command_validation as validation
+from ..chaser_machine import Activity, ChaserMachine
+from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
+from ..fleet import ChaserFleet
+from ..phases import Phase, Trigger
+from ..trajectories import move_to, stay
+
+
+class GotoActivity(Activity):
+    phases = (Phase.GOTO,)
+    commands = ("goto",)
+
+    def __init__(self, fleet: ChaserFleet) -> None:
+        self._fleet = fleet
+
+    def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:
+        if reason := super().refuse(chaser, command, now_s):
+            return reason
+        if chaser.in_corridor():
+            return "the chaser is in its corridor: retreat or abort first"
+        scenario, i = chaser.scenario, chaser.number
+        goals_m = self._fleet.goals_besides(chaser)
+        if reason := validation.why_not_goto(scenario, i, command.offset_m, goals_m):
+            return reason
+        goal_m = np.asarray(command.offset_m)
+        return validation.why_not_in_cone(scenario, i, goal_m) or self._fleet.moves.why_not_safe(
+            chaser, goal_m, now_s
+        )
+
+    def start(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> None:
+        chaser.fire(Trigger.COMMAND_GOTO, now_s, place_m=np.asarray(command.offset_m))
+
+    def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
+        """Go where the command says; a chaser that has searched comes to its nominal offset from
+        where it is, facing the target on the way.
+        """
+        moves, now_s = self._fleet.moves, cause.now_s
+        assert cause.place_m is not None
+        if cause.trigger is Trigger.TARGET_SETTLED:
+            here = stay(cause.place_m, now_s)
+            move = move_to(here, chaser.nominal_m, now_s, moves.goto_m_s)
+            return replace(begun, move=move, faces=True)
+        return replace(begun, move=moves.move(chaser, cause.place_m, now_s, moves.goto_m_s))
+
+    def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
+        if chaser.state.move.over_at(known.now_s):
+            chaser.fire(Trigger.MOVE_COMPLETE, known.now_s)

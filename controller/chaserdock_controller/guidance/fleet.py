@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What concerns several chasers: the timeline, the commands of one tick, who is in whose way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.scenario import FlightScenario
+
+from chaserdock_controller.interfaces import LogEntry
+
+from . import command_validation as validation
+from .chaser_machine import ChaserMachine
+from .chaser_state import ChaserTick, CommandResult, PhaseChange
+from .docking import corridors_apart
+from .moves import MovePlanner
+from .parameters import GUIDANCE
+from .phases import ATTACHED, Phase, Trigger
+from .thruster_commands import THRUSTER_COMMANDS
+
+
+class ChaserFleet:
+    """All ``chasers``, by number. ``changes``: their phase changes in this tick, in order;
+    ``notes``: what else is to be logged in it.
+    """
+
+    def __init__(self, scenario: FlightScenario) -> None:
+        self.scenario = scenario
+        self.moves = MovePlanner(scenario)
+        self.changes: list[PhaseChange] = []
+        self.notes: list[LogEntry] = []
+        numbers = range(len(scenario.chasers))
+        self.chasers = tuple(ChaserMachine(scenario, i, self.changes) for i in numbers)
+        self._timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
+        self._pending_goals: dict[int, Array] = {}
+        self._pending_inspections: set[int] = set()
+        self._seen_s: float | None = None
+
+    def others(self, chaser: ChaserMachine) -> Iterator[ChaserMachine]:
+        """Return all chasers but one."""
+        return (other for other in self.chasers if other is not chaser)
+
+    def drain_events(self) -> tuple[LogEntry, ...]:
+        """Return what has happened since the last call."""
+        events: list[LogEntry] = [
+            (c.level, f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in self.changes
+        ]
+        events += self.notes
+        self.changes.clear()
+        self.notes.clear()
+        return tuple(events)
+
+    # -- the target's estimate ---------------------------------------------------------------------
+
+    def miss_target(self, now_s: float, lost: bool) -> None:
+        """Without the target's pose: stop every chaser that moves relative to it when it is
+        ``lost``, and let those search that have waited for a while.
+        """
+        if lost:
+            for chaser in self.chasers:
+                chaser.lose_target(now_s)
+        for chaser in self.chasers:
+            if now_s - chaser.state.since_s >= GUIDANCE.search_after_s:
+                chaser.fire(Trigger.TARGET_UNKNOWN, now_s)
+
+    def follow_target(
+        self, now_s: float, known: Sequence[ChaserTick], seen: bool, settled: bool
+    ) -> None:
+        """With the target's pose: interrupt and resume approaches by whether any chaser has
+        ``seen`` it, let those hold that waited for it, and those that searched come when its
+        motion is ``settled``.
+        """
+        self._seen_s = now_s if seen or self._seen_s is None else self._seen_s
+        for chaser, tick in zip(self.chasers, known, strict=True):
+            chaser.follow_sight(tick, now_s - self._seen_s)
+        for chaser in self.chasers:
+            chaser.fire(Trigger.TARGET_ACQUIRED, now_s)
+        for chaser, tick in zip(self.chasers, known, strict=True):
+            if settled and tick.own is not None:
+                reason = "the target is found"
+                chaser.fire(Trigger.TARGET_SETTLED, now_s, reason, tick.offset_m)
+
+    # -- commands ----------------------------------------------------------------------------------
+
+    def due_commands(self, now_s: float) -> list[OperatorCommand]:
+        """Return the commands of the scenario's timeline that are due and were not returned before."""
+        out = []
+        while self._timeline and self._timeline[0].at_s <= now_s + 1e-9:
+            entry = self._timeline.pop(0)
+            for chaser in entry.chasers:
+                fields = {
+                    "command": entry.command,
+                    "offset_m": entry.offset_m,
+                    "thruster": entry.thruster,
+                }
+                out.append(OperatorCommand(chaser=chaser, **fields))
+        return out
+
+    def apply(self, commands: Sequence[OperatorCommand], now_s: float) -> list[CommandResult]:
+        """Apply or refuse the commands of one tick, knowing all goals, so that two chasers can swap
+        their places.
+        """
+        self._pending_inspections = {c.chaser for c in commands if c.command == "inspect"}
+        self._pending_goals = {
+            c.chaser: np.asarray(c.offset_m)
+            for c in commands
+            if c.command == "goto"
+            and c.offset_m is not None
+            and c.chaser < len(self.chasers)
+            and not validation.why_not_offset(self.scenario, c.chaser, c.offset_m)
+        }
+        return [self._apply(c, now_s) for c in commands]
+
+    def _apply(self, command: OperatorCommand, now_s: float) -> CommandResult:
+        reason = validation.why_unknown_chaser(
+            command.chaser, len(self.chasers)
+        ) or validation.why_stale(command, now_s)
+        if reason:
+            return CommandResult(False, reason)
+        chaser = self.chasers[command.chaser]
+        if command.command in THRUSTER_COMMANDS:
+            return chaser.thrusters.command(command, now_s)
+        return chaser.command(command, now_s)
+
+    # -- who is in whose way -----------------------------------------------------------------------
+
+    def goals_besides(self, chaser: ChaserMachine) -> dict[int, Array]:
+        """Return where the other chasers go (3,), TRF, after the commands of this tick."""
+        return {
+            other.number: self._pending_goals.get(other.number, other.state.move.goal_m)
+            for other in self.others(chaser)
+        }
+
+    def inspects(self, chaser: ChaserMachine) -> bool:
+        """Return whether a chaser flies around the target, or is commanded to in this tick."""
+        return chaser.phase is Phase.INSPECT or chaser.number in self._pending_inspections
+
+    def why_corridor_occupied(self, chaser: ChaserMachine) -> str:
+        """Return which chaser blocks an approach to a port, or an empty string."""
+        docking, active = self.scenario.docking, 0
+        assert chaser.dock is not None
+        for other in self.others(chaser):
+            aligning = other.phase is Phase.ALIGN
+            if other.dock is None or not (aligning or other.in_corridor()):
+                continue
+            active += other.phase not in ATTACHED
+            if corridors_apart(chaser.dock, other.dock) < docking.clearance_m:
+                return f"chaser {other.number} is in the way"
+        return f"{active} are docking already" if active >= docking.at_once else ""

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Moves of the reference in TRF: within the speed limits and, if enforced, passively safe."""
+
+from __future__ import annotations
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.scenario import FlightScenario
+
+from .chaser_machine import ChaserMachine
+from .escape import EscapePlanner
+from .parameters import GUIDANCE
+from .trajectories import Motion, move_to
+
+
+class MovePlanner:
+    """Plans moves at ``approach_m_s``, ``goto_m_s`` or ``abort_m_s``. ``escapes``: None unless
+    passive safety is enforced.
+    """
+
+    def __init__(self, scenario: FlightScenario) -> None:
+        self._scenario = scenario
+        self.approach_m_s = scenario.approach.max_speed_m_s
+        self.goto_m_s = self.approach_m_s * GUIDANCE.goto_speed_factor
+        self.abort_m_s = self.approach_m_s * GUIDANCE.abort_speed_factor
+        self.escapes: EscapePlanner | None = None
+        if scenario.limits.passive_safety == "enforce":
+            self.escapes = EscapePlanner(scenario, self.abort_m_s)
+
+    def move(self, chaser: ChaserMachine, goal_m: Array, now_s: float, speed_m_s: float) -> Motion:
+        """Return the move to a goal (3,), TRF, at most at a speed; if passive safety is enforced,
+        as slow as it needs.
+        """
+        return self._safe(chaser, goal_m, now_s, speed_m_s) or move_to(
+            chaser.motion(now_s), goal_m, now_s, speed_m_s
+        )
+
+    def why_not_safe(self, chaser: ChaserMachine, goal_m: Array, now_s: float) -> str:
+        """Return why no move to a goal (3,), TRF, is passively safe, or an empty string."""
+        if self._safe(chaser, goal_m, now_s, self.goto_m_s) is not None:
+            return ""
+        return (
+            "no speed makes the move passively safe: the coast after a loss of thrust comes within "
+            f"{self._scenario.limits.min_distance_target_m:g} m of the target (limits.passive_safety)"
+        )
+
+    def _safe(
+        self, chaser: ChaserMachine, goal_m: Array, now_s: float, speed_m_s: float
+    ) -> Motion | None:
+        start = chaser.motion(now_s)
+        speed_m_s = self._closing_speed(start, goal_m, now_s, speed_m_s)
+        if self.escapes is None:
+            return move_to(start, goal_m, now_s, speed_m_s)
+        return self.escapes.limited(
+            chaser.relative, lambda speed: move_to(start, goal_m, now_s, speed), speed_m_s, now_s
+        )
+
+    def _closing_speed(self, start: Motion, goal_m: Array, now_s: float, speed_m_s: float) -> float:
+        """Return the largest speed of a move that keeps the speed limit by range all along its way,
+        at least ``speed_m_s``.
+        """
+        slope = self._scenario.approach.closing_per_s
+        if not slope:
+            return speed_m_s
+        farthest = max(
+            float(np.linalg.norm(goal_m)), float(np.linalg.norm(start.at(np.array([now_s]))[0][0]))
+        )
+        speed = speed_m_s + slope * farthest
+        while speed > speed_m_s:
+            move = move_to(start, goal_m, now_s, speed)
+            positions, velocities, _ = move.at(np.linspace(now_s, now_s + move.duration_s, 65))
+            limits = speed_m_s + slope * np.linalg.norm(positions, axis=1)
+            if np.all(np.linalg.norm(velocities, axis=1) <= limits):
+                return speed
+            speed *= 0.97
+        return speed_m_s

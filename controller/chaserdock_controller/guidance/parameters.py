@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tuned numbers of the phases and moves of the chasers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class GuidanceParameters:
+    """Times in s, distances in m; speed factors multiply `approach.max_speed_m_s`."""
+
+    goto_speed_factor: float = 2.0
+    """Moves that end far from the target may be faster than an approach."""
+    abort_speed_factor: float = 2.0
+    """An abort leaves faster than a retreat, which flies back as slowly as an approach."""
+    search_after_s: float = 1.0
+    """Time without the target's pose after which a chaser searches; a few images may miss it."""
+    sight_loss_s: float = 3.0
+    """An approach stops when no chaser has seen the target for this long."""
+    held_margin_m: float = 0.03
+    """A chaser that docks at a distance may be planned this much nearer than that distance, so
+    that its keep-out does not push it off its reference."""
+    outside_m: float = 0.02
+    """A chaser this far outside of its cone is planned without it (docs/controller.md)."""
+    aligned_s: float = 1.0
+    """Time for which a chaser must keep the corridor's limits before it flies in."""
+    in_line_m: float = 0.3
+    """Greatest distance from its port's axis from which a chaser flies straight to its corridor."""
+    release_s: float = 1.0
+    """A latch that is closed for this long after the command to release it does not open."""
+    stack_rest_s: float = 0.5
+    """Time for which a stack must be below its limits to count as stopped."""
+    stack_moving_s: float = 0.2
+    """Time for which a stopped stack must move to be stopped again; it drifts meanwhile."""
+    stack_settling_s: float = 0.5
+    """Time after the last thrust in which the mean motion of the stack, whose time constant this
+    is, still contains the motion before it."""
+
+
+GUIDANCE = GuidanceParameters()

@@ -98,13 +98,15 @@ def make_parser(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def main(description: str | None, *groups: Group) -> None:
-    """Measure the parts of a benchmark as the command line says, print and write their figures.
+def add_shared(parser: argparse.ArgumentParser, names: Iterable[str]) -> None:
+    """Add options that several benchmarks have."""
+    for name in dict.fromkeys(names):
+        parser.add_argument(f"--{name}", **SHARED[name])
 
-    Raises SystemExit with status 1 if a part misses its bar.
-    """
-    parts = {name: part for group in groups for name, part in group.parts.items()}
-    default = [name for g in groups for name in g.parts if name not in g.on_request]
+
+def parser_of(description: str | None, groups: Sequence[Group]) -> argparse.ArgumentParser:
+    """Return the parser of a benchmark with these groups of parts."""
+    parts = parts_of(groups)
     parser = make_parser(description)
     width = max(map(len, parts))
     lines = [f"  {name:{width}}  {_purpose(part)}" for name, part in parts.items()]
@@ -113,22 +115,40 @@ def main(description: str | None, *groups: Group) -> None:
         "--only",
         nargs="+",
         metavar="PART",
-        default=default,
+        default=[name for g in groups for name in g.parts if name not in g.on_request],
         help="parts by name, or by the begin of several names (before a hyphen)",
     )
-    for name in dict.fromkeys(name for group in groups for name in group.uses):
-        parser.add_argument(f"--{name}", **SHARED[name])
+    add_shared(parser, (name for group in groups for name in group.uses))
     for group in groups:
         if group.add_options is not None:
             group.add_options(parser)
+    return parser
+
+
+def parts_of(groups: Sequence[Group]) -> dict[str, Measure]:
+    """Return the parts of all groups by name."""
+    return {name: part for group in groups for name, part in group.parts.items()}
+
+
+def matching(wanted: str, names: Iterable[str]) -> list[str]:
+    """Return the part of this name, or those whose names begin so."""
+    every = list(names)
+    return [wanted] if wanted in every else [n for n in every if n.startswith(f"{wanted}-")]
+
+
+def main(description: str | None, groups: Sequence[Group]) -> None:
+    """Run the parts of a benchmark as the command line says, print and write their figures.
+
+    Raises SystemExit with status 1 if a part misses its bar.
+    """
+    parts, parser = parts_of(groups), parser_of(description, groups)
     options = parser.parse_args()
-    use_one_thread()
     chosen = []
     for wanted in options.only:
-        matching = [wanted] if wanted in parts else [n for n in parts if n.startswith(f"{wanted}-")]
-        if not matching:
+        chosen += matching(wanted, parts)
+        if not matching(wanted, parts):
             parser.error(f"no part {wanted}; there are: {', '.join(parts)}")
-        chosen += matching
+    use_one_thread()
     figures, failures = Figures(), []
     for name in chosen:
         print(f"{name}:", flush=True)
@@ -172,7 +192,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Results(Generic[T]):
+class KeptResults(Generic[T]):
     """Outcomes of type ``kind`` by seed, which a file of JSON lines keeps.
 
     ``key``: what was flown, beside the seed. Rows with another key are left alone.
@@ -306,14 +326,12 @@ def chaserdock_command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "chaserdock", *map(str, arguments)]
 
 
-def run_chaserdock(*arguments: str | Path, expected: Sequence[int] = (0,)) -> None:
-    """Measure ``chaserdock`` from the clone. Raise SystemExit with its output for another status than
-    expected.
-    """
+def run_chaserdock(*arguments: str | Path) -> None:
+    """Run ``chaserdock`` from the clone. Raise SystemExit with its output if it fails."""
     done = subprocess.run(
         chaserdock_command(*arguments), cwd=ROOT, capture_output=True, text=True, check=False
     )
-    if done.returncode not in expected:
+    if done.returncode:
         raise SystemExit(
             f"chaserdock {arguments[0]}: status {done.returncode}\n{done.stdout}{done.stderr}"
         )

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller in closed loop and the thrusters: ``python benchmarks/control.py [--only PART ...]``.
+"""The controller in closed loop and the thrusters: ``python benchmarks/control.py [--only PART
+...]``.
 
 Avoidance, swaps, clutter and tracking in one process; the cost of distances and of orbital motion
 in the plan; allocation, pulses and failures of thrusters. `benchmarks/nmpc.py` times the solver.
@@ -8,5 +9,12 @@ in the plan; allocation, pulses and failures of thrusters. `benchmarks/nmpc.py` 
 from common import main
 from parts import closed_loop, orbit_solve, shape_distance, thrusters
 
+GROUPS = (
+    closed_loop.GROUP,
+    shape_distance.GROUP,
+    orbit_solve.GROUP,
+    thrusters.GROUP,
+)
+
 if __name__ == "__main__":
-    main(__doc__, closed_loop.GROUP, shape_distance.GROUP, orbit_solve.GROUP, thrusters.GROUP)
+    main(__doc__, GROUPS)

@@ -11,8 +11,8 @@ the attitude were frozen. Largest loads at a port are those of the physics engin
 step (``engine``), or of the equations of motion at the same rate of 960 Hz.
 
 All parts but ``engine`` fly identification and plan in closed loop with the stack as one rigid body
-(``flights.rigid_control``). The stated mass and inertia are 30 % wrong, the stated centre of mass 88
-mm; thrusts (3 %) and pulses (2 %) have errors.
+(``flights.rigid_control``). The stated mass and inertia are 30 % wrong, the stated centre of mass
+88 mm; thrusts (3 %) and pulses (2 %) have errors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import TypeVar
 
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from common import Figures, Group, Options, Results, described, main, seeds_of, summaries
+from common import Figures, Group, KeptResults, Options, described, main, seeds_of, summaries
 from flights.detumble_flights import (
     DetumbleOutcome,
     fly_stack,
@@ -41,7 +41,7 @@ from flights.rigid_control import (
     wrong_knowledge,
 )
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
 """Rate of a free tumble, and how long it is watched."""
@@ -50,6 +50,7 @@ OPTIMUM_S, OPTIMUM_GUESSES = 15.5, 40
 ALONE = ("detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002")
 """Limits of rest of a single chaser, whose thrusters push one way only."""
 ALONE_S = 90.0
+"""Time that a single chaser is given to stop the stack."""
 
 T = TypeVar("T")
 
@@ -115,8 +116,8 @@ CASES: Mapping[str, RigidCase] = {
     "known": RigidCase("Stop so with mass, centre and inertia stated as they are.", knows=True),
     "identify": RigidCase("Stop so after 10 s of identifying pulses.", identify_s=10.0),
     "fast": RigidCase("Stop by feedback only.", plans=False),
-    "stuck": RigidCase("Stop with a drawn thruster stuck off, not reported.", stuck, duration_s=40.0),
-    "reported": RigidCase("Stop with a drawn thruster stuck off, reported.", reported, duration_s=40.0),
+    "stuck": RigidCase("Stop with a thruster stuck off, not reported.", stuck, duration_s=40.0),
+    "reported": RigidCase("Stop with a thruster stuck off, reported.", reported, duration_s=40.0),
     "lost": RigidCase("Stop while a drawn chaser dies at a random moment.", lost, duration_s=40.0),
     "limited": RigidCase("Stop with at most 2.5 N and 0.9 N m at every port.", duration_s=40.0,
                          limits=(2.5, 0.9)),
@@ -187,7 +188,7 @@ def fly_sets(
     for chasers in options.sets[:1] if options.quick else options.sets:
         key = {"part": part, "chasers": chasers, "set": sorted(options.set)}
         key |= {"limits": options.limits, "duration_s": options.duration_s}
-        outcomes = Results(options.results, key, kind).of(
+        outcomes = KeptResults(options.results, key, kind).of(
             seeds_of(options, 50, 1), partial(fly, options, chasers), line, options.jobs
         )
         found |= figures(f"{part}_{chasers}", outcomes)
@@ -282,7 +283,7 @@ def rigid_part(name: str, options: Options) -> Figures:
 
 
 def engine(options: Options) -> Figures:
-    """Stop a stack in the physics engine, with the scenario's sensors and statistical perception."""
+    """Stop a stack in the physics engine, with statistical perception."""
     line = DetumbleOutcome.line
     return fly_sets("engine", DetumbleOutcome, fly_in_engine, line, detumble_figures, options)
 
@@ -305,16 +306,21 @@ def vision(options: Options) -> Figures:
     return fly_sets("vision", TumbleOutcome, watch, str, vision_figures, options)
 
 
-GROUP = Group(
-    {
-        "engine": engine,
-        **{name: described(partial(rigid_part, name), case.text) for name, case in CASES.items()},
-        "optimum": optimum,
-        "vision": vision,
-    },
-    ("flights", "first", "jobs", "set", "results"),
-    add_options,
+GROUPS = (
+    Group(
+        {
+            "engine": engine,
+            **{
+                name: described(partial(rigid_part, name), case.text)
+                for name, case in CASES.items()
+            },
+            "optimum": optimum,
+            "vision": vision,
+        },
+        ("flights", "first", "jobs", "set", "results"),
+        add_options,
+    ),
 )
 
 if __name__ == "__main__":
-    main(__doc__, GROUP)
+    main(__doc__, GROUPS)

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from common import Figures, Group, Options, Results, described, main, seeds_of, summaries
+from common import Figures, Group, KeptResults, Options, described, main, seeds_of, summaries
 from flights.docking_flights import (
     APPROACH_AT_S,
     DockingOutcome,
@@ -26,7 +26,7 @@ from flights.docking_flights import (
 )
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages
+from chaserdock.experiments.perception import PerceptionModel, RenderedImages
 
 PerceptionOf = Callable[[Scenario], PerceptionModel]
 KINDS = {"stuck_on": "sticks open", "stuck_off": "sticks shut"}
@@ -97,7 +97,7 @@ def scenario_of(seed: int, options: Options, failure: Failure | None = None) -> 
 
 
 def failure_of(kind: str, seed: int, failed_at_s: float | None) -> Failure:
-    """Return the failure of a seed: thruster after thruster, at a random time between 2 and 24 s."""
+    """Return the failure of a seed: one thruster after another, at a random time of 2 to 24 s."""
     at_s = failed_at_s or float(np.random.default_rng([seed, 0xFA1]).uniform(2.0, 24.0))
     return kind, seed % 12, at_s
 
@@ -118,7 +118,7 @@ def fly_part(
         "failed_at_s": options.failed_at_s,
         "set": sorted(options.set),
     }
-    outcomes = Results(options.results, settings, DockingOutcome).of(
+    outcomes = KeptResults(options.results, settings, DockingOutcome).of(
         seeds, fly, DockingOutcome.line
     )
     print_causes(name, outcomes)
@@ -161,36 +161,38 @@ def add_options(parser: ArgumentParser) -> None:
     )
 
 
-GROUP = Group(
-    {
-        "noise": described(
-            partial(dock_many, "noise", noisy, "", 100, 3),
-            "Dock with poses measured with noise of 2 mm and 0.1 degrees, a tenth of them missing: "
-            "100 seeds.",
-        ),
-        "images": described(
-            partial(dock_many, "images", RenderedImages, "", 100, 1),
-            "Dock with rendered images and the real perception: 100 seeds.",
-        ),
-        **{
-            kind: described(
-                partial(dock_many, kind, noisy, kind, 12, 1),
-                f"Dock while a thruster {text}, not reported, thruster after thruster: 12 seeds.",
-            )
-            for kind, text in KINDS.items()
+GROUPS = (
+    Group(
+        {
+            "noise": described(
+                partial(dock_many, "noise", noisy, "", 100, 3),
+                "Dock with poses with noise of 2 mm and 0.1 degrees, a tenth of them missing: "
+                "100 seeds.",
+            ),
+            "images": described(
+                partial(dock_many, "images", RenderedImages, "", 100, 1),
+                "Dock with rendered images and the real perception: 100 seeds.",
+            ),
+            **{
+                kind: described(
+                    partial(dock_many, kind, noisy, kind, 12, 1),
+                    f"Dock while a thruster {text}, not reported, one after another: 12 seeds.",
+                )
+                for kind, text in KINDS.items()
+            },
+            "aborts": described(
+                partial(abort_many, "aborts", noisy, 50, 2),
+                "Abort at a random time, with a second approach after every fifth: 50 seeds.",
+            ),
+            "aborts-images": described(
+                partial(abort_many, "aborts_images", RenderedImages, 10, 1),
+                "Abort with rendered images: 10 seeds.",
+            ),
         },
-        "aborts": described(
-            partial(abort_many, "aborts", noisy, 50, 2),
-            "Abort at a random time, with a second approach after every fifth: 50 seeds.",
-        ),
-        "aborts-images": described(
-            partial(abort_many, "aborts_images", RenderedImages, 10, 1),
-            "Abort with rendered images: 10 seeds.",
-        ),
-    },
-    ("flights", "first", "set", "results"),
-    add_options,
+        ("flights", "first", "set", "results"),
+        add_options,
+    ),
 )
 
 if __name__ == "__main__":
-    main(__doc__, GROUP)
+    main(__doc__, GROUPS)

@@ -8,5 +8,11 @@ estimator against the paper's under sensor errors.
 from common import main
 from parts import estimation_flights, observability, robustness
 
+GROUPS = (
+    estimation_flights.GROUP,
+    observability.GROUP,
+    robustness.GROUP,
+)
+
 if __name__ == "__main__":
-    main(__doc__, estimation_flights.GROUP, observability.GROUP, robustness.GROUP)
+    main(__doc__, GROUPS)

@@ -8,5 +8,11 @@ of others. Status 1 if anything is found.
 from common import main
 from parts import decoders, external_tools, kernels
 
+GROUPS = (
+    decoders.GROUP,
+    kernels.GROUP,
+    external_tools.GROUP,
+)
+
 if __name__ == "__main__":
-    main(__doc__, decoders.GROUP, kernels.GROUP, external_tools.GROUP)
+    main(__doc__, GROUPS)

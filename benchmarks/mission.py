@@ -8,5 +8,12 @@ day, and commands that read logs. Measures wall time: run nothing else beside it
 from common import main
 from parts import endurance, long_logs, mission_speed, scale
 
+GROUPS = (
+    mission_speed.GROUP,
+    scale.GROUP,
+    long_logs.GROUP,
+    endurance.GROUP,
+)
+
 if __name__ == "__main__":
-    main(__doc__, mission_speed.GROUP, scale.GROUP, long_logs.GROUP, endurance.GROUP)
+    main(__doc__, GROUPS)

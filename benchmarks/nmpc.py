@@ -5,13 +5,13 @@
 Hard case: D = 30 stages (3 s), cuboids of 10 kg, 3 N, 0.3 N m on a ring around the target; half of
 the chasers swap positions with a neighbour, head-on. Closed loop, perfect state, 10 commands a
 second. A solve is timed by wall clock and by the processor time of its thread, which load on the
-machine affects less. ``--solver`` (repeatable) chooses back ends, ``--n`` (repeatable) the numbers
-of chasers. An unavailable back end is listed with the reason. A flight that uses more than
-``--cell-s`` of processor time is shortened and reported as such. acados (`acados_solver.py`) is
-measured wherever its Python package is installed, coupled and decoupled, by its own total time and
-by processor time. ``--flights R`` repeats each case, identical to the bit, and takes the minimum
-time of each tick, which excludes other load. Also: steady tracking at the paper's rates, the first
-solve of a fresh process, and the compilation of the kernels.
+machine affects less. ``--solver`` (repeatable) chooses solvers, ``--n`` (repeatable) the numbers of
+chasers. Beside the product's back ends these are peers (`peers`): fatrop, alpaqa and acados, which
+is timed by its own total time and by processor time. One that is not installed is listed with the
+reason. A flight that uses more than ``--cell-s`` of processor time is shortened and reported as
+such. ``--flights R`` repeats each case, identical to the bit, and takes the minimum time of each
+tick, which excludes other load. Also: steady tracking at the paper's rates, the first solve of a
+fresh process, and the compilation of the kernels.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from acados_solver import KINDS, AcadosSolver
 from chaserdock_controller.guidance.reference import (
     feed_forward,
     predict_target,
@@ -43,6 +42,7 @@ from chaserdock_controller.nmpc import (
     make_solver,
     native,
 )
+from chaserdock_controller.nmpc.problem import model_of
 from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -50,6 +50,7 @@ from chaserdock_models.native.build import compile_kernels
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
 from chaserdock_protocol.scenario.schema import Controller, Limits
 from common import ROOT, Figures, make_parser, percentiles, print_figures, write_json
+from peers import PEERS, make_peer
 
 LABELS = ("median", "p95", "max")
 TICK_S = 0.1
@@ -76,7 +77,7 @@ def advance(states: Array, inputs: Array, params: NmpcParameters, duration_s: fl
     x = np.empty((len(states), 5, 13))
     x[:, 0] = states
     held = np.repeat(inputs[:, None], 4, axis=1)
-    kernels.roll(kernels.model_of(params, duration_s / 4), x, held)
+    kernels.roll(model_of(params, duration_s / 4), x, held)
     return x[:, -1].copy()
 
 
@@ -127,8 +128,8 @@ def fly_hard(solver: NmpcSolver, n: int, ticks: int, cell_s: float) -> Flown:
         plan = solver.solve(now, TICK_S if k else 0.0)
         wall.append(time.perf_counter() - begin_s)
         cpu.append(time.thread_time() - begin_cpu_s)
-        if isinstance(solver, AcadosSolver):
-            wall[-1], cpu[-1] = solver.solve_time.wall_s, solver.solve_time.cpu_s
+        if (own := getattr(solver, "solve_time", None)) is not None:
+            wall[-1], cpu[-1] = own.wall_s, own.cpu_s
         failures += plan.status.count("failed")
         goal = problem.references[:, 0]
         error = [
@@ -190,15 +191,8 @@ def tracking(gain: float, duration_s: float) -> tuple[float, float]:
 
 
 def solver_of(name: str, n: int) -> NmpcSolver:
-    """Return a back end, ``acados_coupled`` or ``acados_decoupled``. Raise ValueError if it is
-    unavailable.
-    """
-    if not name.startswith("acados_"):
-        return make_solver(name, HARD, n)
-    try:
-        return AcadosSolver(name.removeprefix("acados_"), HARD, n)
-    except (ImportError, OSError, RuntimeError) as error:
-        raise ValueError(str(error)) from error
+    """Return a back end or a peer. Raises ValueError if it is unavailable."""
+    return make_peer(name, HARD, n) if name in PEERS else make_solver(name, HARD, n)
 
 
 def first_solve_s(solver: str) -> float:
@@ -287,7 +281,7 @@ def ratios(figures: Figures) -> Figures:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--solver", action="append", choices=BACK_ENDS)
+    parser.add_argument("--solver", action="append", choices=(*BACK_ENDS, *PEERS))
     parser.add_argument("--n", action="append", type=int, choices=range(1, 17), metavar="N")
     parser.add_argument("--cell-s", type=float, default=120.0, help="processor time of a flight")
     parser.add_argument("--flights", type=int, default=1, metavar="R")
@@ -297,9 +291,9 @@ def main() -> None:
         if options.quick
         else ([1, 2, 4, 8, 16], 150, options.cell_s, 60.0)
     )
-    names: list[str] = options.solver or [n for n in BACK_ENDS if n != "open" or not options.quick]
-    solvers = [*names, *(f"acados_{kind}" for kind in KINDS)]
-    result = measure(solvers, options.n or sizes, ticks, cell_s, options.flights)
+    usual = [name for name in BACK_ENDS if name != "open" or not options.quick]
+    names: list[str] = options.solver or [*usual, *PEERS]
+    result = measure(names, options.n or sizes, ticks, cell_s, options.flights)
     more = ratios(result)
     if "rti" in names:
         for label, gain in (("", 1.0), ("_actuators_5_percent_stronger", 1.05)):

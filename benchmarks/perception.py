@@ -8,5 +8,12 @@ meshes; ``shape``: by shape in single images; ``flight``: by shape in missions.
 from common import main
 from parts import markers, mesh_renderer, shape_flights, shape_views
 
+GROUPS = (
+    markers.GROUP,
+    mesh_renderer.GROUP,
+    shape_views.GROUP,
+    shape_flights.GROUP,
+)
+
 if __name__ == "__main__":
-    main(__doc__, markers.GROUP, mesh_renderer.GROUP, shape_views.GROUP, shape_flights.GROUP)
+    main(__doc__, GROUPS)

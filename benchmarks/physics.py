@@ -8,5 +8,10 @@ missions, and relative orbital motion against Basilisk.
 from common import main
 from parts import engines, relative_orbit
 
+GROUPS = (
+    engines.GROUP,
+    relative_orbit.GROUP,
+)
+
 if __name__ == "__main__":
-    main(__doc__, engines.GROUP, relative_orbit.GROUP)
+    main(__doc__, GROUPS)

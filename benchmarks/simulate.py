@@ -19,9 +19,9 @@ from pathlib import Path
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import Figures, Group, Options, main
 
-from chaserdock.simulation.campaign import Swarm, fly_seed
 from chaserdock.simulation.flight import memory_folder
 from chaserdock.simulation.mission import simulate
+from chaserdock.simulation.seeds import SeedOptions, fly_seed
 
 SCENARIO = "fault-drill"
 STATISTICAL = 'perception.name="statistical"'
@@ -51,7 +51,7 @@ def swarm(options: Options) -> Figures:
     seeds = 3 if options.quick else 50
     begin_s, outcomes, simulated_s = time.process_time(), Counter(), 0.0
     for seed in range(1, seeds + 1):
-        result = fly_seed(Swarm(SCENARIO), seed)
+        result = fly_seed(SeedOptions(SCENARIO), seed)
         outcomes[result.outcome] += 1
         simulated_s += result.sim_time_s
     elapsed_s = time.process_time() - begin_s
@@ -66,6 +66,7 @@ def swarm(options: Options) -> Figures:
 
 
 _TICKS, _SHORT_TICKS = 40, 20
+"""Ticks that are counted, and ticks before them."""
 _FLIGHTS = """
 import sys, tempfile
 from pathlib import Path
@@ -73,11 +74,14 @@ from chaserdock_models.native import KernelLibrary
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock.simulation.mission import simulate
 from chaserdock.simulation.flight import memory_folder
-KernelLibrary.level = property(lambda self: 2)  # valgrind does not know all instructions of the other one
+# valgrind does not know all instructions of the other kernels
+KernelLibrary.level = property(lambda self: 2)
+statistical = 'perception.name="statistical"'
+short = ("timeline=[]", "settling_s=0.0", "steady_until_s=1.0", "success.docked=[]", statistical)
 for duration in sys.argv[2:]:
-    short = ("timeline=[]", "settling_s=0.0", "steady_until_s=1.0", "success.docked=[]", f"duration_s={duration}")
     with tempfile.TemporaryDirectory() as folder:
-        simulate(find_scenario(sys.argv[1]), Path(folder) / "run", ('perception.name="statistical"', *short))
+        overrides = (*short, f"duration_s={duration}")
+        simulate(find_scenario(sys.argv[1]), Path(folder) / "run", overrides)
 """
 
 
@@ -110,6 +114,12 @@ def _count(*durations_s: str) -> int:
     return int(found[1].replace(",", ""))
 
 
+GROUPS = (
+    Group(
+        {"nominal": nominal, "swarm": swarm, "instructions": instructions},
+        on_request=("instructions",),
+    ),
+)
+
 if __name__ == "__main__":
-    parts = {"nominal": nominal, "swarm": swarm, "instructions": instructions}
-    main(__doc__, Group(parts, on_request=("instructions",)))
+    main(__doc__, GROUPS)

@@ -2,9 +2,10 @@
 """Python API of chaserdock: fly missions, open their logs, load scenarios.
 
 >>> import chaserdock as cd
->>> result = cd.run("single", duration_s=20, camera={"width_px": 640, "height_px": 360})     # doctest: +SKIP
->>> result.summary.success, result.summary.chasers[0].steady.position_mse_m2                 # doctest: +SKIP
->>> result.log.table("controller/target").to_pandas()                                        # doctest: +SKIP
+>>> camera = {"width_px": 640, "height_px": 360}
+>>> result = cd.run("single", duration_s=20, camera=camera)  # doctest: +SKIP
+>>> result.summary.success, result.summary.chasers[0].steady.position_mse_m2  # doctest: +SKIP
+>>> result.log.table("controller/target").to_pandas()  # doctest: +SKIP
 
 Errors are ``ChaserdockError`` or a subclass, with the text that the command line prints. Nothing is
 printed, no signal handler is installed; the functions work in notebooks and in threads.

@@ -39,7 +39,8 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]], text: bool = False
     for first, *rest in rows:
         cells = "".join(f"<td{kind}>{_html(cell)}</td>" for cell in rest)
         lines.append(f'<tr><th scope="row">{_html(first)}</th>{cells}</tr>')
-    return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+    content = f"<thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody>"
+    return f'<div class="wide"><table>{content}</table></div>'
 
 
 def _html(cell: str) -> str:

@@ -13,7 +13,7 @@ from msgspec import Struct
 
 
 class SteadyErrors(Struct, frozen=True, kw_only=True):
-    """Mean square tracking errors after the settling time; None where the flight has no such part."""
+    """Mean square tracking errors after the settling time; None in flights without such a part."""
 
     position_mse_m2: float | None
     orientation_mse_rad2: float | None
@@ -103,10 +103,14 @@ class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class TargetEstimateErrors(PoseEstimateErrors, frozen=True, kw_only=True):
-    """Errors of the target estimate after the settling time; None without an estimate there."""
+    """Errors of the target estimate after the settling time; None without an estimate there.
+
+    ``max_orientation_error_at_s``: time of the largest one; None in summaries of earlier versions.
+    """
 
     velocity_rms_m_s: float | None
     omega_rms_rad_s: float | None
+    max_orientation_error_at_s: float | None = None
 
 
 class StackRest(Struct, frozen=True, kw_only=True):

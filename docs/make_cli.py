@@ -10,7 +10,6 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import msgspec
 from typer.main import get_command
 
 from chaserdock import exit_codes
-from chaserdock.cli.help import GroupedHelp, panels_of
+from chaserdock.cli.help import panels_of
 from chaserdock.cli.main import app
 from chaserdock.launch import json_events
 
@@ -51,9 +50,9 @@ All times are in seconds of wall time unless an option says "simulated". `--time
 which a silent peer counts as lost.
 
 ## Scripts
-Results are text on standard output; with `--json` they are one JSON object. `--quiet` suppresses progress. `run` and `judge` take
-longer: with `--json` they print JSON *lines* as things happen, one object each, and nothing else on standard output. `type`
-distinguishes them:
+Results are text on standard output; with `--json` they are one JSON object. `--quiet` suppresses progress. `run` and
+`judge --live` take longer: with `--json` they print JSON *lines* as things happen, one object each, and nothing else on
+standard output. `type` distinguishes them:
 
 | type | content |
 | --- | --- |
@@ -66,15 +65,6 @@ chaserdock run single --json | jq -c 'select(.type == "progress") | [.sim_time_s
 Versions to come may add fields and types; a script should ignore what it does not know. From Python, use the API:
 `import chaserdock`.
 """
-
-
-def commands(group: Any, parents: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Iterate over all commands with their paths, such as ``("log", "info")``."""
-    for name, command in group.commands.items():
-        if isinstance(command, GroupedHelp):
-            yield from commands(command, (*parents, name))
-        else:
-            yield (*parents, name), command
 
 
 def status_table() -> str:
@@ -117,9 +107,9 @@ def fields(kind: type[msgspec.Struct]) -> list[str]:
     return [*rows, ""]
 
 
-def synopsis(path: tuple[str, ...], command: Any) -> str:
+def synopsis(name: str, command: Any) -> str:
     """Return how a command is called."""
-    words = ["chaserdock", *path]
+    words = ["chaserdock", name]
     for p in command.params:
         if p.param_type_name == "argument":
             name = (p.metavar or p.name).strip("{}").upper()
@@ -164,18 +154,14 @@ def page() -> str:
     for panel, members in panels_of(get_command(app)).items():
         parts += [f"## {panel}", ""]
         for name, member in members.items():
-            listed = (
-                commands(member, (name,))
-                if isinstance(member, GroupedHelp)
-                else [((name,), member)]
-            )
-            for path, command in listed:
-                parts += [f"### {' '.join(path)}", synopsis(path, command), ""]
-                parts += [
-                    " ".join(inspect.cleandoc(command.help or "").split()),
-                    "",
-                    *parameters(command),
-                ]
+            parts += [
+                f"### {name}",
+                synopsis(name, member),
+                "",
+                " ".join(inspect.cleandoc(member.help or "").split()),
+                "",
+                *parameters(member),
+            ]
     return "\n".join(parts).rstrip() + "\n"
 
 

@@ -9,6 +9,7 @@ made by commands that stand beside them, those of the camera by make_camera_imag
 from __future__ import annotations
 
 import argparse
+import re
 import subprocess
 import sys
 import tempfile
@@ -639,6 +640,26 @@ def thrusters() -> None:
         save(figure, "thrusters")
 
 
+def results() -> None:
+    """The table of docs/results.md: tracking of every scenario under three grades."""
+    rows = re.findall(
+        r"^\| `([\w-]+)` \| ([\d.]+) mm[^|]*\| ([\d.]+) mm[^|]*\| ([\d.]+) mm",
+        (ROOT / "docs" / "results.md").read_text(encoding="utf-8"),
+        re.M,
+    )
+    rows.sort(key=lambda row: -float(row[2]))
+    with styled():
+        figure = Figure(figsize=(8.0, 0.6 + 0.21 * len(rows)))
+        axes = figure.add_subplot()
+        for k, grade in enumerate(("exact", "lab", "orbit")):
+            values = [float(row[1 + k]) for row in rows]
+            axes.semilogx(values, range(len(rows)), "os^"[k], color=SERIES[k], label=grade)
+        axes.set(xlabel="tracking, RMS of the worst chaser / mm")
+        axes.set_yticks(range(len(rows)), [row[0] for row in rows])
+        axes.legend(loc="upper right")
+        save(figure, "results")
+
+
 # -- cameras ---------------------------------------------------------------------------------------
 
 
@@ -701,7 +722,7 @@ def report() -> None:
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         log = str(logs / "docking-contact" / "run")
-        chaserdock("figures", log, "--out", name, "--format", "png")
+        chaserdock("report", log, "--figures", "--out", name, "--format", "png")
         tiles = []
         for figure in ("trajectories", "docking", "tracking", "thrusters"):
             image = np.asarray(cv2.imread(str(out / f"{figure}.png")))
@@ -737,14 +758,14 @@ def first_flight() -> None:
             "run", "single", "--set", "duration_s=20", "--set", "success={}", "--out", str(out)
         )
     command = "chaserdock run single --set duration_s=20 --set 'success={}' --out runs/first"
-    terminal("terminal", command, chaserdock("summary", str(out)).splitlines()[:14])
+    terminal("terminal", command, chaserdock("judge", str(out)).splitlines()[:14])
 
 
 def log_info() -> None:
     flight("docking-contact")
     log = str(logs / "docking-contact" / "run")
-    text = chaserdock("log", "info", log).replace(log, "runs/capture")
-    terminal("status", "chaserdock log info runs/capture", text.splitlines()[:16])
+    text = chaserdock("log", log).replace(log, "runs/capture")
+    terminal("status", "chaserdock log runs/capture", text.splitlines()[:16])
 
 
 PICTURES: dict[str, Callable[[], None]] = {
@@ -752,7 +773,8 @@ PICTURES: dict[str, Callable[[], None]] = {
     "perception": perception, "errors": errors, "hosts": hosts, "limits": limits,
     "extend": extend, "knowledge": knowledge, "ros2": ros2, "frames": frames,
     "controller": controller, "estimation": estimation, "detumble": detumble,
-    "docking": docking, "faults": faults, "steady": steady, "thrusters": thrusters,
+    "docking": docking, "faults": faults, "steady": steady,
+    "results": results, "thrusters": thrusters,
     "targets": targets, "dataset": dataset, "report": report,
     "terminal": first_flight, "status": log_info,
 }  # fmt: skip

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/scenario.md and scenarios/scenario.schema.json from the schema: ``python
-docs/make_scenario.py``.
+"""Write docs/scenario.md from the schema: ``python docs/make_scenario.py``.
 
-``--print`` prints the page, ``--print-schema`` the JSON schema instead.
-tests/protocol/test_scenario_page.py compares them.
+``--print`` prints it instead. tests/protocol/test_scenario_page.py compares.
 """
 
 from __future__ import annotations
@@ -15,7 +13,6 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.json_schema import (
     SchemaNode,
     description_of,
-    editor_schema_text,
     item_of,
     range_text,
     resolved,
@@ -24,7 +21,6 @@ from chaserdock_protocol.scenario.json_schema import (
 
 DOCS = Path(__file__).resolve().parent
 PAGE = DOCS / "scenario.md"
-SCHEMA = DOCS.parent / "scenarios" / "scenario.schema.json"
 
 INTRODUCTION = """# Scenario reference
 
@@ -35,9 +31,9 @@ key's name; frames: WRF world, CRF chaser, TRF target, IRF image ([frames.md](fr
 values out of range are errors, one line each.
 
 ```sh
-chaserdock scenario new mine            # writes mine.toml, a commented example
-chaserdock scenario validate mine.toml  # status 2, and one line per error
-chaserdock scenario show single         # all values of a scenario
+chaserdock scenario mine --new          # writes mine.toml, a commented example
+chaserdock scenario mine.toml           # status 2, and one line per error
+chaserdock scenario single --show       # all values of a scenario
 chaserdock run single --set seed=3 --set 'chasers.0.position_m=[-1.5, 0.0, 0.0]'
 ```
 
@@ -50,8 +46,8 @@ chaserdock run single --set seed=3 --set 'chasers.0.position_m=[-1.5, 0.0, 0.0]'
   `look_at = "target"`; two of them are an error.
 - **Format.** `format = 3` states the version of the file's format. Without it, the present one is assumed. A key of an older
   format is an error that names the present key. Scenarios in old logs are converted.
-- **Editors.** `chaserdock scenario schema` prints a JSON schema. With taplo or VS Code's Even Better TOML, save it beside the
-  file and begin the file with `#:schema ./scenario.schema.json`.
+- **Editors.** taplo and VS Code's Even Better TOML complete and check keys by a JSON schema: save it beside the file with
+  `chaserdock scenario --schema > schema.json` and begin the file with `#:schema ./schema.json`.
 """
 
 _UNITS = {
@@ -168,4 +164,4 @@ def page() -> str:
 if __name__ == "__main__":
     from page_command import run
 
-    run(__doc__, PAGE, page, schema=lambda: editor_schema_text(Scenario))
+    run(__doc__, PAGE, page)

@@ -145,9 +145,13 @@ def texts_of(files: list[PythonFile]) -> list[str]:
 
 def scenario_keys() -> tuple[int, int]:
     """Return the number of scenario keys, and of those that no shipped scenario sets."""
-    schema = json.loads((ROOT / "scenarios" / "scenario.schema.json").read_text(encoding="utf-8"))
-    keys = set(_schema_keys(schema, schema, ""))
     import tomllib
+
+    from chaserdock_protocol.scenario import Scenario
+    from chaserdock_protocol.scenario.json_schema import editor_schema_text
+
+    schema = json.loads(editor_schema_text(Scenario))
+    keys = set(_schema_keys(schema, schema, ""))
 
     set_by_any: set[str] = set()
     for path in (ROOT / "scenarios").glob("*.toml"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mission in containers by compose.yaml, for the tests and ``benchmarks/containers.py``."""
+"""A mission in containers by compose.yaml, for the tests and ``benchmarks/transport.py``."""
 
 from __future__ import annotations
 

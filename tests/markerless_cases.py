@@ -194,7 +194,7 @@ def backlit_view(rng: np.random.Generator, camera: Camera) -> tuple[PoseInCamera
 
 def satellite_image(pose: PoseInCamera, light: Light, number: int) -> NDArray[np.uint8]:
     """Return an image (540, 960), 60 degrees wide, of `geo_servicer` by the world's renderer, as
-    benchmarks/markerless.py makes it.
+    benchmarks/perception.py makes it.
     """
     camera = Camera.from_hfov(960, 540, np.deg2rad(60.0))
     renderer = MeshRenderer(camera, satellite("geo_servicer"), None, Effects().point_spread_px)

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from chaserdock_controller.guidance.reference import (
@@ -22,6 +23,7 @@ from chaserdock_controller.nmpc import (
     kernels,
     make_solver,
 )
+from chaserdock_controller.nmpc.problem import model_of, settings_of, terms_of
 from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -35,6 +37,14 @@ SETTINGS = nmpc_settings(Controller(), Limits())
 PARAMS = NmpcParameters(
     mass_kg=MASS_KG, inertia_kg_m2=INERTIA, force_max_N=2.0, torque_max_N_m=0.05, **SETTINGS
 )
+
+
+def with_settings(params: NmpcParameters, **changes: Any) -> NmpcParameters:
+    """Return parameters with fields, or settings of terms, changed."""
+    own = {name: changes.pop(name) for name in vars(params).keys() & changes}
+    return replace(params, **own, terms=terms_of(settings_of(params.terms) | changes))
+
+
 V_TARGET = np.array([1.5e-2, 0.75e-2, 3e-2])
 W_TARGET = np.array([1.5e-2, 4.5e-2, 3e-2])
 HALF = np.sqrt(0.5)
@@ -87,7 +97,7 @@ def advance(states: Array, inputs: Array, duration_s: float, parts: int = 4) -> 
     x = np.empty((len(states), parts + 1, 13))
     x[:, 0] = states
     held = np.repeat(inputs[:, None], parts, axis=1)
-    kernels.roll(kernels.model_of(PARAMS, duration_s / parts), x, held)
+    kernels.roll(model_of(PARAMS, duration_s / parts), x, held)
     return x[:, -1].copy()
 
 

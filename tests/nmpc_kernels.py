@@ -12,9 +12,10 @@ from ctypes import Structure, c_double, c_int, c_int64, c_void_p
 from dataclasses import dataclass
 
 import numpy as np
-from chaserdock_controller.nmpc import NmpcInput
-from chaserdock_controller.nmpc.kernels import MAX_ITERATIONS, Model, Weights, zones_of
-from chaserdock_controller.nmpc.native import function
+from chaserdock_controller.nmpc import NmpcInput, NmpcParameters
+from chaserdock_controller.nmpc.kernels import MAX_ITERATIONS, Model
+from chaserdock_controller.nmpc.native import LIBRARY, function
+from chaserdock_controller.nmpc.problem import native_problem
 from chaserdock_controller.nmpc.types import Array, IntArray
 from chaserdock_models.native import address, location, scratch
 
@@ -32,24 +33,24 @@ def roll_linearized(model: Model, x: Array, u: Array, limits: Array, mats: Array
 
 
 def quadratic_model(
-    weights: Weights, x: Array, u: Array, refs: Array, u_ref: Array, limits: Array
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Quadratic cost model of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled
-    inputs w = u / limits.
+    problem: NmpcInput, params: NmpcParameters, i: int, x: Array, u: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Quadratic cost model of chaser ``i`` about x (D+1, 13), u (D, 6), in changes of its state and
+    scaled inputs w = u / limits; ``problem`` as `check_input` returns it.
 
-    Returns q_pos and q_att (D+1, 3, 3), qx (D+1, 12), r_diag, r and w_bar (D, 6).
+    Returns q (D+1, 2, 6, 6), qx (D+1, 12), r_diag, r and w_bar (D, 6).
     """
-    d = len(u)
+    d, native = len(u), native_problem(problem, params)
     out = (
-        np.empty((d + 1, 3, 3)), np.empty((d + 1, 3, 3)), np.empty((d + 1, 12)),
-        np.empty((d, 6)), np.empty((d, 6)), np.empty((d, 6)),
+        np.empty((d + 1, 2, 6, 6)), np.empty((d + 1, 12)), np.empty((d, 6)), np.empty((d, 6)),
+        np.empty((d, 6)),
     )  # fmt: skip
-    function("quadratic_model")(
-        ctypes.byref(weights.native), *(address(a) for a in (x, u, refs, u_ref, limits, *out))
-    )
+    arrays = (address(a) for a in (x, u, *out))
+    function("quadratic_model")(ctypes.byref(native), c_int64(i), *arrays)
     return out
 
 
+@LIBRARY.structure("Rows")
 class _Rows(Structure):
     _fields_ = [
         ("width", c_int64),
@@ -59,24 +60,24 @@ class _Rows(Structure):
         ("n_rows", c_void_p),
         ("a", c_void_p),
         ("c", c_void_p),
-        ("b", c_void_p),
         ("relief", c_void_p),
     ]
 
 
 @dataclass(frozen=True)
 class HalfSpaceRows:
-    """Half-spaces a' dp_k + b' dv_k >= c of each chaser: stage (N, M), a and b (N, M, 3), c (N, M);
-    the first n_rows (N,) are used."""
+    """Half-spaces a' dr_k >= c of each chaser, dr_k the changes of position and velocity: stage
+    (N, M), a (N, M, 6), c (N, M); the first n_rows (N,) are used."""
 
     stage: IntArray
     a: Array
     c: Array
     n_rows: IntArray
-    b: Array
 
 
-def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> HalfSpaceRows:
+def build_rows(
+    problem: NmpcInput, params: NmpcParameters, x: Array, reach_m: Array
+) -> HalfSpaceRows:
     """Build the rows of all chasers about rollouts x (N, D+1, 13); ``problem`` as `check_input`
     returns it.
 
@@ -88,16 +89,18 @@ def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> 
     )
     width = (nodes - 1) * (n + 2 + extra)
     rows = HalfSpaceRows(
-        np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64),
-        np.zeros((n, width, 3)),
+        np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 6)), np.zeros((n, width)),
+        np.zeros(n, dtype=np.int64),
     )  # fmt: skip
-    zones, reach, relief = zones_of(problem, outer_m), np.ascontiguousarray(reach_m), np.empty(n)
-    arrays = (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b, relief)
+    reach, relief = np.ascontiguousarray(reach_m), np.empty(n)
+    arrays = (reach, rows.stage, rows.n_rows, rows.a, rows.c, relief)
     native = _Rows(width, nodes, *(location(a) for a in arrays))
-    function("build_rows")(ctypes.byref(zones), address(x), ctypes.byref(native))
+    stated = native_problem(problem, params)
+    function("build_rows")(ctypes.byref(stated), address(x), ctypes.byref(native))
     return rows
 
 
+@LIBRARY.structure("Qp")
 class _Qp(Structure):
     _fields_ = [
         ("stages", c_int64),
@@ -110,8 +113,7 @@ class _Qp(Structure):
             (name, c_void_p)
             for name in (
                 "mats",
-                "q_pos",
-                "q_att",
+                "q",
                 "qx",
                 "r_diag",
                 "r",
@@ -119,12 +121,12 @@ class _Qp(Structure):
                 "stage",
                 "a",
                 "c",
-                "b",
             )
         ),
     ]
 
 
+@LIBRARY.structure("Answer")
 class _Answer(Structure):
     _fields_ = [
         ("dx", c_void_p),
@@ -150,10 +152,10 @@ class QpAnswer:
 
 def solve_qp(
     mats: Array, h: float, model: tuple[Array, ...], stage: IntArray, a: Array, c: Array, w1: float, w2: float,
-    max_iterations: int = MAX_ITERATIONS, b: Array | None = None,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> QpAnswer:  # fmt: skip
     """Solve the QP of one chaser: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows
-    (R,), (R, 3), (R,), and with velocities (R, 3)."""
+    (R,), (R, 6), (R,)."""
     d, rows = len(mats), len(stage)
     dx, dw, mul = np.empty((d + 1, 12)), np.empty((d, 6)), np.empty(2 * rows + 12 * d)
     qp = _Qp(
@@ -164,7 +166,6 @@ def solve_qp(
         w1,
         w2,
         *(location(v) for v in (mats, *model, stage, a, c)),
-        None if b is None else location(b),
     )
     answer = _Answer(location(dx), location(dw), location(mul))
     work = scratch(function("qp_workspace", c_int64)(c_int64(d), c_int64(rows)))

@@ -39,17 +39,19 @@ def module_name(path: Path) -> str:
 
 
 @cache
-def imported(path: Path) -> frozenset[str]:
-    """Return the full names of the modules that a module imports, anywhere in it; relative names
-    are resolved.
+def imported(path: Path, at_once: bool = False) -> frozenset[str]:
+    """Return the full names of the modules that a module imports; relative names are resolved.
+
+    ``at_once``: only those that are imported with it, not when a function is called.
     """
-    return frozenset(_imported(path))
+    return frozenset(_imported(path, at_once))
 
 
-def _imported(path: Path) -> Iterator[str]:
+def _imported(path: Path, at_once: bool) -> Iterator[str]:
     package = next(f for f in PACKAGES.values() if path.is_relative_to(f))
     parts = (package.name, *path.relative_to(package).parts[:-1])
-    for node in ast.walk(tree_of(path)):
+    tree = tree_of(path)
+    for node in tree.body if at_once else ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

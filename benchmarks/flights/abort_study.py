@@ -24,11 +24,13 @@ from chaserdock_models.relative_motion import relative_acceleration
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 
 STEP_S = 10.0
+"""Step of RK4 of a coast of two orbits (some 5,500 s each)."""
 _POSITION_SHARE, _POSITION_M = 8e-4, 2e-3
 _VELOCITY_SHARE, _VELOCITY_M_S = 3e-6, 4e-4
 """Errors by distance: those of the joint filter in `v-bar` after 30 s are 0.16 m and 0.7 to 1.6
 mm/s at 200 m, 0.08 m and 0.6 to 0.9 mm/s at 100 m, and shrink further."""
 _BURN_ERROR = 0.03
+"""Error of a burn, share, one sigma."""
 
 
 def navigation_covariance(distance_m: float) -> Array:

@@ -21,9 +21,7 @@ from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import stay
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
 from chaserdock_models.mounting import MountedChaser
-from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_protocol.scenario.detumble import RestLimits
@@ -33,11 +31,17 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
-from .latched_stack import attach_plants, body_of_plant, stack_motion, with_port_error
+from .latched_stack import (
+    attach_plants,
+    body_of_plant,
+    moving_with,
+    stack_motion,
+    with_port_error,
+)
 
 COMMAND_AT_S = 5.0
 """Until then the estimator settles."""
@@ -104,7 +108,7 @@ class StackMission(InProcessMission):
         self._damping: dict[int, LocalDamping] = {}
         if math.isfinite(silent_from_s):
             flight = flight_scenario(scenario)
-            self._damping = {i: LocalDamping(flight, i) for i in self.thrusters}
+            self._damping = {i: LocalDamping(flight, i) for i in self.chasers}
         target = self.physics.state(TARGET)
         for i in self.chasers:
             own = with_port_error(scenario, i, nominal_mounting(scenario, i))
@@ -127,7 +131,9 @@ class StackMission(InProcessMission):
             command, thrusts_N = damping_command(
                 damping, odometry[i], effective_ns, self.scenario.chaser
             )
-            commands[i] = self.thrusters[i].add_pulses(command, thrusts_N)
+            thrusters = self.cores[i].thrusters
+            assert thrusters is not None
+            commands[i] = thrusters.add_pulses(command, thrusts_N)
         return commands
 
     def truth(self, states: States) -> tuple[TargetBody, dict[int, MountedChaser], StackMotion]:
@@ -151,18 +157,6 @@ class StackMission(InProcessMission):
         plants = self.physics.plants
         chasers = {i: plants[f"chaser/{i}"] for i in mounted}
         return attach_plants(body_of_plant(plants[TARGET]), chasers, mounted)
-
-
-def moving_with(target: BodyState, place_m: Array, q_wxyz: Array) -> BodyState:
-    """Return the state of a body fixed to the target at a place (3,) and attitude (4,) in TRF."""
-    arm = rotations.rotate(target.q_wxyz, place_m)
-    omega_world = rotations.rotate(target.q_wxyz, target.omega_rad_s)
-    return BodyState(
-        target.position_m + arm,
-        target.velocity_m_s + np.cross(omega_world, arm),
-        rotations.multiply(target.q_wxyz, q_wxyz),
-        rotations.rotate_inverse(q_wxyz, target.omega_rad_s),
-    )
 
 
 def _impulse(record: TickRecord) -> float:

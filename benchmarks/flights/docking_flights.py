@@ -11,25 +11,31 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from chaserdock_controller.estimation.composite_body import target_body
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand, ProbeTouch
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_world.physics.simulation import TARGET, Physics
+from chaserdock_world.physics.simulation import TARGET
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
+from .momentum import GroupMomentum, momentum_of
 
 APPROACH_AT_S = 4.0
+"""The estimator has settled by then."""
 LIMIT_S = 96.0
+"""After the approach command: time for three attempts."""
 ABORT_WITHIN_S = 42.0
 """After the approach command: without a second attempt, docking is verified by then."""
 OPEN_WITHIN_S = 30.0
+"""After an abort, the chaser must be back within this time."""
 REACHED_M = 0.05
+"""Distance from its nominal place within which a chaser that was aborted is back."""
 _NEAR_CONTACT_M = 0.015
+"""Gap from tip to port below which momentum is measured: before any touch."""
+_PAIR = (TARGET, "chaser/0")
+"""Bodies that are isolated but for the actuators of the chaser."""
 
 Failure = tuple[str, int, float]
 """A thruster failure: kind, thruster, time in s."""
@@ -88,14 +94,9 @@ class ConservationMission(InProcessMission):
 
     def __init__(self, scenario: Scenario, perception: PerceptionModel) -> None:
         super().__init__(scenario, perception)
-        body = target_body(scenario)
         self.linear_error: float | None = None
         self.angular_error: float | None = None
-        self._masses = {
-            TARGET: (body.mass_kg, np.diag(body.inertia_kg_m2)),
-            "chaser/0": (scenario.chaser.mass_kg, np.asarray(scenario.chaser.inertia)),
-        }
-        self._initial: tuple[Array, Array] | None = None
+        self._initial: GroupMomentum | None = None
         self._impulse, self._angular_impulse = np.zeros(3), np.zeros(3)
         self._steps_left: int | None = None
 
@@ -106,15 +107,13 @@ class ConservationMission(InProcessMission):
             super().advance(step)
             return
         if self._initial is None:
-            self._initial = momentum(self.physics, self._masses)
+            self._initial = momentum_of(self.physics, _PAIR)
             self.take_delivered(0)
         while self.physics.step_count < step:
             self._advance_one_step()
 
     def _advance_one_step(self) -> None:
-        own, target = self.physics.state("chaser/0"), self.physics.state(TARGET)
-        m, n = self._masses["chaser/0"][0], self._masses[TARGET][0]
-        centre = (m * own.position_m + n * target.position_m) / (m + n)
+        own, centre = self.physics.state("chaser/0"), momentum_of(self.physics, _PAIR).centre_m
         super().advance(self.physics.step_count + 1)
         delivered = self.take_delivered(0).impulse
         impulse = rotations.rotate(own.q_wxyz, delivered[:3])
@@ -139,41 +138,24 @@ class ConservationMission(InProcessMission):
 
     def _conclude(self) -> None:
         assert self._initial is not None
-        now = momentum(self.physics, self._masses)
+        before, after = self._initial, momentum_of(self.physics, _PAIR)
         self.linear_error, self.angular_error = (
-            float(np.linalg.norm(after - before - delivered) / np.linalg.norm(before))
-            for after, before, delivered in zip(
-                now, self._initial, (self._impulse, self._angular_impulse), strict=True
+            float(np.linalg.norm(new - old - given) / np.linalg.norm(old))
+            for old, new, given in (
+                (before.linear_N_s, after.linear_N_s, self._impulse),
+                (before.angular_N_m_s, after.angular_N_m_s, self._angular_impulse),
             )
         )
 
 
-def momentum(physics: Physics, masses: dict[str, tuple[float, Array]]) -> tuple[Array, Array]:
-    """Return momentum (3,), N s, and angular momentum (3,) about the common centre of mass, N m s,
-    in WRF axes.
-
-    ``masses``: mass and principal inertia (3,) of every body by name.
-    """
-    states = {name: physics.state(name) for name in masses}
-    total = sum(m for m, _ in masses.values())
-    centre = sum((m * states[n].position_m for n, (m, _) in masses.items()), np.zeros(3)) / total
-    linear = sum((m * states[n].velocity_m_s for n, (m, _) in masses.items()), np.zeros(3))
-    angular = np.zeros(3)
-    for name, (m, inertia) in masses.items():
-        s = states[name]
-        angular += np.cross(s.position_m - centre, m * (s.velocity_m_s - linear / total))
-        angular += rotations.rotate(s.q_wxyz, inertia * s.omega_rad_s)
-    return linear, angular
-
-
 @dataclass
 class DockingOutcome:
-    """How one flight ended.
+    """How one docking flight ended.
 
-    ``touch``: the one at which the latch closed. ``contacts``: pairs of bodies that collided.
-    ``peak_m``: the largest distance from the reference on the true target between the thruster's
-    ``failure`` and capture. ``thruster_events``: (time in s, text). ``verified_again``: whether a
-    second approach after an abort was.
+    ``cause``: outcome in a few words. ``touch``: the one at which the latch closed. ``contacts``:
+    pairs of bodies that collided. ``peak_m``: the largest distance from the reference on the true
+    target between the thruster's ``failure`` and capture. ``thruster_events``: (time in s, text).
+    ``verified_again``: whether a second approach after an abort was.
     """
 
     seed: int
@@ -216,9 +198,11 @@ class DockingOutcome:
             kind, thruster, at_s = self.failure
             delay_s = self.detection_delay_s()
             detected = "not detected" if delay_s is None else f"detected after {delay_s:.2f} s"
-            text += f"; thruster {thruster} {kind} at {at_s:.2f} s, {detected}, peak {self.peak_m * 1e3:.1f} mm"
+            text += f"; thruster {thruster} {kind} at {at_s:.2f} s, {detected}"
+            text += f", peak {self.peak_m * 1e3:.1f} mm"
         if (t := self.touch) is not None:
-            text += f"; {t.lateral_m * 1e3:.2f} mm, {math.degrees(t.angle_rad):.3f} deg, {t.closing_m_s * 1e3:.2f} mm/s"
+            text += f"; {t.lateral_m * 1e3:.2f} mm, {math.degrees(t.angle_rad):.3f} deg"
+            text += f", {t.closing_m_s * 1e3:.2f} mm/s"
         if self.linear_error is not None and self.angular_error is not None:
             text += f"; momentum errors {self.linear_error:.1e}, {self.angular_error:.1e}"
         if self.opened_s is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
@@ -24,11 +24,15 @@ from chaserdock_world.physics.simulation import TARGET, Physics
 from chaserdock_world.rendering.cameras import States
 
 from . import load_shipped
+from .latched_stack import moving_with
+from .momentum import momentum_of
 
 ENGINES = ("pybullet", "mujoco")
 _TUMBLE = "target.omega_rad_s=[0.045, 0.135, 0.09]"
 _GAP_M, _CLOSING_M_S = 0.002, 0.01
+"""Start of a capture: the tip touches after a fifth of a second."""
 _FAR_M = 10.0
+"""Distance from the target at which nothing touches in 30 s."""
 
 Advance = Callable[[int], None]
 """Makes the steps up to a step."""
@@ -86,7 +90,7 @@ def free_case(seed: int = 0) -> EngineCase:
 
     def start(physics: Physics) -> Advance:
         _spread(physics, np.random.default_rng(seed))
-        return lambda step: _ignore(physics.advance(step - physics.step_count, {}))
+        return lambda step: _coast(physics, step)
 
     return EngineCase(scenario, start, ((TARGET,), *((f"chaser/{i}",) for i in range(4))))
 
@@ -117,7 +121,7 @@ def capture_case(seed: int = 0) -> EngineCase:
             "chaser/0", before_port(scenario, physics.state(TARGET), 0, _GAP_M, _CLOSING_M_S)
         )
         physics.command_latch(0, "arm", 0)
-        return lambda step: _ignore(physics.advance(step - physics.step_count, {}))
+        return lambda step: _coast(physics, step)
 
     return EngineCase(
         scenario, start, ((TARGET, "chaser/0"), ("chaser/1",), ("chaser/2",), ("chaser/3",))
@@ -205,13 +209,9 @@ def before_port(
     port = next(p for p in scenario.docking.ports if p.chaser == chaser)
     axis, q_off = np.array(port.axis), np.asarray(scenario.chasers[chaser].q_wxyz)
     offset = np.array(port.position_m) + (gap_m + scenario.chaser.probe_reach_m) * axis
-    moving = rotations.cross(target.omega_rad_s, offset) - closing_m_s * axis
-    return BodyState(
-        target.position_m + rotations.rotate(target.q_wxyz, offset),
-        target.velocity_m_s + rotations.rotate(target.q_wxyz, moving),
-        rotations.multiply(target.q_wxyz, q_off),
-        rotations.rotate_inverse(q_off, target.omega_rad_s),
-    )
+    still = moving_with(target, offset, q_off)
+    closing = rotations.rotate(target.q_wxyz, closing_m_s * axis)
+    return replace(still, velocity_m_s=still.velocity_m_s - closing)
 
 
 def _scenario(*overrides: str, seed: int) -> Scenario:
@@ -259,27 +259,11 @@ def _firing(scenario: Scenario, physics: Physics, rng: np.random.Generator) -> A
 
 
 def _momenta(case: EngineCase, physics: Physics) -> list[Array]:
-    """Return momentum, N s, and angular momentum about the centre of mass, N m s, (2, 3), WRF, of
-    each isolated group.
-    """
-    found = []
-    for group in case.isolated:
-        masses, places, velocities, spins = [], [], [], []
-        for name in group:
-            s, plant = physics.state(name), physics.plants[name]
-            arm = rotations.rotate(s.q_wxyz, plant.centre_of_mass_m)
-            masses.append(plant.mass_kg)
-            places.append(s.position_m + arm)
-            omega = rotations.rotate(s.q_wxyz, s.omega_rad_s)
-            velocities.append(s.velocity_m_s + rotations.cross(omega, arm))
-            spins.append(rotations.rotate(s.q_wxyz, plant.inertia_kg_m2 @ s.omega_rad_s))
-        mass, place = np.array(masses)[:, None], np.array(places)
-        momentum = mass * np.array(velocities)
-        centre = (mass * place).sum(axis=0) / mass.sum()
-        angular = np.array(spins) + np.cross(place - centre, momentum)
-        found.append(np.array([momentum.sum(axis=0), angular.sum(axis=0)]))
-    return found
+    """Return momentum and angular momentum (2, 3) of each isolated group."""
+    found = [momentum_of(physics, group) for group in case.isolated]
+    return [np.array([m.linear_N_s, m.angular_N_m_s]) for m in found]
 
 
-def _ignore(_: object) -> None:
-    """Discard a result."""
+def _coast(physics: Physics, step: int) -> None:
+    """Advance without loads."""
+    physics.advance(step - physics.step_count, {})

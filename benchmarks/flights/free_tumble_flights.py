@@ -36,10 +36,10 @@ from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import odometry_of
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
-from .detumble_flights import moving_with, stack_scenario
-from .latched_stack import body_of_plant
+from .detumble_flights import stack_scenario
+from .latched_stack import body_of_plant, moving_with
 from .rigid_control import wrong_knowledge
 
 
@@ -117,11 +117,9 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     velocity = np.array(start.velocity_m_s) + rotations.rotate(
         q0, np.cross(omega0, body.centre_trf_m)
     )
-    camera, sensor, estimator = (
-        RenderedImages(scenario),
-        OdometrySensor(scenario),
-        JointEstimator(parameters_of(flight), len(flight.chasers)),
-    )
+    camera = RenderedImages(scenario)
+    sensor = OdometrySensor(scenario)
+    estimator = JointEstimator(parameters_of(flight), len(flight.chasers))
     chasers, before, nees = range(len(scenario.chasers)), None, []
     drawn = scenario.perception.name == "statistical"
     views = [ViewErrors(estimator.parameters, scenario.seed, i) for i in chasers]

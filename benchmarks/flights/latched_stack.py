@@ -12,10 +12,12 @@ from chaserdock_controller.guidance.detumble.stack import StackMotion
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.mounting import MountedChaser
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.plant import Plant
 
 _PORT_ERROR_M, _PORT_ERROR_RAD = 0.002, math.radians(0.3)
+"""Largest errors of a latched chaser's place and attitude per axis."""
 
 
 def with_port_error(scenario: Scenario, chaser: int, nominal: MountedChaser) -> MountedChaser:
@@ -54,3 +56,15 @@ def stack_motion(
         omega_rad_s, body.centre_trf_m
     )
     return StackMotion(body.mass_kg * own, body.inertia_kg_m2 @ omega_rad_s)
+
+
+def moving_with(target: BodyState, place_m: Array, q_wxyz: Array) -> BodyState:
+    """Return the state of a body fixed to the target at a place (3,) and attitude (4,) in TRF."""
+    arm = rotations.rotate(target.q_wxyz, place_m)
+    omega_world = rotations.rotate(target.q_wxyz, target.omega_rad_s)
+    return BodyState(
+        target.position_m + arm,
+        target.velocity_m_s + np.cross(omega_world, arm),
+        rotations.multiply(target.q_wxyz, q_wxyz),
+        rotations.rotate_inverse(q_wxyz, target.omega_rad_s),
+    )

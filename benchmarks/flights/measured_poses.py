@@ -12,7 +12,7 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import true_camera
 
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.perception import PerceptionModel
 
 _LEAST_SIGMA = 1e-4
 """m and rad: the covariance of a measurement without noise must be positive definite, too."""

@@ -39,7 +39,9 @@ from . import load_shipped
 ARCH_CENTRE, ARCH_HALF = np.array([-900.0, -400.0, 0.0, 0.0]), np.array([25.0, 25.0, 0.0, 0.0])
 """Initial set: a box of positions (m), at rest."""
 ARCH_CONE_DEG, ARCH_SPEED_M_S, ARCH_BOX_M = 30.0, 0.055, 0.2
+"""Half angle of the approach cone, largest speed, half edge of the target's box: the task's."""
 ARCH_END_MIN = 300.0
+"""Duration of a sample, of the task."""
 _ARCH_BATCH = 4000
 """Samples that are flown together: their states fit the processor's cache."""
 _ARCH_APPROACH = np.array(
@@ -50,6 +52,7 @@ _ARCH_APPROACH = np.array(
         [-0.000174031357370456, -0.0665123984901026, -0.00875351105536225, -2.90300269286856],
     ]
 )
+"""Closed loop of the task's controller beyond 100 m: d(x, y, vx, vy)/dt, minutes."""
 _ARCH_ATTEMPT = np.array(
     [
         [0.0, 0.0, 1.0, 0.0],
@@ -58,6 +61,7 @@ _ARCH_ATTEMPT = np.array(
         [-0.000262486080737868, -0.575999940191886, -0.00876276068239993, -19.2299765959399],
     ]
 )
+"""The same within 100 m."""
 _ARCH_ABORT = np.array(
     [
         [0.0, 0.0, 1.0, 0.0],
@@ -66,6 +70,7 @@ _ARCH_ABORT = np.array(
         [0.0, 0.0, -0.00876276, 0.0],
     ]
 )
+"""The coast after an abort."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +166,11 @@ def _expm(matrix: Array) -> Array:
 # -- AFRL: three deputies, metres and seconds ------------------------------------------------------
 
 AFRL_RATE_RAD_S, AFRL_MASS_KG, AFRL_FORCE_N = 0.001027, 12.0, 1.0
+"""Mean motion, mass and largest force per axis, of the task."""
 AFRL_DOCKED_M, AFRL_DOCKED_M_S, AFRL_SLOPE = 0.5, 0.2, 2.0
+"""Radius of docking, speed limit there, and its slope in mean motions, of the task."""
 AFRL_START_M, AFRL_TIMEOUT_S, AFRL_STEP_S = (100.0, 150.0), 2000.0, 1.0
+"""Distances of the start, longest episode and control step, of the task."""
 AFRL_DEPUTIES, AFRL_APART_M = 3, 1.0
 """Number of deputies, and the distance that they keep from one another while they fly; the task
 states none.

@@ -10,26 +10,29 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import RelativeEstimate
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.analysis.pose_errors import pose_error, relative_pose
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import PerceptionModel
 
 HOLD_S = 20.0
 """Time before the next command over which tracking at a hold point is measured."""
 _AFTER_CAPTURE_S, _AFTER_COMMAND_S = 1.0, 1.0
+"""A flight ends so long after the verified latch, a leg after the next command."""
 
 
 @dataclass(frozen=True)
 class HoldPoint:
-    """Tracking of a hold point over the last `HOLD_S` before ``until_s``: RMS of the distance from
-    the reference pose on the true target, largest angle, and RMS of the error of the estimated
-    relative position; ``range_m``: distance from the target."""
+    """How well a chaser waited at a hold point, over the last `HOLD_S` before ``until_s``.
+
+    ``range_m``: distance from the target. ``position_rms_m``, ``angle_max_deg``: from the reference
+    pose on the true target. ``estimate_rms_m``: error of the estimated relative position.
+    """
 
     until_s: float
     range_m: float
@@ -40,9 +43,12 @@ class HoldPoint:
 
 @dataclass(frozen=True)
 class HandOver:
-    """The first markers: at ``range_m``. ``step_m`` and ``step_deg``: change of the estimate's
-    error by the tick that uses them; ``step_sigmas``: its largest component over the estimate's
-    standard deviation before; ``error_sigmas`` as well for the error before the step."""
+    """How the estimate changed when the first markers were seen, at ``range_m``.
+
+    ``step_m``, ``step_deg``: change of the estimate's error by the tick that uses them.
+    ``step_sigmas``: its largest component over the estimate's standard deviation before.
+    ``error_sigmas``: the same of the error before.
+    """
 
     time_s: float
     range_m: float
@@ -54,9 +60,12 @@ class HandOver:
 
 @dataclass
 class RendezvousOutcome:
-    """One flight. ``verified_s``: None unless the latch was verified. ``delta_v_m_s``: impulse,
-    summed over axes, over mass. ``keep_out_margin_m``: least distance from the target before the
-    port's corridor, less ``limits.min_distance_target_m``."""
+    """One rendezvous of chaser 0.
+
+    ``verified_s``: when the latch was verified, or None. ``delta_v_m_s``: impulse, summed over
+    axes, over mass. ``keep_out_margin_m``: least distance from the target outside the port's
+    corridor, less ``limits.min_distance_target_m``.
+    """
 
     verified_s: float | None = None
     phase: str = ""
@@ -78,10 +87,8 @@ def estimate_error(estimate: RelativeEstimate, states: States) -> Array:
     vector in CRF axes (rad).
     """
     own, target = states[f"chaser/{estimate.chaser}"], states[TARGET]
-    position = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
-    q = rotations.multiply(rotations.conjugate(target.q_wxyz), own.q_wxyz)
-    turn = rotations.log(rotations.multiply(rotations.conjugate(q), estimate.q_wxyz))
-    return np.concatenate([np.array(estimate.position_m) - position, turn])
+    truth = relative_pose(own.position_m, own.q_wxyz, target.position_m, target.q_wxyz)
+    return pose_error(*truth, np.array(estimate.position_m), np.array(estimate.q_wxyz))
 
 
 class _Recorder:

@@ -38,8 +38,11 @@ from .detumble_flights import DetumbleLog, DetumbleOutcome, least_time
 from .rigid_stack import RigidStack, StackStep
 
 _POSE_M, _POSE_RAD = 0.001, math.radians(0.1)
+"""Sigma of the constant error of the target's pose, per axis."""
 _SETTLE_TICKS = 2
+"""Ticks without thrust, until the identification has odometry at two times."""
 _OPTIMUM_STEP_S = 0.5
+"""Step of the plan whose least impulse is searched."""
 _SILENT_REST_S = 10.0
 """A flight without controller ends so long after the stack came to rest."""
 

@@ -31,6 +31,7 @@ from chaserdock_world.sensors.publish import odometry_of
 from .latched_stack import attach_plants, body_of_plant, with_port_error
 
 _SUBSTEPS = 4
+"""Steps of the free rotation per tick, each with half of the impulse before and after it."""
 _LOAD_HZ = 960
 """Rate of the loads at the ports: that of the physics engine."""
 

@@ -15,16 +15,12 @@ def shape_gap_m(scenario: Scenario, states: States) -> float:
     """Return the least gap between the shapes of two bodies, negative exactly if two overlap, at
     most their distance, m.
     """
-    shape, names = (
-        box_table(scenario.chaser.boxes()),
-        [f"chaser/{i}" for i in range(len(scenario.chasers))],
-    )
+    shape = box_table(scenario.chaser.boxes())
+    names = [f"chaser/{i}" for i in range(len(scenario.chasers))]
     tables = [_placed(box_table(scenario.target_model().boxes), states[TARGET])]
     tables += [_placed(shape, states[name]) for name in names]
-    cuboids, owner = (
-        np.concatenate(tables),
-        np.repeat(np.arange(len(tables)), [len(t) for t in tables]),
-    )
+    cuboids = np.concatenate(tables)
+    owner = np.repeat(np.arange(len(tables)), [len(t) for t in tables])
     one, other = np.nonzero(owner[:, None] < owner)
     return float(separations(cuboids[one], cuboids[other]).min())
 

@@ -19,16 +19,20 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 from numpy.typing import ArrayLike
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import PerceptionModel
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import PerceptionModel
 
 from . import load_shipped
 from .shape_gaps import shape_gap_m
 
 SYMMETRIC_EVERY = 4
+"""Every fourth variation of ``collision-avoidance`` is exactly symmetric."""
 SMALL = {"width_px": 640, "height_px": 360}
+"""A quarter of the scenario's pixels, to save time."""
 CLUTTER_S = 100.0
+"""Longest flight in clutter."""
 CLUTTER_TIMING = ("time.rate_hz=10", "time.image_hz=10", "time.physics_hz=120")
+"""Coarser than the scenario, to save time."""
 _DIAGONAL = 9.0
 """m: stands for a chaser's distance to itself, larger than any between two."""
 
@@ -42,10 +46,8 @@ def avoidance(seed: int, full_images: bool = False) -> Scenario:
     random in WRF. Otherwise starts, goal and chaser 1's place are scattered by up to 10 cm (the
     goal up to 5 cm), attitudes by 0.1 rad.
     """
-    rng, scenario = (
-        np.random.default_rng([seed, 0xA701]),
-        load_shipped("collision-avoidance", f"seed={seed}"),
-    )
+    rng = np.random.default_rng([seed, 0xA701])
+    scenario = load_shipped("collision-avoidance", f"seed={seed}")
     symmetric = seed % SYMMETRIC_EVERY == 0
     rotated = seed > 11 or not symmetric
     attitude = (
@@ -174,11 +176,14 @@ def _places(
 
 @dataclass
 class TransferOutcome:
-    """Figures of one flight: least true distances between centres; ``shapes_m``: least gap between
-    the shapes of two bodies (probes included), if the scenario limits it; ``reached_s``: when the
-    last of the chasers with a goal was there for good, from its command on (NaN if never);
-    ``end_m``: the largest final distance from a goal; ``missed``: chasers that are not at their
-    goal at the end."""
+    """How near bodies came in one flight, and whether chasers reached their goals.
+
+    ``to_target_m``, ``between_m``: least true distances of centres, chaser to target and chaser to
+    chaser. ``shapes_m``: least gap between the shapes of two bodies, probes included, if the
+    scenario limits it. ``reached_s``: from its command on until the last chaser stayed at its goal
+    (NaN: never). ``end_m``: largest distance from a goal at the end. ``missed``: number of chasers
+    not at their goal then. ``failed``, ``relaxed``: solves of single chasers.
+    """
 
     seed: int
     to_target_m: float = math.inf
@@ -194,10 +199,11 @@ class TransferOutcome:
     def line(self) -> str:
         """Return one line for people."""
         return (
-            f"{self.seed:3d}  to target {self.to_target_m:.4f} m  between chasers {self.between_m:.4f} m  "
-            f"between shapes {self.shapes_m:.4f} m  "
-            f"reached after {self.reached_s:.1f} s, {self.end_m * 1e3:.1f} mm  missed {self.missed}  failed {self.failed}  "
-            f"relaxed {self.relaxed}  contacts {self.contacts}"
+            f"{self.seed:3d}  to target {self.to_target_m:.4f} m  "
+            f"between chasers {self.between_m:.4f} m  between shapes {self.shapes_m:.4f} m  "
+            f"reached after {self.reached_s:.1f} s, {self.end_m * 1e3:.1f} mm  "
+            f"missed {self.missed}  failed {self.failed}  relaxed {self.relaxed}  "
+            f"contacts {self.contacts}"
         )
 
 

@@ -16,10 +16,11 @@ from flights import load_shipped
 from flights.measured_poses import measurement_model
 from flights.transfers import CLUTTER, DENSE_CLUTTER, avoidance, clutter, fly_transfer, swap
 
-from chaserdock.evaluation.flight_record import FlightRecord, record_flight
-from chaserdock.evaluation.perception import PerceptionModel, RenderedImages
+from chaserdock.experiments.flight_record import FlightRecord, record_flight
+from chaserdock.experiments.perception import PerceptionModel, RenderedImages
 
 NOISE_M, NOISE_RAD = 0.002, math.radians(0.1)
+"""White noise of measured poses, per axis: coarser than markers at 1 m."""
 STEADY_FROM_S = 40.0
 """From here on the transient of a start 0.85 m away has decayed."""
 

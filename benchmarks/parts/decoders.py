@@ -39,8 +39,9 @@ def decoders(options: Options) -> Figures:
         growth = process.memory_info().rss - before
         refused = " ".join(f"{reason} {count}" for reason, count in sorted(out.refused.items()))
         print(
-            f"{name:36} {out.total:8} total, {out.accepted:7} accepted, {len(out.crashes)} crashes, "
-            f"{len(out.garbage)} accepted invalid; {time.monotonic() - begin_s:.0f} s; {refused}",
+            f"{name:36} {out.total:8} total, {out.accepted:7} accepted, "
+            f"{len(out.crashes)} crashes, {len(out.garbage)} accepted invalid; "
+            f"{time.monotonic() - begin_s:.0f} s; {refused}",
             flush=True,
         )
         for line in (out.crashes + out.garbage)[:5]:

@@ -26,7 +26,9 @@ from chaserdock.launch.launcher import Fleet, open_hub
 SCENARIO = ROOT / "scenarios" / "endurance.toml"
 CHASERS = 2
 SAMPLE_S = 1800.0
+"""Simulated time between samples of the memory."""
 LARGEST_GROWTH = 0.05
+"""Bar of a process's growth, share."""
 
 Samples = dict[str, list[float]]
 """Resident set, bytes, by process."""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The physics engines against each other: the cases of ``flights.engine_comparison`` in open loop, and
-whole missions in closed loop.
+"""The physics engines against each other: the cases of ``flights.engine_comparison`` in open loop,
+and whole missions in closed loop.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def compare(name: str, options: Options) -> Figures:
 
 
 def missions(options: Options) -> Figures:
-    """Fly ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s) and ``four-chaser-capture`` (75
-    s) as ``simulate`` does on each engine, with statistical perception: successes, and the largest
-    differences of any body. ``--quick``: the first of them for 10 s.
+    """Fly ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s) and ``four-chaser-capture``
+    (75 s) as ``simulate`` does on each engine, with statistical perception: successes, and the
+    largest differences of any body. ``--quick``: the first of them for 10 s.
     """
     flown = {"four-chaser-docking": QUICK} if options.quick else MISSIONS
     seeds = seeds_of(options, 1, 1)

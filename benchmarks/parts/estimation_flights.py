@@ -24,11 +24,11 @@ from chaserdock_protocol.messages import Image, Sighting, TargetEstimate
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.sensors.errors import true_camera
-from common import Figures, Group, Options, Results, described, seeds_of
+from common import Figures, Group, KeptResults, Options, described, seeds_of
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages, States
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages, States
 
 Row = dict[str, Any]
 SIDES = (((-1.0, 0.0, 0.0), 0.0), ((0.0, -1.0, 0.0), 90.0), ((1.0, 0.0, 0.0), 180.0))
@@ -36,6 +36,7 @@ SIDES = (((-1.0, 0.0, 0.0), 0.0), ((0.0, -1.0, 0.0), 90.0), ((1.0, 0.0, 0.0), 18
 target.
 """
 SETTLED_S = 6.0
+"""From here on the estimate counts as settled."""
 
 
 def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: Any) -> Scenario:
@@ -73,7 +74,8 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
                 "ambient": 0.25,
                 "earth": {"direction": (0.25, 0.5, -0.83), "radius_deg": 64.0},
                 "intrinsics": {
-                    "width_px": 1280, "height_px": 720, "fx_px": 1105.0, "fy_px": 1107.0, "cx_px": 644.2, "cy_px": 356.8,
+                    "width_px": 1280, "height_px": 720,
+                    "fx_px": 1105.0, "fy_px": 1107.0, "cx_px": 644.2, "cy_px": 356.8,
                     "distortion": (-0.18, 0.05, 0.0006, -0.0004, 0.0),
                 },
                 "effects": {"exposure_s": 0.003, "glare": 500.0},
@@ -86,9 +88,10 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
 
 @dataclass
 class EstimatorErrors:
-    """An estimator's errors against ground truth by tick: position (m), angle (rad), velocity
-    (m/s), rate (rad/s), NEES of the pose (6 degrees of freedom), the share of its six components
-    inside 3 sigma, and the status."""
+    """An estimator's errors against ground truth, one value a tick.
+
+    ``nees``: of the pose, 6 expected. ``inside``: share of its six components inside 3 sigma.
+    """
 
     time_s: list[float] = field(default_factory=list)
     position_m: list[float] = field(default_factory=list)
@@ -130,9 +133,12 @@ class EstimatorErrors:
 
 @dataclass
 class EstimationFlight:
-    """A flight: errors of its estimator and of the parallel estimators, tracking errors as (time s,
-    m, rad) of all chasers, events as (time s, level, text), whether each image had a detection by
-    chaser, the last outputs, and reinitializations."""
+    """What a flight shows of its estimator.
+
+    ``estimates``: its errors; ``parallel``: those of the estimators beside it, by name.
+    ``tracking``: (time s, m, rad) of all chasers. ``events``: (time s, level, text).
+    ``detections``: whether each image had one, by chaser. ``last``: outputs of the last tick.
+    """
 
     estimates: EstimatorErrors
     parallel: dict[str, EstimatorErrors]
@@ -245,6 +251,7 @@ ERRORS = {
     "camera_turn_deg": 0.3,
     "camera_shift_m": 5e-4,
 }
+"""Calibration errors of a camera, one sigma."""
 HEAVY = {
     "exposure_s": 0.003,
     "glare": 500.0,
@@ -253,6 +260,7 @@ HEAVY = {
     "point_spread_px": 0.9,
     "jpeg_quality": 75,
 }
+"""Image effects beyond the defaults."""
 
 
 def with_errors(scenario: Scenario) -> Scenario:
@@ -330,6 +338,7 @@ def calibrate(target: str, seed: int) -> Row:
 
 
 LOCKED_S = 3.0
+"""The estimate must be right for so long to count as found."""
 
 
 def acquire(seed: int) -> Row:
@@ -375,6 +384,7 @@ def acquire(seed: int) -> Row:
 
 
 WRONG_IRF_M, WRONG_RAD = (0.2, 0.0, 0.0), (0.0, 0.0, math.radians(15.0))
+"""Error of the poses that a chaser reports wrongly."""
 
 
 def fault(which: str, seed: int) -> Row:
@@ -435,7 +445,7 @@ def flights_of(
     def fly_kinds(options: Options) -> Figures:
         out: Figures = {}
         for kind, flight in kinds.items():
-            results = Results(options.results, {"estimation": f"{part} {kind}"}, dict[str, Any])
+            results = KeptResults(options.results, {"estimation": f"{part} {kind}"}, dict[str, Any])
             rows = results.of(seeds_of(options, number, quick), flight, shown)
             key = f"{part} {kind}".strip().replace(" ", "_")
             out[f"{key}_flights"] = len(rows)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A log read by independent programs, which are installed into a virtual environment of their own.
 
-- evo_ape on the tracks of ``chaserdock log tracks``: root mean square errors within 1 % of ours;
+- evo_ape on the tracks of ``chaserdock log --export --format tum``: root mean square errors within 1 % of ours;
 - pymcap-cli doctor: no error;
 - the reader of the mcap package: every channel has a schema, every message is readable;
 - rerun: draws the log without a window and saves the image to ``--image``. Without a graphics card
@@ -32,6 +32,7 @@ from chaserdock.simulation.mission import simulate
 
 PACKAGES = ("evo", "pymcap-cli", "mcap", "mcap-ros2-support-fast", "rerun-sdk")
 TOLERANCE = 0.01
+"""Largest difference of evo's and our errors, share."""
 LEAST_GREY_LEVELS = 64
 """An image of an empty window has fewer."""
 
@@ -51,7 +52,7 @@ CheckedFigures = tuple[Figures, bool]
 
 
 def call(*command: str | Path, **environment: str) -> str:
-    """Measure a program and return its output. Raise RuntimeError if it fails."""
+    """Run a program and return its output. Raise RuntimeError if it fails."""
     done = subprocess.run(
         [str(c) for c in command],
         env=os.environ | environment,

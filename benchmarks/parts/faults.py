@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults during a shortened docking: ``fault-drill`` as separate processes with one fault, of
-which kind, process, time and severity are drawn from the number of the run.
+"""Random faults during a shortened docking: ``fault-drill`` as separate processes with one fault,
+of which kind, process, time and severity are drawn from the number of the run.
 
 Outcomes: ``docked``; ``safe`` (not docked, and the log states why); ``no reason named``;
 ``collision``; ``stalled``.
@@ -23,8 +23,8 @@ from common import (
     BenchmarkFailed,
     Figures,
     Group,
+    KeptResults,
     Options,
-    Results,
     chaserdock_command,
     seeds_of,
 )
@@ -36,12 +36,13 @@ from chaserdock.toml_text import toml_value
 
 SCENARIO = "fault-drill"
 TIMEOUT_S = 300.0
+"""A run that lasts longer has stalled."""
 GOOD = ("docked", "safe")
 
 
 @dataclass(frozen=True)
 class FaultResult:
-    """Outcome of one run. ``reason``: the first warning or error in the log after the fault began."""
+    """Outcome of one run. ``reason``: the first warning or error logged since the fault began."""
 
     number: int
     kind: str
@@ -146,7 +147,7 @@ def faults(options: Options) -> Figures:
     complete log.
     """
     numbers = seeds_of(options, 200, len(KINDS))
-    results = Results(options.results, {"faults": options.mode}, FaultResult)
+    results = KeptResults(options.results, {"faults": options.mode}, FaultResult)
     flown = results.of(numbers, lambda number: fly(number, options.mode), line_of)
     print(table(flown))
     bad = [r for r in flown if r.outcome not in GOOD or not r.log_complete]
@@ -167,7 +168,8 @@ def faults(options: Options) -> Figures:
 def line_of(result: FaultResult) -> str:
     """Return one line for people."""
     log = "" if result.log_complete else ", log incomplete"
-    return f"{toml_value(result.fault)}: {result.outcome}{log}: {result.reason} ({result.wall_s:.0f} s)"
+    text = f"{toml_value(result.fault)}: {result.outcome}{log}: {result.reason}"
+    return f"{text} ({result.wall_s:.0f} s)"
 
 
 def add_options(parser: ArgumentParser) -> None:

@@ -20,7 +20,7 @@ from common import ROOT, BenchmarkFailed, Figures, Group, Options
 def fuzz_all(
     kernel: str | None, inputs: int, seed: int, first: int, jobs: int
 ) -> tuple[Figures, int]:
-    """Measure the fuzz targets; return figures and the number of kernels with a finding."""
+    """Run the fuzz targets; return figures and the number of kernels with a finding."""
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as threads:
         programs = threads.map(
             lambda item: sanitizers.compile_program(item[1], ROOT / item[0], Path(folder)),
@@ -38,7 +38,8 @@ def fuzz_all(
         bad, figures = 0, Figures()
         for name, found, duration_s in threads.map(timed, chosen):
             print(
-                f"{name:24} {inputs:9} inputs  {duration_s:6.1f} s  {'FOUND' if found else 'nothing found'}",
+                f"{name:24} {inputs:9} inputs  {duration_s:6.1f} s  "
+                f"{'FOUND' if found else 'nothing found'}",
                 flush=True,
             )
             for line in found.splitlines()[:12] + found.splitlines()[-1:] * bool(found):
@@ -65,7 +66,7 @@ def kernels(options: Options) -> Figures:
 
 
 def kernel_tests(_: Options) -> Figures:
-    """Measure the Python tests that call the kernels with kernels under sanitizers."""
+    """Run the Python tests that call the kernels with kernels under sanitizers."""
     require_compiler()
     run = sanitizers.run_tests()
     print("\n".join(run.stdout.splitlines()[-5:]))

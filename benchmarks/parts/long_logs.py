@@ -64,7 +64,7 @@ def repeat(log: Path, out: Path, hours: float) -> int:
 
 
 def cost_of(*arguments: str | Path) -> tuple[float, float]:
-    """Measure ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise
+    """Run ``chaserdock`` and return wall time (s) and largest resident set (bytes). Raise
     SystemExit if it fails.
     """
     begin_s = time.perf_counter()
@@ -84,12 +84,12 @@ def costs(log: Path, label: str) -> Figures:
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         for command, arguments in {
-            "log_info": ("log", "info", log),
-            "summary": ("summary", log),
+            "log_info": ("log", log),
+            "summary": ("judge", log),
             "report": ("report", log, "--out", out / "report.html"),
-            "figures": ("figures", log, "--out", out / "figures"),
-            "log_export": ("log", "export", log, "--out", out / "tables"),
-            "log_tracks": ("log", "tracks", log, "--out", out / "tracks"),
+            "figures": ("report", log, "--figures", "--out", out / "figures"),
+            "log_export": ("log", log, "--export", out / "tables"),
+            "log_tracks": ("log", log, "--export", out / "tracks", "--format", "tum"),
         }.items():
             wall_s, peak_bytes = cost_of(*arguments)
             figures |= {
@@ -103,7 +103,7 @@ QUICK = ("duration_s=10.0", "settling_s=5.0", "steady_until_s=10.0", "timeline=[
 
 
 def logs(options: Options) -> Figures:
-    """Measure each command that reads a log on ``--log`` (default: a flight of the main mission), and
+    """Run each command that reads a log on ``--log`` (default: a flight of the main mission), and
     on a log of ten hours (``--quick``: 0.2) made of it by repetition.
     """
     with tempfile.TemporaryDirectory(prefix="long-log-") as folder:

@@ -43,8 +43,11 @@ from chaserdock.analysis.pose_errors import normalized_square, pose_error
 
 CAMERA_POSITION, CAMERA_ATTITUDE = np.zeros(3), rotations.IDENTITY  # IRF = WRF
 HFOV = np.deg2rad(60.0)
+"""Horizontal field of view, rad: that of the default camera."""
 GROSS_M, GROSS_RAD = 0.1, np.deg2rad(10.0)
+"""Errors of a pose above which it is grossly wrong."""
 JPEG_QUALITY = 85
+"""That of images between processes."""
 # Attitude of an upright face that faces the camera.
 FACING = rotations.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
@@ -70,7 +73,7 @@ class Views:
         self.count = 0
 
     def view(self, position: Array, q: Array, to_sun: Array) -> View:
-        """Return an image with all default effects, encoded and decoded as between the processes."""
+        """Return an image with all default effects, encoded and decoded as between processes."""
         exact = self.renderer.render(
             CAMERA_POSITION, CAMERA_ATTITUDE, position, q, (), Light(tuple(to_sun.tolist()))
         )
@@ -247,7 +250,7 @@ def reach(count: int) -> Figures:
 
 
 def near_views(count: int) -> Figures:
-    """Evaluate random attitudes with the centre at 0.28 to 0.45 m, where the body fills the image."""
+    """Evaluate random attitudes with the centre at 0.28 to 0.45 m: the body fills the image."""
     views, results = Views("servicer"), ViewResults()
     perception = views.perception()
     for view in views.random_views(count, 0.28, 0.45, 8):
@@ -312,19 +315,15 @@ def far(count: int) -> Figures:
     of two solutions the nearer.
     """
     scenario = load_shipped("docking-contact", 'navigation.grade="exact"')
-    cameras, perception, camera = (
-        Cameras(scenario),
-        make_perception(scenario),
-        scenario.camera_model(),
-    )
-    zero, out = np.zeros(3), {}
+    cameras = Cameras(scenario)
+    perception = make_perception(scenario)
+    camera = scenario.camera_model()
+    zero, out = np.zeros(3), Figures()
     for metres in (5.0, 6.0, 6.5, 7.0, 7.5):
         rng, found = np.random.default_rng([24, int(10 * metres)]), []
         for k in range(count):
-            q, turn = (
-                rotations.exp(rng.normal(0.0, 0.15, 3)),
-                rotations.exp(rng.normal(0.0, 0.01, 3)),
-            )
+            q = rotations.exp(rng.normal(0.0, 0.15, 3))
+            turn = rotations.exp(rng.normal(0.0, 0.01, 3))
             own = np.array([-metres, *rng.normal(0.0, 0.05 * metres, 2)])
             states = {
                 "target": BodyState(zero, zero, q, zero),
@@ -340,17 +339,17 @@ def far(count: int) -> Figures:
             ]
             if errors:
                 found.append(min(errors, key=lambda e: float(np.linalg.norm(e[0][3:]))))
-        e = np.array([error for error, _ in found])
-        squares = normalized_square(e, np.array([covariance for _, covariance in found]))
         at = f"far_{metres:g}m_"
-        out |= {
-            f"{at}without_a_pose": count - len(found),
-            f"{at}nees_mean": float(squares.mean()),
-            f"{at}depth_rms_m": float(np.sqrt(np.mean(e[:, 2] ** 2))),
-            f"{at}angle_rms_deg": float(
-                np.degrees(np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1))))
-            ),
-        }
+        out[f"{at}without_a_pose"] = count - len(found)
+        if found:
+            e = np.array([error for error, _ in found])
+            squares = normalized_square(e, np.array([covariance for _, covariance in found]))
+            angles_rad = np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1)))
+            out |= {
+                f"{at}nees_mean": float(squares.mean()),
+                f"{at}depth_rms_m": float(np.sqrt(np.mean(e[:, 2] ** 2))),
+                f"{at}angle_rms_deg": float(np.degrees(angles_rad)),
+            }
     return out
 
 
@@ -376,20 +375,12 @@ def bearing(count: int) -> Figures:
     perception, camera = make_perception(scenarios[0]), scenarios[0].camera_model()
     zero, still, out = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), {}
     for metres in (7.0, 10.0, 15.0, 20.0, 30.0, 50.0, 80.0, 120.0, 160.0, 200.0):
-        rng, errors, squares, ranges, alone, wrong, missed = (
-            np.random.default_rng([24, int(metres)]),
-            [],
-            [],
-            [],
-            0,
-            0,
-            0,
-        )
+        rng = np.random.default_rng([24, int(metres)])
+        errors, squares, ranges = [], [], []
+        alone = wrong = missed = 0
         for k in range(count):
-            q, own = (
-                rotations.normalize(rng.normal(size=4)),
-                np.array([-metres, *rng.uniform(-0.2, 0.2, 2) * metres]),
-            )
+            q = rotations.normalize(rng.normal(size=4))
+            own = np.array([-metres, *rng.uniform(-0.2, 0.2, 2) * metres])
             states = {
                 "target": BodyState(zero, zero, q, zero),
                 "chaser/0": BodyState(own, zero, still, zero),

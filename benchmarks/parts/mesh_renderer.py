@@ -24,6 +24,7 @@ from markerless_cases import random_view
 SATELLITES = ("geo_servicer", "cubesat_12u")
 RANGES_M = (1.0, 3.0)
 RUNS = 4
+"""Repetitions of which the least time counts: other programs prolong some."""
 
 
 def measure_time(options: Options) -> Figures:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed and accuracy of the main mission: ``four-chaser-docking`` in lock-step, in separate processes,
-with images and recording.
+"""Speed and accuracy of the main mission: ``four-chaser-docking`` in lock-step, in separate
+processes, with images and recording.
 """
 
 from __future__ import annotations

@@ -25,14 +25,19 @@ from chaserdock_models.camera import Camera
 from common import Figures, Group, Options
 
 RATES = {"still": np.zeros(3), "tumbling": np.array([0.015, 0.045, 0.03])}
+"""rad/s; tumbling: the paper's."""
 ERRORS = FOCAL.stop - TURN.start
 MOUNTING = mounting_of(Camera.from_hfov(640, 480, math.radians(60.0)))
 IMAGE_HZ, DURATION_S = 5.0, 60.0
+"""Rate of the images, and time over which their poses are stacked."""
 MEASUREMENT_SIGMA = np.array([5e-4] * 3 + [math.radians(0.05)] * 3)
+"""Of a measured pose: m and rad."""
 # Prior: the target's state is unknown; 0.3 degrees, 2 mm and 0.1 % of each camera.
 TARGET_SIGMA = np.array([10.0] * 3 + [1.0] * 3 + [3.0] * 3 + [1.0] * 3)
 CAMERA_SIGMA = np.array([math.radians(0.3)] * 3 + [2e-3] * 3 + [1e-3])
+"""Rotation (rad), position (m) and focal length (share) of a camera."""
 YAWS_DEG = (0.0, 90.0, 180.0, 270.0)
+"""Directions from which the chasers see the target."""
 
 
 def jacobian(chasers: int, omega: Array, errors: int, manoeuvre: bool) -> Array:

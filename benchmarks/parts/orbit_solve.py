@@ -15,8 +15,8 @@ from chaserdock_protocol.scenario import Scenario
 from common import Figures, Group, Options
 from flights import load_shipped
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -38,7 +38,7 @@ class TimedFlight:
 
 
 def timed(function: Callable[P, T], durations_s: list[float]) -> Callable[P, T]:
-    """Return the function, which then appends its processor time to ``durations_s`` at each call."""
+    """Return a function that appends its processor time to ``durations_s`` at each call."""
 
     def measured(*args: P.args, **options: P.kwargs) -> T:
         start_s = time.process_time()
@@ -50,7 +50,7 @@ def timed(function: Callable[P, T], durations_s: list[float]) -> Callable[P, T]:
 
 
 def orbit(options: Options) -> Figures:
-    """Time solver and controller with ``[orbit]`` over those without, 600 ticks (``--quick``: 60)."""
+    """Time solver and controller with ``[orbit]`` and without, 600 ticks (``--quick``: 60)."""
     overrides = ("perception.name='statistical'", "timeline=[]", "duration_s=1000.0")
     in_orbit = load_shipped(
         options.scenario, *overrides, f"limits.passive_safety='{options.safety}'"

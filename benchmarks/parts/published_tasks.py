@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published rendezvous and docking tasks by their own criteria: AFRL's docking of three deputies, and
-the spacecraft rendezvous of ARCH-COMP.
+"""Published rendezvous and docking tasks by their own criteria: AFRL's docking of three deputies,
+and the spacecraft rendezvous of ARCH-COMP.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def afrl(options: Options) -> Figures:
 
 
 def arch(options: Options) -> Figures:
-    """Fly 10^5 samples of ARCH-COMP's initial set without an abort (SRNA01) and with one at a random
-    time within 240 minutes (SRA08), by the task's controller.
+    """Fly 10^5 samples of ARCH-COMP's initial set without an abort (SRNA01) and with one at a
+    random time within 240 minutes (SRA08), by the task's controller.
     """
     samples, figures = 1000 if options.quick else 100_000, {}
     for name, abort_min in (("srna01", (1e9, 1e9)), ("sra08", (0.0, 240.0))):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real time: ``four-chaser-docking`` with ticks and images at 30 Hz, 640 x 480, in separate processes
-on this machine.
+"""Real time: ``four-chaser-docking`` with ticks and images at 30 Hz, 640 x 480, in separate
+processes on this machine.
 
 ``image_to_command``: from the sending of an image to the sending of the actuator command of that
 tick, by the senders' time stamps; the images of a tick are sent together, as by cameras that expose
@@ -45,9 +45,11 @@ SCENARIO = ROOT / "scenarios" / "four-chaser-docking.toml"
 CHASERS = 4
 RATE_HZ = 30
 SETTLE_S = 6.0
+"""Time until processes have imported and compiled what they use."""
 PAUSE_S = 1.0
 """Between windows: a stopped process catches up."""
 LATE_S = 0.033
+"""A tick at 30 Hz: a later command is for the next one."""
 LEASE_MS = 60_000  # as under `chaserdock run`
 OVERRIDES = (
     f"time.rate_hz={RATE_HZ}",
@@ -72,7 +74,7 @@ _head = msgspec.msgpack.Decoder(Head)
 
 @dataclass
 class LatencyObserver:
-    """Sending times (wall clock, ns) of ticks by tick, of images and commands by chaser and tick."""
+    """Sending times (wall clock, ns) of ticks, and of images and commands by chaser and tick."""
 
     ticks: dict[int, int] = field(default_factory=dict)
     images: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -239,7 +241,7 @@ def figures(name: str, windows: list[Window], observer: LatencyObserver) -> Figu
 
 
 def wait_for_images(observer: LatencyObserver, tick: int, fleet: Fleet, hub: Node) -> None:
-    """Wait until the images of a tick have been sent. Raise SystemExit if the mission ends before."""
+    """Wait until the images of a tick were sent. Raise SystemExit if the mission ends before."""
     while observer.last_tick < tick:
         received = hub.receive(0.05)
         exited = [c.last_line() for c in fleet.children if c.process.poll() is not None]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: two spacecraft 100 m apart fly one
-orbit under two-body gravity, and with J2.
+"""Relative orbital motion against Basilisk and Clohessy-Wiltshire: two spacecraft 100 m apart fly
+one orbit under two-body gravity, and with J2.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ ORBITS = {
     "eccentric_j2": (OrbitalElements(9e6, 0.2, 1.1, 0.2, 1.0, 0.3), EARTH_J2),
 }
 STARTS = {"radial": (100.0, 0.0, 0.0), "along": (0.0, -100.0, 0.0), "cross": (0.0, 0.0, 100.0)}
+"""Start in the Hill frame, m."""
 
 # Runs in Basilisk's interpreter: cases on stdin, final ECI states of both spacecraft on stdout.
 _BASILISK = """

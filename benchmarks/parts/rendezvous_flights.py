@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole rendezvous from 200 m to the verified latch in one process, with statistical perception, and
-aborts at random moments of them.
+"""Whole rendezvous from 200 m to the verified latch in one process, with statistical perception,
+and aborts at random moments of them.
 
 Figures: time, change of velocity, tracking at the hold points, step of the estimate at the first
 markers, and contact.
@@ -18,8 +18,8 @@ from flights import load_shipped
 from flights.abort_study import study
 from flights.rendezvous import last_leg, leg, rendezvous
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 
 def fly(name: str, seed: int, options: Options) -> Figures:
@@ -116,15 +116,16 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--abort-scenario", default="v-bar", metavar="NAME", help="of aborts")
 
 
-SCENARIOS = ("v-bar", "r-bar")
+SCENARIOS = ("v-bar", "r-bar", "v-bar-images")
 GROUP = Group(
     {
         **{
-            name: described(partial(fly_seeds, name), f"Fly {name} from 200 m to the latch.")
+            name: described(partial(fly_seeds, name), f"Fly {name} to the verified latch.")
             for name in SCENARIOS
         },
         "aborts": aborts,
     },
     ("flights", "first", "set"),
     add_options,
+    on_request=("v-bar-images",),
 )

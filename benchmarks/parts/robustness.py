@@ -28,12 +28,13 @@ from chaserdock_protocol.messages import Odometry, Sighting
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.navigation import GRADES
 from chaserdock_world.rendering.cameras import States
-from common import ROOT, Figures, Group, Options, Results, map_jobs, print_figures, seeds_of
+from common import ROOT, Figures, Group, KeptResults, Options, map_jobs, print_figures, seeds_of
 from flights.measured_poses import measurement_model
+from flights.rendezvous import estimate_error
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 SIGHTING_SIGMA_M, SIGHTING_SIGMA_RAD = 2e-4, math.radians(0.25)
 """Statistical sightings: about those of one large marker at 1 m."""
@@ -52,7 +53,7 @@ CALIBRATED_S = 65.0
 
 
 @dataclass(frozen=True)
-class Flight:
+class ErrorFlight:
     """A flight to evaluate from ``settled_s`` on."""
 
     label: str
@@ -81,23 +82,21 @@ def relative_error(tick: TickRecord, chaser: int) -> tuple[Array, float]:
     """Return the error (6,) of a chaser's estimated pose relative to the target (TRF, m; CRF, rad)
     and its NEES, NaN without a covariance."""
     assert tick.outputs is not None
-    estimate, true, own = (
-        tick.outputs.target,
-        tick.states["target"],
-        tick.states[f"chaser/{chaser}"],
-    )
-    truth = relative_pose(own.position_m, own.q_wxyz, true.position_m, true.q_wxyz)
+    estimate = tick.outputs.target
     found = next((r for r in estimate.relative if r.chaser == chaser), None)
-    if found is None:
-        odometry = tick.odometry[chaser]
-        own_pose = np.array(odometry.position_m), np.array(odometry.q_wxyz)
-        target_pose = np.array(estimate.position_m), np.array(estimate.q_wxyz)
-        return pose_error(*truth, *relative_pose(*own_pose, *target_pose)), math.nan
-    error = pose_error(*truth, np.array(found.position_m), np.array(found.q_wxyz))
-    return error, float(normalized_square(error, np.reshape(found.covariance, (6, 6))))
+    if found is not None:
+        error = estimate_error(found, tick.states)
+        return error, float(normalized_square(error, np.reshape(found.covariance, (6, 6))))
+    true = tick.states["target"]
+    own = tick.states[f"chaser/{chaser}"]
+    odometry = tick.odometry[chaser]
+    truth = relative_pose(own.position_m, own.q_wxyz, true.position_m, true.q_wxyz)
+    own_pose = np.array(odometry.position_m), np.array(odometry.q_wxyz)
+    target_pose = np.array(estimate.position_m), np.array(estimate.q_wxyz)
+    return pose_error(*truth, *relative_pose(*own_pose, *target_pose)), math.nan
 
 
-def fly(flight: Flight) -> Array:
+def fly(flight: ErrorFlight) -> Array:
     """Fly a mission; return its figures (7,): estimate m, rad, tracking m, rad, NEES, gated share,
     re-initializations.
     """
@@ -137,7 +136,7 @@ def fly(flight: Flight) -> Array:
     return np.array([*np.sqrt(np.mean(rows, axis=0)), np.mean(nees), share, restarts])
 
 
-def fly_all(flights: Sequence[Flight], jobs: int) -> Figures:
+def fly_all(flights: Sequence[ErrorFlight], jobs: int) -> Figures:
     """Return the mean figures of each label, and print them as they come."""
     figures: Figures = {}
     results = zip(flights, map_jobs(fly, flights, jobs), strict=True)
@@ -179,7 +178,7 @@ def grades(options: Options) -> Figures:
                     overrides = (f'navigation.grade="{grade}"', *truth)
                     scenario = scenario_of(name, estimator, seed, duration_s, *overrides)
                     flights.append(
-                        Flight(f"{grade}_{number}_{estimator}", scenario, settled_s, True)
+                        ErrorFlight(f"{grade}_{number}_{estimator}", scenario, settled_s, True)
                     )
             if estimator != "joint":
                 continue
@@ -190,12 +189,14 @@ def grades(options: Options) -> Figures:
                 overrides = ('navigation.grade="orbit"', *truth, calibrate)
                 scenario = scenario_of(name, estimator, seed, CALIBRATED_S + 12.0, *overrides)
                 flights.append(
-                    Flight(f"orbit_calibrated_{number}_{estimator}", scenario, CALIBRATED_S, True)
+                    ErrorFlight(
+                        f"orbit_calibrated_{number}_{estimator}", scenario, CALIBRATED_S, True
+                    )
                 )
         for seed in seeds:
             overrides = ('navigation.grade="lab"', *truth)
             scenario = scenario_of("harsh-light", estimator, seed, duration_s, *overrides)
-            flights.append(Flight(f"harsh_light_lab_2_{estimator}", scenario, settled_s, True))
+            flights.append(ErrorFlight(f"harsh_light_lab_2_{estimator}", scenario, settled_s, True))
     return fly_all([f for f in flights if f.label.startswith(tuple(options.rows))], options.jobs)
 
 
@@ -216,7 +217,7 @@ def sources(options: Options) -> Figures:
                         "four-chaser-docking", estimator, seed, duration_s, *overrides
                     )
                     flights.append(
-                        Flight(f"{source}_{factor:g}_{estimator}", scenario, 20.0, False)
+                        ErrorFlight(f"{source}_{factor:g}_{estimator}", scenario, 20.0, False)
                     )
     figures = fly_all(flights, options.jobs)
     if options.figure is not None:
@@ -273,6 +274,7 @@ ODOMETRY_FAILURES: dict[str, Callable[[Odometry], Odometry]] = {
     "overconfident": overconfident,
 }
 FAILED_AT_S, BLIND_S, FAILED_CHASER = 35.0, 20.0, 1
+"""The estimate is steady from 20 s on; a blind time of 20 s lets it drift visibly."""
 
 
 class FailureMission(InProcessMission):
@@ -337,13 +339,13 @@ def fly_failure(failure: str, seed: int) -> list[float]:
 
 
 def failures(options: Options) -> Figures:
-    """Fly four chasers under ``lab`` with plant mismatch and statistical perception: no sight for 20
-    s, and odometry of one chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a
-    tenth of its sigma of position.
+    """Fly four chasers under ``lab`` with plant mismatch and statistical perception: no sight for
+    20 s, and odometry of one chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or
+    a tenth of its sigma of position.
     """
     figures: Figures = {}
     for kind in ("blind", *ODOMETRY_FAILURES):
-        results = Results(options.results, {"failure": kind}, list[float])
+        results = KeptResults(options.results, {"failure": kind}, list[float])
         flown = results.of(seeds_of(options, 20, 1), partial(fly_failure, kind), jobs=options.jobs)
         rows = np.array(flown)
         figures |= {

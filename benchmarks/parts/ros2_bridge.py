@@ -111,11 +111,9 @@ def cost(options: Options) -> Figures:
 def large_image(options: Options) -> Figures:
     """Time the steps for an image of the default camera's size, 0.9 MB, not compressed."""
     repetitions = repetitions_of(options)
-    endpoint, kind, topic = (
-        f"tcp/127.0.0.1:{free_port()}",
-        "sensor_msgs/msg/Image",
-        "/chaser_0/image",
-    )
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    kind = "sensor_msgs/msg/Image"
+    topic = "/chaser_0/image"
     session, reader = PlainSession((), (endpoint,), "router"), PlainSession((endpoint,), (), "peer")
     ros, listener = RosNode(session, 0, "bridge"), RosNode(reader, 0, "reader")
     try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cost of a tick with 1 to 16 chasers, by part: the first N of ``sixteen-chasers``.
 
-In one process (``chaserdock.evaluation.in_process``) each part is timed by the thread's processor
+In one process (``chaserdock.experiments.in_process``) each part is timed by the thread's processor
 time, medians over ticks: render, physics, perceive, fuse, solve, guide (references, prediction,
 messages). Then ``chaserdock run`` flies the same mission in lock-step: wall time per tick, and
 processor time of its processes. ``record`` is the recorder's; ``transport`` is what world, chasers
@@ -27,15 +27,16 @@ from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.rendering.cameras import Cameras
 from common import ROOT, Figures, Group, Options, chaserdock_command
 
-from chaserdock.evaluation import perception
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments import perception
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 from chaserdock.logs import open_log
 
 SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"
 WARM_TICKS = 15
 """Excluded from every figure: first calls and the estimator's start."""
 SAMPLE_S = 0.2
+"""Time between samples of the processor time of processes."""
 TOLERANT = (
     "settling_s=1.0",
     "success.steady_position_rms_m=0.3",
@@ -112,7 +113,7 @@ def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
 
 
 def fly(n: int, duration_s: float) -> dict[str, float]:
-    """Measure the mission with ``n`` chasers; return wall time and processor time of each command, s
+    """Run the mission with ``n`` chasers; return wall time and processor time of each command, s
     per tick.
 
     Raise SystemExit if it fails.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distance of a chaser's shape from cuboids: our kernel and the library coal, which the product does
-not need (``pip install coal``).
+"""Distance of a chaser's shape from cuboids: our kernel and the library coal, which the product
+does not need (``pip install coal``).
 
 Random poses of a chaser (body and probe) about random cuboids. Time per pair of a chaser and a
 cuboid: of the planner's kernel (gap along one direction, with its gradient) in a plan's check, and
@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from chaserdock_controller.nmpc import NmpcInput, NmpcParameters
-from chaserdock_controller.nmpc.checks import check_input
 from chaserdock_controller.nmpc.kernels import plan_violation
+from chaserdock_controller.nmpc.problem import check_input, native_problem
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -30,6 +30,7 @@ from common import Figures, Group, Options
 from flights import load_shipped
 
 CUBOIDS = 8
+"""Number of cuboids about the chaser."""
 
 
 def random_cuboids(rng: np.random.Generator) -> Array:
@@ -73,11 +74,11 @@ def kernel_s(params: NmpcParameters, table: Array, states: Array, repeats: int) 
     )
     boxes, clearance = np.repeat(table[None], d + 1, axis=0), np.array([0.02])
     both = [problem, replace(problem, boxes=boxes, box_clearance_m=clearance)]
-    with_boxes = replace(params, boxes=CUBOIDS)
     took = []
     for one in both:
-        checked, plan = check_input(one, with_boxes, 1), states[None, : d + 1].copy()
-        took.append(best_of(partial(plan_violation, checked, plan, 1e6), repeats))
+        checked, plan = check_input(one, params, 1), states[None, : d + 1].copy()
+        call = partial(plan_violation, native_problem(checked, params), plan)
+        took.append(best_of(call, repeats))
     return (took[1] - took[0]) / (CUBOIDS * (d + 1))
 
 
@@ -122,7 +123,7 @@ def all_distances(
 
 
 def coal_figures(coal: Any, table: Array, states: Array, repeats: int) -> Figures:
-    """Return times per pair of chaser and cuboid, and how much less than the distance our gap is."""
+    """Return times per pair of chaser and cuboid, and by how much our gap is below the distance."""
     body = box_table(chaser_boxes())
     places = [placed(coal, row) for row in table]
     poses = [[placed(coal, r) for r in moved(body, s[None, :3], s[None, 6:10])[0]] for s in states]

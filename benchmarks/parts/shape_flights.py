@@ -33,12 +33,12 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import true_camera
-from common import Figures, Group, Options, Results, described, seeds_of
+from common import Figures, Group, KeptResults, Options, described, seeds_of
 from flights import load_shipped
 
 from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.perception import RenderedImages
 
 SCENARIOS = {
     "docking": "markerless-docking",
@@ -47,14 +47,16 @@ SCENARIOS = {
 }
 QUICK = ("duration_s=20.0", "settling_s=10.0", "steady_until_s=20.0", "timeline=[]")
 PROGRESS_S = 5.0
+"""Time between lines of progress."""
 LAGS_S = (0.0, 1.0, 5.0, 20.0)
 """Lags of the correlations; 0 stands for the next image."""
 KINDS = {"position": slice(0, 3), "rotation": slice(3, 6)}
 STEADY_RAD = math.radians(0.3)
+"""Bar of the tracking error with that of 3 mm."""
 
 
 class MarkerlessOutcome(msgspec.Struct, frozen=True):
-    """How one flight ended.
+    """How one flight ended, and what perception, estimate and computer did in it.
 
     ``steady_position_m``, ``steady_orientation_rad``: RMS tracking errors of the worst chaser in
     the steady interval. ``estimate_*``: of the target's estimate from its first sighting on, RMS
@@ -180,7 +182,7 @@ def sighting_figures(errors: Array, images_per_s: float) -> Figures:
 
 
 class TimedMission(InProcessMission):
-    """A mission that keeps the CPU times of its controller and the newest estimate of the geometry."""
+    """Keeps the CPU times of its controller and the newest estimate of the geometry."""
 
     controller_s = 0.0
     geometry: GeometryEstimate | None = None
@@ -257,9 +259,10 @@ def print_progress(
         for phase, e in zip(phases, record.tracking_errors.values(), strict=True)
     )
     print(
-        f"  {seed}: {record.time_s:.0f} s; estimate {1e3 * error.position_m:.2f} mm {math.degrees(error.rotation_rad):.3f} deg, "
-        f"NEES {error.nees:.1f}; "
-        f"{tracking}; perception {1e3 * np.mean(images.perception_s):.1f} ms, most {1e3 * max(images.perception_s):.0f} ms",
+        f"  {seed}: {record.time_s:.0f} s; estimate {1e3 * error.position_m:.2f} mm "
+        f"{math.degrees(error.rotation_rad):.3f} deg, NEES {error.nees:.1f}; {tracking}; "
+        f"perception {1e3 * np.mean(images.perception_s):.1f} ms, "
+        f"most {1e3 * max(images.perception_s):.0f} ms",
         file=sys.stderr,
         flush=True,
     )
@@ -353,9 +356,10 @@ def line_of(o: MarkerlessOutcome) -> str:
     """Return one line for people."""
     text = (
         f"{o.cause} at {o.time_s:.1f} s; steady {1e3 * o.steady_position_m:.2f} mm "
-        f"{math.degrees(o.steady_orientation_rad):.3f} deg; estimate {1e3 * o.estimate_rms_m:.2f} mm "
-        f"{math.degrees(o.estimate_rms_rad):.3f} deg, NEES {o.nees:.1f} "
-        f"(position {o.nees_position:.1f}, rotation {o.nees_rotation:.1f}); {o.tick_ms:.0f} ms a tick"
+        f"{math.degrees(o.steady_orientation_rad):.3f} deg; "
+        f"estimate {1e3 * o.estimate_rms_m:.2f} mm {math.degrees(o.estimate_rms_rad):.3f} deg, "
+        f"NEES {o.nees:.1f} (position {o.nees_position:.1f}, rotation {o.nees_rotation:.1f}); "
+        f"{o.tick_ms:.0f} ms a tick"
     )
     if o.touch_m is not None and o.touch_deg is not None:
         text += f"; contact {1e3 * o.touch_m:.2f} mm {o.touch_deg:.2f} deg"
@@ -369,7 +373,9 @@ def line_of(o: MarkerlessOutcome) -> str:
 def fly_part(part: str, options: Options) -> Figures:
     """Fly five seeds of a mission (``--quick``: one, 20 s, which cannot dock)."""
     changes = (*options.set, *(QUICK if options.quick else ()))
-    results = Results(options.results, {"flight": part, "set": list(changes)}, MarkerlessOutcome)
+    results = KeptResults(
+        options.results, {"flight": part, "set": list(changes)}, MarkerlessOutcome
+    )
     outcomes = results.of(
         seeds_of(options, 5, 1),
         lambda seed: fly(seed, load_shipped(SCENARIOS[part], f"seed={seed}", *changes)),

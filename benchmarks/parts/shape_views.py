@@ -14,7 +14,6 @@ darker than 5 grey levels are left out. Times are CPU times of this process.
 
 from __future__ import annotations
 
-import itertools
 import time
 import zlib
 from argparse import ArgumentParser
@@ -27,49 +26,54 @@ import cv2
 import numpy as np
 from chaserdock_agents.chaser.perception.model import tracking
 from chaserdock_agents.chaser.perception.model.acquisition import Acquisition
-from chaserdock_agents.chaser.perception.model.alignment import Alignment, Pyramid
 from chaserdock_agents.chaser.perception.model.mesh import TrackerMesh
 from chaserdock_agents.chaser.perception.model.perception import ModelPerception
 from chaserdock_agents.chaser.perception.refine import PoseInCamera
-from chaserdock_agents.chaser.sighting import geometry_message
-from chaserdock_controller.estimation.target_shape import ShapeFilter, seen_place
+from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.camera import Camera
-from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
+from chaserdock_models.meshes import with_geometry_errors
 from chaserdock_models.satellites import satellite
-from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import PoseSolution
 from chaserdock_protocol.scenario.camera import Effects
-from chaserdock_protocol.scenario.navigation import NavigationSection
-from chaserdock_world.rendering.background import SPACE_LEVEL, Earth, Light
+from chaserdock_world.rendering.background import Light
 from chaserdock_world.rendering.effects import CameraEffects
-from chaserdock_world.rendering.mesh_renderer import MeshRenderer
-from common import Figures, Group, Options, Results, described
+from common import Figures, Group, KeptResults, Options, described
 from markerless_cases import backlit_view, perturbed, random_view
 from numpy.typing import NDArray
 
-CAMERA = Camera.from_hfov(960, 540, np.deg2rad(60.0))
+from .shape_scene import (
+    CAMERA,
+    EXACT,
+    KNOWN,
+    NEAR_PRIOR,
+    PANEL_SIGMA_RAD,
+    PRIOR,
+    RIGHT_ANGLE,
+    SCALE_SIGMA,
+    TARGET,
+    CamerasAround,
+    SatelliteImages,
+    drawn_mesh,
+    earth_behind,
+    error_of,
+    inspected,
+    is_gross,
+    track,
+)
+
 RANGES_M = (1.0, 3.0, 10.0)
-TARGET = "geo_servicer"
-EXACT = TrackerMesh.of_mesh(satellite(TARGET), 0.0, 0.0)
-KNOWN = satellite(TARGET, 0.001)
-EARTH_RADIUS_RAD = 1.1
-PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
-PRIOR, NEAR_PRIOR = (0.01, np.deg2rad(1.5)), (0.003, np.deg2rad(0.3))
 FLIGHT_IMAGES = 30
 TURN = np.deg2rad(4.0) / 15.0 * np.array([0.6, 0.64, 0.48])
 """Turn of a tumbling target from image to image."""
 LEAST_GREY = 5.0
+"""A darker target is not seen by anyone."""
 MOST_UNSEEN = 120
-HALF_TURN = np.diag([-1.0, 1.0, -1.0])
-RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0])))
+"""Images within which a target must be acquired: eight seconds."""
 
 ViewRow = dict[str, float]
 """Figures of one view."""
-LAB = NavigationSection(grade="lab").errors()
-"""Errors of odometry and cameras of grade `lab`."""
-_EXPOSURES, _BLUR_PX, _LAMP = 8, 4.0, 60.0
+_BLUR_PX, _LAMP = 4.0, 60.0
+"""Blur of an image in pixels, power of the lamp (that of `harsh-light`)."""
 _SHADED = (
     (1.5, (0.3, -0.5, 1.0)),
     (1.0, (-0.2, 0.3, 1.0)),
@@ -79,62 +83,9 @@ _SHADED = (
 )
 """Ranges, and directions of the sun behind the target."""
 _SHADED_IMAGES = 40
-_VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
-"""Views of an inspection, and views of each mesh after it."""
-
-
-class SatelliteImages:
-    """Images of the satellite by the world's renderer, with the default effects of the camera."""
-
-    def __init__(self, earth: Earth | None = None) -> None:
-        self._renderer = MeshRenderer(CAMERA, satellite(TARGET), earth, Effects().point_spread_px)
-        self._effects = CameraEffects(CAMERA.width_px, CAMERA.height_px, Effects(), 11)
-
-    def image(self, pose: PoseInCamera, light: Light, number: int) -> NDArray[np.uint8]:
-        """Return the image (h, w)."""
-        q = rotations.from_matrix(pose.rotation)
-        exact = self._renderer.render(np.zeros(3), rotations.IDENTITY, pose.position, q, (), light)
-        return self._effects.apply(exact, 0, number)
-
-    def mean_grey(self, image: NDArray[np.uint8], pose: PoseInCamera) -> float:
-        """Return the mean grey level of the target in an image (h, w)."""
-        return float(
-            image[self.coverage(pose.position, rotations.from_matrix(pose.rotation))].mean()
-        )
-
-    def blurred(
-        self, pose: PoseInCamera, step_m: Array, light: Light, number: int
-    ) -> NDArray[np.uint8]:
-        """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure,
-        ``pose`` in the middle of it.
-        """
-        q, total = (
-            rotations.from_matrix(pose.rotation),
-            np.zeros((CAMERA.height_px, CAMERA.width_px)),
-        )
-        shares = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
-        for share in shares:
-            at = pose.position + share * step_m
-            total += self._renderer.render(np.zeros(3), rotations.IDENTITY, at, q, (), light)
-        return self._effects.apply(np.rint(total / _EXPOSURES).astype(np.uint8), 0, number)
-
-    def coverage(self, position: Array, q: Array) -> NDArray[np.bool_]:
-        """Return the mask (h, w) of the pixels on the target: those that light from everywhere
-        brightens.
-        """
-        light = Light((0.0, 0.0, -1.0), 0.0, 1.0)
-        image = self._renderer.render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
-        return image > SPACE_LEVEL + 4
-
-
-def error_of(pose: PoseInCamera, truth: PoseInCamera) -> tuple[float, float]:
-    """Return the error in m and rad."""
-    error = tracking.pose_error(pose, truth)
-    return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
-
-
-def is_gross(error: tuple[float, float], range_m: float) -> bool:
-    return error[0] > 0.02 * range_m or error[1] > np.deg2rad(2.0)
+"""Images of each turning target."""
+_VIEWS_AFTER = 12
+"""Views of each mesh after it."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +105,7 @@ class Cells:
         or that of the cell ``like``.
         """
         stream = zlib.crc32((like or cell).encode())
-        return Results(self.path, {"cell": cell}, ViewRow).of(
+        return KeptResults(self.path, {"cell": cell}, ViewRow).of(
             range(views), lambda number: view(np.random.default_rng([stream, number]), number)
         )
 
@@ -189,7 +140,7 @@ def inspect(views: int) -> Figures:
         for k in range(_VIEWS_AFTER):
             pose, light = random_view(rng, 1.0, CAMERA)
             image = scene.image(pose, light, 1000 * number + 500 + k)
-            found = _track(image, corrected, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
+            found = track(image, corrected, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
             if found is None or not tracking.is_valid(found):
                 rejected += 1
                 continue
@@ -207,70 +158,6 @@ def inspect(views: int) -> Figures:
     }
 
 
-@dataclass(frozen=True)
-class CamerasAround:
-    """Cameras around the target at one time, with odometry of grade `lab`: ``turns``, (3, 3), of
-    their axes about the target, and ``shifts_m`` (n, 3) of their lenses, which flight software does
-    not know."""
-
-    turns: tuple[Array, ...]
-    shifts_m: Array
-
-    @classmethod
-    def drawn(cls, turns: tuple[Array, ...], rng: np.random.Generator) -> CamerasAround:
-        return cls(turns, rng.normal(0.0, LAB.camera_shift_m, (len(turns), 3)))
-
-    def fused(
-        self, before: ShapeFilter, mesh: TrackerMesh, scene: SatelliteImages, rng: np.random.Generator, first: int, inspect: bool
-    ) -> ShapeFilter:  # fmt: skip
-        """Return the geometry after one image of each camera at 1 to 1.6 m: by their distances, and
-        if they ``inspect`` by each.
-        """
-        fused, count, seen_from = before, len(mesh.modes_m), []
-        pose, light = random_view(rng, 1.0, CAMERA)
-        for number, turn in enumerate(self.turns):
-            aside, _ = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
-            seen = PoseInCamera(aside.position, turn @ pose.rotation)
-            image = scene.image(
-                seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), first + number
-            )
-            lens_m = seen.rotation.T @ (self.shifts_m[number] - seen.position)
-            lens_m += rng.normal(0.0, LAB.position_noise_m, 3)
-            found = _track(image, mesh, perturbed(seen, rng, *PRIOR))
-            if found is None or not tracking.is_valid(found):
-                continue
-            if inspect:
-                direction = -found.pose.rotation.T @ found.pose.position
-                direction /= np.linalg.norm(direction)
-                fused = fused.with_view(direction, found.geometry.matrix, found.geometry.vector)
-            solution = PoseSolution(
-                position_m=vector(found.pose.position),
-                q_wxyz=vector(rotations.from_matrix(found.pose.rotation)),
-                covariance=vector(found.covariance),
-                reprojection_rms_px=found.rms_px,
-            )
-            place = seen_place(solution, geometry_message(found.geometry), count)
-            seen_from += [] if place is None else [(place, lens_m)]
-        sigma_m, common_m = np.sqrt(2.0) * LAB.position_noise_m, np.sqrt(2.0) * LAB.camera_shift_m
-        for (a, lens_a), (b, lens_b) in itertools.combinations(seen_from, 2):
-            length_m = float(np.linalg.norm(lens_a - lens_b))
-            fused = fused.with_baseline(a, b, length_m, float(sigma_m), float(common_m))
-        return fused
-
-
-def inspected(
-    scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int
-) -> ShapeFilter:
-    """Return the geometry by the views of two cameras on opposite sides of the target."""
-    cameras, fused = (
-        CamerasAround.drawn((np.eye(3), HALF_TURN), rng),
-        ShapeFilter.prior(len(mesh.modes_m)),
-    )
-    for number in range(0, _VIEWS_BEFORE, 2):
-        fused = cameras.fused(fused, mesh, scene, rng, first + number, inspect=True)
-    return fused
-
-
 def triangulated(cells: Cells, range_m: float, views: int) -> Figures:
     """Track single images after one image of each of four cameras around the target, whose
     distances tell the scale.
@@ -279,7 +166,7 @@ def triangulated(cells: Cells, range_m: float, views: int) -> Figures:
     turns = tuple(np.linalg.matrix_power(quarter, k) for k in range(4))
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        mesh = _drawn_mesh(rng)
+        mesh = drawn_mesh(rng)
         before = ShapeFilter.prior(len(mesh.modes_m))
         fused = CamerasAround.drawn(turns, rng).fused(
             before, mesh, scene, rng, 5 * number, inspect=False
@@ -299,7 +186,7 @@ def tracked_view(
     """Return the result of tracking one image."""
     _ = mesh.suns  # made once in a flight
     begin_s = time.process_time()
-    found = _track(image, mesh, prior)
+    found = track(image, mesh, prior)
     took_s = time.process_time() - begin_s
     if found is None:
         return {"s": took_s, "valid": 0.0, "wrong": 1.0}
@@ -338,7 +225,7 @@ def track_cell(cells: Cells, name: str, range_m: float, views: int) -> Figures:
     scene = SatelliteImages()
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        mesh = _drawn_mesh(rng) if name == "knowledge" else EXACT
+        mesh = drawn_mesh(rng) if name == "knowledge" else EXACT
         pose, light = random_view(rng, range_m, CAMERA)
         image = scene.image(pose, light, number)
         return tracked_view(image, mesh, pose, perturbed(pose, rng, *PRIOR))
@@ -352,7 +239,7 @@ def crossed(cells: Cells, range_m: float, views: int) -> Figures:
     scene = SatelliteImages()
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        mesh = _drawn_mesh(rng)
+        mesh = drawn_mesh(rng)
         pose, light = random_view(rng, range_m, CAMERA)
         total, weighted, took_s = np.zeros((6, 6)), np.zeros(6), 0.0
         for turn in (np.eye(3), RIGHT_ANGLE):
@@ -360,7 +247,7 @@ def crossed(cells: Cells, range_m: float, views: int) -> Figures:
             image = scene.image(seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), number)
             prior = perturbed(seen, rng, *PRIOR)
             begin_s = time.process_time()
-            found = _track(image, mesh, prior)
+            found = track(image, mesh, prior)
             took_s += time.process_time() - begin_s
             if found is None or not tracking.is_valid(found):
                 return {"s": took_s, "valid": 0.0, "wrong": 0.0}
@@ -395,7 +282,7 @@ def independent(cells: Cells, name: str, range_m: float, views: int) -> Figures:
     tracker = TrackerMesh.of_mesh(mesh, 0.0, 0.0)
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        drawn = tracker if name == "independent" else _drawn_mesh(rng, plain(KNOWN))
+        drawn = tracker if name == "independent" else drawn_mesh(rng, plain(KNOWN))
         pose, light = random_view(rng, range_m, CAMERA)
         exact = trace(
             mesh, CAMERA, pose.position, rotations.from_matrix(pose.rotation), light, 3
@@ -534,11 +421,6 @@ def blur(cells: Cells, views: int) -> Figures:
     return tracking_figures("blur", cells.rows("blur", views, view))
 
 
-def earth_behind(rng: np.random.Generator) -> Earth:
-    """Draw the place of the Earth behind a target."""
-    return Earth((rng.normal(0.0, 0.5), rng.normal(0.0, 0.5), 1.0), EARTH_RADIUS_RAD)
-
-
 def gate(cells: Cells, views: int) -> Figures:
     """Track from priors that are mostly too far off."""
     scene = SatelliteImages()
@@ -666,18 +548,6 @@ def shaded(images: int) -> Figures:
     }
 
 
-def _track(image: NDArray[np.uint8], mesh: TrackerMesh, prior: PoseInCamera) -> Alignment | None:
-    refined = tracking.refine_from_prior(Pyramid(image, CAMERA), mesh, prior)
-    return refined[0] if refined else None
-
-
-def _drawn_mesh(rng: np.random.Generator, known: TriangleMesh = KNOWN) -> TrackerMesh:
-    """Return a tracker mesh with drawn errors."""
-    turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in known.joints}
-    wrong = with_geometry_errors(known, rng.normal(0.0, SCALE_SIGMA), turns)
-    return TrackerMesh.of_mesh(wrong, PANEL_SIGMA_RAD, SCALE_SIGMA)
-
-
 def _quantiles(key: str, errors: Array) -> Figures:
     out: Figures = {}
     for share in (50, 95):
@@ -726,8 +596,8 @@ AT_RANGES: dict[str, tuple[Callable[[Cells, float, int], Figures], str]] = {
 VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     "inspect": (
         lambda _, views: inspect(views),
-        "Track at 1 m after the geometry has been estimated by the controller's filter from 36 views "
-        "at 1 to 1.6 m, by two cameras on opposite sides: twelve views of each drawn mesh.",
+        "Track at 1 m after the geometry has been estimated by the controller's filter from 36 "
+        "views at 1 to 1.6 m, by two cameras on opposite sides: twelve views of each drawn mesh.",
     ),
     "behind": (behind, "Track at 1 to 3 m in front of the Earth."),
     "backlit": (backlit, "Track at 1 to 3 m with the sun behind the target."),
@@ -744,13 +614,13 @@ VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     ),
     "blur": (
         blur,
-        "Track at 1 to 3 m a target that moves by four pixels during the exposure; the pose is that "
-        "in the middle of it.",
+        "Track at 1 to 3 m a target that moves by four pixels during the exposure; the pose is "
+        "that in the middle of it.",
     ),
     "gate": (
         gate,
-        "Track from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and "
-        "those that pass the gate.",
+        "Track from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, "
+        "and those that pass the gate.",
     ),
     "acquisition": (
         lambda cells, views: acquire(cells, "acquisition", views),
@@ -774,8 +644,8 @@ VIEWS: dict[str, tuple[Callable[[Cells, int], Figures], str]] = {
     ),
     "shaded": (
         lambda _, views: shaded(min(views, _SHADED_IMAGES)),
-        "Time images of the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that others "
-        "expect: the least of three repetitions, as other programs on the machine prolong it.",
+        "Time images of the shaded side of tumbling targets at 0.8 to 2.2 m, from poses that "
+        "others expect: the least of three repetitions, as other programs prolong it.",
     ),
 }
 
@@ -786,13 +656,13 @@ def views_of(options: Options) -> int:
 
 
 def run_at_ranges(name: str, options: Options) -> Figures:
-    """Measure a cell at the ranges of the options."""
+    """Run a cell at the ranges of the options."""
     cells = Cells(options.results)
     return at_ranges(AT_RANGES[name][0], cells, options.ranges, views_of(options))
 
 
 def run_views(name: str, options: Options) -> Figures:
-    """Measure a cell."""
+    """Run a cell."""
     return VIEWS[name][0](Cells(options.results), views_of(options))
 
 

@@ -38,7 +38,9 @@ from chaserdock.launch.launcher import Fleet, fly_mission, free_port
 SCENARIO = ROOT / "scenarios" / "fault-drill.toml"
 CHASERS = 4
 OUTAGE_S = 3.0
+"""Longer than the lease, so that the standby takes over."""
 LEASE_MS = 2000
+"""Of the router's links."""
 EARLIEST_S, LATEST_S = 7.0, 14.0
 """Times of the fault: chasers 0 and 3 have been approaching since 5 s."""
 
@@ -118,8 +120,10 @@ class TakeoverObserver:
 
 @dataclass(frozen=True)
 class Takeover:
-    """Outcome of one flight. ``takeover_s``: from the fault to the first command of another
-    controller; infinite if none.
+    """How a standby took over in one flight.
+
+    ``takeover_s``: from the fault to the first command of another controller; infinite without one.
+    ``two_commanding``: commands of an older term that a chaser executed after one of a newer term.
     """
 
     takeover_s: float
@@ -259,7 +263,7 @@ def takeovers(name: str, flights: int) -> Figures:
 
 
 def is_identical(at_s: float) -> bool:
-    """Return whether all bodies move identically in lock-step with and without a killed controller."""
+    """Return whether all bodies move identically in lock-step if the controller is killed."""
     truths = []
     for fault in ("[]", f'[{{kind="kill", at_s={at_s}, process="controller"}}]'):
         with tempfile.TemporaryDirectory() as name:
@@ -271,7 +275,7 @@ def is_identical(at_s: float) -> bool:
 
 
 def identity(options: Options) -> Figures:
-    """Compare pairs of lock-step flights, one with the controller killed: bodies move identically."""
+    """Compare pairs of lock-step flights, one with the controller killed: equal motion."""
     pairs = 1 if options.quick else 2
     draw = random.Random("identity")
     same = [is_identical(round(draw.uniform(EARLIEST_S, LATEST_S), 1)) for _ in range(pairs)]

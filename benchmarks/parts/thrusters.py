@@ -20,10 +20,11 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from common import Figures, Group, Options
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.flight_record import FlightRecord, record_flight
+from chaserdock.experiments.flight_record import FlightRecord, record_flight
 
 FAILED_AT_S = 30.01  # just after a tick: the longest time until two whole ticks are observed
 PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.045, 0.03)}
+"""Rates of the paper's target."""
 
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -63,7 +64,7 @@ def fly(s: Scenario) -> FlightRecord:
 
 
 def allocation(options: Options) -> Figures:
-    """Measure accuracy and time of the allocation of random feasible wrenches, up to full thrust."""
+    """Measure accuracy and time of the allocation of random wrenches, up to full thrust."""
     out: Figures = {}
     for body in ("tetra12", "slider"):
         rng = np.random.default_rng(1)
@@ -206,7 +207,8 @@ def failures(options: Options) -> Figures:
             peaks.append((float(errors[0].max()), float(errors[1].max())))
             final.append(record.rms(record.time_s[-1] - 10.0)[0])
             print(
-                f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, peak {peaks[-1][0] * 1e3:.1f} mm, "
+                f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, "
+                f"peak {peaks[-1][0] * 1e3:.1f} mm, "
                 f"{math.degrees(peaks[-1][1]):.2f} deg; {record.thruster_events}",
                 file=sys.stderr,
             )
@@ -239,8 +241,13 @@ def healthy(options: Options) -> Figures:
         target = {
             key: _randomly_rotated(rng, np.array(v) * times) for key, v in PAPER_RATES.items()
         }
-        s = scenario(40.0 if options.quick else 60.0, ("tetra12", "slider")[seed % 2], (15, 10, 30)[seed % 3], start=start,
-                     target=target)  # fmt: skip
+        s = scenario(
+            40.0 if options.quick else 60.0,
+            ("tetra12", "slider")[seed % 2],
+            (15, 10, 30)[seed % 3],
+            start=start,
+            target=target,
+        )
         record = record_flight(s, measurement_model(s, seed, 0.002, math.radians(0.1)))
         alarms += len(record.thruster_events)
         for event in record.thruster_events:

@@ -27,8 +27,8 @@ _NEAR_M = 0.02
 """Least depth (m) of what is drawn, so that no division overflows. Chosen; bodies are farther away.
 """
 _SHIFT = 4
-"""Bits of OpenCV's fixed-point coordinates behind the point: 1/16 px, finer than antialiasing shows.
-"""
+"""Bits of OpenCV's fixed-point coordinates behind the point: 1/16 px, finer than antialiasing
+shows."""
 _SPACE = (26, 21, 18)
 """Colour (BGR, 0 to 255) of space without a background. Chosen."""
 _TARGET_PATH = (150, 150, 150)
@@ -46,8 +46,8 @@ def tint(chaser: int) -> Array:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera aimed at ``centre_m`` (WRF) from a distance of ``distance_m``: azimuth and elevation
-    in WRF, radians.
+    """A camera that looks at a point. ``centre_m`` (3,), WRF: that point, in the middle of the
+    image. ``distance_m``, ``azimuth_rad``, ``elevation_rad``: where it is from there, in WRF.
     """
 
     centre_m: Array
@@ -93,8 +93,8 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class RenderedBodies:
-    """Bodies as rendered (`body_renderer`): ``behind`` and ``bgr`` (h, w, 3), space without and
-    with them; ``covered`` (h, w).
+    """Rendered bodies over a background (`body_renderer`). ``bgr`` (h, w, 3): the image.
+    ``behind`` (h, w, 3): the same without bodies. ``covered`` (h, w): pixels that a body covers.
     """
 
     behind: BgrImage

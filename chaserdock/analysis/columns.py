@@ -19,7 +19,8 @@ _MAX_IN_MEMORY = 1 << 17
 
 
 class Columns:
-    """Rows of ``width`` numbers. Data beyond 1 MB moves to a temporary file (in ``TMPDIR``).
+    """A table that grows row by row, of ``width`` numbers each. Beyond 1 MB it moves to a
+    temporary file (in ``TMPDIR``).
 
     Methods raise ChaserdockError when that file cannot be written.
     """
@@ -40,13 +41,16 @@ class Columns:
         try:
             if self._file is None:
                 # Unbuffered: the memory map must see all data.
-                self._file = tempfile.TemporaryFile(prefix="chaserdock-", buffering=0)  # noqa: SIM115
+                self._file = tempfile.TemporaryFile(  # noqa: SIM115
+                    prefix="chaserdock-", buffering=0
+                )
             rest = memoryview(self._data).cast("B")
             while rest:
                 rest = rest[self._file.write(rest) :]
         except OSError as error:
             raise ChaserdockError(
-                f"{tempfile.gettempdir()}: cannot store the tables of the flight: {error.strerror or error}; "
+                f"{tempfile.gettempdir()}: cannot store the tables of the flight: "
+                f"{error.strerror or error}; "
                 "TMPDIR selects another folder"
             ) from None
         self._data = array("d")

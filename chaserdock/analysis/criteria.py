@@ -15,8 +15,8 @@ from chaserdock_protocol.scenario import Scenario
 from .flight import LoadHistory, RecordedFlight
 
 _CONTACT_SLACK_M = 0.02
-"""Distance (m) by which a chaser in contact may be nearer than latched: by its tilt and the spring of
-its probe. Chosen."""
+"""Distance (m) by which a chaser in contact may be nearer than latched: by its tilt and the spring
+of its probe. Chosen."""
 _VERIFIED = ("verified", "identify", "detumble", "stack_hold")
 """Phases of a chaser whose latch has passed the test."""
 
@@ -81,11 +81,13 @@ def overloads(result: dict[str, Any], s: Scenario) -> list[str]:
             load, what = c["capture"]["port_load"], quantity.split("_")[1]
             if load is None:
                 out.append(
-                    f"chaser {i}: largest {what} on its port: unknown, at most {limit:g} {unit} allowed"
+                    f"chaser {i}: largest {what} on its port: unknown, at most {limit:g} {unit} "
+                    "allowed"
                 )
             elif load[quantity] > limit:
                 out.append(
-                    f"chaser {i}: largest {what} on its port: {load[quantity]:.4g} {unit}, at most {limit:g} {unit} allowed; "
+                    f"chaser {i}: largest {what} on its port: {load[quantity]:.4g} {unit}, at most "
+                    f"{limit:g} {unit} allowed; "
                     f"exceeded from {load['limit_exceeded_s']:.2f} s on"
                 )
     return out
@@ -130,7 +132,8 @@ def capture_text(capture: dict[str, Any]) -> str:
     if capture["latch_time_s"] is None:
         return f"; {capture_state(capture)}"
     return (
-        f"; {capture_state(capture)}, latched at {capture['latch_time_s']:.1f} s: {capture['contact_lateral_m'] * 1e3:.2f} mm and "
+        f"; {capture_state(capture)}, latched at {capture['latch_time_s']:.1f} s: "
+        f"{capture['contact_lateral_m'] * 1e3:.2f} mm and "
         f"{np.degrees(capture['contact_angle_rad']):.2f} deg off, closing at "
         f"{capture['contact_closing_m_s'] * 1e3:.1f} mm/s"
     )
@@ -179,7 +182,8 @@ def rest_failures(result: dict[str, Any], s: Scenario) -> list[str]:
     if stack is None:
         return ["the log has no truth to judge success.detumbled"]
     return [
-        f"the stack moves at {stack['speed_m_s'] * 1e3:.2f} mm/s and {np.degrees(stack['rate_rad_s']):.3f} degrees/s; at most "
+        f"the stack moves at {stack['speed_m_s'] * 1e3:.2f} mm/s and "
+        f"{np.degrees(stack['rate_rad_s']):.3f} degrees/s; at most "
         f"{limits.speed_m_s * 1e3:g} mm/s and {limits.rate_deg_s:g} degrees/s allowed"
     ]
 
@@ -216,7 +220,8 @@ def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[s
     took_s = time_s - goal[0]
     if success.reached_within_s is not None and took_s > success.reached_within_s:
         return [
-            f"chaser {chaser} reached its goal after {took_s:.1f} s, at most {success.reached_within_s:g} s allowed"
+            f"chaser {chaser} reached its goal after {took_s:.1f} s, at most "
+            f"{success.reached_within_s:g} s allowed"
         ]
     return []
 
@@ -262,14 +267,16 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
         left = tuple(i for i in success.arrival.chasers if i not in late)
         changes["arrival"] = success.arrival.model_copy(update={"chasers": left}) if left else None
         skipped += [
-            f"success.arrival, chaser {i}: the flight ends at {scenario.duration_s:g} s, its goto is at {first_s:g} s"
+            f"success.arrival, chaser {i}: the flight ends at {scenario.duration_s:g} s, its goto "
+            f"is at {first_s:g} s"
             for i, first_s in late.items()
         ]
     first_s = min((e.at_s for e in scenario.timeline if e.command == "detumble"), default=None)
     if success.detumbled is not None and first_s is not None and first_s >= scenario.duration_s:
         changes["detumbled"] = None
         skipped.append(
-            f"success.detumbled: the flight ends at {scenario.duration_s:g} s, detumble is at {first_s:g} s"
+            f"success.detumbled: the flight ends at {scenario.duration_s:g} s, detumble is at "
+            f"{first_s:g} s"
         )
     return scenario.model_copy(update={"success": success.model_copy(update=changes)}), skipped
 

@@ -175,7 +175,8 @@ def _mark_phases(axes: Axes, flight: RecordedFlight, labelled: bool) -> None:
 
 @_figure(
     "Tracking errors",
-    "Distance and angle of each chaser from its reference pose on the true target. Shaded: steady-state "
+    "Distance and angle of each chaser from its reference pose on the true target. Shaded: "
+    "steady-state "
     "interval.",
 )
 def tracking(flight: RecordedFlight, _: Traces) -> Figure:
@@ -205,7 +206,8 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
 
 @_figure(
     "Tracking errors by axis",
-    "Pose of each chaser minus its reference pose on the true target: position in target axes, orientation as a rotation vector "
+    "Pose of each chaser minus its reference pose on the true target: position in target axes, "
+    "orientation as a rotation vector "
     "in chaser axes.",
 )
 def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
@@ -283,8 +285,10 @@ def keep_out(flight: RecordedFlight, chaser: int) -> tuple[Array, Array]:
 
 @_figure(
     "Docking",
-    "Distance between the centres of chaser and target, and the closing speed. Dotted, in the colour of the chaser: the limits "
-    "that hold for it at that time (keep-out distance, none once it is latched; closing speed in the phases that limit it).",
+    "Distance between the centres of chaser and target, and the closing speed. Dotted, in the "
+    "colour of the chaser: the limits "
+    "that hold for it at that time (keep-out distance, none once it is latched; closing speed in "
+    "the phases that limit it).",
 )
 def docking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
@@ -333,7 +337,8 @@ def _docks_at_distance(flight: RecordedFlight, chaser: int) -> bool:
 
 @_figure(
     "Loads at the ports",
-    "Largest force and torque that each latched chaser exerts on its port, over the physics steps of each tick; thin: the part "
+    "Largest force and torque that each latched chaser exerts on its port, over the physics steps "
+    "of each tick; thin: the part "
     "of the force across the port's axis. The steps in which a latch closes are left out.",
 )
 def loads(flight: RecordedFlight, _: Traces) -> Figure:
@@ -378,7 +383,8 @@ def loads(flight: RecordedFlight, _: Traces) -> Figure:
 
 @_figure(
     "Identified mass properties",
-    "Mass, centre of mass and inertia of the target alone, as identified in flight, with a band of two standard deviations; "
+    "Mass, centre of mass and inertia of the target alone, as identified in flight, with a band of "
+    "two standard deviations; "
     "dashed: true values; dotted: values stated in the scenario.",
 )
 def identification(flight: RecordedFlight, _: Traces) -> Figure:
@@ -412,7 +418,8 @@ def identification(flight: RecordedFlight, _: Traces) -> Figure:
 
 @_figure(
     "Passive safety",
-    "Margin of the coasts after a loss of all thrust at any state of the newest plan, in standard deviations; dashed: the margin "
+    "Margin of the coasts after a loss of all thrust at any state of the newest plan, in standard "
+    "deviations; dashed: the margin "
     "of a plan that counts as passively safe.",
 )
 def passive_safety(flight: RecordedFlight, _: Traces) -> Figure:
@@ -459,7 +466,8 @@ def separation(flight: RecordedFlight, _: Traces) -> Figure:
 
 @_figure(
     "Actuator forces and torques",
-    "Applied force and torque, body axes, mean over each tick; dashed: limits of the planned force and torque. Pulses of thrusters "
+    "Applied force and torque, body axes, mean over each tick; dashed: limits of the planned force "
+    "and torque. Pulses of thrusters "
     "may exceed them within a tick; dotted: all thrusters of an axis open.",
 )
 def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
@@ -576,7 +584,8 @@ def component_errors(flight: RecordedFlight) -> tuple[Array, Array, Array]:
 
 @_figure(
     "Errors of the target estimate",
-    "Truth minus estimate by axis, with the filter's three-sigma bounds (position and velocity WRF, "
+    "Truth minus estimate by axis, with the filter's three-sigma bounds (position and velocity "
+    "WRF, "
     "attitude and rate TRF).",
 )
 def estimate(flight: RecordedFlight, _: Traces) -> Figure:
@@ -632,8 +641,10 @@ def consistency_text(nees: Array, low: float, high: float) -> str:
 
 @_figure(
     "Consistency of the target estimate",
-    "Normalized estimation error squared (NEES) of the pose, six degrees of freedom. A consistent filter "
-    "has 95 % of its values within the band; values above it indicate an overconfident filter, values "
+    "Normalized estimation error squared (NEES) of the pose, six degrees of freedom. A consistent "
+    "filter "
+    "has 95 % of its values within the band; values above it indicate an overconfident filter, "
+    "values "
     "below it a conservative one.",
 )
 def consistency(flight: RecordedFlight, _: Traces) -> Figure:
@@ -714,8 +725,8 @@ def _distribution(axes: Axes, values: Array, number: int) -> None:
 
 
 class _FewTicks(LogLocator):
-    """Ticks at 1, 2 and 5 of each decade; over more than two decades at its beginning only, so that
-    labels do not touch.
+    """Ticks of a logarithmic axis: at 1, 2 and 5 of each decade. An axis of more than two decades
+    has them at 1 only, so that labels do not touch.
     """
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
@@ -771,7 +782,8 @@ def solver(flight: RecordedFlight, _: Traces) -> Figure:
 
 @_figure(
     "Latency",
-    "Wall-clock time from the publication of an image to the actuator command of its tick. In lock-step "
+    "Wall-clock time from the publication of an image to the actuator command of its tick. In "
+    "lock-step "
     "it reflects the load of the machine and does not affect the flight.",
 )
 def latency(_: RecordedFlight, traces: Traces) -> Figure:

@@ -97,11 +97,11 @@ class Tracks(Mapping[str, Track]):
 
 @dataclass
 class ReferenceHistory:
-    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s)
-    and name of its phases.
+    """What a chaser was to follow. ``offset_m`` (K, 3), TRF: commanded offsets, each from
+    ``time_s`` (K,) on. ``phases``: start (s) and name of each.
 
-    ``keep_out`` (L, 2): from a time (s) on, the distance from the target's centre that its plan
-    keeps, m; 0: none, it is latched.
+    ``keep_out`` (L, 2): times (s), and the distance (m) from the target's centre that the plan
+    keeps from then on; 0 while the chaser is latched, which keeps none.
     """
 
     time_s: Array

@@ -50,8 +50,8 @@ def pairs(log: Path, chasers: int) -> Iterator[Pair]:
 def shots(
     log: Path, chasers: int, every_s: float, first_s: float = 0.0
 ) -> Iterator[tuple[float, dict[int, Pair]]]:
-    """Yield at ``first_s`` and then ``every_s`` (simulated seconds) the time and each chaser's
-    latest image up to then.
+    """Yield the latest image of each chaser at regular times: at ``first_s``, then ``every_s``
+    (simulated time, s), with that time.
 
     The last item lies at or after the last image; there is none if that precedes ``first_s``. Where
     the log is not ordered by time, an image may be older by one than necessary.

@@ -117,13 +117,15 @@ def _failures(i: int, found: RendezvousResult, s: Scenario) -> Iterator[str]:
     cone = success.approach_cone
     if cone is not None and angle is not None and math.degrees(angle) > cone.half_angle_deg:
         yield (
-            f"chaser {i} was {math.degrees(angle):.4g} degrees off the axis of success.approach_cone within {cone.within_m:g} m; at "
+            f"chaser {i} was {math.degrees(angle):.4g} degrees off the axis of "
+            f"success.approach_cone within {cone.within_m:g} m; at "
             f"most {cone.half_angle_deg:g} degrees allowed"
         )
     yield from _arrival_failures(i, found["arrived_s"], s)
     if success.abort_clear_m is not None and clear is not None and clear < success.abort_clear_m:
         yield (
-            f"chaser {i} came within a cube of half edge {clear:.4g} m about the target after its abort; it must stay out of "
+            f"chaser {i} came within a cube of half edge {clear:.4g} m about the target after its "
+            "abort; it must stay out of "
             f"{success.abort_clear_m:g} m"
         )
 

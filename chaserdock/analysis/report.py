@@ -59,7 +59,8 @@ def report_of(log: Path) -> str:
         svg = to_inline_svg(figure, kind.name, kind.title)
         figures.append(
             f'<h3 id="figure-{kind.name}">{escape(kind.title)}</h3>\n<figure>'
-            f'<figcaption>{escape(kind.caption)}</figcaption>\n<div class="wide">{svg}</div></figure>'
+            f"<figcaption>{escape(kind.caption)}</figcaption>\n<div "
+            f'class="wide">{svg}</div></figure>'
         )
     replay, script = "", ""
     if "target" in flight.truth:
@@ -68,7 +69,8 @@ def report_of(log: Path) -> str:
         # "</" would end the script element.
         text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
         code = (PAGE_FILES / "replay.js").read_text(encoding="utf-8")
-        script = f'<script type="application/json" id="replay-data">{text}</script>\n<script>\n{code}</script>'
+        stored = f'<script type="application/json" id="replay-data">{text}</script>'
+        script = f"{stored}\n<script>\n{code}</script>"
     else:
         missing.insert(0, "3-D replay: the log holds no ground truth of the target.")
     body = [
@@ -130,7 +132,8 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
     return (
         f"<h1>{escape(s.name)}</h1><p>{escape(s.description)}</p>\n<p>{verdict} "
         f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '
-        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed {s.seed}; "
+        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed "
+        f"{s.seed}; "
         f"digest {escape(result['digest'][:16])}</span></p>\n<nav>{links}</nav>"
     )
 
@@ -220,13 +223,22 @@ def _captures(result: dict[str, Any]) -> str:
         for i, c in result["chasers"].items()
         if (k := c.get("capture")) is not None
     ]
-    head = ("", "at the end", "latched at", "lateral offset", "misalignment", "closing speed", "lateral speed",
-            "touches of the probe")  # fmt: skip
+    head = (
+        "",
+        "at the end",
+        "latched at",
+        "lateral offset",
+        "misalignment",
+        "closing speed",
+        "lateral speed",
+        "touches of the probe",
+    )
     if not rows:
         return ""
     return (
         f"<h2>Capture</h2>{table(head, rows)}"
-        '<p class="faint">Offset, misalignment and speeds at the touch that closed the latch. Verified: the latch held in the '
+        '<p class="faint">Offset, misalignment and speeds at the touch that closed the latch. '
+        "Verified: the latch held in the "
         "pull test.</p>"
     )
 
@@ -246,8 +258,15 @@ def _rendezvous(result: dict[str, Any]) -> str:
         for i, c in result["chasers"].items()
         if (k := c.get("rendezvous")) is not None
     ]
-    head = ("", "least margin to the speed limit", "largest angle from the cone's axis", "arrived at", "speed on arrival",
-            "aborted at", "clear of the target since")  # fmt: skip
+    head = (
+        "",
+        "least margin to the speed limit",
+        "largest angle from the cone's axis",
+        "arrived at",
+        "speed on arrival",
+        "aborted at",
+        "clear of the target since",
+    )
     return f"<h2>Rendezvous</h2>{table(head, rows)}" if rows else ""
 
 
@@ -281,7 +300,8 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
     ]
     return (
-        f'<div class="pair"><section><h2>Target estimate</h2>{table(("", "RMS", "largest error"), estimate)}'
+        '<div class="pair"><section><h2>Target '
+        f"estimate</h2>{table(('', 'RMS', 'largest error'), estimate)}"
         f'<p class="faint">Fused estimate relative to ground truth at the time of exposure, from '
         f"{flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
@@ -305,7 +325,8 @@ def _identified(flight: RecordedFlight) -> str:
     cells = [(r.name, r.target, r.stated, r.true, r.off, r.stack) for r in rows]
     return (
         f'<h2 id="identified">Identified mass properties</h2>{table(head, cells)}'
-        f'<p class="faint">At {last.sim_time_ns / 1e9:.1f} s, with one standard deviation. Centre of mass and inertia about it in '
+        f'<p class="faint">At {last.sim_time_ns / 1e9:.1f} s, with one standard deviation. Centre '
+        "of mass and inertia about it in "
         "TRF axes. Stated: what the controllers know before the flight.</p>"
     )
 
@@ -333,9 +354,17 @@ def _drawn(flight: RecordedFlight) -> str:
         for b in flight.drawn
     ]
     quantities = (
-        "mass, kg (stated)", "inertia xx, yy, zz, kg m²", "centre of mass, mm", "force, mN", "torque, mN m",
-        "thrust, %", "camera turn, deg", "camera shift, mm", "focal length, %", "gyro bias, deg/s",
-    )  # fmt: skip
+        "mass, kg (stated)",
+        "inertia xx, yy, zz, kg m²",
+        "centre of mass, mm",
+        "force, mN",
+        "torque, mN m",
+        "thrust, %",
+        "camera turn, deg",
+        "camera shift, mm",
+        "focal length, %",
+        "gyro bias, deg/s",
+    )
     # One column per body: with one per quantity, even a wide screen would cut the table off.
     rows = list(zip(quantities, *columns, strict=True))
     head = ("", *(b.body for b in flight.drawn))
@@ -354,7 +383,8 @@ def _replay(data: dict[str, Any]) -> str:
     width = 256 if len(cameras) <= 2 else 210 if len(cameras) == 3 else 190
     images = "".join(f'<img data-chaser="{i}" alt="image of chaser {i}">' for i in cameras)
     views = (
-        f'<div id="replay-views" style="grid-template-columns: repeat({columns}, 1fr); width: {width * columns}px">'
+        f'<div id="replay-views" style="grid-template-columns: repeat({columns}, 1fr); width: '
+        f'{width * columns}px">'
         f"{images}</div>"
     )
     rows = "".join(f'<tr id="replay-row-{c["id"]}"></tr>' for c in data["chasers"])
@@ -364,18 +394,19 @@ def _replay(data: dict[str, Any]) -> str:
     )
     return f"""<h2 id="replay-section">Replay</h2>
 <div class="player">
-<div class="stage"><canvas id="replay" tabindex="0" role="img" aria-label="target and chasers in three dimensions">
-</canvas>{views}</div>
+<div class="stage"><canvas id="replay" tabindex="0" role="img"
+aria-label="target and chasers in three dimensions"></canvas>{views}</div>
 <div class="controls"><button id="replay-play" type="button">Play</button>
 <input id="replay-time" type="range" min="0" max="{end}" step="0.05" value="0" aria-label="time">
 <span id="replay-clock"></span>
 <label>speed <select id="replay-speed">{speeds}</select></label>
 <label><input id="replay-ride" type="checkbox"> target frame</label></div>
 <div class="wide"><table>
-<thead><tr><th></th><th>phase</th><th>distance to target</th><th>position error</th><th>image</th></tr></thead>
+<thead><tr><th></th><th>phase</th><th>distance to target</th>
+<th>position error</th><th>image</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
-<p class="faint">Drag to rotate, wheel to zoom; or arrow keys, + and −; space starts and stops. Ground truth. A camera frustum is
-bright while its image is used. Chasers have the colours of the figures.</p>
+<p class="faint">Drag to rotate, wheel to zoom; or arrow keys, + and −; space starts and stops. Ground truth.
+A camera frustum is bright while its image is used. Chasers have the colours of the figures.</p>
 </div>"""  # noqa: RUF001
 
 
@@ -394,9 +425,11 @@ def _events(result: dict[str, Any], seekable: bool) -> str:
         time_s = event["time_s"]
         label = f"{time_s:.2f} s"
         if seekable:
-            label = f'<button type="button" data-time="{time_s:.3f}" title="show in the replay">{label}</button>'
+            shown = f'data-time="{time_s:.3f}" title="show in the replay"'
+            label = f'<button type="button" {shown}>{label}</button>'
         rows.append(f'<tr><td>{label}</td><td class="text">{escape(event["what"])}</td></tr>')
-    return f'<h2 id="events">Events</h2><div class="wide"><table><tbody>{"".join(rows)}</tbody></table></div>'
+    lines = f"<table><tbody>{''.join(rows)}</tbody></table>"
+    return f'<h2 id="events">Events</h2><div class="wide">{lines}</div>'
 
 
 def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
@@ -417,6 +450,7 @@ def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
         f"<details><summary>Messages</summary>{table(('topic', 'in the log', 'lost'), messages)}"
         + (f"<h3>Rejected on receipt</h3>{table(('reason', 'count'), refused)}" if refused else "")
         + "</details>"
-        f"<details><summary>Summary as JSON</summary><pre>{escape(json.dumps(result, indent=2))}</pre></details>"
+        "<details><summary>Summary as "
+        f"JSON</summary><pre>{escape(json.dumps(result, indent=2))}</pre></details>"
         f'<h2 id="versions">Run and versions</h2>{table(("", ""), [*run, *versions], text=True)}'
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies of a mission as coloured faces in body axes, for the 3-D replay, the video and the viewer."""
+"""Bodies of a mission as coloured faces in body axes, for 3-D replay, video and viewer."""
 
 from __future__ import annotations
 

@@ -210,6 +210,10 @@ def _greatest(x: Array) -> float | None:
     return float(np.max(x)) if len(x) else None
 
 
+def _time_of_greatest(x: Array, time_s: Array) -> float | None:
+    return float(time_s[np.argmax(x)]) if len(x) else None
+
+
 def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
     out: dict[str, float | None] = {
         n: float(np.percentile(x, p)) if len(x) else None for n, p in names.items()
@@ -307,6 +311,9 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             **_pose_figures(errors, s.settling_s),
             "velocity_rms_m_s": _rms(errors["velocity_m_s"][late]),
             "omega_rms_rad_s": _rms(errors["omega_rad_s"][late]),
+            "max_orientation_error_at_s": _time_of_greatest(
+                errors["orientation_rad"][late], errors["time_s"][late]
+            ),
         },
         "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
         "late_commands": flight.world.late_commands,
@@ -373,7 +380,8 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         and nearest < s.limits.min_distance_chasers_m
     ):
         out.append(
-            f"two chasers came within {nearest:.3f} m; the limit is {s.limits.min_distance_chasers_m:g} m"
+            f"two chasers came within {nearest:.3f} m; the limit is "
+            f"{s.limits.min_distance_chasers_m:g} m"
         )
     for i, c in result["chasers"].items():
         distance = c["min_distance_target_m"]
@@ -450,7 +458,8 @@ def text_of(result: dict[str, Any]) -> str:
     """Format the summary as a few lines of text."""
     factor = result["sim_time_s"] / result["wall_time_s"] if result["wall_time_s"] else 0.0
     lines = [
-        f"{result['scenario']}: {'success' if result['success'] else 'FAILED'}; {result['sim_time_s']:.1f} s flown in "
+        f"{result['scenario']}: {'success' if result['success'] else 'FAILED'}; "
+        f"{result['sim_time_s']:.1f} s flown in "
         f"{result['wall_time_s']:.1f} s ({factor:.2f} x real time), digest {result['digest'][:16]}"
     ]
     for i, c in result["chasers"].items():
@@ -482,12 +491,14 @@ def text_of(result: dict[str, Any]) -> str:
             f"  target estimate: RMS {estimate['position_rms_m'] * 1e3:.2f} mm, "
             f"{math.degrees(estimate['orientation_rms_rad']):.3f} deg; largest error "
             f"{estimate['max_position_error_m'] * 1e3:.2f} mm, "
-            f"{math.degrees(estimate['max_orientation_error_rad']):.3f} deg; mean NEES {estimate['nees_mean']:.2f} of 6"
+            f"{math.degrees(estimate['max_orientation_error_rad']):.3f} deg; mean NEES "
+            f"{estimate['nees_mean']:.2f} of 6"
         )
     if result["mode"] == "realtime" and result["latency_s"]["p50"] is not None:
         latency = result["latency_s"]
         lines.append(
-            f"  exposure to command: median {latency['p50'] * 1e3:.1f} ms, p99 {latency['p99'] * 1e3:.1f} ms; "
+            f"  exposure to command: median {latency['p50'] * 1e3:.1f} ms, p99 "
+            f"{latency['p99'] * 1e3:.1f} ms; "
             f"{result['late_commands']} commands late, {result['unanswered']} missing"
         )
     lines += [f"  not met: {failure}" for failure in result["failures"]]

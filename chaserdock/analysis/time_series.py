@@ -62,8 +62,8 @@ class ActuatorHistory:
 
 @dataclass
 class Traces:
-    """Time series by chaser. ``latency``: rows of exposure time (s) and wall-clock seconds to the
-    actuator command.
+    """Time series of each chaser, by number. ``latency``: rows of the time of an exposure (s) and
+    the wall-clock time from it to the command of the actuators (s).
     """
 
     inputs: dict[int, ActuatorHistory]

@@ -228,7 +228,7 @@ class _ExternalView:
         return image
 
     def _background(self, look: Viewpoint) -> BgrImage:
-        """Return stars and Earth as the simulated cameras see them; the view's direction is fixed."""
+        """Return stars and Earth as the simulated cameras see them, in the direction of view."""
         if self._sky is None:
             disc = earth_disc(self.flight.scenario)
             space = Background(
@@ -242,7 +242,7 @@ class _ExternalView:
     def _rendered(
         self, look: Viewpoint, at: BodyPose, chasers: dict[int, BodyPose]
     ) -> RenderedBodies | None:
-        """Return the bodies as rendered; None for a target without a mesh, whose faces are drawn."""
+        """Return the rendered bodies; None for a target without a mesh, whose faces are drawn."""
         if self._mesh is None:
             return None
         size = (look.width_px, look.height_px)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera calibration and printable marker sheets."""
+"""Calibration of a camera from images of a board."""

@@ -19,8 +19,13 @@ from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 LEAST_IMAGES = 6
+"""Usable images: twice the three that determine a camera matrix (Z. Zhang, 2000), for distortion
+and for outliers."""
 _LEAST_CORNERS = 8
+"""Corners in an image: twice the four that determine the pose of a plane."""
 _OUTLIER_RATIO, _OUTLIER_PX = 3.0, 0.5
+"""RMS error of an outlier: above this multiple of the median, and above this many pixels, which
+sharp corners do not reach."""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -34,8 +39,8 @@ class TooFew(Exception):
 
 @dataclass(frozen=True)
 class Board:
-    """``points_m`` (n, 3): inner corners; ``charuco``: OpenCV's board, or None for a chessboard of
-    ``size`` corners.
+    """A calibration board. ``points_m`` (n, 3): inner corners, in board axes. ``charuco``: OpenCV's
+    board; None for a chessboard, which has ``size`` corners.
     """
 
     points_m: NDArray[np.float32]
@@ -45,8 +50,11 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibration:
-    """``matrix`` (3, 3), ``distortion`` (5,) k1, k2, p1, p2, k3; ``sigma`` (4,): one standard
-    deviation of fx, fy, cx, cy, pixels; ``rms_px``: by used image; ``excluded``: reason by image.
+    """A calibrated camera and how well the images fit it.
+
+    ``matrix`` (3, 3), pixels. ``distortion`` (5,): k1, k2, p1, p2, k3. ``sigma`` (4,): standard
+    deviations of fx, fy, cx and cy, pixels. ``rms_px``: error of each image that was used.
+    ``excluded``: why each other image was not.
     """
 
     width_px: int

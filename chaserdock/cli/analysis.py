@@ -1,15 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that look at a recorded flight: summary, report, figures, video, snapshot."""
+"""Commands that look at a flight: judge, report, video."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from .options import JsonOpt, LogArg, fail, print_result
+from .options import (
+    FromOpt,
+    LinkOptions,
+    LogArg,
+    QuietOpt,
+    ToOpt,
+    errors_as_json,
+    fail,
+    print_result,
+    refuse_options,
+    show_of,
+    with_link_options,
+)
 
 
 class FigureFormat(StrEnum):
@@ -20,10 +33,50 @@ class FigureFormat(StrEnum):
     pdf = "pdf"
 
 
-def summary(log: LogArg, as_json: JsonOpt = False) -> None:
-    """Judge a recorded flight again and print its summary. Status 0 only if the flight is a
-    success.
-    """
+@with_link_options("listen")
+def judge(
+    context: typer.Context,
+    log: Annotated[
+        Path,
+        typer.Argument(
+            help="folder of a run, or its mission.mcap; --live: what `record --by-run` writes to"
+        ),
+    ],
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live", help="watch a mission that other machines fly, and wait for its log"
+        ),
+    ] = False,
+    *,
+    link: LinkOptions,
+    timeout: Annotated[
+        float, typer.Option(min=0.1, help="--live: seconds to wait for a mission")
+    ] = 120.0,
+    world_timeout: Annotated[
+        float,
+        typer.Option(min=0.1, help="--live: seconds after which an absent world counts as lost"),
+    ] = 60.0,
+    quiet: QuietOpt = False,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json", help="print the summary as one JSON object; --live: JSON lines (docs/cli.md)"
+        ),
+    ] = False,
+) -> None:
+    """Judge a flight and print its summary. Status 0 only if it is a success."""
+    if live:
+        from chaserdock.launch.judge import judge_mission
+
+        show = show_of(quiet, as_json)
+        with errors_as_json(as_json):
+            status = judge_mission(log, link.link(timeout_s=timeout), timeout, world_timeout, show)
+        raise typer.Exit(status)
+    link_options = (f.name for f in fields(LinkOptions))
+    refuse_options(
+        context, ("timeout", "world_timeout", "quiet", *link_options), "only with --live"
+    )
     from chaserdock.analysis.summary import summarize, text_of
 
     result = summarize(log)
@@ -32,37 +85,80 @@ def summary(log: LogArg, as_json: JsonOpt = False) -> None:
 
 
 def report(
+    context: typer.Context,
     log: LogArg,
     out: Annotated[
-        Path | None, typer.Option(help="page to write; report.html beside the log by default")
+        Path | None,
+        typer.Option(
+            help="page to write, report.html beside the log by default; --figures: folder; "
+            "--at: image, .png or .jpg"
+        ),
     ] = None,
+    figures: Annotated[
+        bool,
+        typer.Option(
+            "--figures",
+            help="draw figures instead, one file each: trajectories, errors, distances, inputs, "
+            "estimate, cameras",
+        ),
+    ] = False,
+    format: Annotated[
+        FigureFormat, typer.Option("--format", help="--figures: file format")
+    ] = FigureFormat.svg,
+    at: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="draw what every camera saw at this simulated time, seconds, with detections, "
+            "instead",
+        ),
+    ] = None,
+    width: Annotated[
+        int, typer.Option(min=64, max=4096, help="--at: width of each camera image, pixels")
+    ] = 640,
 ) -> None:
     """Write a self-contained page about a recorded flight: verdict, tables, 3-D replay, figures,
-    events, scenario.
+    events, scenario. Or only figures, or one picture of what the cameras saw.
     """
-    from chaserdock.analysis.report import write_report
+    if not figures:
+        refuse_options(context, ("format",), "only with --figures")
+    if at is None:
+        refuse_options(context, ("width",), "only with --at")
+    if not figures and at is None:
+        from chaserdock.analysis.report import write_report
 
-    print(write_report(log, out))
+        print(write_report(log, out))
+        return
+    if figures and at is not None:
+        raise fail("--figures and --at exclude each other")
+    if out is None:
+        raise fail("--out: needed with --figures and --at")
+    if at is None:
+        _draw_figures(log, out, format.value)
+    else:
+        _draw_cameras(log, out, at, width)
 
 
-def figures(
-    log: LogArg,
-    out: Annotated[Path, typer.Option(help="folder to write to")],
-    format: Annotated[
-        FigureFormat, typer.Option("--format", help="file format")
-    ] = FigureFormat.svg,
-) -> None:
-    """Draw figures of a recorded flight, one file each: trajectories, errors, distances, inputs,
-    estimate, cameras.
-    """
+def _draw_figures(log: Path, out: Path, format: str) -> None:
     from chaserdock.analysis.figures import write_figures
 
-    files, missing = write_figures(log, out, format.value)
+    files, missing = write_figures(log, out, format)
     for file in files:
         print(file)
     for name, reason in missing.items():
         print(f"{name}: not drawn: {reason}")
     raise typer.Exit(0 if files else 1)
+
+
+def _draw_cameras(log: Path, out: Path, at_s: float, width: int) -> None:
+    import cv2
+
+    from chaserdock.analysis.snapshot import snapshot
+
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise fail(f"--out {out}: must end in .png or .jpg")
+    if not cv2.imwrite(str(out), snapshot(log, at_s, width)):
+        raise fail(f"--out {out}: cannot be written")
 
 
 def video(
@@ -74,15 +170,8 @@ def video(
     fps: Annotated[int, typer.Option(min=1, max=60, help="frames per second of video")] = 15,
     width: Annotated[int, typer.Option(min=320, max=3840, help="pixels, even")] = 1280,
     height: Annotated[int, typer.Option(min=180, max=2160, help="pixels, even")] = 720,
-    from_s: Annotated[
-        float, typer.Option("--from", min=0.0, help="simulated time of the first frame, seconds")
-    ] = 0.0,
-    to_s: Annotated[
-        float | None,
-        typer.Option(
-            "--to", min=0.0, help="simulated time of the last frame, seconds; the end by default"
-        ),
-    ] = None,
+    from_s: FromOpt = 0.0,
+    to_s: ToOpt = None,
     quality: Annotated[int, typer.Option(min=0, max=100, help=".webp: image quality")] = 60,
 ) -> None:
     """Render a recorded flight as a video: an outside view beside the camera images with their
@@ -93,22 +182,3 @@ def video(
     window_s = (from_s, float("inf") if to_s is None else to_s)
     number = write_video(log, out, speed, fps, width, height, window_s, quality)
     print(f"{out}: {number} frames, {number / fps:.1f} s")
-
-
-def snapshot(
-    log: LogArg,
-    at: Annotated[float, typer.Option(min=0.0, help="simulated time, seconds")],
-    out: Annotated[Path, typer.Option(help="image to write: .png or .jpg")],
-    width: Annotated[
-        int, typer.Option(min=64, max=4096, help="width of each camera image, pixels")
-    ] = 640,
-) -> None:
-    """Draw what every camera saw at one time of a recorded flight, with detections."""
-    import cv2
-
-    from chaserdock.analysis.snapshot import snapshot as draw
-
-    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise fail(f"--out {out}: must end in .png or .jpg")
-    if not cv2.imwrite(str(out), draw(log, at, width)):
-        raise fail(f"--out {out}: cannot be written")

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from .options import JsonOpt, LogArg, SetOpt, fail, print_result
+from .options import JsonOpt, LogArg, SetOpt, print_result
 
 ToleranceOpt = Annotated[
     float,
@@ -27,8 +27,8 @@ def replay(
         str,
         typer.Option(
             metavar="STAGE",
-            help="part of the software: perception, fusion, controller, or one that a package provides "
-            "(entry points of `chaserdock.replays`)",
+            help="part of the software: perception, fusion, controller, or one that a package "
+            "provides (entry points of `chaserdock.replays`)",
         ),
     ],
     overrides: SetOpt = None,
@@ -81,6 +81,10 @@ def reproduce(
     out: Annotated[
         Path, typer.Option(help="folder for results and page; a second call resumes there")
     ] = Path("runs/reproduce"),
+    jobs: Annotated[
+        int,
+        typer.Option(min=1, help="concurrent flights; more than one disturbs the solve times"),
+    ] = 1,
 ) -> None:
     """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and
     .html.
@@ -88,31 +92,9 @@ def reproduce(
     The paper's chain needs its solver, OpEn: the extra chaserdock[open] and Rust's cargo. Without
     them the page lacks that chain, and the status is 1.
     """
-    from chaserdock_protocol.process import SINGLE_THREADED
+    from chaserdock.experiments.reproduction.reproduce import reproduce as fly_all
 
-    os.environ |= SINGLE_THREADED  # as in flight; must precede the import of NumPy
-    from chaserdock.reproduce.main import reproduce as fly_all
-
-    raise typer.Exit(fly_all(quick, out))
-
-
-def study(
-    cases: Annotated[
-        Path,
-        typer.Argument(
-            help="cases, one JSON object per line (StudyCase in chaserdock/evaluation/study_cases.py)"
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="results are appended to this file")],
-) -> None:
-    """Fly a file of cases in one process: with perfect knowledge of the target, or with images and
-    an estimator.
-    """
-    if not cases.is_file():
-        raise fail(f"{cases}: no such file")
-    from chaserdock.evaluation.study import main as fly_cases
-
-    raise typer.Exit(fly_cases(cases, out))
+    raise typer.Exit(fly_all(quick, out, jobs))
 
 
 def check(

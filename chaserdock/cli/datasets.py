@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands for labelled images: ``chaserdock dataset`` and ``chaserdock evaluate …``."""
+"""``chaserdock dataset``: labelled images, and the scores of a perception on them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import Annotated
 
 import typer
 
-from .help import add_command, command_group
-from .options import JsonOpt, ScenarioArg, SetOpt, complete_scenario, fail, print_result
+from .options import JsonOpt, SetOpt, complete_scenario, fail, print_result, refuse_options
 
 
 class LayoutOption(StrEnum):
@@ -45,19 +44,37 @@ def _show_progress(label: str, total: int, quiet: bool) -> Callable[[int], None]
 
 
 def dataset(
-    scenario: ScenarioArg,
-    images: Annotated[int, typer.Option(min=1, max=1_000_000, help="number of images")],
-    out: Annotated[Path, typer.Option(help="folder to write; a new one")],
+    context: typer.Context,
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="folder of a dataset (ours, or in the SPEED+ or BOP format) to score a perception "
+            "on; with --out: scenario whose target is drawn",
+            autocompletion=complete_scenario,
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="draw a dataset into this folder, a new one")
+    ] = None,
+    images: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1_000_000,
+            help="--out: number of images; scoring: use the first so many only",
+        ),
+    ] = None,
     layout: Annotated[
-        LayoutOption, typer.Option("--format", help="layout of images and labels")
+        LayoutOption, typer.Option("--format", help="--out: layout of images and labels")
     ] = LayoutOption.both,
     seed: Annotated[
-        int, typer.Option(min=0, max=2**32 - 1, help="seed of views, noise and geometry errors")
+        int,
+        typer.Option(min=0, max=2**32 - 1, help="--out: seed of views, noise and geometry errors"),
     ] = 0,
     range_m: Annotated[
         tuple[float, float],
         typer.Option(
-            "--range", metavar="LEAST MOST", help="distance of the target, m, log-uniform"
+            "--range", metavar="LEAST MOST", help="--out: distance of the target, m, log-uniform"
         ),
     ] = (1.0, 3.0),
     offset: Annotated[
@@ -65,24 +82,52 @@ def dataset(
         typer.Option(
             min=0.0,
             max=1.0,
-            help="largest distance of the target from the middle, share of half the image",
+            help="--out: largest distance of the target from the middle, share of half the image",
         ),
     ] = 0.2,
     phase: Annotated[
         tuple[float, float],
         typer.Option(
-            metavar="LEAST MOST", help="angle at the target between sun and camera, degrees"
+            metavar="LEAST MOST", help="--out: angle at the target between sun and camera, degrees"
         ),
     ] = (0.0, 120.0),
     validation: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="share of the images for validation")
+        float, typer.Option(min=0.0, max=1.0, help="--out: share of the images for validation")
     ] = 0.2,
     overrides: SetOpt = None,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--perception",
+            help="scoring: model, default, paper, an installed plugin, or MODULE:CLASS; the "
+            "scenario's by default",
+        ),
+    ] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            help="scoring: scenario with the target's geometry; for datasets from elsewhere",
+            autocompletion=complete_scenario,
+        ),
+    ] = None,
+    split: Annotated[
+        SplitOption, typer.Option(help="scoring: part of the dataset")
+    ] = SplitOption.validation,
+    as_json: JsonOpt = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
 ) -> None:
-    """Export images of random views of a scenario's target with pose labels, in the SPEED+ and BOP
-    formats.
+    """Score a perception on labelled images (SPEED score, ADD); or draw such images: random views
+    of a scenario's target with pose labels, in the SPEED+ and BOP formats.
     """
+    if out is None:
+        drawing = ("layout", "seed", "range_m", "offset", "phase", "validation", "overrides")
+        refuse_options(context, drawing, "only with --out")
+        _score(Path(source), name, scenario, split, images, as_json, quiet)
+        return
+    refuse_options(context, ("name", "scenario", "split", "as_json"), "not with --out")
+    if images is None:
+        raise fail("--images: needed with --out")
+
     from chaserdock_protocol.scenario import load_scenario
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
@@ -92,7 +137,7 @@ def dataset(
 
     limits = ViewLimits(range_m, offset, phase)
     sets = (EXACT_CAMERA, f"seed={seed}", *(overrides or ()))
-    loaded = load_scenario(find_scenario(scenario), sets)
+    loaded = load_scenario(find_scenario(source), sets)
     layouts: tuple[Layout, ...] = (
         ("bop", "speed+") if layout is LayoutOption.both else (layout.value,)
     )
@@ -101,44 +146,16 @@ def dataset(
     print(f"{out}: {images} images of {loaded.target.model}, {' and '.join(layouts)}, seed {seed}")
 
 
-evaluate = command_group("evaluate", "Score parts of the flight software on data.")
-
-
-@evaluate.callback()
-def group() -> None:
-    """Score parts of the flight software on data."""
-
-
-def perception(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DATASET",
-            help="folder of `chaserdock dataset`, or one in the SPEED+ or BOP format",
-        ),
-    ],
-    name: Annotated[
-        str | None,
-        typer.Option(
-            "--perception",
-            help="model, default, paper, an installed plugin, or MODULE:CLASS; the scenario's by default",
-        ),
-    ] = None,
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            help="scenario with the target's geometry; for datasets from elsewhere",
-            autocompletion=complete_scenario,
-        ),
-    ] = None,
-    split: Annotated[
-        SplitOption, typer.Option(help="part of the dataset")
-    ] = SplitOption.validation,
-    images: Annotated[int | None, typer.Option(min=1, help="use the first images only")] = None,
-    as_json: JsonOpt = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
+def _score(
+    folder: Path,
+    name: str | None,
+    scenario: str | None,
+    split: SplitOption,
+    images: int | None,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
-    """Score a perception on labelled images: SPEED score and ADD."""
+    """Print the scores of a perception."""
     from chaserdock_protocol.scenario import flight_scenario, load_scenario
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
@@ -178,7 +195,8 @@ def _table(title: str, f: dict[str, float]) -> list[str]:
     add = "add_s" if "add_s_right_share" in f else "add"
     lines = [title, f"images {count}, with a pose {found} ({found / count:.1%})"]
     lines += [
-        f"SPEED score {year}: {f[f'speed_score_{year}']:.5f} over all images, {f[f'speed_score_{year}_with_pose']:.5f} over poses"
+        f"SPEED score {year}: {f[f'speed_score_{year}']:.5f} over all images, "
+        f"{f[f'speed_score_{year}_with_pose']:.5f} over poses"
         for year in ("2019", "2021")
     ]
     lines.append(f"{'':24}{'mean':>12}{'p50':>12}{'p95':>12}")
@@ -196,12 +214,11 @@ def _table(title: str, f: dict[str, float]) -> list[str]:
             )
     if f"{add}_right_share" in f:
         lines.append(
-            f"{add.upper().replace('_', '-')} below 10 % of {f['diameter_m']:.3f} m: {f[f'{add}_right_share']:.1%} of all images"
+            f"{add.upper().replace('_', '-')} below 10 % of {f['diameter_m']:.3f} m: "
+            f"{f[f'{add}_right_share']:.1%} of all images"
         )
     lines.append(
-        f"CPU time per image: {1e3 * f['cpu_s_mean']:.1f} ms mean, {1e3 * f['cpu_s_max']:.1f} ms max"
+        f"CPU time per image: {1e3 * f['cpu_s_mean']:.1f} ms mean, {1e3 * f['cpu_s_max']:.1f} ms "
+        "max"
     )
     return lines
-
-
-add_command(evaluate, perception)

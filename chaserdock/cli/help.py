@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command and group classes: grouped help that loads nothing but typer, and one check that every
-number is finite.
+"""Classes of the program and its commands: help by panel that loads nothing but typer, and one
+check that every number is finite.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -26,19 +26,15 @@ class FiniteCommand(TyperCommand):
             value = ctx.params.get(param.name)
             values = cast("Sequence[Any]", value if isinstance(value, list | tuple) else [value])
             if any(isinstance(v, float) and not math.isfinite(v) for v in values):
-                raise typer.BadParameter("must be a finite number", ctx=ctx, param=param)  # type: ignore[arg-type]
+                text = "must be a finite number"
+                raise typer.BadParameter(text, ctx=ctx, param=param)  # type: ignore[arg-type]
         return super().invoke(ctx)
 
 
-class GroupedHelp(TyperGroup):
-    """Print ``COMMAND … --help`` before typer prepares to parse values (which loads pydantic),
-    commands by panel.
-
-    ``panel_order``: panels in the order of the help; others follow (typer lists groups after
-    commands).
+class ProgramHelp(TyperGroup):
+    """Print ``COMMAND … --help`` before typer prepares to parse values (which loads pydantic), and
+    list the commands by panel.
     """
-
-    panel_order: ClassVar[tuple[str, ...]] = ()
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         own = args[: args.index("--")] if "--" in args else args
@@ -47,8 +43,6 @@ class GroupedHelp(TyperGroup):
             inner = command.context_class(
                 command, info_name=args[0], parent=ctx, **(command.context_settings or {})
             )
-            if isinstance(command, GroupedHelp) and args[1] in command.commands:
-                command.parse_args(inner, args[1:])
             typer.echo(command.get_help(inner))
             ctx.exit()
         return super().parse_args(ctx, args)
@@ -60,12 +54,11 @@ class GroupedHelp(TyperGroup):
                 formatter.write_dl([(name, first_sentence(c.help)) for name, c in commands.items()])
 
 
-def panels_of(group: GroupedHelp) -> dict[str, dict[str, Any]]:
-    """Return the commands of a group by panel, in the order of the help."""
-    panels: dict[str, dict[str, Any]] = {panel: {} for panel in group.panel_order}
-    for name, command in group.commands.items():
-        panel = getattr(command, "rich_help_panel", None)
-        panels.setdefault(panel if isinstance(panel, str) else "Commands", {})[name] = command
+def panels_of(program: Any) -> dict[str, dict[str, Any]]:
+    """Return the commands of the program by panel, in the order of the help."""
+    panels: dict[str, dict[str, Any]] = {}
+    for name, command in program.commands.items():
+        panels.setdefault(str(getattr(command, "rich_help_panel", "")), {})[name] = command
     return panels
 
 
@@ -75,18 +68,6 @@ def first_sentence(text: str | None) -> str:
     return line.partition(". ")[0].removesuffix(".")
 
 
-def command_group(name: str, description: str) -> typer.Typer:
-    """Return a group of commands, ``chaserdock NAME …``."""
-    return typer.Typer(
-        name=name,
-        cls=GroupedHelp,
-        context_settings=HELP_OPTIONS,
-        rich_markup_mode=None,
-        help=description,
-        no_args_is_help=True,
-    )
-
-
 def add_command(app: typer.Typer, function: Callable[..., None], **options: Any) -> None:
-    """Add a function to a program or group as a command."""
+    """Add a function to a program as a command."""
     app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS, **options)(function)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands for recorded logs: ``chaserdock log …``."""
+"""Commands for recorded logs: ``chaserdock log`` and ``chaserdock play``."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ import typer
 
 from chaserdock.exit_codes import DONE, STOPPED
 
-from .help import add_command, command_group
-from .options import JsonOpt, LinkOptions, print_result, with_link_options
-
-app = command_group("log", "Inspect, repair, export and play a log.")
-
-LogFilesArg = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="LOG", help="folder of a run, its mission.mcap, or the files of a rotated log"
-    ),
-]
-FolderOpt = Annotated[Path, typer.Option("--out", help="folder to write into")]
+from .options import (
+    FromOpt,
+    JsonOpt,
+    LinkOptions,
+    LogFilesArg,
+    ToOpt,
+    fail,
+    print_result,
+    refuse_options,
+    with_link_options,
+)
 
 
 class ExportFormat(StrEnum):
@@ -32,6 +31,7 @@ class ExportFormat(StrEnum):
 
     parquet = "parquet"
     csv = "csv"
+    tum = "tum"
     rosbag2 = "rosbag2"
 
 
@@ -39,10 +39,58 @@ def _source(log: list[Path]) -> Path | list[Path]:
     return log[0] if len(log) == 1 else log
 
 
-def info(log: LogFilesArg, as_json: JsonOpt = False) -> None:
-    """Check all of a log and print what it holds. Status 1 when it is incomplete (cut off, messages
-    lost or rejected).
+def log(
+    context: typer.Context,
+    log: LogFilesArg,
+    export: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="write the log's content into this folder")
+    ] = None,
+    format: Annotated[
+        ExportFormat,
+        typer.Option(
+            help="--export: a table per topic as parquet (with types and units) or csv; tum: "
+            "trajectories of truth, estimate, odometry and references; rosbag2: a bag of ROS 2 "
+            "(MCAP), which needs chaserdock[ros2]"
+        ),
+    ] = ExportFormat.parquet,
+    images: Annotated[
+        bool, typer.Option("--images", help="--export: include the images; not in tum")
+    ] = False,
+    from_s: FromOpt = 0.0,
+    to_s: ToOpt = None,
+    recover: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="copy the readable messages of a damaged log into a new one"
+        ),
+    ] = None,
+    as_json: JsonOpt = False,
+) -> None:
+    """Check all of a log and print what it holds; or export it, or repair it. Status 1 when it is
+    incomplete (cut off, messages lost or rejected).
+
+    --from and --to limit trajectories (--format tum).
     """
+    if export is not None and recover is not None:
+        raise fail("--export and --recover exclude each other")
+    if export is None:
+        refuse_options(context, ("format", "images"), "only with --export")
+    else:
+        refuse_options(context, ("as_json",), "not with --export")
+    if format is ExportFormat.tum:
+        refuse_options(context, ("images",), "not with --format tum")
+    else:
+        refuse_options(context, ("from_s", "to_s"), "only with --format tum")
+    if export is not None:
+        _export(log, export, format, images, (from_s, math.inf if to_s is None else to_s))
+    elif recover is not None:
+        _recover(log, recover, as_json)
+    else:
+        _check(log, as_json)
+
+
+def _check(log: list[Path], as_json: bool) -> None:
+    """Print what a log holds."""
     import msgspec
 
     from chaserdock.logs.info import info_lines, info_of
@@ -54,76 +102,49 @@ def info(log: LogFilesArg, as_json: JsonOpt = False) -> None:
     raise typer.Exit(0 if result.whole else 1)
 
 
-def recover(
-    log: Annotated[Path, typer.Argument(help="log that is cut off or damaged")],
-    out: Annotated[Path, typer.Option(help="file to write the readable messages to")],
-    as_json: JsonOpt = False,
+def _export(
+    log: list[Path], out: Path, format: ExportFormat, images: bool, window_s: tuple[float, float]
 ) -> None:
-    """Copy the readable messages of a damaged log to a new one. Status 1 when messages in its
-    middle are lost.
-    """
+    """Write a log in another format."""
+    source = _source(log)
+    if format is ExportFormat.tum:
+        from chaserdock.logs.tracks import write_tracks
+
+        written, unit = write_tracks(source, out, *window_s), "points"
+    elif format is ExportFormat.rosbag2:
+        from chaserdock.logs.rosbag import export_bag
+
+        for topic, messages in export_bag(source, out, images).items():
+            print(f"{topic}: {messages} messages")
+        return
+    else:
+        from chaserdock.logs.export import export
+
+        written, unit = export(source, out, format.value, images), "rows"
+    for name, number in written.items():
+        print(f"{out / name}: {number} {unit}")
+
+
+def _recover(log: list[Path], out: Path, as_json: bool) -> None:
+    """Copy what is readable; exit with status 1 when messages in the middle of the log are lost."""
     import msgspec
 
-    from chaserdock.logs.recover import recover as recover_log
+    from chaserdock.logs.recover import recover
 
-    result = recover_log(log, out)
+    if len(log) > 1:
+        raise fail("--recover: needs one log")
+    result = recover(log[0], out)
     lines = [f"{out}: {result.messages} messages in {result.chunks} chunks recovered"]
     if result.skipped_bytes:
         lines.append(f"{result.skipped_bytes} bytes are not readable")
     lost = result.broken_records or result.messages_without_channel
     if lost:
         lines.append(
-            f"lost: {result.broken_records} damaged records, {result.messages_without_channel} messages whose "
-            "channel is declared in one of them"
+            f"lost: {result.broken_records} damaged records, {result.messages_without_channel} "
+            "messages whose channel is declared in one of them"
         )
     print_result(as_json, msgspec.to_builtins(result), lines)
     raise typer.Exit(1 if lost else 0)
-
-
-def export(
-    log: LogFilesArg,
-    out: FolderOpt,
-    format: Annotated[
-        ExportFormat,
-        typer.Option(
-            help="parquet keeps types and units; csv is readable everywhere; rosbag2 is a bag of ROS 2 (MCAP), "
-            "which needs chaserdock[ros2]"
-        ),
-    ] = ExportFormat.parquet,
-    images: Annotated[bool, typer.Option("--images", help="include the images")] = False,
-) -> None:
-    """Write one table per topic, all chasers together, or a bag of ROS 2."""
-    if format is ExportFormat.rosbag2:
-        from chaserdock.logs.rosbag import export_bag
-
-        for topic, messages in export_bag(_source(log), out, images).items():
-            print(f"{topic}: {messages} messages")
-        return
-    from chaserdock.logs.export import export as write
-
-    for name, rows in write(_source(log), out, format.value, images).items():
-        print(f"{out / name}: {rows} rows")
-
-
-def tracks(
-    log: LogFilesArg,
-    out: FolderOpt,
-    from_s: Annotated[
-        float, typer.Option("--from", min=0.0, help="simulated time of the first point, seconds")
-    ] = 0.0,
-    to_s: Annotated[
-        float | None,
-        typer.Option(
-            "--to", min=0.0, help="simulated time of the last point, seconds; the end by default"
-        ),
-    ] = None,
-) -> None:
-    """Write trajectories as TUM files: truth of all bodies, target estimate, odometry, references."""
-    from chaserdock.logs.tracks import write_tracks
-
-    end_s = math.inf if to_s is None else to_s
-    for name, points in write_tracks(_source(log), out, from_s, end_s).items():
-        print(f"{out / name}: {points} points")
 
 
 @with_link_options("keys", "lease")
@@ -151,7 +172,3 @@ def play(
     )
     print(f"{count} messages sent")
     raise typer.Exit(STOPPED if signal()() else DONE)
-
-
-for member in (info, recover, export, tracks, play):
-    add_command(app, member)

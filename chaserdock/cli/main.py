@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``chaserdock`` program: all commands by group. Exit statuses: ``chaserdock.exit_codes``."""
+"""The ``chaserdock`` program: all commands. Exit statuses: ``chaserdock.exit_codes``."""
 
 from __future__ import annotations
 
 import gc
 import os
 import sys
+from collections.abc import Callable
 from importlib import metadata
 from typing import Annotated, Any
 
@@ -15,46 +16,41 @@ from typer.exceptions import TyperException
 
 from chaserdock.exit_codes import FAILED
 
-from . import logs, mesh, scenario
-from .analysis import figures, report, snapshot, summary, video
-from .compare import check, compare, replay, reproduce, study
-from .datasets import dataset, evaluate
-from .help import HELP_OPTIONS, GroupedHelp, add_command
-from .operate import command, status, thruster_fault, view
+from .analysis import judge, report, video
+from .calibrate import calibrate
+from .compare import check, compare, replay, reproduce
+from .datasets import dataset
+from .deploy import deploy
+from .help import HELP_OPTIONS, ProgramHelp, add_command
+from .logs import log, play
+from .operate import command, status, view
 from .options import fail
 from .processes import chaser, controller, record, ros2, router, world
-from .run import campaign, judge, run
-from .setup import calibrate, compose, keys, markers
+from .renamed import renamed
+from .run import campaign, run
+from .scenario import scenario
 from .simulate import simulate
+from .target import target
 
 _GC_THRESHOLD = 100_000
 """Objects between two garbage collections. Imports make several 100,000 objects that stay: with
 Python's default, 700, collecting among them is an eighth of the start of a process."""
 
-GROUPS: dict[str, tuple[Any, ...]] = {
-    "Fly": (run, campaign, simulate),
-    "Scenarios": (scenario.app, mesh.app),
-    "Processes": (world, chaser, controller, record, router, ros2),
-    "Operate": (command, thruster_fault, status, view, judge),
-    "Look at a flight": (summary, report, figures, video, snapshot),
-    "Logs": (logs.app,),
-    "Reproduce and compare": (replay, compare, reproduce, study, check),
-    "Datasets": (dataset, evaluate),
-    "Setup": (markers, calibrate, keys, compose),
+GROUPS: dict[str, tuple[Callable[..., None], ...]] = {
+    "Fly": (run, simulate, campaign, reproduce),
+    "Processes": (world, chaser, controller, record, play, router, ros2),
+    "Operate": (command, status, view),
+    "Look at a flight": (judge, report, video, log),
+    "Compare": (replay, compare, check),
+    "Prepare": (scenario, target, calibrate, dataset, deploy),
 }
-"""Commands (functions) and groups of commands (apps) by the section of the help that lists them."""
+"""Commands by the section of the help that lists them."""
 
 
 def _print_version(requested: bool) -> None:
     if requested:
         typer.echo(f"chaserdock {metadata.version('chaserdock')}")
         raise typer.Exit
-
-
-class ProgramHelp(GroupedHelp):
-    """Help of the program, in the order of ``GROUPS``."""
-
-    panel_order = tuple(GROUPS)
 
 
 app = typer.Typer(
@@ -67,10 +63,7 @@ app = typer.Typer(
 )
 for panel, members in GROUPS.items():
     for member in members:
-        if isinstance(member, typer.Typer):
-            app.add_typer(member, rich_help_panel=panel)
-        else:
-            add_command(app, member, rich_help_panel=panel)
+        add_command(app, member, rich_help_panel=panel)
 
 
 @app.callback()
@@ -89,6 +82,8 @@ def main() -> None:
     """Run the program; report an error as one line, and a closed pipe (``| head``) not at all."""
     gc.set_threshold(_GC_THRESHOLD)
     try:
+        if notice := renamed(sys.argv[1:]):
+            raise ChaserdockError(notice)
         sys.exit(app(prog_name="chaserdock", standalone_mode=False) or 0)
     except ChaserdockError as error:
         sys.exit(fail(str(error)).exit_code)
@@ -105,15 +100,19 @@ def main() -> None:
 
 _PLAIN_TEXTS = {
     "Value error, ": "",
-    "Input should be a valid integer, unable to parse string as an integer": "must be a whole number",
-    "Input should be a valid integer, got a number with a fractional part": "must be a whole number",
+    "Input should be a valid integer, unable to parse string as an integer": "must be a whole "
+    "number",
+    "Input should be a valid integer, got a number with a fractional part": "must be a whole "
+    "number",
     "Input should be a valid number, unable to parse string as a number": "must be a number",
     "Input should be": "must be",
 }
 
 
 def _report_usage_error(error: Any) -> int:
-    """Print typer's error as one line, or the help where that is the error; return the exit status."""
+    """Print typer's error as one line, or the help where that is the error; return the exit
+    status.
+    """
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
         return error.exit_code

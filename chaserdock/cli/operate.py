@@ -18,6 +18,7 @@ from .options import (
     WatchOpt,
     fail,
     print_result,
+    refuse_options,
     with_link_options,
 )
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class CommandName(StrEnum):
-    """Operator commands to a chaser."""
+    """Operator commands to a chaser, and one to its simulated hardware."""
 
     approach = "approach"
     hold = "hold"
@@ -39,10 +40,21 @@ class CommandName(StrEnum):
     detumble = "detumble"
     isolate = "isolate"
     restore = "restore"
+    thruster_fault = "thruster-fault"
+
+
+class ThrusterFaultKind(StrEnum):
+    """Thruster failures, and the end of one."""
+
+    stuck_on = "stuck_on"
+    stuck_off = "stuck_off"
+    weak = "weak"
+    healthy = "healthy"
 
 
 @with_link_options("listen", "lease", joins_run=True)
 def command(
+    context: typer.Context,
     what: Annotated[CommandName, typer.Argument(help="command")],
     number: ChaserArg,
     offset: Annotated[
@@ -50,7 +62,18 @@ def command(
         typer.Option(metavar="X Y Z", help="goto: position in the target's frame, metres"),
     ] = None,
     thruster: Annotated[
-        int | None, typer.Option(min=0, max=254, help="isolate, restore: thruster number, from 0")
+        int | None,
+        typer.Option(
+            min=0, max=254, help="isolate, restore, thruster-fault: thruster number, from 0"
+        ),
+    ] = None,
+    fault: Annotated[
+        ThrusterFaultKind | None,
+        typer.Option(help="thruster-fault: failure; healthy ends it"),
+    ] = None,
+    factor: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1.0, help="thruster-fault, weak: fraction of the nominal thrust"),
     ] = None,
     operator: OperatorOpt = "",
     before: Annotated[
@@ -66,11 +89,22 @@ def command(
 ) -> None:
     """Send a command to a chaser of a running mission. Status 1 when refused, 2 when there is no
     reply.
-    """
-    from chaserdock.launch.operator import send_command
 
-    _print_reply(
-        send_command(
+    thruster-fault injects a failure of which the chaser is not informed; the scenario must allow it
+    with chaser.thruster_faults_by_command.
+    """
+    from chaserdock.launch.operator import send_command, send_thruster_fault
+
+    if what is CommandName.thruster_fault:
+        refuse_options(context, ("offset", "before"), "not with thruster-fault")
+        if thruster is None or fault is None:
+            raise fail("thruster-fault: needs --thruster and --fault")
+        reply = send_thruster_fault(
+            link.link(timeout_s=timeout), number, thruster, fault.value, factor, timeout, operator
+        )
+    else:
+        refuse_options(context, ("fault", "factor"), "only with thruster-fault")
+        reply = send_command(
             link.link(timeout_s=timeout),
             what.value,
             number,
@@ -79,47 +113,8 @@ def command(
             thruster,
             operator,
             before,
-        ),
-        as_json,
-    )
-
-
-class ThrusterFaultKind(StrEnum):
-    """Thruster failures, and the end of one."""
-
-    stuck_on = "stuck_on"
-    stuck_off = "stuck_off"
-    weak = "weak"
-    healthy = "healthy"
-
-
-@with_link_options("listen", "lease", joins_run=True)
-def thruster_fault(
-    number: ChaserArg,
-    thruster: Annotated[int, typer.Argument(min=0, max=254, help="thruster number, from 0")],
-    kind: Annotated[ThrusterFaultKind, typer.Argument(help="failure; healthy ends it")],
-    factor: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="weak: fraction of the nominal thrust")
-    ] = None,
-    operator: OperatorOpt = "",
-    *,
-    link: LinkOptions,
-    timeout: ReplyTimeoutOpt = 5.0,
-    as_json: JsonOpt = False,
-) -> None:
-    """Inject a thruster failure into a running mission. Status 1 when refused, 2 when there is no
-    reply.
-
-    The scenario must allow it with chaser.thruster_faults_by_command. The chaser is not informed.
-    """
-    from chaserdock.launch.operator import send_thruster_fault
-
-    _print_reply(
-        send_thruster_fault(
-            link.link(timeout_s=timeout), number, thruster, kind.value, factor, timeout, operator
-        ),
-        as_json,
-    )
+        )
+    _print_reply(reply, as_json)
 
 
 def _print_reply(reply: CommandReply, as_json: bool) -> None:
@@ -160,7 +155,8 @@ def view(
         list[Path] | None,
         typer.Argument(
             metavar="[LOG]",
-            help="folder of a run, its mission.mcap, or the files of a rotated log; the running mission by default",
+            help="folder of a run, its mission.mcap, or the files of a rotated log; the running "
+            "mission by default",
         ),
     ] = None,
     host: Annotated[
@@ -182,7 +178,9 @@ def view(
     link: LinkOptions,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """Show a running mission, or a log, in a web browser: scene, images, plots, phases, commands."""
+    """Show a running mission, or a log, in a web browser: scene, images, plots, phases,
+    commands.
+    """
     from chaserdock.viewer.live import ViewOptions, view_live
 
     options = ViewOptions(host, port, dark, truth)

@@ -47,7 +47,9 @@ class NetMode(StrEnum):
 
 
 def complete_scenario(incomplete: str) -> list[str]:
-    """Return shipped scenarios and TOML files that begin with ``incomplete``, for shell completion."""
+    """Return shipped scenarios and TOML files that begin with ``incomplete``, for shell
+    completion.
+    """
     folder, _, stem = incomplete.rpartition("/")
     files = [
         f"{folder}/{path.name}" if folder else path.name
@@ -73,7 +75,8 @@ SeedOpt = Annotated[
 ModeOpt = Annotated[
     ModeOption,
     typer.Option(
-        help="lockstep: simulated time waits for every process (reproducible); realtime: it follows the wall clock"
+        help="lockstep: simulated time waits for every process (reproducible); realtime: it "
+        "follows the wall clock"
     ),
 ]
 KeysOpt = Annotated[
@@ -82,7 +85,7 @@ KeysOpt = Annotated[
         "--keys",
         envvar="CHASERDOCK_KEYS",
         metavar="DIR",
-        help="keys of the mission or of this process (see `keys init`): connect to a router over TLS",
+        help="keys of the mission or of this process (see `deploy`): connect to a router over TLS",
     ),
 ]
 JoinTimeoutOpt = Annotated[
@@ -98,7 +101,8 @@ StallOpt = Annotated[
     typer.Option(
         "--stall-s",
         min=1.0,
-        help="seconds without progress after which a lock-step mission ends, or without the world after which a process ends",
+        help="seconds without progress after which a lock-step mission ends, or without the "
+        "world after which a process ends",
     ),
 ]
 ReplyTimeoutOpt = Annotated[
@@ -119,6 +123,17 @@ OutOpt = Annotated[
     typer.Option("--out", help="folder for log and summary; a new folder in runs/ by default"),
 ]
 LogArg = Annotated[Path, typer.Argument(help="folder of a run, or its mission.mcap")]
+LogFilesArg = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG", help="folder of a run, its mission.mcap, or the files of a rotated log"
+    ),
+]
+FromOpt = Annotated[float, typer.Option("--from", min=0.0, help="first simulated time, seconds")]
+ToOpt = Annotated[
+    float | None,
+    typer.Option("--to", min=0.0, help="last simulated time, seconds; the end by default"),
+]
 
 
 def fail(text: str) -> typer.Exit:
@@ -126,6 +141,15 @@ def fail(text: str) -> typer.Exit:
     for line in text.splitlines():
         print(f"chaserdock: {line}", file=sys.stderr)
     return typer.Exit(BAD_INPUT)
+
+
+def refuse_options(context: typer.Context, names: Iterable[str], reason: str) -> None:
+    """Exit with status 2 if one of these parameters was given on the command line."""
+    refused = set(names)
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in refused and source is not None and source.name == "COMMANDLINE":
+            raise fail(f"{parameter.opts[0]}: {reason}")
 
 
 def print_result(as_json: bool, value: dict[str, Any], lines: Iterable[str]) -> None:
@@ -162,7 +186,9 @@ _OTHER_ENDPOINT = re.compile(r"(?:unixsock-stream|unixpipe|serial|vsock)/\S+")
 
 
 def check_endpoints(option: str, endpoints: Iterable[str], tls: bool = False) -> None:
-    """Exit with status 2 for a malformed endpoint and, with ``tls``, for one that is not encrypted."""
+    """Exit with status 2 for a malformed endpoint and, with ``tls``, for one that is not
+    encrypted.
+    """
     for endpoint in endpoints:
         found = _ADDRESS_PORT.fullmatch(endpoint)
         if not (_OTHER_ENDPOINT.fullmatch(endpoint) or (found and int(found[1]) <= 65_535)):
@@ -332,7 +358,8 @@ def with_link_options(
         def wrapper(**values: Any) -> None:
             command(link=LinkOptions(**{p.name: values.pop(p.name) for p in options}), **values)
 
-        wrapper.__signature__ = Signature([*own[:place], *options, *own[place + 1 :]])  # type: ignore[attr-defined]
+        shown = Signature([*own[:place], *options, *own[place + 1 :]])
+        wrapper.__signature__ = shown  # type: ignore[attr-defined]
         return wrapper
 
     return decorate
@@ -352,6 +379,7 @@ def tls_of(keys: Path, process: str) -> Tls:
         if not os.access(file, os.R_OK):
             raise fail(
                 f"--keys {keys}: {file} does not exist or is not readable; "
-                f"make a mission's keys with `chaserdock keys init {keys}`, and give {name} its folder"
+                f"make a mission's keys with `chaserdock deploy --keys {keys}`, and give {name} "
+                "its folder"
             )
     return tls

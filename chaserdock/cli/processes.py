@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 
 
 def start_process(name: str, options: ProcessOptions) -> None:
-    """Run a process by its entry point (group ``chaserdock.processes``) and exit with its status."""
+    """Run a process by its entry point (group ``chaserdock.processes``) and exit with its
+    status.
+    """
     installed = [e for e in entry_points(group="chaserdock.processes") if e.name == name]
     if not installed:
         raise fail(f"no process {name!r} is installed")
@@ -55,7 +57,8 @@ def world(
         float | None,
         typer.Option(
             min=0.1,
-            help="seconds to wait for a router and, before the first tick, for another process to connect; unlimited by default",
+            help="seconds to wait for a router and, before the first tick, for another process "
+            "to connect; unlimited by default",
         ),
     ] = None,
     rejoin_timeout: Annotated[
@@ -193,8 +196,8 @@ def ros2(
         bool,
         typer.Option(
             "--control",
-            help="real time: take the controller's place, with wrenches from /chaser_N/wrench_command, instead of "
-            "showing the mission",
+            help="real time: take the controller's place, with wrenches from "
+            "/chaser_N/wrench_command, instead of showing the mission",
         ),
     ] = False,
     timeout: JoinTimeoutOpt = None,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that fly whole missions on this machine, or judge one that other machines fly."""
+"""Commands that fly whole missions on this machine: ``run`` and ``campaign``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from chaserdock_protocol.stall import DEFAULT_STALL_S
 from .options import (
     JsonLinesOpt,
     KeysOpt,
-    LinkOptions,
     ModeOpt,
     ModeOption,
     OutOpt,
@@ -29,7 +28,6 @@ from .options import (
     errors_as_json,
     fail,
     show_of,
-    with_link_options,
 )
 
 
@@ -113,30 +111,6 @@ def announce_viewer(port: int, url: str) -> threading.Thread:
     return thread
 
 
-@with_link_options("listen")
-def judge(
-    out: Annotated[Path, typer.Argument(help="folder that the recorder writes to with --by-run")],
-    *,
-    link: LinkOptions,
-    timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for a mission")] = 120.0,
-    world_timeout: Annotated[
-        float, typer.Option(min=0.1, help="seconds after which an absent world counts as lost")
-    ] = 60.0,
-    quiet: QuietOpt = False,
-    as_json: JsonLinesOpt = False,
-) -> None:
-    """Watch a mission that other machines fly, wait for its log and judge it. Status 0 only if it
-    is a success.
-    """
-    from chaserdock.launch.judge import judge_mission
-
-    show = show_of(quiet, as_json)
-    with errors_as_json(as_json):
-        raise typer.Exit(
-            judge_mission(out, link.link(timeout_s=timeout), timeout, world_timeout, show)
-        )
-
-
 class KeepLogs(StrEnum):
     """Runs whose logs are kept."""
 
@@ -164,11 +138,14 @@ def campaign(
         int | None, typer.Option(min=0, help="fly this run only, and print its result")
     ] = None,
 ) -> None:
-    """Fly many runs of a scenario; a stopped campaign resumes. Status 0 when all runs have
-    finished.
+    """Fly many runs of a scenario; a stopped campaign resumes. Status 0 when all runs have ended.
+
+    Each run is a whole mission or, with the table [alone] in the file, the controller alone.
     """
-    from chaserdock.campaign.scheduler import direct
+    from chaserdock.experiments.campaign import fly_campaign
+    from chaserdock.experiments.worker import Workers
 
     if only is not None and (cluster is not None or jobs is not None):
         raise fail("--only flies one run on this machine; it excludes --cluster and --jobs")
-    raise typer.Exit(direct(file, out, jobs, cluster, keep_logs.value, only))
+    workers = Workers(jobs or os.cpu_count() or 1, cluster, keep_logs.value)
+    raise typer.Exit(fly_campaign(file, out, workers, only))

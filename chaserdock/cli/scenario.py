@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands for scenario files: ``chaserdock scenario …``."""
+"""``chaserdock scenario``: list, check, show and create scenarios."""
 
 from __future__ import annotations
 
@@ -12,18 +12,15 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock.exit_codes import BAD_INPUT
 from chaserdock.toml_text import toml_document
 
-from .help import add_command, command_group
-from .options import JsonOpt, ScenarioArg, SetOpt, fail
+from .options import JsonOpt, SetOpt, complete_scenario, fail, refuse_options
 
 if TYPE_CHECKING:
     from chaserdock_protocol.scenario import Scenario
 
-app = command_group("scenario", "List, check, show and create scenarios.")
-
 _NEW = """\
-# A scenario: what flies, and when a mission is a success. Every key: docs/scenario.md, or for editors
-# `chaserdock scenario schema`. Check it with
-#   chaserdock scenario validate {file}
+# A scenario: what flies, and when a mission is a success. Every key: docs/scenario.md, or for
+# editors `chaserdock scenario --schema`. Check it with
+#   chaserdock scenario {file}
 # and run it with
 #   chaserdock run {file}
 format = 3
@@ -33,7 +30,8 @@ duration_s = 40.0
 # The steady interval, which the errors under [success] refer to, begins here.
 settling_s = 20.0
 
-# Initial motion of the target, in m/s and rad/s. `model` is `paper`, `servicer`, or the path of a target file.
+# Initial motion of the target, in m/s and rad/s. `model` is `paper`, `servicer`, or the path of a
+# target file.
 [target]
 model = "paper"
 velocity_m_s = [0.015, 0.0075, 0.03]
@@ -47,7 +45,8 @@ grade = "exact"
 width_px = 960
 height_px = 540
 
-# One table per chaser: its place relative to the target, and where it starts relative to that place.
+# One table per chaser: its place relative to the target, and where it starts relative to that
+# place.
 [[chasers]]
 position_m = [-1.0, 0.0, 0.0]
 look_at = "target"
@@ -59,7 +58,72 @@ steady_orientation_rms_deg = 0.5
 """
 
 
-def list_scenarios(as_json: JsonOpt = False) -> None:
+def scenario(
+    context: typer.Context,
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SCENARIO]",
+            help="scenario files, or names of shipped scenarios; none: list the shipped ones",
+            autocompletion=complete_scenario,
+        ),
+    ] = None,
+    overrides: SetOpt = None,
+    show: Annotated[
+        bool,
+        typer.Option(
+            "--show", help="print it as TOML: with its base, its overrides and all defaults"
+        ),
+    ] = False,
+    changes: Annotated[
+        bool, typer.Option("--changes", help="print only values that differ from the default")
+    ] = False,
+    new: Annotated[
+        bool, typer.Option("--new", help="write a short commented scenario file of this name")
+    ] = False,
+    schema: Annotated[
+        bool,
+        typer.Option(
+            "--schema",
+            help="print the JSON schema of scenario files, for editors (taplo, Even Better TOML)",
+        ),
+    ] = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Check scenarios; or list, show or create them. Status 2 if one is not valid, with one line
+    per error.
+    """
+    if sum((show or changes, new, schema)) > 1:
+        raise fail("--show, --new and --schema exclude each other")
+    if names:
+        refuse_options(context, ("schema", "as_json"), "not with a scenario")
+    else:
+        refuse_options(context, ("overrides", "show", "changes", "new"), "needs a scenario")
+    if schema:
+        _print_schema()
+    elif not names:
+        _list_shipped(as_json)
+    elif new:
+        refuse_options(context, ("overrides",), "not with --new")
+        _write_new(_only(names))
+    elif show or changes:
+        from chaserdock_protocol.scenario import load_scenario
+        from chaserdock_protocol.shipped_scenarios import find_scenario
+
+        loaded = load_scenario(find_scenario(_only(names)), tuple(overrides or ()))
+        print(as_toml(loaded, changes), end="")
+    else:
+        _check(names, tuple(overrides or ()))
+
+
+def _only(names: list[str]) -> str:
+    """Return the one name; exit with status 2 for several."""
+    if len(names) > 1:
+        raise fail(f"{names[1]}: one scenario only with --show and --new")
+    return names[0]
+
+
+def _list_shipped(as_json: bool) -> None:
     """List the shipped scenarios with their duration and number of chasers."""
     import json
 
@@ -85,58 +149,35 @@ def list_scenarios(as_json: JsonOpt = False) -> None:
         print(f"{s.name:{width}}  {len(s.chasers):7}  {s.duration_s:6.0f} s  {s.description}")
 
 
-def validate(
-    files: Annotated[
-        list[str], typer.Argument(help="scenario files, or names of shipped scenarios")
-    ],
-) -> None:
-    """Check scenario files. Status 2 if one is not valid, with one line per error."""
+def _check(names: list[str], overrides: tuple[str, ...]) -> None:
+    """Print whether each scenario is valid; exit with status 2 if one is not."""
     from chaserdock_protocol.scenario import load_scenario
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
     failed = False
-    for file in files:
+    for file in names:
         try:
-            scenario = load_scenario(find_scenario(file))
+            found = load_scenario(find_scenario(file), overrides)
         except ChaserdockError as error:
             fail(str(error))
             failed = True
         else:
-            number = len(scenario.chasers)
+            number = len(found.chasers)
             chasers = "1 chaser" if number == 1 else f"{number} chasers"
-            print(f"{file}: valid: {scenario.name}, {chasers}, {scenario.duration_s:g} s")
+            print(f"{file}: valid: {found.name}, {chasers}, {found.duration_s:g} s")
     if failed:
         raise typer.Exit(BAD_INPUT)
 
 
-def show(
-    scenario: ScenarioArg,
-    overrides: SetOpt = None,
-    changes: Annotated[
-        bool, typer.Option("--changes", help="only values that differ from the default")
-    ] = False,
-) -> None:
-    """Print the resolved scenario as TOML: with its base, its overrides and all defaults."""
-    from chaserdock_protocol.scenario import load_scenario
-    from chaserdock_protocol.shipped_scenarios import find_scenario
-
-    print(as_toml(load_scenario(find_scenario(scenario), tuple(overrides or ())), changes), end="")
-
-
-def schema() -> None:
-    """Print the JSON schema of scenario files, for editors (taplo, Even Better TOML)."""
+def _print_schema() -> None:
     from chaserdock_protocol.scenario import Scenario
     from chaserdock_protocol.scenario.json_schema import editor_schema_text
 
     print(editor_schema_text(Scenario), end="")
 
 
-def new(
-    name: Annotated[
-        str, typer.Argument(metavar="NAME", help="name of the scenario, or path of its file")
-    ],
-) -> None:
-    """Write a short commented scenario file that can be run, and changed."""
+def _write_new(name: str) -> None:
+    """Write a scenario file that can be run, and changed."""
     import tomllib
 
     from chaserdock_protocol.scenario import parse_scenario
@@ -152,11 +193,6 @@ def new(
     except OSError as error:
         raise fail(f"{path}: cannot be written: {error.strerror or error}") from None
     print(f"{path}: run it with: chaserdock run {path}")
-
-
-add_command(app, list_scenarios, name="list")
-for member in (validate, show, schema, new):
-    add_command(app, member)
 
 
 def as_toml(scenario: Scenario, changes: bool = False) -> str:

@@ -66,8 +66,8 @@ def simulate(
     """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if
     all of them hold.
     """
-    from chaserdock.simulation.campaign import (
-        Swarm,
+    from chaserdock.simulation.seeds import (
+        SeedOptions,
         UnflownSeed,
         consistency,
         fly_seeds,
@@ -88,10 +88,10 @@ def simulate(
     begin_s = time.monotonic()
     results: list[SimulationResult] = []
     outcomes: Counter[str] = Counter()
-    swarm = Swarm(scenario, images, None if mode is None else mode.value, to_violation=stop)
+    options = SeedOptions(scenario, images, None if mode is None else mode.value, to_violation=stop)
     stopped = False
     try:
-        for result in fly_seeds(swarm, _seed_range(seeds), jobs):
+        for result in fly_seeds(options, _seed_range(seeds), jobs):
             if isinstance(result, UnflownSeed):
                 outcomes["not flown"] += 1
                 print(f"seed {result.seed}: not flown: {result.reason}", flush=True)
@@ -113,7 +113,8 @@ def simulate(
     counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common()) or "none flown"
     mean, flights = consistency(results)
     print(
-        f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 over {flights} flights"
+        f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 "
+        f"over {flights} flights"
     )
     if reason := inconsistency(results):
         print(f"chaserdock: {reason}", file=sys.stderr)
@@ -130,7 +131,7 @@ def _check_writable(out: Path) -> None:
 
 def _shrink(result: SimulationResult, out: Path) -> None:
     """Reduce a case that fails; write and print the simplest one, on Ctrl-C that so far."""
-    from chaserdock.simulation.campaign import shrink_result, write_case
+    from chaserdock.simulation.seeds import shrink_result, write_case
 
     simplest = result
     try:

@@ -232,7 +232,7 @@ class Ledger:
                 self.report(key, "a command that the chaser rejects", reason)
 
     def _check_authority(self, key: str, message: WrenchCommand, turn: RecordedTick) -> None:
-        """Check that a command names its sender, and the term that the leases of the tick give it."""
+        """Check that a command names its sender, and the term that the leases of the tick give."""
         leases = LeaseHolder(self.process, turn.tick.controllers.get(self.process, ""))
         for raw in turn.answers:
             found = topics.topic_of_key(raw.key)

@@ -108,7 +108,8 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
     scenario, run = logged_scenario(log)
     if run.get("mode") == "realtime":
         raise CheckError(
-            f"{log}: flown in real time; a check needs a lock-step log, in which every tick is complete"
+            f"{log}: flown in real time; a check needs a lock-step log, in which every tick is "
+            "complete"
         )
     role, number = role_of(process, len(scenario.chasers))
     inputs = input_topics(role)
@@ -144,7 +145,8 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
         played.append(turn)
     if not played:
         raise CheckError(
-            f"{log}: its first tick expects no answer of {process}; give a log that begins at tick 0"
+            f"{log}: its first tick expects no answer of {process}; give a log that begins at tick "
+            "0"
         )
     return Recorded(scenario, flight_scenario_json(scenario), played)
 

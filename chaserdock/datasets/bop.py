@@ -89,7 +89,8 @@ def check_camera(camera: Camera) -> None:
     """Raise DatasetError for a camera with lens distortion."""
     if camera.distortion:
         raise DatasetError(
-            "camera.intrinsics.distortion: the BOP format has no lens distortion; use --format speed+, or a camera without it"
+            "camera.intrinsics.distortion: the BOP format has no lens distortion; use --format "
+            "speed+, or a camera without it"
         )
 
 

@@ -59,9 +59,14 @@ def _section_of(camera: Camera) -> FlightCamera:
     c = camera
     distortion = c.distortion or (0.0,) * 5
     intrinsics = Intrinsics(
-        width_px=c.width_px, height_px=c.height_px, fx_px=c.fx_px, fy_px=c.fy_px, cx_px=c.cx_px, cy_px=c.cy_px,
+        width_px=c.width_px,
+        height_px=c.height_px,
+        fx_px=c.fx_px,
+        fy_px=c.fy_px,
+        cx_px=c.cx_px,
+        cy_px=c.cy_px,
         distortion=distortion,
-    )  # fmt: skip
+    )
     return FlightCamera(intrinsics=intrinsics)
 
 

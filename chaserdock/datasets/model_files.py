@@ -35,8 +35,10 @@ def _write_ply(mesh: TriangleMesh, path: Path) -> None:
     vertices, index = np.unique(rows, axis=0, return_inverse=True)
     triangles = index.reshape(-1, 3)
     head = [
-        "ply", "format ascii 1.0", f"comment {mesh.name}, millimetres", f"element vertex {len(vertices)}",
-        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")), f"element face {len(triangles)}",
+        "ply", "format ascii 1.0", f"comment {mesh.name}, millimetres", "element vertex "
+            f"{len(vertices)}",
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")), "element "
+            f"face {len(triangles)}",
         "property list uchar int vertex_indices", "end_header",
     ]  # fmt: skip
     lines = [" ".join(f"{v:.6g}" for v in row) for row in vertices.tolist()]

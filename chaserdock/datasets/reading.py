@@ -36,7 +36,8 @@ def read_dataset(folder: Path) -> tuple[LabelledDataset, FlightScenario | None]:
         dataset = read_bop(folder)
     else:
         raise DatasetError(
-            f"{root}: no dataset; expected a folder of `chaserdock dataset`, or one with camera.json and synthetic/ (SPEED+) "
+            f"{root}: no dataset; expected a folder of `chaserdock dataset`, or one with "
+            "camera.json and synthetic/ (SPEED+) "
             "or train/, val/ or test/ (BOP)"
         )
     return dataset, _flight(own) if own.is_file() else None

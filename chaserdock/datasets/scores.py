@@ -31,8 +31,8 @@ ADD_SHARE = 0.1
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of one pose: of the attitude, rad; of the position, m and over the range; ADD, or
-    ADD-S of a symmetric target, m.
+    """Errors of one pose: attitude (rad), position (m, and as a share of the range), and ADD, for a
+    symmetric target ADD-S (m).
     """
 
     attitude_rad: float

@@ -16,6 +16,7 @@ from .types import TargetShape
 _SAME_SHARE = 0.002
 """Share of the diameter within which vertices count as at one place."""
 _MOST_POINTS = 2000
+"""Points of a shape for ADD, spread evenly over its vertices: bounds the cost of an image."""
 
 
 def shape_of(mesh: TriangleMesh, symmetric: bool = True) -> TargetShape:

@@ -128,7 +128,8 @@ def _labelled(file: Path, domain: Path, split: Split, number: int, row: Any) -> 
     q = numbers(place, row, _Q, (4,))
     if not abs(float(np.linalg.norm(q)) - 1.0) < 1e-3:
         raise DatasetError(
-            f"{place}: {_Q} must be a unit quaternion, scalar first; its norm is {np.linalg.norm(q):.4g}"
+            f"{place}: {_Q} must be a unit quaternion, scalar first; its norm is "
+            f"{np.linalg.norm(q):.4g}"
         )
     position = numbers(place, row, _R, (3,))
     return LabelledImage(

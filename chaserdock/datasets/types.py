@@ -84,6 +84,7 @@ def read_grey(path: Path, camera: Camera) -> NDArray[np.uint8]:
     height, width = pixels.shape
     if (width, height) != (camera.width_px, camera.height_px):
         raise DatasetError(
-            f"{path}: {width} x {height} pixels; the camera of the dataset has {camera.width_px} x {camera.height_px}"
+            f"{path}: {width} x {height} pixels; the camera of the dataset has {camera.width_px} "
+            f"x {camera.height_px}"
         )
     return np.asarray(pixels, dtype=np.uint8)

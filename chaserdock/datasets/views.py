@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from .shapes import shape_of
 from .types import DatasetError, PoseLabel
 
-_STREAM = 0xDA7A
+_STREAM = 0xDA7A  # separates these random numbers from others of the same seed
 _WHITE = Material("mask", diffuse=1.0)
 _FULL_LIGHT = Light(sun=0.0, ambient=1.0)
 
@@ -53,11 +53,13 @@ class ViewLimits:
     def __post_init__(self) -> None:
         if not 0.0 < self.range_m[0] <= self.range_m[1]:
             raise DatasetError(
-                f"range: must be positive and in ascending order, not {self.range_m[0]:g} to {self.range_m[1]:g}"
+                f"range: must be positive and in ascending order, not {self.range_m[0]:g} to "
+                f"{self.range_m[1]:g}"
             )
         if not 0.0 <= self.phase_deg[0] <= self.phase_deg[1] <= 180.0:
             raise DatasetError(
-                f"phase: must be 0 to 180 degrees in ascending order, not {self.phase_deg[0]:g} to {self.phase_deg[1]:g}"
+                f"phase: must be 0 to 180 degrees in ascending order, not {self.phase_deg[0]:g} "
+                f"to {self.phase_deg[1]:g}"
             )
         if not 0.0 <= self.offset_share <= 1.0:
             raise DatasetError(f"offset: must be 0 to 1, not {self.offset_share:g}")
@@ -73,9 +75,12 @@ class TargetView:
 
 @dataclass(frozen=True, eq=False)
 class ViewImage:
-    """Image (h, w) of a view; ``mask`` (h, w): pixels that the target covers by half; ``visible``
-    (h, w): without those behind the chaser's own probe; ``silhouette``: the mask on a canvas that
-    reaches ``margin_px`` (2,) columns and rows beyond the image, so that it is not cut off there.
+    """A rendered view with its masks.
+
+    ``pixels`` (h, w): the image. ``mask`` (h, w): pixels of which the target covers half or more.
+    ``visible`` (h, w): the same without those behind the chaser's own probe. ``silhouette``: the
+    mask on a larger canvas, ``margin_px`` (2,) columns and rows on every side, that does not cut it
+    off.
     """
 
     view: TargetView
@@ -131,7 +136,8 @@ class ViewRenderer:
         self.camera = scenario.camera_model()
         if true_camera(scenario, 0) != self.camera:
             raise DatasetError(
-                "truth.camera and navigation: labels hold for a camera without errors; remove the errors of the camera"
+                "truth.camera and navigation: labels hold for a camera without errors; remove "
+                "the errors of the camera"
             )
         self._scenario, self._limits = scenario, limits
         self._cameras = Cameras(scenario)
@@ -176,10 +182,10 @@ class ViewRenderer:
 
 
 class _Coverage:
-    """Masks of a target: a white one, in light from everywhere, in front of the stars of one
-    attitude of the camera.
+    """Finds the pixels that a target covers: renders it white, in light from everywhere, before the
+    stars of one attitude of the camera.
 
-    ``own``: a box, in the axes of the chaser, that is drawn in black.
+    ``own``: a box in chaser axes that is drawn in black and hides the target.
     """
 
     def __init__(self, camera: Camera, mesh: TriangleMesh, own: Box | None = None) -> None:

@@ -71,7 +71,7 @@ def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None
         return None
     return (
         f"SCENARIO={scenario} has {needed} chasers, but there are {services} chaser services; "
-        f"make others with chaserdock compose --chasers {needed} > compose.yaml"
+        f"make others with chaserdock deploy --chasers {needed} > compose.yaml"
     )
 
 
@@ -104,7 +104,8 @@ def run(arguments: list[str], host: str, port: int) -> int:
             linked_s = now_s if is_linked(port) else linked_s
             if now_s - linked_s > ROUTER_TIMEOUT_S:
                 log(
-                    f"{' '.join(arguments[:2])}: no router for {ROUTER_TIMEOUT_S:g} s, the mission is over"
+                    f"{' '.join(arguments[:2])}: no router for {ROUTER_TIMEOUT_S:g} s, the mission "
+                    "is over"
                 )
                 process.terminate()
                 process.wait()

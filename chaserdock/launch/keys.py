@@ -29,7 +29,7 @@ class KeysError(ChaserdockError):
 
 
 def names(chasers: int) -> list[str]:
-    """Return the names of all that get keys: the router and every process that may connect to it."""
+    """Return the names of all that get keys: the router and the processes that may connect."""
     return [ROUTER, *(identity.common_name for identity in identities(chasers))]
 
 

@@ -90,7 +90,7 @@ class Child:
 
 
 # Of Zenoh's two receiving threads the second mostly wakes up without work: with one, seven
-# processes on two cores need two thirds of the time per tick (benchmarks/realtime.py). Not for a
+# processes on two cores need two thirds of the time per tick (benchmarks/transport.py). Not for a
 # router, where one slow reader would block all others.
 _ZENOH_THREADS = "(rx: (worker_threads: 1))"
 
@@ -214,7 +214,7 @@ def check_keys(keys: Path, chasers: int) -> None:
 
     if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
         raise RunError(
-            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`"
+            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock deploy --keys {keys}`"
         )
 
 
@@ -345,7 +345,7 @@ _folders_lock = threading.Lock()
 
 
 def _new_folder(name: str) -> Path:
-    """Return a folder ``runs/NAME-TIME`` that does not exist, with a number appended where needed."""
+    """Return a folder ``runs/NAME-TIME`` that does not exist, with a number appended if needed."""
     base = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
     folder, number = base, 1
     with _folders_lock:

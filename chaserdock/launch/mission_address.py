@@ -47,7 +47,8 @@ def read_address(folder: Path) -> MissionAddress:
         return msgspec.json.decode(file.read_bytes(), type=MissionAddress)
     except FileNotFoundError:
         raise AddressError(
-            f"--run {folder}: no {ADDRESS_FILE}; it exists while `chaserdock run` flies a mission into this folder"
+            f"--run {folder}: no {ADDRESS_FILE}; it exists while `chaserdock run` flies a mission "
+            "into this folder"
         ) from None
     except OSError as error:
         raise AddressError(f"--run {folder}: {ADDRESS_FILE}: {error.strerror or error}") from None

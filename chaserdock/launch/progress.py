@@ -175,7 +175,8 @@ class ProgressReporter:
         progress = self.state.progress(now_s)
         parts = [f"{self.state.scenario.name}  {headline(self.state, progress)}"]
         parts += [
-            f"{c.chaser} {c.phase} {c.position_error_m * 1e3:.1f} mm {math.degrees(c.orientation_error_rad):.2f} deg"
+            f"{c.chaser} {c.phase} {c.position_error_m * 1e3:.1f} mm "
+            f"{math.degrees(c.orientation_error_rad):.2f} deg"
             for c in progress.chasers
         ]
         return " | ".join(parts)
@@ -215,7 +216,8 @@ def headline(state: FlightState, progress: Progress) -> str:
     """Return simulated time, speed, remaining wall time and the status of the target estimate as
     text.
     """
-    text = f"{progress.sim_time_s:6.1f} of {state.scenario.duration_s:g} s  {progress.speed_now:.2f} x real time  "
+    text = f"{progress.sim_time_s:6.1f} of {state.scenario.duration_s:g} s  "
+    text += f"{progress.speed_now:.2f} x real time  "
     remaining_s = state.remaining_s(progress)
     if remaining_s is not None and remaining_s < 360_000:
         text += f"{int(remaining_s) // 60}:{int(remaining_s) % 60:02d} left  "

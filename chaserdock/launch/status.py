@@ -69,7 +69,7 @@ class MissionStatus:
         return simulated_s / (self.received_s[-1] - self.received_s[0])
 
     def as_dict(self) -> dict[str, object]:
-        """Return plain values for JSON; ``expected``: whether the open tick waits for the process."""
+        """Return plain values for JSON. ``expected``: whether the open tick waits for it."""
         tick = self.ticks[-1] if self.ticks else None
         return {
             "tick": tick.tick if tick else None,

@@ -16,7 +16,7 @@ from chaserdock_protocol.recording.schema_migrations import decode_logged
 
 
 class FileInfo(msgspec.Struct):
-    """One file; ``closed`` and ``cut_bytes`` as in ``recording.scan.FileState``."""
+    """A file of a log. ``closed`` and ``cut_bytes``: as in ``recording.scan.FileState``."""
 
     path: str
     bytes: int
@@ -26,8 +26,8 @@ class FileInfo(msgspec.Struct):
 
 
 class KeyInfo(msgspec.Struct):
-    """One key: messages, their bytes, first and last simulated time, and gaps in their sequence
-    numbers.
+    """What a log holds of a key: number and bytes of its messages, first and last simulated time
+    (s). ``lost``: gaps in their sequence numbers.
     """
 
     key: str
@@ -126,7 +126,8 @@ def info_lines(info: LogInfo) -> list[str]:
         f"{k} {v}" for k, v in info.run.items() if not k.startswith("version.") and k != "crc32"
     )
     lines = [
-        f"{info.scenario}, seed {info.seed}; {run}; chaserdock {info.run.get('version.chaserdock', '?')}",
+        f"{info.scenario}, seed {info.seed}; {run}; chaserdock "
+        f"{info.run.get('version.chaserdock', '?')}",
         f"{info.sim_time_s:.2f} s of simulated, {info.wall_time_s:.1f} s of wall time",
     ]
     for f in info.files:
@@ -136,7 +137,7 @@ def info_lines(info: LogInfo) -> list[str]:
             else f"cut off ({f.cut_bytes} bytes of a broken record)"
         )
         if not f.closed:
-            end += "; `chaserdock log recover` makes a complete file of it"
+            end += "; `chaserdock log --recover` makes a complete file of it"
         if f.recovered:
             end += "; recovered"
         lines.append(f"{f.path}: {f.bytes / 1e6:.1f} MB, {end}")
@@ -146,7 +147,8 @@ def info_lines(info: LogInfo) -> list[str]:
     )
     for k in info.keys:
         lines.append(
-            f"{k.key:{width}} {k.messages:9d} {k.bytes / 1e3:10.1f} {k.first_s:9.2f} {k.last_s:9.2f} {k.lost:6d}"
+            f"{k.key:{width}} {k.messages:9d} {k.bytes / 1e3:10.1f} {k.first_s:9.2f} "
+            f"{k.last_s:9.2f} {k.lost:6d}"
         )
     lines += [f"rejected: {what}: {number}" for what, number in info.rejected.items()]
     lines.append(f"{info.viewer} messages of the viewer layer")

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Open a log: typed messages, and tables by topic.
 
->>> from chaserdock.logs import open_log                                                # doctest: +SKIP
+>>> from chaserdock.logs import open_log  # doctest: +SKIP
 >>> log = open_log("runs/main")
 >>> for estimate in log.messages(TargetEstimate): print(estimate.position_m)
->>> log.table("controller/target").to_pandas()                                  # where pandas is installed
+>>> log.table("controller/target").to_pandas()  # where pandas is installed
 """
 
 # pyarrow has no type stubs.
-# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+# pyright: reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
 
 from __future__ import annotations

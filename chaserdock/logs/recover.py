@@ -35,7 +35,9 @@ _CHUNK_MARK, _MARK_OFFSET = b"\x04\x00\x00\x00zstd", _HEAD.size + 28
 
 
 class Recovered(msgspec.Struct):
-    """Recovered messages and chunks; lost: records with a wrong checksum or format, bytes skipped."""
+    """What was recovered from a damaged log: messages and chunks. What was lost: records with a
+    wrong checksum or format, and bytes that were skipped.
+    """
 
     messages: int = 0
     chunks: int = 0
@@ -74,7 +76,9 @@ def recover(log: Path, out: Path) -> Recovered:
 
 
 def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[int, bytes]]:
-    """Iterate over opcode and content of records; after a broken one, continue with the next chunk."""
+    """Yield opcode and content of each record; after a broken one, continue with the next
+    chunk.
+    """
     place = len(MCAP0_MAGIC)
     while place + _HEAD.size <= len(data):
         opcode, length = _HEAD.unpack_from(data, place)

@@ -41,11 +41,12 @@ class Deviation(msgspec.Struct):
 
 
 class RunComparison(msgspec.Struct):
-    """``summary``: keys whose values differ, both values. ``deviations``: by track; ``target
-    estimate`` is the fused one.
+    """What differs between two recorded flights. ``summary``: both values of each key of the
+    summaries that differs. ``deviations``: of the motion of each body; ``target estimate`` is the
+    fused one.
 
-    ``blas``: processes whose linear algebra libraries (recording.provenance.blas_in_use) are known
-    and differ, both libraries.
+    ``blas``: both linear algebra libraries (recording.provenance.blas_in_use) of each process for
+    which they are known and differ.
     """
 
     digests: tuple[str, str]
@@ -131,7 +132,8 @@ def comparison_lines(result: RunComparison) -> list[str]:
                 continue
             ratio = f"  {y / x:8.3f}" if _is_size(x) and _is_size(y) else ""
             lines.append(
-                f"  {key}: {_format(x)}  {_format(y)}{ratio}{'  (machine-dependent)' if wall else ''}"
+                f"  {key}: {_format(x)}  "
+                f"{_format(y)}{ratio}{'  (machine-dependent)' if wall else ''}"
             )
     lines.append("largest deviations between the flights:")
     for name, d in result.deviations.items():

@@ -175,7 +175,8 @@ def first_difference(topics: list[TopicDifference]) -> str | None:
     first = min(unequal, key=lambda t: (t.first_time_s or 0.0, t.key))
     fields = sorted(first.fields.values(), key=lambda f: (f.first_time_s, f.name))
     if fields and fields[0].first_time_s == first.first_time_s:
-        return f"{first.key}: {fields[0].name} at {first.first_time_s:.3f} s (tick {fields[0].first_tick})"
+        when = f"{first.first_time_s:.3f} s (tick {fields[0].first_tick})"
+        return f"{first.key}: {fields[0].name} at {when}"
     return f"{first.key}: a message at {first.first_time_s or 0.0:.3f} s present on one side only"
 
 
@@ -194,7 +195,8 @@ def difference_lines(topics: list[TopicDifference], sides: tuple[str, str]) -> I
             values = ", ".join(
                 f"{side} {_format(x)}" for side, x in zip(sides, f.first, strict=True)
             )
-            yield f"  {f.name}: {f.unequal} times, first at {f.first_time_s:.3f} s (tick {f.first_tick}): {values}"
+            when = f"{f.first_time_s:.3f} s (tick {f.first_tick})"
+            yield f"  {f.name}: {f.unequal} times, first at {when}: {values}"
             if f.largest is not None:
                 yield f"    largest difference {f.largest:.3g} at {f.largest_time_s:.3f} s"
 

@@ -88,6 +88,7 @@ def replay(
     notes = []
     if not lockstep:
         notes.append(
-            "flown in real time: arrival times are not recorded, so that differences are not conclusive"
+            "flown in real time: arrival times are not recorded, so that differences are not "
+            "conclusive"
         )
     return Replay(through=through, topics=comparison.finish(), notes=notes)

@@ -23,11 +23,12 @@ from .swarm import Case
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """One simulated flight. ``fingerprint``: of all messages with their times; equal in equal
-    flights.
+    """A simulated flight and its verdict. ``outcome``: the first violated invariant, or the least
+    final state of the chasers that are to dock. ``fingerprint``: of all messages and their times,
+    equal in equal flights.
 
-    ``nees``: of the estimate, one value a second; ``honest``: no sensor lies, so that it should be
-    consistent.
+    ``nees``: normalized squared errors of the estimate, one a second. ``honest``: no sensor lies
+    and the plant is as stated, so that they should be consistent.
     """
 
     seed: int
@@ -43,9 +44,9 @@ class SimulationResult:
 def fly_case(
     case: Case, seed: int, folder: Path | None = None, *, to_violation: bool = False
 ) -> SimulationResult:
-    """Simulate a case and check the invariants, with ``to_violation`` only until one is violated.
+    """Simulate a case and check the invariants. Raises ScenarioError.
 
-    The log stays in ``folder`` if one is given. Raises ScenarioError.
+    ``folder``: keep the log there. ``to_violation``: end the flight at the first violation.
     """
     with contextlib.ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))

@@ -21,7 +21,8 @@ from chaserdock_protocol.transport import Link, RawSample
 from chaserdock_world import process as world
 from chaserdock_world.requirements import require_packages
 
-from .network import SimulatedNetwork, Traffic
+from .links import Traffic
+from .network import SimulatedNetwork
 from .scheduler import Scheduler, Task
 
 Tap = Callable[[str, RawSample], None]

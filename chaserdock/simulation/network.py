@@ -2,16 +2,15 @@
 """Simulated network: carries the messages of all nodes in virtual time, with the faults of
 ``Conditions``.
 
-It behaves as Zenoh over TCP links: messages of one priority arrive in order, declarations and
-messages travel the same links, a link that is cut or congested holds back what must not be lost and
-drops the rest. Deliveries run within the scheduler, so that publishing never waits.
+Declarations and messages travel the same links (`links.py`). Deliveries run within the scheduler,
+so that publishing never waits.
 """
 
 from __future__ import annotations
 
 import random
 import re
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -23,17 +22,11 @@ from chaserdock_protocol.transport import RawSample
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from chaserdock_protocol.transport.network import Connection, Host, Query, Reply, T, Undo
 
-from .scheduler import NEVER, Due, Killed, Scheduler, VirtualQueue
+from .links import Links, MessageLink, Traffic
+from .scheduler import Killed, Scheduler, VirtualQueue
 
-LINK_BYTES = 1 << 20
-"""A link drops droppable messages while so many bytes are on it, as Zenoh with the options of
-``transport.config`` does.
-"""
 LEASE_S = 2.0
-"""Time (s) after which a silent process counts as lost in real time, as under ``chaserdock run``."""
-_RETRY_S = 0.2
-"""Time (s) after which a lost message that must not be lost is sent again: as TCP does in Linux
-(TCP_RTO_MIN)."""
+"""Time (s) after which a silent process counts as lost in real time, as under `chaserdock run`."""
 EPOCH_NS = 1_800_000_000 * 10**9
 """Wall-clock time (ns) at the begin of a simulation. Chosen: in January 2027."""
 
@@ -56,33 +49,12 @@ def matches(expression: str, key: str) -> bool:
 
 
 @dataclass
-class Traffic:
-    """What the network has carried and lost. ``recorded``: messages that arrived at the recorder,
-    by key.
-    """
-
-    sent: int = 0
-    lost: int = 0
-    most_bytes: int = 0
-    recorded: Counter[str] = field(default_factory=Counter)
-    queues: dict[str, VirtualQueue] = field(default_factory=dict)
-
-
-@dataclass
-class _LinkState:
-    """One direction between two processes: bytes on the way, and the last arrival by priority."""
-
-    bytes: int = 0
-    last: dict[str, Due] = field(default_factory=dict)
-
-
-@dataclass
 class _Subscription:
     owner: SimulatedConnection
     expression: str
     arrived: Callable[[RawSample], None]
     known_to: set[str] = field(default_factory=set)
-    links: dict[str, _LinkState] = field(default_factory=dict)
+    links: dict[str, MessageLink] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.records_all = self.owner.name == "recorder" and self.expression == "**"
@@ -90,10 +62,7 @@ class _Subscription:
 
 class SimulatedNetwork:
     """The ``Network`` of one simulated mission. ``tap`` sees every message when it is published:
-    sender, sample.
-
-    ``lockstep``: nothing is lost, duplicated or reordered on one link, as TCP guarantees;
-    conditions only delay.
+    sender, sample. ``lockstep``: see ``Links``.
     """
 
     def __init__(
@@ -104,23 +73,14 @@ class SimulatedNetwork:
         lockstep: bool,
         tap: Callable[[str, RawSample], None] | None = None,
     ) -> None:
-        self.scheduler, self.conditions, self.lockstep, self.tap = (
-            scheduler,
-            conditions,
-            lockstep,
-            tap,
-        )
+        self.scheduler, self.conditions = scheduler, conditions
+        self.lockstep, self.tap = lockstep, tap
         self.traffic = Traffic()
-        self.first_tick_s: float | None = None
-        self._latency_s, self._jitter_s = conditions.latency_s, conditions.jitter_s
-        self._is_steady = not (conditions.jitter_s or conditions.partition)
-        """Whether all messages that are not late take the same time."""
+        self.links = Links(scheduler, conditions, seed, lockstep, self.traffic)
         self._seed = seed
-        self._random = random.Random(f"network {seed}")
         self._connections: dict[str, SimulatedConnection] = {}
         self._subscriptions: list[_Subscription] = []
         self._routes: dict[str, list[_Subscription]] = {}
-        self._links: dict[tuple[str, str], _LinkState] = {}
 
     def open(self, name: str) -> tuple[Connection, Host]:
         """Connect a process. A process that is started again replaces itself."""
@@ -129,11 +89,6 @@ class SimulatedNetwork:
         for subscription in self._subscriptions:
             self._declare(subscription, name)
         return self._connections[name], host
-
-    @property
-    def mission_s(self) -> float:
-        """Time since the first tick (s), which ``Conditions`` refer to; negative before."""
-        return -1.0 if self.first_tick_s is None else self.scheduler.now_s - self.first_tick_s
 
     def seeded(self, *parts: object) -> random.Random:
         """Return a random stream of this network's seed."""
@@ -149,8 +104,8 @@ class SimulatedNetwork:
             return
         if raw.key == topics.TICK.key:
             self.scheduler.note_progress()
-            if self.first_tick_s is None:
-                self.first_tick_s = self.scheduler.now_s
+            if self.links.first_tick_s is None:
+                self.links.first_tick_s = self.scheduler.now_s
                 self._schedule_partitions()
         self.traffic.sent += 1
         if self.tap is not None:
@@ -176,23 +131,13 @@ class SimulatedNetwork:
         qos: str,
         blocking: bool,
     ) -> None:
-        name, size = sender.name, len(raw.payload)
-        link = to.links.get(name)
+        link = to.links.get(sender.name)
         if link is None:
-            link = to.links[name] = self._link(name, to.owner.name)
-        copies, late_s, now_s = 1, 0.0, self.scheduler.now_s
-        if not self.lockstep:
-            copies, late_s = self._draw_faults(link, name, to.owner.name, size, not blocking)
-        for _ in range(copies):
-            link.bytes += size
-            if link.bytes > self.traffic.most_bytes:
-                self.traffic.most_bytes = link.bytes
-            due_s = now_s + self._latency_s
-            if late_s or not self._is_steady:
-                due_s = self._due_s(name, to.owner.name, late_s)
-            self._call_in_order(link, due_s, self._arrive, qos, late_s, (link, to, raw))
+            link = to.links[sender.name] = self.links.between(sender.name, to.owner.name)
+        size = len(raw.payload)
+        self.links.send(link, size, qos, blocking, self._arrive, (link, to, raw))
 
-    def _arrive(self, link: _LinkState, to: _Subscription, raw: RawSample) -> None:
+    def _arrive(self, link: MessageLink, to: _Subscription, raw: RawSample) -> None:
         """Hand a sample that has crossed a link to the subscriber."""
         link.bytes -= len(raw.payload)
         if to.owner.closed:
@@ -201,98 +146,13 @@ class SimulatedNetwork:
             self.traffic.recorded[raw.key] += 1
         to.arrived(raw)
 
-    def _draw_faults(
-        self, link: _LinkState, sender: str, receiver: str, size: int, droppable: bool
-    ) -> tuple[int, float]:
-        """Return how many copies of a message arrive in real time, and the additional delay (s)."""
-        c, late_s = self.conditions, 0.0
-        if droppable and (
-            link.bytes + size > LINK_BYTES or self._cut_until_s(sender, receiver) > 0.0
-        ):
-            self.traffic.lost += 1
-            return 0, 0.0
-        if self.first_tick_s is None:
-            return 1, 0.0
-        if c.loss and self._random.random() < c.loss:
-            self.traffic.lost += droppable
-            return (0, 0.0) if droppable else (1, _RETRY_S)
-        if c.reorder and droppable and self._random.random() < c.reorder:
-            late_s = -1.0
-        copies = 2 if c.duplicate and droppable and self._random.random() < c.duplicate else 1
-        return copies, late_s
-
-    def deliver(
-        self,
-        sender: str,
-        receiver: str,
-        call: Callable[..., None],
-        qos: str = "control",
-        late_s: float = 0.0,
-        args: tuple[Any, ...] = (),
-    ) -> None:
-        """Call ``call(*args)`` when a message arrives that is sent now.
-
-        It arrives after all earlier ones of its priority, unless ``late_s`` < 0, and after all
-        declarations.
-        """
-        link, due_s = self._link(sender, receiver), self._due_s(sender, receiver, late_s)
-        self._call_in_order(link, due_s, call, qos, late_s, args)
-
-    def _due_s(self, sender: str, receiver: str, late_s: float) -> float:
-        """Return when a message arrives that is sent now, but for those before it."""
-        delay_s = self._latency_s
-        if late_s > 0.0:
-            delay_s += late_s
-        if self._jitter_s:
-            delay_s += self._random.expovariate(1.0 / self._jitter_s)
-        if late_s < 0.0:
-            delay_s += 4.0 * (self._latency_s + self._jitter_s)
-        due_s = self.scheduler.now_s + delay_s
-        return (
-            max(due_s, self._cut_until_s(sender, receiver)) if self.conditions.partition else due_s
-        )
-
-    def _call_in_order(
-        self,
-        link: _LinkState,
-        due_s: float,
-        call: Callable[..., None],
-        qos: str,
-        late_s: float,
-        args: tuple[Any, ...],
-    ) -> None:
-        if late_s < 0.0:
-            self.scheduler.call_at(due_s, call, args=args)
-            return
-        last = link.last
-        after, declared = last.get(qos, NEVER), last.get("control", NEVER)
-        last[qos] = self.scheduler.call_at(
-            due_s, call, after if after > declared else declared, args
-        )
-
-    def _link(self, sender: str, receiver: str) -> _LinkState:
-        link = self._links.get((sender, receiver))
-        if link is None:
-            link = self._links[sender, receiver] = _LinkState()
-        return link
-
     # -- partitions and liveliness -----------------------------------------------------------------
-
-    def _cut_until_s(self, sender: str, receiver: str) -> float:
-        """Return the end of the partition between two processes (virtual time, s), 0 without one."""
-        now_s, end_s = self.mission_s, 0.0
-        if now_s < 0.0:
-            return 0.0
-        for p in self.conditions.partition:
-            if p.at_s <= now_s < p.at_s + p.duration_s and p.separates(sender, receiver):
-                end_s = max(end_s, p.at_s + p.duration_s)
-        return end_s and end_s + (self.first_tick_s or 0.0)
 
     def _schedule_partitions(self) -> None:
         """Let processes lose sight of each other when a partition outlasts the lease."""
         if self.lockstep:
             return
-        begin_s = self.first_tick_s or 0.0
+        begin_s = self.links.first_tick_s or 0.0
         for partition in self.conditions.partition:
             if partition.duration_s > LEASE_S:
                 for at_s in (
@@ -320,7 +180,7 @@ class SimulatedNetwork:
         if silent_s > LEASE_S:
             return False
         return not any(
-            p.at_s + LEASE_S <= self.mission_s < p.at_s + p.duration_s
+            p.at_s + LEASE_S <= self.links.mission_s < p.at_s + p.duration_s
             for p in self.conditions.partition
             if p.separates(name, seen_from)
         )
@@ -340,7 +200,7 @@ class SimulatedNetwork:
         """
         for other in list(self._connections.values()):
             if other.name != name:
-                self.deliver(name, other.name, lambda other=other: other.review(name))
+                self.links.deliver(name, other.name, lambda other=other: other.review(name))
 
     # -- declarations ------------------------------------------------------------------------------
 
@@ -357,7 +217,7 @@ class SimulatedNetwork:
 
     def _declare(self, subscription: _Subscription, publisher: str) -> None:
         """Let a publisher know a subscription when the declaration arrives there."""
-        self.deliver(
+        self.links.deliver(
             subscription.owner.name, publisher, lambda: subscription.known_to.add(publisher)
         )
 
@@ -376,10 +236,10 @@ class SimulatedNetwork:
                 continue
 
             def answer(reply: Reply, server: SimulatedConnection = server) -> None:
-                self.deliver(server.name, asker.name, lambda: replied(reply), "event")
+                self.links.deliver(server.name, asker.name, lambda: replied(reply), "event")
 
             query = _SimulatedQuery(payload, encoding, answer)
-            self.deliver(
+            self.links.deliver(
                 asker.name, server.name, lambda s=server, q=query: s.serve(key, q), "event"
             )
             return
@@ -520,7 +380,7 @@ class SimulatedHost:
         return EPOCH_NS + round(self.now_s() * 1e9)
 
     def pause(self, timeout_s: float | None, over: Callable[[], bool] = lambda: False) -> None:
-        """Wait until ``over``, after which the task is woken, or for a time of this host's clock."""
+        """Wait until ``over``, after which the task is woken, or for a time of the host's clock."""
         end_s = None if timeout_s is None else self._scheduler.now_s + timeout_s / self._rate
         while not over() and (end_s is None or self._scheduler.now_s < end_s):
             self._scheduler.pause(None if end_s is None else end_s - self._scheduler.now_s)
@@ -535,7 +395,7 @@ class SimulatedHost:
 
     def _read_slowly(self) -> None:
         """Take as long as a slow reader does before it reads a message."""
-        now_s = self._network.mission_s
+        now_s = self._network.links.mission_s
         for slow in self._slow:
             if slow.at_s <= now_s < slow.at_s + slow.duration_s:
                 self.sleep(slow.each_s)

@@ -91,10 +91,8 @@ class Scheduler:
         after: Due = NEVER,
         args: tuple[Any, ...] = (),
     ) -> Due:
-        """Call ``call(*args)``, which must not wait, at a time and after the call of ``after``;
-        return when.
-
-        At once if the time has passed.
+        """Schedule ``call(*args)`` at a virtual time (s), at once if it has passed, and not before
+        the event ``after``. Return when it comes. The call must not wait.
         """
         self._count += 1
         now_s = self.now_s

@@ -75,7 +75,9 @@ def path_below_token(path: str, token: str) -> str | None:
     """Return the path and query of a request without the token in front, or None if it has no valid
     token.
     """
-    first, rest = re.fullmatch(r"/?([^/?]*)(.*)", path, re.DOTALL).groups()  # type: ignore[union-attr]
+    found = re.fullmatch(r"/?([^/?]*)(.*)", path, re.DOTALL)
+    assert found is not None  # all parts are optional
+    first, rest = found.groups()
     if not compare_digest(first.encode(errors="replace"), token.encode()):
         return None
     return rest if rest.startswith("/") else f"/{rest}"

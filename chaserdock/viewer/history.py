@@ -119,7 +119,9 @@ class Trail:
 
 
 class History:
-    """Series by quantity and chaser (None: of the mission), trails by chaser, and event lines."""
+    """What the page shows of the past: ``series`` by quantity and chaser (None: of the mission),
+    ``trails`` by chaser, and ``lines`` of events.
+    """
 
     def __init__(self, chasers: int) -> None:
         self.series: dict[tuple[ChartQuantity, int | None], Series] = defaultdict(Series)

@@ -66,7 +66,9 @@ class ViewOptions:
 
 
 def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> int:
-    """Serve the page until stopped; return 0. Raise ViewError or TransportError if it cannot start."""
+    """Serve the page until stopped; return 0. Raise ViewError or TransportError if it cannot
+    start.
+    """
     stop, token = StopSignal(watch_parent), page_token()
     with ThreadPoolExecutor(1, "session") as opener:
         opener.submit(int).result()
@@ -83,7 +85,8 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
         with page_server(options.host, options.port, token) as server:
             print_status(
                 "viewer",
-                f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends this",
+                f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends "
+                "this",
             )
             patient, run_id = _Patience(connect, stop), ""
             with suppress(_Stopped):
@@ -133,7 +136,9 @@ def _join(node: Node) -> JoinReply | None:
 def _next_mission(
     connect: Callable[[], Node], server: viser.ViserServer, past: str, stop: StopSignal
 ) -> JoinReply | None:
-    """Wait for a mission other than ``past``; return None when stopped. The page shows the status."""
+    """Wait for a mission other than ``past``; return None when stopped. The page shows the
+    status.
+    """
     shown = None
     notice = server.gui.add_markdown("") if not past else None
     node = connect()
@@ -186,7 +191,7 @@ class _Feed:
 
 
 class _MissionView:
-    """One mission, until another one starts."""
+    """Shows one mission, until another one starts."""
 
     def __init__(
         self,
@@ -302,7 +307,11 @@ class _MissionView:
         while (item := self._commands.get()) is not None:
             what, chaser = item
             self._page.show_reply(f"{what} chaser {chaser}: sent")
-            command = OperatorCommand(command=what, chaser=chaser, operator="viewer")  # type: ignore[arg-type]
+            command = OperatorCommand(
+                command=what,  # type: ignore[arg-type]
+                chaser=chaser,
+                operator="viewer",
+            )
             try:
                 reply = self._node.query(
                     topics.OPERATE_KEY, command, CommandReply, _REPLY_TIMEOUT_S
@@ -312,7 +321,8 @@ class _MissionView:
                 continue
             if reply is None:
                 self._page.show_reply(
-                    f"⚠ {what} chaser {chaser}: no reply from the controller within {_REPLY_TIMEOUT_S:g} s"
+                    f"⚠ {what} chaser {chaser}: no reply from the controller within "
+                    f"{_REPLY_TIMEOUT_S:g} s"
                 )
             else:
                 self._page.show_reply(("✓ " if reply.accepted else "⚠ ") + reply_text(reply))

@@ -306,7 +306,7 @@ class Page:
                 chart.data = points_of(plot, history, 0.0, state.time_s())
 
     def _draw_image(self, state: MissionState) -> None:
-        """Draw the images that have changed, all at once, so that the tiles show the same moment."""
+        """Draw the images that have changed, all at once: the tiles show the same moment."""
         if time.monotonic() - self._images_s < _IMAGES_S:
             return
         enlarged, changed = self._enlarged, False

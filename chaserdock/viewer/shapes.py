@@ -25,7 +25,9 @@ radius."""
 
 @dataclass(frozen=True)
 class Mesh:
-    """``vertices_m`` (V, 3), ``triangles`` (F, 3) of their indices, ``colours`` (V, 3), 0 to 255."""
+    """Coloured triangles to draw. ``vertices_m`` (V, 3); ``triangles`` (F, 3): indices of their
+    corners; ``colours`` (V, 3): of the vertices, 0 to 255.
+    """
 
     vertices_m: Array
     triangles: NDArray[np.int32]

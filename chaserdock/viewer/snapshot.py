@@ -113,7 +113,7 @@ class ChaserState:
             keep_newest(self.images, message.sim_time_ns, message, _IMAGES_KEPT)
 
     def error(self) -> tuple[float, float] | None:
-        """Return distance (m) and angle (rad) from the reference, by odometry; None while unknown."""
+        """Return distance (m) and angle (rad) from the reference, by odometry; None if unknown."""
         reference = self.reference
         odometry = self._odometries.get(reference.tick) if reference is not None else None
         if reference is None or odometry is None:

@@ -122,7 +122,8 @@ def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
         out.append(f"chaser {i}: the controller commands {chaser.wrench.mode}")
     if (safety := chaser.safety) is not None and not safety.safe:
         out.append(
-            f"chaser {i}: not passively safe: {safety.margin_sigmas:.1f} sigmas, {safety.distance_m:.2f} m "
+            f"chaser {i}: not passively safe: {safety.margin_sigmas:.1f} sigmas, "
+            f"{safety.distance_m:.2f} m "
             f"after {safety.closest_s:.0f} s"
         )
     if chaser.actuators is not None and chaser.actuators.source != "command":

@@ -17,7 +17,9 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 
 def length(vector: Array) -> float:
-    """Return the length of a vector (n,): the bits of ``numpy.linalg.norm`` in a fifth of its time."""
+    """Return the length of a vector (n,): the bits of ``numpy.linalg.norm`` in a fifth of its
+    time.
+    """
     return math.sqrt(vector.dot(vector))
 
 

@@ -17,9 +17,14 @@ from .meshes import MeshPart, TriangleMesh, open_edges
 _SAMPLES = 8_000
 """Approximate number of points on a surface from which nearby triangles are found."""
 _QUERIES = 6_000
+"""Approximate number of points of a surface whose distance from the other one is computed: about as
+many as samples, so that both directions cost the same."""
 _NEAR = 6
+"""Samples whose triangles may be the nearest to a point: those around it in a triangular grid."""
 _LEAST = 12
+"""Fewest triangles of a part: those of a cuboid."""
 _BISECTIONS = 5
+"""Steps of the search for a number of triangles: each halves the range of its logarithm."""
 
 
 def deviation_m(part: MeshPart, other: MeshPart) -> float:

@@ -54,7 +54,9 @@ class MeshPart:
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A body: its parts, and the position (body axes, m) of each joint that some of them move with."""
+    """A body: its parts, and the position (body axes, m) of each joint that some of them move
+    with.
+    """
 
     name: str
     parts: tuple[MeshPart, ...]

@@ -20,8 +20,8 @@ from .arrays import Array
 from .rigid_body import rk4_step
 from .scalar_rotations import cross_components
 
-EARTH_MU_M3_S2 = 3.986004415e14
-EARTH_RADIUS_M = 6378136.3
+EARTH_MU_M3_S2 = 3.986004415e14  # EGM96
+EARTH_RADIUS_M = 6378136.3  # EGM96
 EARTH_J2 = 1.0826269e-3
 """Gravitational parameter, equatorial radius and second zonal coefficient: EGM96."""
 
@@ -81,7 +81,9 @@ def state_of(elements: OrbitalElements) -> OrbitState:
 
 
 def gravity(position_m: Array, j2: float = EARTH_J2) -> Array:
-    """Return the acceleration (3,) of gravity at a position (3,), ECI. ``j2`` = 0: of a point mass."""
+    """Return the acceleration (3,) of gravity at a position (3,), ECI. ``j2`` = 0: of a point
+    mass.
+    """
     r2 = float(position_m @ position_m)
     r = math.sqrt(r2)
     two_body = -EARTH_MU_M3_S2 / (r2 * r) * position_m
@@ -170,7 +172,9 @@ def _j2_change(position_m: Array, velocity_m_s: Array, j2: float) -> Array:
 def to_eci(
     state: OrbitState, position_m: ArrayLike, velocity_m_s: ArrayLike, j2: float = EARTH_J2
 ) -> OrbitState:
-    """Return the ECI state of a body at a position (3,) and velocity (3,) in an orbit's Hill frame."""
+    """Return the ECI state of a body at a position (3,) and velocity (3,) in an orbit's Hill
+    frame.
+    """
     frame = hill_frame(state, j2)
     rho, v = np.asarray(position_m, dtype=float), np.asarray(velocity_m_s, dtype=float)
     moving = v + np.cross(frame.rate_rad_s, rho)

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from .arrays import Array
 from .orbit import EARTH_RADIUS_M
 
-EARTH_RATE_RAD_S = 7.2921159e-5
-_AU_M = 1.495978707e11
-_SUN_RADIUS_M = 6.957e8
+EARTH_RATE_RAD_S = 7.2921159e-5  # sidereal rotation, WGS 84
+_AU_M = 1.495978707e11  # IAU 2012, resolution B2
+_SUN_RADIUS_M = 6.957e8  # IAU 2015, resolution B3
 _J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 # Altitude, km; density there, kg/m^3; scale height, km. Vallado, 4th edition, table 8-4.
 _ATMOSPHERE = (

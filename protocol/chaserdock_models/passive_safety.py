@@ -173,9 +173,14 @@ class CoastModel:
         columns, room = _columns(states), np.empty(len(self._times_s) - 1)
         work = scratch(columns.size)
         function("coast_room")(
-            c_int64(len(room)), address(self._transitions), c_int64(columns.shape[1]), address(columns),
-            c_double(self._sagitta_share * self._step_s), address(room), address(work),
-        )  # fmt: skip
+            c_int64(len(room)),
+            address(self._transitions),
+            c_int64(columns.shape[1]),
+            address(columns),
+            c_double(self._sagitta_share * self._step_s),
+            address(room),
+            address(work),
+        )
         return room
 
     def _closest_in(
@@ -189,9 +194,16 @@ class CoastModel:
         )
         approaches = (c_void_p * 3)(*map(location, found))
         function("coast_closest")(
-            c_int64(len(steps)), address(steps), address(self._transitions), c_int64(padded.shape[1]), address(padded),
-            address(spread), c_double(keep_out_m), c_double(self._sagitta_share * self._step_s), approaches,
-        )  # fmt: skip
+            c_int64(len(steps)),
+            address(steps),
+            address(self._transitions),
+            c_int64(padded.shape[1]),
+            address(padded),
+            address(spread),
+            c_double(keep_out_m),
+            c_double(self._sagitta_share * self._step_s),
+            approaches,
+        )
         margins, away, moments = found[:, : len(states)]
         return ClosestApproaches(margins, away, moments * self._step_s)
 

@@ -51,7 +51,9 @@ class RigidBody(Protocol):
 
 
 def rk4_step(derivative: Callable[[Array], Array], y: Array, step_s: float) -> Array:
-    """Return ``y`` after one step of the classical Runge-Kutta method for y' = ``derivative`` (y)."""
+    """Return ``y`` after one step of the classical Runge-Kutta method for y' = ``derivative``
+    (y).
+    """
     k1 = derivative(y)
     k2 = derivative(y + 0.5 * step_s * k1)
     k3 = derivative(y + 0.5 * step_s * k2)
@@ -97,7 +99,14 @@ def free_rotation(
         np.empty((count, 3)),
     )
     function("free_rotation")(
-        address(q), address(omega), address(inertia), address(inverse), c_double(step_s), c_int64(count),
-        address(attitudes), address(rates), address(accelerations),
-    )  # fmt: skip
+        address(q),
+        address(omega),
+        address(inertia),
+        address(inverse),
+        c_double(step_s),
+        c_int64(count),
+        address(attitudes),
+        address(rates),
+        address(accelerations),
+    )
     return attitudes, rates, accelerations

@@ -34,9 +34,21 @@ NOZZLE = Material("nozzle", diffuse=0.18, specular=0.25, shininess=18.0)
 BLACK_PAINT = Material("black paint", diffuse=0.06)
 
 BOX_TRIANGLES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
-     [1, 5, 7], [1, 7, 3]]
-)  # fmt: skip
+    [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
+)
 """Triangles (12, 3) of a cuboid's corners, in the order of `targets.cuboid_corners`."""
 
 
@@ -63,9 +75,14 @@ def box(
 
 
 def lathe(
-    name: str, material: Material, profile_m: Sequence[tuple[float, float]], base_m: Vector3, axis: Vector3,
-    tolerance_m: float, joint: str = "",
-) -> MeshPart:  # fmt: skip
+    name: str,
+    material: Material,
+    profile_m: Sequence[tuple[float, float]],
+    base_m: Vector3,
+    axis: Vector3,
+    tolerance_m: float,
+    joint: str = "",
+) -> MeshPart:
     """Return a surface of revolution about ``axis`` through ``base_m``.
 
     ``profile_m``: radius and height of the corners of a closed polygon, counter-clockwise with the
@@ -106,17 +123,28 @@ def _rotation_from_z(axis: Vector3) -> Array:
 
 
 def _cylinder(
-    name: str, material: Material, radius_m: float, length_m: float, base_m: Vector3, axis: Vector3, tolerance_m: float,
+    name: str,
+    material: Material,
+    radius_m: float,
+    length_m: float,
+    base_m: Vector3,
+    axis: Vector3,
+    tolerance_m: float,
     joint: str = "",
-) -> MeshPart:  # fmt: skip
+) -> MeshPart:
     profile = ((0.0, 0.0), (radius_m, 0.0), (radius_m, length_m), (0.0, length_m))
     return lathe(name, material, profile, base_m, axis, tolerance_m, joint)
 
 
 def _tube(
-    name: str, material: Material, radii_m: tuple[float, float], length_m: float, base_m: Vector3, axis: Vector3,
+    name: str,
+    material: Material,
+    radii_m: tuple[float, float],
+    length_m: float,
+    base_m: Vector3,
+    axis: Vector3,
     tolerance_m: float,
-) -> MeshPart:  # fmt: skip
+) -> MeshPart:
     inner, outer = radii_m
     profile = ((inner, 0.0), (outer, 0.0), (outer, length_m), (inner, length_m))
     return lathe(name, material, profile, base_m, axis, tolerance_m)
@@ -153,10 +181,18 @@ def _wings(
         joint = f"panel_{label}"
         middle = side * (bus_half_m + boom_m + panel_m[1] / 2.0)
         parts += [
-            _cylinder(f"boom_{label}", BARE_METAL, 0.008, boom_m + 0.01, (0.0, side * bus_half_m, 0.0), (0.0, side, 0.0),
-                      tolerance_m, joint),
+            _cylinder(
+                f"boom_{label}",
+                BARE_METAL,
+                0.008,
+                boom_m + 0.01,
+                (0.0, side * bus_half_m, 0.0),
+                (0.0, side, 0.0),
+                tolerance_m,
+                joint,
+            ),
             box(joint, CELLS, panel_m, (0.0, middle, 0.0), (0.0, tilt_rad, 0.0), joint),
-        ]  # fmt: skip
+        ]
     return parts
 
 
@@ -230,9 +266,15 @@ def _geo_servicer(tolerance_m: float) -> TriangleMesh:
     ]
     for k, (y, z) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         parts.append(
-            lathe(f"thruster_{k}", NOZZLE, _bell(0.006, 0.014, 0.028, 0.0015), (-0.20, 0.135 * y, 0.135 * z),
-                  (-1.0, 0.0, 0.0), tolerance_m)
-        )  # fmt: skip
+            lathe(
+                f"thruster_{k}",
+                NOZZLE,
+                _bell(0.006, 0.014, 0.028, 0.0015),
+                (-0.20, 0.135 * y, 0.135 * z),
+                (-1.0, 0.0, 0.0),
+                tolerance_m,
+            )
+        )
     return TriangleMesh(
         "geo_servicer",
         tuple(parts),
@@ -253,13 +295,52 @@ def _cubesat_12u(tolerance_m: float) -> TriangleMesh:
         box("cells_top", CELLS, (0.300, 0.180, 0.003), (0.0, 0.0, 0.1095)),
         box("radiator", WHITE_PAINT, (0.200, 0.150, 0.003), (0.04, 0.0, -0.1095)),
         *_wings(0.113, (0.320, 0.200, 0.004), 0.012, 0.0, tolerance_m),
-        _tube("camera", BLACK_PAINT, (0.024, 0.029), 0.035, (0.165, 0.045, 0.03), (1.0, 0.0, 0.0), tolerance_m),
-        _tube("star_tracker", BLACK_PAINT, (0.014, 0.017), 0.030, (0.165, -0.05, -0.04), (1.0, 0.0, 0.0), tolerance_m),
-        _tube("docking_ring", BARE_METAL, (0.052, 0.060), 0.015, (-0.165, 0.0, 0.0), (-1.0, 0.0, 0.0), tolerance_m),
-        lathe("nozzle", NOZZLE, _bell(0.008, 0.022, 0.030, 0.002), (-0.165, 0.07, -0.07), (-1.0, 0.0, 0.0), tolerance_m),
-        box("antenna_0", BARE_METAL, (0.0016, 0.006, 0.170), (-0.155, 0.03, 0.190), (0.0, 0.15, 0.0)),
-        box("antenna_1", BARE_METAL, (0.0016, 0.006, 0.170), (-0.155, -0.03, -0.190), (0.0, -0.15, 0.0)),
-    ]  # fmt: skip
+        _tube(
+            "camera",
+            BLACK_PAINT,
+            (0.024, 0.029),
+            0.035,
+            (0.165, 0.045, 0.03),
+            (1.0, 0.0, 0.0),
+            tolerance_m,
+        ),
+        _tube(
+            "star_tracker",
+            BLACK_PAINT,
+            (0.014, 0.017),
+            0.030,
+            (0.165, -0.05, -0.04),
+            (1.0, 0.0, 0.0),
+            tolerance_m,
+        ),
+        _tube(
+            "docking_ring",
+            BARE_METAL,
+            (0.052, 0.060),
+            0.015,
+            (-0.165, 0.0, 0.0),
+            (-1.0, 0.0, 0.0),
+            tolerance_m,
+        ),
+        lathe(
+            "nozzle",
+            NOZZLE,
+            _bell(0.008, 0.022, 0.030, 0.002),
+            (-0.165, 0.07, -0.07),
+            (-1.0, 0.0, 0.0),
+            tolerance_m,
+        ),
+        box(
+            "antenna_0", BARE_METAL, (0.0016, 0.006, 0.170), (-0.155, 0.03, 0.190), (0.0, 0.15, 0.0)
+        ),
+        box(
+            "antenna_1",
+            BARE_METAL,
+            (0.0016, 0.006, 0.170),
+            (-0.155, -0.03, -0.190),
+            (0.0, -0.15, 0.0),
+        ),
+    ]
     return TriangleMesh(
         "cubesat_12u",
         tuple(parts),

@@ -6,9 +6,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-_CYCLIC_AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+_CYCLIC_AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # rotations by thirds about a diagonal
 _FAST = {"min_on_s": 0.005, "rise_s": 0.001, "fall_s": 0.001}
-_HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+_HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))  # about x, y and z
 
 
 def _tetra12() -> dict[str, Any]:

@@ -15,7 +15,9 @@ from msgspec import Struct, inspect
 from .messages import Message, encoding_of
 
 MAX_BYTES = 17_000_000
+"""Largest message: an image of the largest size (`Image.data`, 16 MB) and its other fields."""
 UNIT_QUATERNION_TOLERANCE = 1e-6
+"""Largest error of a quaternion's length: ten times the rounding of single precision."""
 MAX_MAGNITUDE = 1e15
 """Bound of every float (SI units): beyond any mission, and small enough that its powers remain
 finite.

@@ -23,7 +23,8 @@ def require_extra(package: str, extra: str) -> None:
     """
     if find_spec(package) is None:
         raise MissingPackageError(
-            f"{package} is not installed; install chaserdock[{extra}]: pip install 'chaserdock[{extra}]'",
+            f"{package} is not installed; install chaserdock[{extra}]: pip install "
+            f"'chaserdock[{extra}]'",
             name=package,
         )
 

@@ -12,7 +12,9 @@ from .messages import Odometry
 
 
 def extrapolate(odometry: Odometry, tick: int, time_ns: int) -> Odometry:
-    """Extrapolate odometry to a later tick and time (ns) at constant velocity (WRF) and rate (CRF)."""
+    """Extrapolate odometry to a later tick and time (ns) at constant velocity (WRF) and rate
+    (CRF).
+    """
     elapsed_s = (time_ns - odometry.sim_time_ns) / 1e9
     rotation = rotations.exp(np.asarray(odometry.omega_rad_s) * elapsed_s)
     return msgspec.structs.replace(

@@ -36,7 +36,7 @@ from .messages import Message, Odometry, PoseSolution, Sighting, WrenchCommand
 from .topics import Topic
 from .transport.network import Host
 
-_CORRUPTED_BYTES = 4
+_CORRUPTED_BYTES = 4  # as a burst of noise; one byte is often within a number, and harmless
 _SENDER_FIELDS = ("commander", "instance", "holder")
 """Fields that name a sender. In real time a reader must refuse a message that names another one;
 see ``FaultLayer``.
@@ -249,7 +249,9 @@ class FaultLayer:
 def create_fault_layer(
     faults: ProcessFaults, name: str, timing: Timing, lockstep: bool, host: Host
 ) -> FaultLayer | None:
-    """Return the fault layer of process ``name``, which runs on ``host``, or None without faults."""
+    """Return the fault layer of process ``name``, which runs on ``host``, or None without
+    faults.
+    """
     return (
         FaultLayer(faults.faults, name, timing, faults.seed, lockstep, host)
         if faults.faults

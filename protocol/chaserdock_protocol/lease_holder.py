@@ -24,6 +24,7 @@ PATIENCE_TICKS = 3
 other commands meanwhile.
 """
 _MOST_KNOWN = 8
+"""Ticks whose first message is kept: half a second at 15 Hz, longer than `PATIENCE_TICKS`."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,10 @@ def defect_of(lease: Lease, rate_hz: float) -> str:
     if not lease.holder:
         return ""
     if commander_of(lease.term) != lease.holder:
-        return f"term {lease.term} belongs to {commander_of(lease.term) or 'no controller'}, not to {lease.holder}"
+        return (
+            f"term {lease.term} belongs to {commander_of(lease.term) or 'no controller'}, not to "
+            f"{lease.holder}"
+        )
     # A command may arrive, and renew the lease, before its tick.
     latest = lease.tick + 2 * longest_lease_ticks(rate_hz)
     if not lease.from_tick <= lease.tick <= lease.until_tick < latest:
@@ -66,7 +69,9 @@ def is_majority(granted: Collection[int], live: Collection[int]) -> bool:
 
 
 def no_command(chaser: int, tick: Tick) -> WrenchCommand:
-    """Return the message for a chaser that waits for the command of a tick for which there is none."""
+    """Return the message for a chaser that waits for the command of a tick for which there is
+    none.
+    """
     zero = (0.0, 0.0, 0.0)
     return WrenchCommand(
         tick=tick.tick,

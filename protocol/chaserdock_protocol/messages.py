@@ -263,7 +263,7 @@ class Image(Message, frozen=True, kw_only=True):
     ranging: RangeMeasurement | None = None
 
 
-_EXACT = (0.0,) * 9
+_EXACT = (0.0,) * 9  # covariance (3, 3) of what has no error
 
 
 class Odometry(Message, frozen=True, kw_only=True):

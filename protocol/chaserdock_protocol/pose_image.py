@@ -20,7 +20,7 @@ from .codec import UNIT_QUATERNION_TOLERANCE
 
 NAME = "statistical"
 """Value of ``perception.name``."""
-_NUMBERS = 9
+_NUMBERS = 9  # position (3), rotation (4) and seed (2)
 WIDTH_PX = 8 * _NUMBERS
 _NUMBERS_OF = struct.Struct(f"<{_NUMBERS}d")
 

@@ -42,7 +42,9 @@ def shipped_scenario(name: str) -> Path:
 
 
 def find_scenario(name: str) -> Path:
-    """Return a scenario file by its path, or by the name of a shipped one. Raises ScenarioNotFound."""
+    """Return a scenario file by its path, or by the name of a shipped one. Raises
+    ScenarioNotFound.
+    """
     path = Path(name)
     if path.is_file():
         return path

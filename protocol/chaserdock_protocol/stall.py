@@ -10,6 +10,8 @@ DEFAULT_STALL_S = 60.0
 a process ends.
 """
 _LONGEST_STEP_S = 0.5
+"""Most that one step counts, s: callers update at least twice a second, so that a longer step is
+one in which the process, or the machine, stood still."""
 
 
 class StallTimer:

@@ -12,9 +12,10 @@ from chaser_cases import ZERO, deliver, docking, lost, odometry, step, tick_of
 from chaserdock_agents.chaser.core import ChaserCore
 from chaserdock_agents.chaser.outbox import ChaserOutputs
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import Image, Plan, TargetEstimate, WrenchCommand
+from chaserdock_protocol.messages import Event, Image, Plan, TargetEstimate, WrenchCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.transport import ReceivedMessage
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -227,3 +228,38 @@ def test_late_docking_status_replaces_an_assumed_one(capture: Scenario) -> None:
     assert chaser.inbox.docking == msgspec.structs.replace(
         docking(capture, 3, latched=True), contact=False
     )
+
+
+# -- real time -------------------------------------------------------------------------------------
+
+
+def test_fallback_begins_after_a_commands_lifetime_in_real_time(scenario: Scenario) -> None:
+    """The lease is stated again at once, and a command that arrives later takes precedence."""
+    chaser, lifetime_s = ChaserCore(scenario, 0, realtime=True), 0.5
+    deliver(chaser, topics.TICK, tick_of(scenario, 1, (0,)))
+    deliver(chaser, topics.ODOMETRY, odometry(scenario, 0, 1))
+    published = deliver(chaser, topics.WRENCH, wrench(scenario, 1))
+    assert [t for t, _ in published] == [topics.LEASE, topics.ACTUATORS]
+    acted = {}
+    for tick in range(2, 9):
+        deliver(chaser, topics.TICK, tick_of(scenario, tick, (0,)))
+        acted[tick] = actuated(deliver(chaser, topics.ODOMETRY, odometry(scenario, 0, tick)))
+    silent_s = {tick: (tick - 1) / scenario.time.rate_hz for tick in acted}
+    assert [bool(own) for own in acted.values()] == [s > lifetime_s for s in silent_s.values()]
+    assert any(acted.values())
+    assert chaser.gate.executed_tick == 1
+    assert actuated(deliver(chaser, topics.WRENCH, wrench(scenario, 8))) == [(8, "command")]
+
+
+def test_command_that_waited_beyond_its_lifetime_is_refused_in_real_time(
+    scenario: Scenario,
+) -> None:
+    """Simulated time goes on by the host's clock while the process does not read its messages."""
+    chaser = ChaserCore(scenario, 0, realtime=True)
+    deliver(chaser, topics.TICK, tick_of(scenario, 1, (0,)))
+    deliver(chaser, topics.ODOMETRY, odometry(scenario, 0, 1))
+    received = ReceivedMessage(topics.WRENCH, "0", wrench(scenario, 1), 0)
+    outputs = chaser.step(received, now_s=0.6)
+    events = [m.what for _, _, m in outputs.messages if isinstance(m, Event)]
+    assert events == ["command refused", "no command", "fallback: hold"]
+    assert outputs.stale

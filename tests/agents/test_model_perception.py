@@ -267,7 +267,7 @@ def test_search_for_the_sun_behind_a_target_is_spread_over_images(monkeypatch):
 
 @pytest.mark.parametrize("number", [167, 171])
 def test_backlit_target_is_tracked_while_it_turns(number):
-    """Views of benchmarks/markerless.py, `backlit-flight`, in which the track was lost."""
+    """Views of benchmarks/perception.py, `backlit-flight`, in which the track was lost."""
     wide = Camera.from_hfov(960, 540, np.deg2rad(60.0))
     mesh = TrackerMesh.of_mesh(satellite("geo_servicer"), 0.0, 0.0)
     rng = np.random.default_rng([zlib.crc32(b"backlit"), number])

@@ -116,7 +116,7 @@ def test_docking_port_that_fills_the_image_is_tracked(position, q, sun):
 
 @pytest.mark.parametrize("number", [85, 254])
 def test_sun_behind_a_target_is_estimated_from_its_rims(number):
-    """Views of benchmarks/markerless.py, `backlit`: 0.5 and 0.7 deg off with light from everywhere,
+    """Views of benchmarks/perception.py, `backlit`: 0.5 and 0.7 deg off with light from everywhere,
     or with a sun in front.
     """
     rng = np.random.default_rng([zlib.crc32(b"backlit"), number])
@@ -258,7 +258,7 @@ def test_backlit_target_without_an_observable_attitude_is_rejected():
 
 
 def drawn(cell, number):
-    """Return the random numbers of a view of benchmarks/markerless.py."""
+    """Return the random numbers of a view of benchmarks/perception.py."""
     return np.random.default_rng([zlib.crc32(cell), number])
 
 

@@ -17,7 +17,7 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from flights.measured_poses import measurement_model
 from thruster_cases import at_rest, mission, wrench
 
-from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.experiments.flight_record import record_flight
 
 PERIOD_S, S = 0.1, 1_000_000_000
 

@@ -28,7 +28,7 @@ from flight_cases import fleet_of, odometry, order, tick_inputs
 from flights.measured_poses import measurement_model
 from thruster_cases import at_rest, box, mission, wrench
 
-from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.experiments.flight_record import record_flight
 
 
 def limits(report: ThrusterReport) -> np.ndarray:

@@ -16,7 +16,15 @@ import pytest
 from chaserdock_protocol import topics
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node
-from source_tree import FLYING, MODULES, PACKAGES, imported, module_name, short, tree_of
+from source_tree import (
+    FLYING,
+    MODULES,
+    PACKAGES,
+    imported,
+    module_name,
+    short,
+    tree_of,
+)
 
 MAY_IMPORT = {
     "chaserdock_models": set(),
@@ -44,7 +52,7 @@ def test_there_are_modules_to_check() -> None:
 
 def test_relative_imports_are_resolved() -> None:
     """The checks below depend on it."""
-    chaser = own_imports(PACKAGES["chaserdock_agents"] / "chaser" / "process.py")
+    chaser = own_imports(PACKAGES["chaserdock_agents"] / "chaser" / "core.py")
     assert {"chaserdock_agents.chaser.command_gate", "chaserdock_protocol.scenario"} <= chaser
 
 
@@ -86,6 +94,42 @@ def test_one_module_imports_the_library(library: str, homes: set[str]) -> None:
         if any(n.split(".")[0].startswith(library) for n in imported(p))
     }
     assert users == homes
+
+
+OPTIONAL = {
+    "chaserdock.calibration": {"chaserdock.cli.calibrate"},
+    "chaserdock.datasets": {"chaserdock.cli.datasets"},
+    "chaserdock.experiments": {"chaserdock.cli.compare", "chaserdock.cli.run"},
+    "chaserdock.targets": {"chaserdock.cli.target"},
+    "chaserdock_agents.ros2": {"chaserdock.logs.rosbag"},
+    "chaserdock.logs.rosbag": {"chaserdock.cli.logs"},
+    "chaserdock_world.physics.mujoco_engine": {"chaserdock_world.physics.engine_factory"},
+}
+"""What few users need, and the modules that may import it: its command or its table. The process
+``ros2`` is started by its entry point.
+"""
+
+
+def belongs(name: str, package: str) -> bool:
+    """Return whether a module is a package or inside it."""
+    return name == package or name.startswith(f"{package}.")
+
+
+def test_core_does_not_import_optional_parts() -> None:
+    for package, homes in OPTIONAL.items():
+        users = {
+            name
+            for name, path in NAMES.items()
+            if not belongs(name, package) and any(belongs(n, package) for n in imported(path))
+        }
+        assert users == homes, package
+
+
+def test_optional_parts_are_imported_only_when_they_are_used() -> None:
+    for package, homes in OPTIONAL.items():
+        for home in homes - set(OPTIONAL) - {"chaserdock.logs.rosbag"}:
+            at_once = set(imported(NAMES[home], at_once=True))
+            assert not any(belongs(name, package) for name in at_once), (package, home)
 
 
 def test_transport_depends_on_neither_faults_nor_scenario() -> None:

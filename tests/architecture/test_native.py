@@ -6,10 +6,10 @@ cannot be had.
 from __future__ import annotations
 
 import ctypes
+import itertools
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from chaserdock_controller.estimation.joint import kernels as joint_kernels
 from chaserdock_controller.estimation.joint import native as joint_native
 from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
 from chaserdock_controller.nmpc import native as nmpc_native
+from chaserdock_controller.nmpc.rti import RtiSolver
 from chaserdock_models import native, passive_safety
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import KernelLibrary
@@ -37,7 +38,7 @@ from joint_cases import SyntheticFlight, navigation, parameters
 from nmpc_cases import PARAMS, Array, at_rest, fixed_problem, fly, swap
 from nmpc_kernels import build_rows
 from numpy.typing import NDArray
-from source_tree import ROOT
+from source_tree import MODULES, ROOT
 
 LEVELS = [number for number, _ in X86_64]
 
@@ -251,7 +252,7 @@ def copied(folder: Path) -> KernelLibrary:
 def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
     copy = copied(tmp_path)
     assert copy.library.source_digest().decode() == source_digest(copy.path.parent)
-    with (copy.path.parent / "cost.c").open("a") as file:
+    with (copy.path.parent / "problem.c").open("a") as file:
         file.write("\n/* an edit */\n")
     with pytest.raises(ImportError, match=r"compiled from other sources.*pip install"):
         _ = KernelLibrary(str(copy.path)).library
@@ -265,6 +266,36 @@ def test_a_library_that_is_missing_or_broken_is_named(tmp_path: Path) -> None:
     copy.path.unlink()
     with pytest.raises(ImportError, match=r"missing.*pip install"):
         _ = copy.library
+
+
+def test_a_structure_of_another_layout_is_refused(tmp_path: Path) -> None:
+    """Members of equal size in another order, another size, one too few: each named, on loading."""
+    fields = kernels.Model._fields_
+    swapped = [fields[1], fields[0], *fields[2:]]
+    narrow = [(fields[0][0], ctypes.c_float), *fields[1:]]
+    path = str(copied(tmp_path).path)
+    for members, said in (
+        (swapped, "step_s of 8 bytes at byte 0 in C, mass_kg of 8 bytes at byte 0 in Python"),
+        (narrow, "step_s of 8 bytes at byte 0 in C, step_s of 4 bytes at byte 0 in Python"),
+        (fields[:-1], "Model of 240 bytes at byte 0 in C, Model of 232 bytes at byte 0 in Python"),
+    ):
+        copy = KernelLibrary(path)
+        copy.structure("Model")(type("Wrong", (ctypes.Structure,), {"_fields_": members}))
+        with pytest.raises(ImportError, match=f"structure Model of C and Wrong.*: {said}"):
+            _ = copy.library
+    with pytest.raises(ImportError, match="structure Model"):
+        nmpc_native.LIBRARY.structure("Model")(type("Late", (ctypes.Structure,), {"_fields_": []}))
+    nmpc_native.LIBRARY.structure("Model")(kernels.Model)
+    with pytest.raises(ImportError, match=r"no LAYOUT\(Unknown, ...\)"):
+        nmpc_native.LIBRARY.structure("Unknown")(kernels.Model)
+
+
+def test_every_structure_is_compared_with_c() -> None:
+    """No ctypes structure of the sources is left out, except the one that describes the others."""
+    for _, path in MODULES:
+        for before, line in itertools.pairwise(path.read_text().splitlines()):
+            if re.match(r"class \w+\((ctypes\.)?Structure\)", line):
+                assert before.startswith("@LIBRARY.structure(") or "_Member" in line, path
 
 
 @pytest.mark.parametrize("folder", NATIVE_FOLDERS)
@@ -285,14 +316,14 @@ def test_rows_between_chasers_far_apart_are_left_out_only_where_none_is_reached(
     x = frame.rolled(task, task.start)
     room_m = 0.5 * (4.0 - 0.35 - 5e-3)
     for reach_m, rows in ((room_m - 1e-6, 0), (room_m + 1e-6, 30)):
-        found = build_rows(task.problem, x, 25.0, np.full((2, 31), reach_m))
+        found = build_rows(task.problem, PARAMS, x, np.full((2, 31), reach_m))
         assert list(found.n_rows) == [rows, rows]
 
 
 def test_working_memory_is_enough() -> None:
     """No kernel writes beyond its output, with the largest number of rows."""
-    n, d, params = 3, PARAMS.stages, replace(PARAMS, boxes=2)
-    sizes = (ctypes.c_int64(value) for value in (n, d, params.boxes))
+    n, d = 3, PARAMS.stages
+    sizes = (ctypes.c_int64(value) for value in (n, d, 2))
     doubles = nmpc_native.function("tick_workspace", ctypes.c_int64)(*sizes)
     guarded = np.full(doubles + 64, 7.0)
     rng = np.random.default_rng(1)
@@ -303,8 +334,9 @@ def test_working_memory_is_enough() -> None:
     problem = NmpcInput(
         **{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors, **shapes}
     )
-    solver = make_solver("rti", params, n)
-    solver._workspace = guarded  # pyright: ignore[reportAttributeAccessIssue]
+    solver = make_solver("rti", PARAMS, n)
+    assert isinstance(solver, RtiSolver)
+    solver._workspace, solver._extra = guarded, 2  # pyright: ignore[reportPrivateUsage]
     plan = solver.solve(problem, 0.0)
     assert plan.iterations.all()
     assert (guarded[doubles:] == 7.0).all()

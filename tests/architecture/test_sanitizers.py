@@ -2,7 +2,7 @@
 """The C kernels under sanitizers: arbitrary floating-point input, and that the sanitizers and
 checks find faults.
 
-`python benchmarks/fuzz_kernels.py` does the same for longer.
+`python benchmarks/fuzz.py` does the same for longer.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def test_python_tests_call_all_kernels_under_sanitizers() -> None:
     [
         (1, "draw_stars", "scene.c", "if (!(x > -1.0 && y > -1.0", "if ((x < -1.0 && y > -1.0", "outside the range"),
         (2, "refine_corners", "corners.c", "if (row > p->height - 2)", "if (row > p->height)", "heap-buffer-overflow"),
-        (3, "plan_violation", "planes.c", "or_nan(worst[i], zones->to_target", "of(worst[i], zones->to_target", "violated: worst"),
+        (3, "plan_violation", "planes.c", "or_nan(worst[i], problem->to_target", "of(worst[i], problem->to_target", "violated: worst"),
     ],
 )  # fmt: skip
 def test_planted_faults_are_found(

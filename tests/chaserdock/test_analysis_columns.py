@@ -47,6 +47,7 @@ def test_incomplete_row_raises_an_error(monkeypatch: pytest.MonkeyPatch) -> None
         table.table()
 
 
+@pytest.mark.slow
 def test_report_is_equal_with_tables_in_files(monkeypatch: pytest.MonkeyPatch) -> None:
     in_memory = report_of(GOLDEN)
     monkeypatch.setattr(columns, "_MAX_IN_MEMORY", 64)

@@ -55,6 +55,7 @@ def test_public_names_exist() -> None:
         _ = cd.nothing  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_run_from_a_thread_prints_nothing(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -101,6 +102,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 def test_keyboard_interrupt_ends_all_processes(tmp_path: Path) -> None:
     program = subprocess.Popen(
         [sys.executable, "-c", _INTERRUPTED, str(tmp_path / "run")],

@@ -73,6 +73,7 @@ def board_images(board, count, seed=3):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["charuco 8x6", "chessboard 7x5"])
 def test_calibration_recovers_the_camera_of_rendered_boards(kind, tmp_path):
     board = board_of(kind, 0.03, 0.022, "DICT_4X4_50")

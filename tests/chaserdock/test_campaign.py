@@ -23,13 +23,22 @@ from harness import chaserdock, descendants, finished
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chaserdock.campaign.plan import Campaign, load_campaign
-from chaserdock.campaign.report import page
-from chaserdock.campaign.table import cause_of, causes, rank_correlation, row_of, rows_of, wilson
-from chaserdock.campaign.worker import (
-    CampaignError,
-    FinishedRun,
-    fly_campaign,
+from chaserdock.experiments.campaign_file import load_campaign
+from chaserdock.experiments.campaign_report import sections
+from chaserdock.experiments.page import html as html_of
+from chaserdock.experiments.plan import Alone, ExperimentError, ExperimentPlan
+from chaserdock.experiments.results import (
+    cause_of,
+    causes,
+    rank_correlation,
+    row_of,
+    rows_of,
+    wilson,
+)
+from chaserdock.experiments.worker import (
+    FlightOutcome,
+    Workers,
+    fly_plan,
     read_result,
     result_path,
     write_result,
@@ -75,7 +84,7 @@ values = [-0.02, -0.04, -0.06, -0.08]
 """
 
 
-def campaign_of(text: str, folder: Path) -> Campaign:
+def campaign_of(text: str, folder: Path) -> ExperimentPlan:
     file = folder / "campaign.toml"
     file.write_text(text)
     return load_campaign(file)
@@ -85,14 +94,14 @@ def test_grid_contains_every_combination_with_every_seed(tmp_path: Path) -> None
     campaign = campaign_of(GRID, tmp_path)
     points = [
         (r.varied["chasers.0.start_offset_m.0"], r.varied["controller.solver"], r.seed)
-        for r in campaign.runs
+        for r in campaign.flights
     ]
     assert sorted(points) == sorted(
         (x, s, seed) for x in (-0.05, -0.3) for s in ("rti", "ipopt") for seed in (3, 5)
     )
-    assert len({r.name for r in campaign.runs}) == 8
-    for run in campaign.runs:
-        scenario = load_scenario(run.scenario, run.overrides)
+    assert len({r.name for r in campaign.flights}) == 8
+    for run in campaign.flights:
+        scenario = load_scenario(Path(run.scenario), run.overrides)
         assert scenario.seed == run.seed
         assert scenario.duration_s == 8.0
         assert scenario.controller.solver == run.varied["controller.solver"]
@@ -100,15 +109,15 @@ def test_grid_contains_every_combination_with_every_seed(tmp_path: Path) -> None
 
 def test_sample_follows_its_distributions_and_is_reproducible(tmp_path: Path) -> None:
     campaign = campaign_of(SAMPLE, tmp_path)
-    rates = [r.varied["target.omega_rad_s.0"] for r in campaign.runs]
-    masses = [r.varied["chaser.mass_kg"] for r in campaign.runs]
-    assert len(campaign.runs) == 20
+    rates = [r.varied["target.omega_rad_s.0"] for r in campaign.flights]
+    masses = [r.varied["chaser.mass_kg"] for r in campaign.flights]
+    assert len(campaign.flights) == 20
     assert all(0.0 <= rate <= 0.05 for rate in rates)
     assert len(set(rates)) == 20
     assert 29.0 < sum(masses) / 20 < 31.0
-    assert {r.varied["controller.integrator"] for r in campaign.runs} == {"rk4", "euler"}
+    assert {r.varied["controller.integrator"] for r in campaign.flights} == {"rk4", "euler"}
     assert campaign_of(SAMPLE, tmp_path) == campaign
-    assert campaign_of(SAMPLE.replace("= 7", "= 8"), tmp_path).runs != campaign.runs
+    assert campaign_of(SAMPLE.replace("= 7", "= 8"), tmp_path).flights != campaign.flights
 
 
 @pytest.mark.parametrize(
@@ -201,24 +210,18 @@ def summary(failures: list[str]) -> dict[str, Any]:
     }
 
 
-def results_of(campaign: Campaign) -> list[tuple[Any, FinishedRun]]:
-    out = []
-    for k, run in enumerate(campaign.runs):
+def outcomes_of(campaign: ExperimentPlan) -> dict[str, FlightOutcome]:
+    out = {}
+    for k, flight in enumerate(campaign.flights):
         bad = [f"chaser 0: steady RMS: 0.0{k} m"] if k % 2 else []
-        out.append(
-            (
-                run,
-                FinishedRun(
-                    run.name, 1 if bad else 0, summary(bad), "", f"/logs/{k}.mcap" if bad else None
-                ),
-            )
-        )
+        log = f"/logs/{k}.mcap" if bad else None
+        out[flight.name] = FlightOutcome(flight.name, 1 if bad else 0, summary(bad), "", log)
     return out
 
 
 def test_row_holds_the_worst_chaser_and_no_wall_clock_values(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
-    rows = rows_of(results_of(campaign))
+    rows = rows_of(campaign, outcomes_of(campaign))
     assert rows[0]["steady_position_mse_m2"] == 4e-6
     assert rows[0]["steady_orientation_mse_rad2"] == 9e-6
     assert rows[0]["min_distance_target_m"] == 0.8
@@ -226,11 +229,10 @@ def test_row_holds_the_worst_chaser_and_no_wall_clock_values(tmp_path: Path) -> 
     assert not any("wall" in column for column in rows[0])
     assert math.isnan(rows[0]["estimate_max_position_error_m"])
     assert causes(rows) == [(cause_of("chaser 0: steady RMS: 0.01 m"), 4)]
-    crashed = row_of(
-        campaign.runs[0], FinishedRun(campaign.runs[0].name, 2, None, "chaserdock: no port")
-    )
+    first = campaign.flights[0]
+    crashed = row_of(0, first, FlightOutcome(first.name, 2, None, "no port"))
     assert not crashed["success"]
-    assert crashed["cause"] == "chaserdock: no port"
+    assert crashed["cause"] == "no port"
 
 
 class LinkCollector(HTMLParser):
@@ -244,8 +246,10 @@ class LinkCollector(HTMLParser):
 
 def test_report_counts_passes_and_links_failures(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
-    results = results_of(campaign)
-    text = page(campaign, rows_of(results[:-1]), Path("/logs/here"))
+    outcomes = outcomes_of(campaign)
+    del outcomes[campaign.flights[-1].name]
+    rows = rows_of(campaign, outcomes)
+    text = html_of(campaign.name, sections(campaign, rows, Path("/logs/here")))
     assert "4 of 7 passed" in text
     assert "1 are missing" in text
     assert "--set 'seed=5'" in html.unescape(text)
@@ -263,37 +267,83 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     campaign = campaign_of(GRID, tmp_path)
     flown: list[str] = []
 
-    def fly(run: Any, *_: Any) -> FinishedRun:
-        flown.append(run.name)
-        return FinishedRun(run.name, 0, summary([]), "")
+    def fly(flight: Any, *_: Any) -> FlightOutcome:
+        flown.append(flight.name)
+        return FlightOutcome(flight.name, 0, summary([]), "")
 
-    monkeypatch.setattr("chaserdock.campaign.worker.fly", fly)
-    earlier = campaign.runs[2]
-    write_result(tmp_path, earlier, FinishedRun(earlier.name, 1, None, "earlier"))
+    monkeypatch.setattr("chaserdock.experiments.worker.fly", fly)
+    earlier, crashed = campaign.flights[2:4]
+    write_result(tmp_path, FlightOutcome(earlier.name, 1, summary(["far"]), "earlier"))
+    write_result(tmp_path, FlightOutcome(crashed.name, 2, None, "no port"))
     progress: list[int] = []
-    results = fly_campaign(
+    outcomes = fly_plan(
         campaign,
         tmp_path,
-        "none",
-        2,
-        None,
-        lambda finished, total, run, result: progress.append(finished),
+        Workers(2),
+        lambda ended, total, flight, outcome: progress.append(ended),
         threading.Event(),
     )
-    assert sorted(flown) == sorted(r.name for r in campaign.runs if r is not earlier)
-    assert [r.name for r, _ in results] == [r.name for r in campaign.runs]
-    assert results[2][1].last_words == "earlier"
+    assert sorted(flown) == sorted(f.name for f in campaign.flights if f is not earlier)
+    assert list(outcomes) == [f.name for f in campaign.flights]
+    assert outcomes[earlier.name].last_words == "earlier"
     assert progress == [2, 3, 4, 5, 6, 7, 8]
 
 
 def test_damaged_result_raises_an_error(tmp_path: Path) -> None:
-    campaign = campaign_of(GRID, tmp_path)
-    run = campaign.runs[0]
-    assert read_result(tmp_path, run) is None
-    write_result(tmp_path, run, FinishedRun(run.name, 0, None, ""))
-    result_path(tmp_path, run).write_text(result_path(tmp_path, run).read_text()[:-9])
-    with pytest.raises(CampaignError, match="delete it"):
-        read_result(tmp_path, run)
+    assert read_result(tmp_path, "a") is None
+    write_result(tmp_path, FlightOutcome("a", 0, summary([]), ""))
+    path = result_path(tmp_path, "a")
+    path.write_text(path.read_text()[:-9])
+    with pytest.raises(ExperimentError, match="delete it"):
+        read_result(tmp_path, "a")
+
+
+ALONE = """
+name = "late"
+scenario = "paper-single"
+[set]
+duration_s = 21.0
+[vary."controller.horizon_s"]
+values = [1.0, 3.0]
+[alone]
+delay_s = 0.1
+"""
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"0.1": "-0.1"}, "alone.delay_s"),
+        ({"0.1": "nan"}, "alone.delay_s"),
+        ({"[alone]": "[alone]\nimages = true"}, "alone.images"),
+        ({"21.0": "21.0\ntarget.motion = 'torque_free'"}, "must be constant_rates or static"),
+        ({'"paper-single"': '"single-thrusters"'}, "needs chaser.actuation"),
+        ({"21.0": "3.0"}, r"duration_s (3) ends before settling_s (20)"),
+    ],
+)
+def test_controller_alone_needs_what_it_can_fly(
+    tmp_path: Path, changed: dict[str, str], message: str
+) -> None:
+    (old, new), *_ = changed.items()
+    with pytest.raises(ScenarioError, match=re.escape(message)):
+        campaign_of(ALONE.replace(old, new), tmp_path)
+
+
+@pytest.mark.slow
+def test_controller_alone_is_flown_and_tabulated(tmp_path: Path) -> None:
+    campaign = campaign_of(ALONE, tmp_path)
+    assert [f.alone for f in campaign.flights] == [Alone(0.1)] * 2
+    mission = campaign_of(ALONE.replace("[alone]\ndelay_s = 0.1", ""), tmp_path)
+    assert not {f.name for f in campaign.flights} & {f.name for f in mission.flights}
+    campaign_of(ALONE, tmp_path)
+    status, said = finished(
+        "campaign", str(tmp_path / "campaign.toml"), "--out", str(tmp_path / "alone")
+    )
+    assert status == 0, said
+    rows = table(tmp_path / "alone")
+    assert [row["vary.controller.horizon_s"] for row in rows] == [1.0, 3.0]
+    # A horizon of 1 s is too short for the transient.
+    assert rows[1]["steady_position_mse_m2"] < 1e-3 < rows[0]["steady_position_mse_m2"]
 
 
 def test_bad_arguments_print_one_line_errors(tmp_path: Path) -> None:

@@ -143,6 +143,7 @@ def check(
     return finished("check", *limits, process, str(LOG), "--", *command)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", ["controller", "chaser/0"])
 def test_our_own_process_conforms(process: str) -> None:
     words = [sys.executable, "-m", "chaserdock", *process.split("/")]

@@ -114,7 +114,7 @@ def test_container_mounts_only_its_own_keys() -> None:
 
 
 def test_file_in_the_repository_is_the_output_for_four_chasers() -> None:
-    """Remedy: chaserdock compose --chasers 4 --standby --view > compose.yaml"""
+    """Remedy: chaserdock deploy --chasers 4 --standby --view > compose.yaml"""
     assert (ROOT / "compose.yaml").read_text(encoding="utf-8") == compose_file(
         4, standby=True, view=True
     )

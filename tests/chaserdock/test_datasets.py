@@ -77,6 +77,7 @@ def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
+@pytest.mark.slow
 def test_bop_layout_read_by_other_code_agrees_with_its_masks(exported: Path) -> None:
     """Files as in the documentation of BOP, read with json, OpenCV and trimesh alone; the model
     projected by OpenCV.
@@ -130,6 +131,7 @@ def test_both_layouts_hold_the_same_images_and_labels(exported: Path) -> None:
         assert rotations.angle_between(a.label.q_irf_trf_wxyz, b.label.q_irf_trf_wxyz) < 1e-7
 
 
+@pytest.mark.slow
 def test_speed_plus_labels_and_distortion_agree_with_the_mask(tmp_path: Path) -> None:
     """The convention of SPEED+: x_camera = R(q) x_target + r, then OpenCV's distortion."""
     export_dataset(scenario(DISTORTED), tmp_path / "d", 2, LIMITS, ("speed+",), 0.0)
@@ -149,6 +151,7 @@ def test_speed_plus_labels_and_distortion_agree_with_the_mask(tmp_path: Path) ->
         assert image[mask].mean() > 3.0 * image[~mask].mean()
 
 
+@pytest.mark.slow
 def test_equal_arguments_make_equal_datasets_and_another_seed_another(
     exported: Path, tmp_path: Path
 ) -> None:
@@ -229,17 +232,18 @@ def test_evaluate_scores_markers_in_both_layouts(
     )
     assert "4 images of servicer, bop and speed+, seed 2" in capsys.readouterr().out
     for folder in (made / "bop", made / "speedplus"):
-        app(["evaluate", "perception", str(folder), "--json"], standalone_mode=False)
+        app(["dataset", str(folder), "--json"], standalone_mode=False)
         figures = json.loads(capsys.readouterr().out)
         assert (figures["images"], figures["with_pose"]) == (3, 3)
         assert figures["perception"] == "default"
         assert figures["speed_score_2019"] < 0.01
         assert figures["add_m_p95"] < 0.005
         assert figures["add_right_share"] == 1.0
-    app(["evaluate", "perception", str(made), "--quiet"], standalone_mode=False)
+    app(["dataset", str(made), "--quiet"], standalone_mode=False)
     assert "images 3, with a pose 3 (100.0%)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_evaluate_scores_shapes_without_memory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -250,7 +254,7 @@ def test_evaluate_scores_shapes_without_memory(
     export_dataset(
         scenario("seed=1"), folder, 3, ViewLimits((1.0, 2.0), 0.2, (20.0, 60.0)), ("speed+",), 1.0
     )
-    app(["evaluate", "perception", str(folder), "--json"], standalone_mode=False)
+    app(["dataset", str(folder), "--json"], standalone_mode=False)
     figures = json.loads(capsys.readouterr().out)
     assert figures["perception"] == "model"
     assert (figures["images"], figures["with_pose"]) == (3, 3)
@@ -336,7 +340,7 @@ def test_bad_dataset_is_one_line(
     monkeypatch.setitem(sys.modules, "blind", blind)
     with pytest.raises(ChaserdockError) as caught:
         app(
-            ["evaluate", "perception", str(root), "--perception", "blind:Blind"],
+            ["dataset", str(root), "--perception", "blind:Blind"],
             standalone_mode=False,
         )
     assert text in str(caught.value)
@@ -376,6 +380,6 @@ def test_export_refuses_what_it_cannot_label(tmp_path: Path) -> None:
 )
 def test_unusable_perception_is_one_line(name: str, text: str, exported: Path) -> None:
     with pytest.raises(ChaserdockError) as caught:
-        app(["evaluate", "perception", str(exported), "--perception", name], standalone_mode=False)
+        app(["dataset", str(exported), "--perception", name], standalone_mode=False)
     assert text in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1

@@ -24,7 +24,15 @@ from source_tree import MODULES
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 EVIDENCE = sorted((DOCS / "evidence").glob("*.md"))
-GENERATED = {"api.md", "cli.md", "phases.md", "protocol.md", "reproduction.md", "scenario.md"}
+GENERATED = {
+    "api.md",
+    "cli.md",
+    "invariants.md",
+    "phases.md",
+    "protocol.md",
+    "reproduction.md",
+    "scenario.md",
+}
 GUIDES = [page for page in PAGES if page.name not in GENERATED | {"results.md"}]
 WRITTEN = [
     *(page for page in (*PAGES, *EVIDENCE) if page.name not in GENERATED),
@@ -309,32 +317,3 @@ def test_commands_in_the_docs_exist() -> None:
     for page in WRITTEN:
         named = re.findall(r"`chaserdock ([a-z][a-z-]*)\b", page.read_text(encoding="utf-8"))
         assert set(named) <= verbs, page.name
-
-
-def test_benchmark_commands_in_the_docs_exist() -> None:
-    """Every ``python benchmarks/NAME.py --option`` of a guide names a script that defines the option.
-
-    Evidence names what was run at its commit; where that script is gone, evidence/index.md says what
-    it is called today.
-    """
-    shared = (ROOT / "benchmarks" / "common.py").read_text(encoding="utf-8")
-    tried = 0
-    guides = (*PAGES, DOCS / "evidence" / "index.md", ROOT / "README.md", ROOT / "CONTRIBUTING.md")
-    for page in guides:
-        text = page.read_text(encoding="utf-8")
-        for folder, name, arguments in re.findall(
-            r"python (benchmarks|docs|release)/([a-z]\w+)\.py([^`\n#]*)", text
-        ):
-            source = (ROOT / folder / f"{name}.py").read_text(encoding="utf-8") + shared
-            for option in re.findall(r"--[a-z][a-z-]*", arguments):
-                assert f'"{option}"' in source, (page.name, name, option)
-            tried += 1
-    assert tried > 30
-    table = (
-        (DOCS / "evidence" / "index.md").read_text("utf-8").partition("## Commands of earlier")[2]
-    )
-    renamed = set(re.findall(r"(\w+)\.py", "".join(re.findall(r"^\| ([^|]*) \|", table, re.M))))
-    for page in EVIDENCE:
-        for name in re.findall(r"benchmarks/([a-z]\w+)\.py", page.read_text(encoding="utf-8")):
-            known = (ROOT / "benchmarks" / f"{name}.py").is_file() or name in renamed
-            assert known, (page.name, name)

@@ -29,6 +29,7 @@ def distance_m(flight: EngineFlight, name: str) -> float:
     )
 
 
+@pytest.mark.slow
 def test_engines_agree_over_30_s_of_free_flight() -> None:
     bullet, mujoco = flights("free", 30.0)
     apart = difference(bullet, mujoco)
@@ -45,6 +46,7 @@ def rate_change(flight: EngineFlight, name: str) -> float:
     return float(np.linalg.norm(rates - rates[0], axis=1).max())
 
 
+@pytest.mark.slow
 def test_engines_agree_with_thrusters() -> None:
     bullet, mujoco = flights("thrusters", 8.0)
     apart = difference(bullet, mujoco)
@@ -53,6 +55,7 @@ def test_engines_agree_with_thrusters() -> None:
     assert min(distance_m(bullet, f"chaser/{i}") for i in range(4)) > 0.1
 
 
+@pytest.mark.slow
 def test_engines_agree_over_a_capture_and_30_s_after_it() -> None:
     """The joint stops the same closing speed; without loads the stack then moves alike."""
     bullet, mujoco = flights("capture", 30.0)
@@ -75,6 +78,7 @@ def test_engines_agree_over_a_capture_and_30_s_after_it() -> None:
         assert 0.0 < flight.angular_momentum_error < 1e-4
 
 
+@pytest.mark.slow
 def test_engines_agree_on_a_stack_that_fires_its_thrusters() -> None:
     bullet, mujoco = flights("stack", 3.0)
     apart = difference(bullet, mujoco)

@@ -150,5 +150,5 @@ def test_foreign_controller_flies_to_success(tmp_path: Path) -> None:
     finally:
         hand.end()
         words.close()
-    status, said = finished("summary", str(out))
+    status, said = finished("judge", str(out))
     assert status == 0, said

@@ -124,6 +124,7 @@ def test_viewer_layer_has_schemas_images_and_frames(tmp_path: Path) -> None:
 # -- rotation --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rotation_by_size_keeps_every_message(tmp_path: Path) -> None:
     folder = recorded(tmp_path / "r", Rotation(size_bytes=400_000), repeat=4)
     parts = log_files(folder)
@@ -198,6 +199,7 @@ def test_closing_on_a_full_disk_is_an_error(tmp_path: Path) -> None:
     assert list(read_log(path)) == []
 
 
+@pytest.mark.slow
 def test_flipped_bytes_are_detected_or_harmless_and_the_rest_is_recovered(tmp_path: Path) -> None:
     path, out = recorded(tmp_path / "r", repeat=4) / "mission.mcap", tmp_path / "out.mcap"
     data, expected = path.read_bytes(), [r.message for r in read_log(path)]
@@ -232,6 +234,7 @@ def test_flipped_bytes_are_detected_or_harmless_and_the_rest_is_recovered(tmp_pa
     assert detected > 20
 
 
+@pytest.mark.slow
 def test_cut_anywhere_and_recovered(tmp_path: Path) -> None:
     path, cut, out = (
         recorded(tmp_path / "r", repeat=4) / "mission.mcap",
@@ -292,24 +295,23 @@ def test_recovery_skips_nothing_where_only_the_summary_is_damaged(tmp_path: Path
     assert (found.messages, found.broken_records, found.skipped_bytes) == (30, 0, 0)
 
 
+@pytest.mark.slow
 def test_log_commands(tmp_path: Path) -> None:
     log, cut = tmp_path / "a.mcap", tmp_path / "cut.mcap"
     shutil.copy(GOLDEN, log)
-    status, said = finished("log", "info", str(log))
+    status, said = finished("log", str(log))
     assert status == 0, said
     assert "two-chaser-tracking, seed 0" in said
     cut.write_bytes(log.read_bytes()[:600_000])  # within the last of three chunks
-    status, said = finished("log", "info", str(cut))
+    status, said = finished("log", str(cut))
     assert status == 1, said
     assert "cut off" in said
-    assert "chaserdock log recover" in said
-    status, said = finished("log", "recover", str(cut), "--out", str(tmp_path / "whole.mcap"))
+    assert "chaserdock log --recover" in said
+    status, said = finished("log", str(cut), "--recover", str(tmp_path / "whole.mcap"))
     assert status == 0, said
-    status, said = finished("log", "recover", str(cut), "--out", str(log))
+    status, said = finished("log", str(cut), "--recover", str(log))
     assert (status, "already exists; a log is never overwritten" in said) == (2, True)
-    status, said = finished(
-        "log", "export", str(tmp_path / "none.mcap"), "--out", str(tmp_path / "x")
-    )
+    status, said = finished("log", str(tmp_path / "none.mcap"), "--export", str(tmp_path / "x"))
     assert (status, "Traceback" in said) == (2, False)
 
 

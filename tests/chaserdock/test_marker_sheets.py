@@ -10,7 +10,7 @@ import pytest
 from chaserdock_agents.chaser.perception.detect import detect, dictionary_of
 from chaserdock_models.targets import target_model
 
-from chaserdock.calibration.marker_sheets import SHEETS_MM, lay_out, write_sheets
+from chaserdock.targets.marker_sheets import SHEETS_MM, lay_out, write_sheets
 
 POINTS_PER_MM = 72.0 / 25.4
 
@@ -53,6 +53,7 @@ def rectangles_of(corners: np.ndarray) -> np.ndarray:
     return boxes[np.lexsort(boxes.round(2).T)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "servicer"])
 def test_svg_shows_every_marker_in_true_size(name: str, tmp_path: Path) -> None:
     """Paint the rectangles of the SVG file, detect the markers in the painting, measure them."""
@@ -79,6 +80,7 @@ def test_svg_shows_every_marker_in_true_size(name: str, tmp_path: Path) -> None:
         assert sides_mm[marker.id] == pytest.approx(1000 * marker.side_m, abs=0.5)
 
 
+@pytest.mark.slow
 def test_pdf_and_svg_contain_the_rectangles_of_the_layout(tmp_path: Path) -> None:
     model = target_model("servicer")
     width, height = SHEETS_MM["letter"]

@@ -93,6 +93,7 @@ def test_invalid_network_options_are_one_line(
 # -- a mission -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     """Every process has only its own keys; the router restarts in flight; the flight is a success."""
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
@@ -121,7 +122,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
         start("chaser-0", "chaser", "0", *reach)
         start("chaser-1", "chaser", "1", *reach)
         start("recorder", "record", "--out", str(runs), "--by-run", *reach)
-        start("operator", "judge", str(runs), *reach)
+        start("operator", "judge", str(runs), "--live", *reach)
         start_router()  # the last, as order must not matter
         deadline = time.monotonic() + 60
         while not (logs := list(runs.glob("two-chaser-tracking-*/mission.mcap"))):
@@ -171,6 +172,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     assert "controller" in ticks[-1].controllers
 
 
+@pytest.mark.slow
 def test_run_with_keys_equals_run_without(short_flight: Path, tmp_path: Path) -> None:
     """The digests are equal; the router enforced access rights and denied nothing."""
     keys = ["--keys", str(make_keys(tmp_path / "keys"))]
@@ -187,11 +189,12 @@ def test_run_with_keys_equals_run_without(short_flight: Path, tmp_path: Path) ->
     assert not (short_flight / "processes" / "router.txt").exists()
 
 
+@pytest.mark.slow
 def test_run_with_missing_keys_is_rejected(tmp_path: Path) -> None:
     keys = ["--keys", str(tmp_path / "none")]
     status, said = run("two-chaser-tracking", tmp_path / "out", arguments=keys)
     assert status == 2
-    assert "it contains no keys; make a mission's keys with `chaserdock keys init" in said
+    assert "it contains no keys; make a mission's keys with `chaserdock deploy --keys" in said
     assert len(said.strip().splitlines()) == 1
     four = make_keys(tmp_path / "three")  # of three chasers
     status, said = finished(
@@ -265,7 +268,7 @@ def test_world_gets_overrides_and_too_many_chasers_are_rejected() -> None:
     assert container.too_many_chasers("four-chaser-docking", "", 4) is None
     reason = container.too_many_chasers("four-chaser-docking", "", 3) or ""
     assert "has 4 chasers" in reason
-    assert "chaserdock compose --chasers 4 > compose.yaml" in reason
+    assert "chaserdock deploy --chasers 4 > compose.yaml" in reason
 
 
 def test_container_forwards_signals_and_leaves_no_process(tmp_path: Path) -> None:

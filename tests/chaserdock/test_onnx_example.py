@@ -77,6 +77,7 @@ def corners(dataset: Path) -> np.ndarray:
     return shape.points_m[np.linspace(0, len(shape.points_m) - 1, 12).astype(int)]
 
 
+@pytest.mark.slow
 def test_perfect_landmarks_give_the_true_pose(
     dataset: Path, example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,7 @@ def test_every_patch_applies() -> None:
     assert int(text.split()[0]) >= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "row"),
     [

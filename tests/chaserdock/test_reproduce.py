@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import math
 import re
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,19 +19,12 @@ from harness import finished
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.study_cases import (
-    StudyCase,
-    StudyError,
-    StudyResult,
-    line_of,
-    read_lines,
-)
-from chaserdock.reproduce import main as reproduce_main
-from chaserdock.reproduce.content import pitch_rad, sections
-from chaserdock.reproduce.main import fly_plan
-from chaserdock.reproduce.page import PageSection, Table, html, markdown
-from chaserdock.reproduce.paper import BASELINE, PAPER_S, ROWS
-from chaserdock.reproduce.plan import (
+from chaserdock.experiments.page import PageSection, Table, html, markdown
+from chaserdock.experiments.plan import Alone, ExperimentPlan, PlannedFlight
+from chaserdock.experiments.reproduction import reproduce as reproduction
+from chaserdock.experiments.reproduction.content import pitch_rad, sections
+from chaserdock.experiments.reproduction.paper import BASELINE, PAPER_S, ROWS
+from chaserdock.experiments.reproduction.plan import (
     CODE,
     COLUMNS,
     DEFAULT,
@@ -40,35 +35,41 @@ from chaserdock.reproduce.plan import (
     SCENARIO,
     TRACKING,
     WRITTEN,
-    Mission,
-    ReproductionPlan,
     dispersed_start,
     draws_of,
+    flight_of,
     make_plan,
+    mission,
+    mission_name,
+    missions_of,
     needs_open,
     table_name,
 )
-from chaserdock.reproduce.provenance import Provenance
-from chaserdock.reproduce.runner import MissionResult, ReproductionResults, code_digest, results_of
-from chaserdock.reproduce.tables import (
+from chaserdock.experiments.reproduction.provenance import Provenance
+from chaserdock.experiments.reproduction.reproduce import fly_and_report
+from chaserdock.experiments.reproduction.tables import (
+    Summaries,
     changes,
     comes_out,
     errors_of,
     over_two_minutes,
+    results_by_label,
     spread,
     verdict,
 )
-from chaserdock.reproduce.trends import trend_rows
+from chaserdock.experiments.reproduction.trends import trend_rows
+from chaserdock.experiments.worker import results_of
 
-PATH = str(find_scenario(SCENARIO))
-
-
-def plan(quick: bool) -> ReproductionPlan:
-    return make_plan(quick, PATH)
+PATH = find_scenario(SCENARIO)
+plan = cache(make_plan)
 
 
-def scenario_of(case: StudyCase) -> Scenario:
-    return load_scenario(Path(case.scenario), case.overrides)
+def scenario_of(flight: PlannedFlight) -> Scenario:
+    return load_scenario(Path(flight.scenario), flight.overrides)
+
+
+def table_flights(p: ExperimentPlan) -> list[PlannedFlight]:
+    return [f for f in p.flights if f.alone is None and f not in missions_of(p)]
 
 
 # -- the plan --------------------------------------------------------------------------------------
@@ -76,15 +77,15 @@ def scenario_of(case: StudyCase) -> Scenario:
 
 @pytest.mark.parametrize("quick", [True, False])
 def test_every_flight_of_the_plan_is_valid_and_unique(quick: bool) -> None:
-    p = plan(quick)
-    assert len({f.name for f in (*p.cases, *p.missions)}) == len(p.cases) + len(p.missions)
-    assert {scenario_of(case).duration_s for case in p.cases} == {QUICK_S if quick else PAPER_S}
-    for m in p.missions:
-        load_scenario(find_scenario(m.scenario), m.overrides)
+    flights = plan(quick).flights
+    assert len({f.label for f in flights}) == len({f.name for f in flights}) == len(flights)
+    single = [f for f in flights if f not in missions_of(plan(quick))]
+    assert {scenario_of(f).duration_s for f in single} == {QUICK_S if quick else PAPER_S}
+    assert len(flights) - len(single) == (0 if quick else 7)
 
 
 def test_full_plan_repeats_nine_rows_from_three_starts() -> None:
-    names = {c.name for c in plan(False).cases if c.images}
+    names = {f.label for f in table_flights(plan(False))}
     wanted = {
         table_name(column, row, draw)
         for column in COLUMNS
@@ -98,19 +99,18 @@ def test_full_plan_repeats_nine_rows_from_three_starts() -> None:
 
 def test_draws_have_the_same_starts_in_all_rows_within_the_bounds() -> None:
     starts = {}
-    for case in plan(False).cases:
-        if case.images:
-            s = scenario_of(case)
-            c, t = s.chasers[0], s.target
-            start = (
-                c.start_offset_m,
-                c.start_rotation_rad,
-                t.q_wxyz,
-                t.velocity_m_s,
-                t.omega_rad_s,
-                s.seed,
-            )
-            starts.setdefault(case.name[-1], set()).add(start)
+    for flight in table_flights(plan(False)):
+        s = scenario_of(flight)
+        c, t = s.chasers[0], s.target
+        start = (
+            c.start_offset_m,
+            c.start_rotation_rad,
+            t.q_wxyz,
+            t.velocity_m_s,
+            t.omega_rad_s,
+            s.seed,
+        )
+        starts.setdefault(flight.label[-1], set()).add(start)
     assert {draw: len(found) for draw, found in starts.items()} == {"0": 1, "1": 1, "2": 1}
     assert len(set.union(*starts.values())) == 3
     for ((offset, rotation, q, velocity, omega, _),) in starts.values():
@@ -123,7 +123,7 @@ def test_draws_have_the_same_starts_in_all_rows_within_the_bounds() -> None:
 
 
 def test_paper_settings_equal_the_reference() -> None:
-    cases = {c.name: scenario_of(c) for c in plan(False).cases if c.name.endswith("/0")}
+    cases = {f.label: scenario_of(f) for f in plan(False).flights if f.label.endswith("/0")}
     for row in ROWS:
         for column, perception in ((WRITTEN, "paper"), (CODE, "paper_iterative")):
             if table_name(column, row, 0) not in cases:
@@ -148,7 +148,7 @@ def test_paper_settings_equal_the_reference() -> None:
 
 
 def test_nominal_start_is_that_of_the_scenario() -> None:
-    s = load_scenario(Path(PATH))
+    s = load_scenario(PATH)
     assert (s.target.velocity_m_s, s.target.omega_rad_s) == (
         (0.015, 0.0075, 0.03),
         (0.015, 0.045, 0.03),
@@ -159,10 +159,10 @@ def test_nominal_start_is_that_of_the_scenario() -> None:
 
 
 def test_missions_of_the_papers_chain_have_its_settings() -> None:
-    chains = [m for m in plan(False).missions if m.column != DEFAULT]
+    chains = [f for f in missions_of(plan(False)) if f.varied["chain"] != DEFAULT]
     assert len(chains) == 4
-    for m in chains:
-        s = load_scenario(find_scenario(m.scenario), m.overrides)
+    for flight in chains:
+        s = scenario_of(flight)
         assert (s.navigation.grade, s.time.latency_s, s.controller.integrator) == (
             "exact",
             0.0,
@@ -172,8 +172,9 @@ def test_missions_of_the_papers_chain_have_its_settings() -> None:
 
 
 def test_default_settings_equal_the_scenario_defaults() -> None:
-    case = next(c for c in plan(False).cases if c.name == table_name(DEFAULT, BASELINE, 0))
-    ours, plain = scenario_of(case), load_scenario(Path(PATH).with_name("single.toml"))
+    label = table_name(DEFAULT, BASELINE, 0)
+    flight = next(f for f in plan(False).flights if f.label == label)
+    ours, plain = scenario_of(flight), load_scenario(PATH.with_name("single.toml"))
     assert ours.controller == plain.controller
     assert (ours.perception, ours.estimator) == (plain.perception, plain.estimator)
     assert ours.time.model_copy(update={"latency_s": plain.time.latency_s}) == plain.time
@@ -199,54 +200,54 @@ def test_mean_over_two_minutes_by_hand() -> None:
         over_two_minutes(1.0, 1.0, 121.0)
 
 
-def result_of(case: StudyCase, position: float, orientation: float) -> StudyResult:
-    return StudyResult(
-        case=case,
-        duration_s=120.0,
-        position_mse_m2=position,
-        orientation_mse_rad2=orientation,
-        steady_position_mse_m2=1e-6,
-        steady_orientation_mse_rad2=1e-7,
-        min_distance_target_m=0.9,
-        failed_solves=0,
-        solve_p50_s=1e-3,
-        solve_max_s=2e-3,
-        floor_m2_s=1.5 if case.floor else None,
-    )
+def result_of(position: float, orientation: float) -> dict[str, Any]:
+    return {
+        "sim_time_s": 120.0,
+        "chasers": {
+            "0": {
+                "position_mse_m2": position,
+                "orientation_mse_rad2": orientation,
+                "steady": {"position_mse_m2": 1e-6, "orientation_mse_rad2": 1e-7},
+                "min_distance_target_m": 0.9,
+            }
+        },
+        "solver": {"solve_s": {"p50": 1e-3}},
+        "floor_m2_s": 1.5,
+    }
 
 
-def mission_result(mission: Mission) -> MissionResult:
-    return MissionResult(
-        mission=mission,
-        steady_position_rms_m=0.001,
-        steady_orientation_rms_rad=0.001,
-        min_distance_target_m=0.98,
-        min_distance_chasers_m=1.4,
-        dock_time_s={"0": 97.3},
-        reached_time_s={},
-        estimate_rms_rad=0.001,
-        estimate_max_rad=0.003,
-        estimate_max_at_s=100.0,
-    )
+def mission_result() -> dict[str, Any]:
+    docked = {
+        "steady": {"position_mse_m2": 1e-6, "orientation_mse_rad2": 1e-6},
+        "min_distance_target_m": 0.98,
+        "docked": True,
+        "dock_time_s": 97.3,
+        "reached_time_s": None,
+    }
+    estimate = {
+        "orientation_rms_rad": 0.001,
+        "max_orientation_error_rad": 0.003,
+        "max_orientation_error_at_s": 100.0,
+    }
+    return {
+        "chasers": {"0": docked},
+        "min_distance_chasers_m": 1.4,
+        "target_estimate": estimate,
+    }
 
 
-def complete(p: ReproductionPlan) -> ReproductionResults:
+def complete(p: ExperimentPlan) -> Summaries:
     """Results with the errors of the paper's baseline everywhere."""
     errors = BASELINE.position_mse_m2, BASELINE.orientation_mse_rad2
-    return ReproductionResults(
-        {c.name: result_of(c, *errors) for c in p.cases},
-        {m.name: mission_result(m) for m in p.missions},
-    )
+    missions = missions_of(p)
+    return {f.label: mission_result() if f in missions else result_of(*errors) for f in p.flights}
 
 
-def scale(results: ReproductionResults, name: str, factor: float) -> None:
+def scale(results: Summaries, label: str, factor: float) -> None:
     """Multiply the errors of a flight."""
-    r = results.cases[name]
-    results.cases[name] = msgspec.structs.replace(
-        r,
-        position_mse_m2=factor * r.position_mse_m2,
-        orientation_mse_rad2=factor * r.orientation_mse_rad2,
-    )
+    own = results[label]["chasers"]["0"]
+    own["position_mse_m2"] *= factor
+    own["orientation_mse_rad2"] *= factor
 
 
 ABOUT = Provenance(date="2026-11-23", commit="0123456789ab-dirty", machine="a machine")
@@ -301,9 +302,12 @@ def test_spread_is_least_median_greatest() -> None:
 def test_flight_fails_by_a_small_distance_or_without_coming_nearer(
     changed: dict[str, float],
 ) -> None:
-    good = result_of(StudyCase(name="x", scenario=PATH), 1.0, 1.0)
+    good = result_of(1.0, 1.0)
     assert not errors_of(good).failed
-    assert errors_of(msgspec.structs.replace(good, **changed)).failed
+    own = good["chasers"]["0"]
+    own["steady"]["position_mse_m2"] = changed.pop("steady_position_mse_m2", 1e-6)
+    own |= changed
+    assert errors_of(good).failed
 
 
 # -- trends ----------------------------------------------------------------------------------------
@@ -330,13 +334,13 @@ def test_changes_compare_equal_starts() -> None:
         scale(results, table_name(CODE, BASELINE, draw), factor)
         scale(results, table_name(CODE, row, draw), factor * 0.866)
     assert changes(results, CODE, row, "position") == pytest.approx([-0.134] * 3)
-    del results.cases[table_name(CODE, BASELINE, 1)]
+    del results[table_name(CODE, BASELINE, 1)]
     assert len(changes(results, CODE, row, "position")) == 2
     shown = next(r for r in trend_rows(results) if r[0] == "dt=1/30")
     assert shown[1:3] == ("-13.4 %; -1.3 %", "-13.4 % yes; -13.4 % no")
 
 
-def explanations(results: ReproductionResults) -> dict[str, str]:
+def explanations(results: Summaries) -> dict[str, str]:
     return {row[0]: row[-1] for row in trend_rows(results)}
 
 
@@ -368,16 +372,14 @@ def test_explanations_quote_measurements_or_say_unexplained() -> None:
     assert found["alpha=10 %"].startswith(
         "Position not separable from the start, which changes the baseline"
     )
-    assert explanations(ReproductionResults({}, {}))["T=0.5"] == "Unexplained."
+    assert explanations({})["T=0.5"] == "Unexplained."
 
 
 def test_trend_that_comes_out_needs_no_explanation() -> None:
     results, row = complete(plan(False)), ROWS[3]
     for draw in DRAWS:
-        name = table_name(CODE, row, draw)
-        results.cases[name] = result_of(
-            results.cases[name].case, row.position_mse_m2, row.orientation_mse_rad2
-        )
+        errors = row.position_mse_m2, row.orientation_mse_rad2
+        results[table_name(CODE, row, draw)] = result_of(*errors)
     assert explanations(results)["dt=1/5"] == "It comes out."
 
 
@@ -437,7 +439,7 @@ def test_page_is_well_formed_and_escaped() -> None:
 
 def test_page_of_a_complete_plan_has_all_rows_and_its_provenance() -> None:
     p = plan(False)
-    parts = sections(p, complete(p), ABOUT)
+    parts = sections(p, complete(p), ABOUT, quick=False)
     text = markdown("t", parts)
     assert "NOT COMPLETE" not in text
     assert "2026-11-23, commit 0123456789ab-dirty, a machine" in text
@@ -456,8 +458,8 @@ def test_page_of_a_complete_plan_has_all_rows_and_its_provenance() -> None:
 
 def test_page_reports_missing_results() -> None:
     p = plan(True)
-    text = markdown("t", sections(p, ReproductionResults({}, {}), ABOUT))
-    n = len(p.cases)
+    text = markdown("t", sections(p, {}, ABOUT, quick=True))
+    n = len(p.flights)
     assert f"NOT COMPLETE: {n} of {n} flights have no result" in text
     assert "chaserdock reproduce --quick" in text
     assert not re.search(r"\d met", text)
@@ -469,10 +471,10 @@ def test_page_reports_missing_results() -> None:
 def test_missing_solver_is_one_error_and_a_failed_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    case = StudyCase(name="alone/baseline", scenario=PATH, overrides=("controller.solver='open'",))
-    assert needs_open(case)
-    monkeypatch.setattr(reproduce_main, "missing_part", lambda: "solver 'open' needs cargo")
-    assert fly_plan(ReproductionPlan(True, 40.0, (case,), ()), tmp_path) == 1
+    flight = flight_of("alone/baseline", SCENARIO, ("controller.solver='open'",), Alone())
+    assert needs_open(flight)
+    monkeypatch.setattr(reproduction, "missing_part", lambda: "solver 'open' needs cargo")
+    assert fly_and_report(ExperimentPlan("x", (flight,)), tmp_path) == 1
     errors = [
         line for line in capsys.readouterr().err.splitlines() if line.startswith("chaserdock:")
     ]
@@ -480,24 +482,22 @@ def test_missing_solver_is_one_error_and_a_failed_status(
     assert "NOT COMPLETE: 1 of 1 flights" in (tmp_path / "reproduction.md").read_text()
 
 
-def test_incomplete_line_and_changed_settings_count_as_not_flown(tmp_path: Path) -> None:
-    cases = tuple(StudyCase(name=name, scenario=PATH) for name in "abc")
-    path = tmp_path / f"flights-{code_digest()}.jsonl"
-    lines = [line_of(result_of(c, 1.0, 1.0)) for c in cases]
-    path.write_text(lines[0] + lines[1][:40])
-    assert list(results_of(ReproductionPlan(True, 40.0, cases, ()), tmp_path).cases) == ["a"]
-    assert path.read_text() == lines[0]
-    changed = (StudyCase(name="a", scenario=PATH, delay_s=0.1),)
-    assert results_of(ReproductionPlan(True, 40.0, changed, ()), tmp_path).cases == {}
+def test_result_with_other_settings_counts_as_not_flown() -> None:
+    flights = [
+        flight_of("a", SCENARIO, (), Alone()),
+        flight_of("a", SCENARIO, (), Alone(0.1)),
+        flight_of("a", SCENARIO, ("duration_s=40.0",), Alone()),
+        flight_of("a", SCENARIO, ()),
+    ]
+    assert len({f.name for f in flights}) == 4
 
 
-def test_invalid_study_line_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "cases.jsonl"
-    path.write_text(line_of(StudyCase(name="a", scenario=PATH)) + '{"name": 3, "scenario": "x"}\n')
-    with pytest.raises(StudyError, match=r"line 2: Expected `str`, got `int` - at `\$.name`"):
-        read_lines(path, StudyCase)
-    with pytest.raises(StudyError, match="cannot be read"):
-        read_lines(tmp_path / "none", StudyCase)
+def test_flight_that_crashes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = flight_of(table_name(DEFAULT, BASELINE, 0), SCENARIO, ())
+    broken = msgspec.structs.replace(flight, overrides=("controller.dt_s=-1",))
+    assert fly_and_report(ExperimentPlan("x", (broken,)), tmp_path) == 1
+    assert f"chaserdock: {flight.label}: " in capsys.readouterr().err
+    assert results_of(ExperimentPlan("x", (broken,)), tmp_path) == {}
 
 
 def test_bad_input_prints_one_line_error(tmp_path: Path) -> None:
@@ -505,40 +505,33 @@ def test_bad_input_prints_one_line_error(tmp_path: Path) -> None:
     status, said = finished("reproduce", "--quick", "--out", str(tmp_path / "file"))
     assert status == 2
     assert said.strip() == f"chaserdock: {tmp_path / 'file'}: cannot be written: File exists"
-    cases = tmp_path / "cases.jsonl"
-    cases.write_text(line_of(StudyCase(name="a", scenario=PATH, overrides=("controller.dt_s=-1",))))
-    status, said = finished("study", str(cases), "--out", str(tmp_path / "results"))
-    assert status == 2
-    assert "controller.dt_s" in said
-    assert "Traceback" not in said
 
 
+@pytest.mark.slow
 def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A flight with small images, its lower bound, and a mission; a second call flies nothing and
     writes an equal page.
     """
     small = ("camera.width_px=480", "camera.height_px=270", "time.rate_hz=15", "time.image_hz=15")
     short = (*small, "duration_s=21.0")
-    cases = (
-        StudyCase(
-            name=table_name(DEFAULT, BASELINE, 0), scenario=PATH, overrides=short, images=True
-        ),
-        StudyCase(name="floor/0", scenario=PATH, overrides=short, floor=True),
+    seen_label = table_name(DEFAULT, BASELINE, 0)
+    flights = (
+        flight_of(seen_label, SCENARIO, short),
+        flight_of("floor/0", SCENARIO, short, Alone(floor=True)),
+        mission(TRACKING, DEFAULT, (*small, "duration_s=3.0", "settling_s=2.0")),
     )
-    mission = Mission(TRACKING, DEFAULT, (*small, "duration_s=3.0", "settling_s=2.0"))
-    cut = ReproductionPlan(False, 21.0, cases, (mission,))
-    assert fly_plan(cut, tmp_path) == 0
-    assert f"3 of 3: {TRACKING}, ours" in capsys.readouterr().err
-    results = results_of(cut, tmp_path)
-    seen, bound = (results.cases[c.name] for c in cases)
-    assert not errors_of(seen).failed
-    assert bound.floor_m2_s is not None
-    assert bound.floor_m2_s < 21.0 * seen.position_mse_m2 < 2.0 * bound.floor_m2_s
-    flown = results.missions[mission.name]
-    assert flown.estimate_max_at_s is not None
-    assert 2.0 <= flown.estimate_max_at_s <= 3.0
-    assert 0.9 < flown.min_distance_target_m < 1.2
+    cut = ExperimentPlan("cut", flights)
+    assert fly_and_report(cut, tmp_path) == 0
+    assert f"3/3 {TRACKING}, ours (" in capsys.readouterr().out
+    results = results_by_label(cut, results_of(cut, tmp_path))
+    seen = errors_of(results[seen_label])
+    floor_m2_s = results["floor/0"]["floor_m2_s"]
+    assert not seen.failed
+    assert floor_m2_s < PAPER_S * seen.position < 2.0 * floor_m2_s
+    flown = results[mission_name(TRACKING, DEFAULT)]
+    assert 2.0 <= flown["target_estimate"]["max_orientation_error_at_s"] <= 3.0
+    assert 0.9 < min(c["min_distance_target_m"] for c in flown["chasers"].values()) < 1.2
     pages = [(tmp_path / f"reproduction.{kind}").read_text() for kind in ("md", "html")]
-    assert fly_plan(cut, tmp_path) == 0
-    assert " of 3: " not in capsys.readouterr().err
+    assert fly_and_report(cut, tmp_path) == 0
+    assert "/3 " not in capsys.readouterr().out
     assert [(tmp_path / f"reproduction.{kind}").read_text() for kind in ("md", "html")] == pages

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from chaserdock_protocol.messages import Sighting
 from chaserdock_world.rendering.cameras import States
 from flights.detumble_flights import StackMission, stack_scenario
@@ -27,6 +28,7 @@ def no_sight(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
     )
 
 
+@pytest.mark.slow
 def test_four_chasers_stop_the_stack_without_a_controller() -> None:
     scenario = stack_scenario(0, (0, 1, 2, 3))
     outcome = fly_controlled(scenario, 120.0, events=FlightEvents(silent_from_s=0.0))
@@ -37,6 +39,7 @@ def test_four_chasers_stop_the_stack_without_a_controller() -> None:
     assert outcome.held_N_s < 0.5
 
 
+@pytest.mark.slow
 def test_the_rigid_stack_keeps_its_momentum_and_moves_as_in_the_physics_engine() -> None:
     scenario = stack_scenario(1, (0, 3))
     stack = RigidStack(scenario)

@@ -18,18 +18,18 @@ from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, chaserdock, finished
 
 from chaserdock.cli.simulate import simulate
-from chaserdock.simulation.campaign import (
-    Swarm,
+from chaserdock.simulation.checks import flight_checks
+from chaserdock.simulation.checks.check import Check
+from chaserdock.simulation.checks.reader import reads
+from chaserdock.simulation.flight import fly_case
+from chaserdock.simulation.seeds import (
+    SeedOptions,
     UnflownSeed,
     fly_seed,
     fly_seeds,
     shrink_result,
     write_case,
 )
-from chaserdock.simulation.checks import flight_checks
-from chaserdock.simulation.checks.check import Check
-from chaserdock.simulation.checks.reader import reads
-from chaserdock.simulation.flight import fly_case
 from chaserdock.simulation.swarm import draw_case
 
 SHORT = """
@@ -57,6 +57,7 @@ def bad(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     status, text = finished(
@@ -67,6 +68,7 @@ def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Pat
     assert not out.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--seeds", "1:2")], ids=["one", "seeds"])
 @pytest.mark.parametrize("out", ["good.toml", "good.toml/below"])
 def test_out_must_be_a_folder_that_can_be_written(
@@ -85,6 +87,7 @@ def test_out_must_be_writable(good: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert exit_.value.exit_code == 2
 
 
+@pytest.mark.slow
 def test_options_of_seeds_need_seeds(good: Path) -> None:
     options = ("--jobs", "2", "--images", "--stop", "--no-shrink")
     status, text = finished("simulate", str(good), *options)
@@ -92,6 +95,7 @@ def test_options_of_seeds_need_seeds(good: Path) -> None:
     assert text == "chaserdock: --jobs, --images, --no-shrink, --stop: only with --seeds\n"
 
 
+@pytest.mark.slow
 def test_a_seed_that_cannot_be_flown_does_not_end_the_others(good: Path) -> None:
     """A goto beside the only distance that the limits allow is refused."""
     text = (
@@ -115,6 +119,7 @@ def test_a_seed_that_cannot_be_flown_does_not_end_the_others(good: Path) -> None
     assert "1 not flown" in text
 
 
+@pytest.mark.slow
 def test_targets_without_markers_need_images() -> None:
     status, text = finished("simulate", "markerless-docking", "--seeds", "1:3")
     assert status == 2
@@ -124,6 +129,7 @@ def test_targets_without_markers_need_images() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_flight_without_seeds_keeps_its_log_once(good: Path, tmp_path: Path) -> None:
     arguments = ("simulate", str(good), "--out", str(tmp_path / "out"))
     status, text = finished(*arguments)
@@ -134,14 +140,15 @@ def test_a_flight_without_seeds_keeps_its_log_once(good: Path, tmp_path: Path) -
     assert "exists already" in text
 
 
+@pytest.mark.slow
 def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_path: Path) -> None:
-    seed = next(s for s in range(1, 50) if fly_seed(Swarm(str(bad)), s).violations)
-    result = fly_seed(Swarm(str(bad)), seed)
+    seed = next(s for s in range(1, 50) if fly_seed(SeedOptions(str(bad)), s).violations)
+    result = fly_seed(SeedOptions(str(bad)), seed)
     arguments = ("simulate", str(bad), "--seeds", f"{seed}:{seed + 5}", "--no-shrink", "--stop")
     status, text = finished(*arguments)
     assert status == 1
     assert "\n1 seeds in" in text
-    assert fly_seed(Swarm(str(bad)), seed).fingerprint == result.fingerprint
+    assert fly_seed(SeedOptions(str(bad)), seed).fingerprint == result.fingerprint
     *_, simplest = shrink_result(result, attempts=60)
     path = write_case(simplest, tmp_path / "out")
     case = simplest.case
@@ -201,14 +208,15 @@ def test_a_flight_may_end_at_the_first_violation(
 def test_cases_of_two_scenarios_have_files_of_their_own(
     good: Path, bad: Path, tmp_path: Path
 ) -> None:
-    results = [fly_seed(Swarm(str(path)), 2) for path in (good, bad)]
+    results = [fly_seed(SeedOptions(str(path)), 2) for path in (good, bad)]
     paths = [write_case(result, tmp_path / "out") for result in results]
     assert [path.name for path in paths] == ["good-seed-2.toml", "bad-seed-2.toml"]
     assert [load_scenario(path).success.docked for path in paths] == [(), (0,)]
 
 
+@pytest.mark.slow
 def test_a_killed_process_costs_one_seed(good: Path) -> None:
-    flights = fly_seeds(Swarm(str(good)), range(1, 7), jobs=2)
+    flights = fly_seeds(SeedOptions(str(good)), range(1, 7), jobs=2)
     results = [next(flights)]
     os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
     results += flights
@@ -218,6 +226,7 @@ def test_a_killed_process_costs_one_seed(good: Path) -> None:
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_flights_on_several_processes_at_once() -> None:
     """The parent alone receives the signal; a flight of ``detumble`` takes minutes."""
     arguments = ("simulate", "detumble", "--seeds", "1:20", "--jobs", "2")
@@ -236,6 +245,7 @@ def test_ctrl_c_ends_flights_on_several_processes_at_once() -> None:
     assert out.startswith(b"0 seeds in")
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_shrinking_writes_the_simplest_case_so_far(bad: Path, tmp_path: Path) -> None:
     arguments = ("simulate", str(bad), "--seeds", "2:5", "--out", str(tmp_path / "out"))
     process = chaserdock(*arguments, stdout=subprocess.PIPE)
@@ -252,7 +262,8 @@ def test_ctrl_c_while_shrinking_writes_the_simplest_case_so_far(bad: Path, tmp_p
     assert fly_case({"extends": str(path)}, seed).violations
 
 
+@pytest.mark.slow
 def test_regressions_are_scenarios_that_run_accepts() -> None:
     for path in (ROOT / "tests" / "regressions").glob("*.toml"):
-        status, text = finished("scenario", "validate", str(path))
+        status, text = finished("scenario", str(path))
         assert status == 0, text

@@ -49,7 +49,6 @@ from harness import ROOT
 from message_samples import BY_TYPE
 from pydantic import ValidationError
 
-from chaserdock.simulation.campaign import inconsistency, shrink_result
 from chaserdock.simulation.checks.check import Violation
 from chaserdock.simulation.checks.commands import ThrustersOpen
 from chaserdock.simulation.checks.docking import DockedOrSafe
@@ -58,8 +57,10 @@ from chaserdock.simulation.checks.flight_checks import CHECKS, FlightChecks
 from chaserdock.simulation.checks.messages import covariance_defect, defects_of
 from chaserdock.simulation.checks.processes import BoundedQueues, queue_limit
 from chaserdock.simulation.flight import SimulationResult
+from chaserdock.simulation.links import Traffic
 from chaserdock.simulation.mission import SimulatedFlight
-from chaserdock.simulation.network import EPOCH_NS, Traffic
+from chaserdock.simulation.network import EPOCH_NS
+from chaserdock.simulation.seeds import inconsistency, shrink_result
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import (
     KINDS,
@@ -1333,7 +1334,7 @@ def test_shrinking_keeps_the_violation_not_only_its_invariant(
         cut = [NOT_DOCKED] if wanted and case.get("duration_s", 25.0) < 20.0 else []
         return a_result(case, *([STALL] if case["fault"] else cut))
 
-    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    monkeypatch.setattr("chaserdock.simulation.seeds.fly_case", flown)
     case: Case = {"extends": "fault-drill", "fault": [FLOOD]}
     small = shrunk(a_result(case, STALL))
     assert [fault["kind"] for fault in small["fault"]] == ["flood"]
@@ -1349,7 +1350,7 @@ def test_shrinking_keeps_the_commands_to_approach_of_a_chaser_that_does_not_dock
         docks = "approach" in commands and not case["fault"]
         return a_result(case, *([] if docks else [NOT_DOCKED]))
 
-    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    monkeypatch.setattr("chaserdock.simulation.seeds.fly_case", flown)
     timeline = [
         {"at_s": 5.0, "command": "approach", "chasers": [0]},
         {"at_s": 9.0, "command": "hold", "chasers": [1]},
@@ -1369,7 +1370,7 @@ def test_shrinking_takes_violations_that_differ_in_numbers_only_as_equal(
             case, Violation("no contact", 1.0, f"chaser/{chaser}: {len(case['fault'])}e-05 m")
         )
 
-    monkeypatch.setattr("chaserdock.simulation.campaign.fly_case", flown)
+    monkeypatch.setattr("chaserdock.simulation.seeds.fly_case", flown)
     case: Case = {"extends": "fault-drill", "fault": [FLOOD], "seed": 3}
     small = shrunk(flown(case, 1))
     assert (small["fault"], small["seed"]) == ([], 3)

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Targets defined by a file: validation, rendering, detection."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import Perception
@@ -11,6 +14,8 @@ from chaserdock_protocol.scenario import load_scenario, scenario_from_json
 from chaserdock_protocol.scenario.errors import ScenarioError
 from chaserdock_protocol.scenario.files import find_target
 from chaserdock_world.rendering.rasterizer import Renderer
+
+from chaserdock.cli.main import app
 
 TARGET = """
 dictionary = "DICT_4X4_50"
@@ -90,3 +95,33 @@ def test_invalid_target_file_is_rejected(change, message, tmp_path):
     with pytest.raises(ScenarioError, match=message) as error:
         find_target(str(tmp_path / "mine.toml"))
     assert str(tmp_path / "mine.toml") in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [
+        ("servicer", "cuboids", 1),
+        ("paper", "dictionary", "DICT_5X5_50"),
+        ("chaser_body", "notes", []),
+    ],
+)
+def test_command_states_what_becomes_of_a_target(
+    name: str, key: str, value: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app(["target", name, "--json"], standalone_mode=False)
+    assert json.loads(capsys.readouterr().out)[key] == value
+    app(["target", name], standalone_mode=False)
+    assert capsys.readouterr().out.startswith(f"{name}: ")
+
+
+def test_command_writes_a_mesh_that_it_can_read_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "body.glb"
+    app(
+        ["target", "chaser_body", "--mesh", str(path), "--tolerance-mm", "2"], standalone_mode=False
+    )
+    app(["target", str(path), "--json"], standalone_mode=False)
+    written, _, read = capsys.readouterr().out.partition("\n")
+    assert written.startswith(f"{path}: ")
+    assert f"{json.loads(read)['triangles']} triangles" in written

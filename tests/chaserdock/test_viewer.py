@@ -326,6 +326,7 @@ def test_truncated_log_is_shown_up_to_its_end(tmp_path: Path) -> None:
     assert mission.at(mission.end_s).tick is not None
 
 
+@pytest.mark.slow
 def test_invalid_log_prints_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"no log at all")
     with pytest.raises(LogError, match="no MCAP log"):
@@ -506,6 +507,7 @@ def test_token_is_random_or_that_of_the_environment(monkeypatch: pytest.MonkeyPa
         page_token()
 
 
+@pytest.mark.slow
 def test_viewer_without_a_router_reports_it_and_can_be_stopped() -> None:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
     process = chaserdock(

@@ -19,7 +19,7 @@ from chaserdock_protocol.scenario import Scenario, ScenarioError
 from flight_cases import odometry, scenario, tick_inputs
 from nmpc_cases import PARAMS, far_start, swap
 
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 SLOW_S = 0.01
 

@@ -16,9 +16,10 @@ from flights import load_shipped
 from flights.docking_flights import ConservationMission, dock, docking_scenario
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 
+@pytest.mark.slow
 def test_docking_meets_its_tolerances_and_backs_out_again() -> None:
     """A seed with fast rates, noise of 2 mm and 0.1 degrees: 5 mm, 1.5 degrees, 1.2 cm/s; momentum
     to 1e-4.
@@ -53,6 +54,7 @@ def test_docking_meets_its_tolerances_and_backs_out_again() -> None:
     assert not flight.physics.latches["chaser/0"].latched
 
 
+@pytest.mark.slow
 def test_a_slipping_latch_is_not_verified_and_a_stuck_one_is_not_pulled_at() -> None:
     """The pull moves the chaser; it is to retreat, but the latch opens only 8 s after it has
     closed. It backs out alone.
@@ -160,6 +162,7 @@ def test_a_docking_section_that_cannot_be_flown_is_refused(changes: dict, messag
     assert message in str(error.value)
 
 
+@pytest.mark.slow
 def test_probe_latches_on_the_adapter_ring_of_a_mesh() -> None:
     """`markerless-capture` with measurements of 1 mm and 0.05 degrees in place of images, from the
     corridor's entry on.

@@ -14,7 +14,7 @@ from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario
 from flights.measured_poses import measurement_model
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 V = (0.0, 2.0, 0.0)
 

@@ -21,8 +21,8 @@ from docking_cases import scenario as capture_scenario
 from flight_cases import odometry, tick_inputs
 from harness import ROOT
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 
 def three_chasers() -> Scenario:
@@ -128,6 +128,7 @@ def latency_error_m() -> float:
     return float(np.sqrt(np.mean(trace.position_error_m[trace.time_s >= 40.0] ** 2)))
 
 
+@pytest.mark.slow
 def test_latency_compensation_predicts_the_state_at_actuation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -143,6 +144,7 @@ def test_latency_compensation_predicts_the_state_at_actuation(
     assert latency_error_m() > 5e-4
 
 
+@pytest.mark.slow
 def test_chasers_leave_keep_out_zones_in_which_they_start() -> None:
     """Chaser 0 starts 0.2 m from the target's centre, chasers 1 and 2 start 0.4 m apart with a
     limit of 0.6 m.

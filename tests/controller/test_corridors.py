@@ -29,8 +29,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 LIMIT_M = 0.35
 NEAR = {"approach": {"dock_distance_m": 0.25, "max_speed_m_s": 0.03}}
@@ -198,6 +198,7 @@ def test_in_flight_the_plan_stays_in_the_corridor(order: Any) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_chaser_docks_nearer_than_the_others_may_come() -> None:
     """The docking distance lies within the ball that everybody keeps; only the way in along the
     corridor leads there.

@@ -20,12 +20,12 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CommandReply, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, ScenarioError
 from flights import load_shipped
-from flights.detumble_flights import StackMission, moving_with, stack_scenario
-from flights.latched_stack import stack_motion
+from flights.detumble_flights import StackMission, stack_scenario
+from flights.latched_stack import moving_with, stack_motion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 SETTLED_S = 2.0
 
@@ -42,6 +42,7 @@ def at_command(scenario: Scenario, *chasers: int) -> tuple[StackMission, list[Co
     return mission, out.replies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chasers", [(0, 1, 2, 3), (0, 3)])
 def test_a_tumbling_stack_stops_and_holds_without_propellant(chasers: tuple[int, ...]) -> None:
     mission, replies = at_command(stack_scenario(2, chasers), *range(len(chasers)))
@@ -64,6 +65,7 @@ def test_a_tumbling_stack_stops_and_holds_without_propellant(chasers: tuple[int,
     mission.close()
 
 
+@pytest.mark.slow
 def test_no_thruster_fires_at_the_target() -> None:
     mission, _ = at_command(stack_scenario(1, (0, 3)), 0, 1)
     thrusters, fired = mission.scenario.chaser.thrusters, set()

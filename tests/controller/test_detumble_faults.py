@@ -28,9 +28,10 @@ from flights.rigid_control import (
     wrong_knowledge,
 )
 
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.perception import RenderedImages
 
 
+@pytest.mark.slow
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:
     fault = "fault=[{kind='latch_open',process='chaser/1',at_s=2.5,duration_s=1.0}]"
     changes = [*wrong_knowledge(1), "truth.values=[]", "target.mass_kg=150.0", fault]
@@ -61,6 +62,7 @@ def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() ->
     mission.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "expected"), [("stuck_off", "stuck off"), ("stuck_on", "stuck on")]
 )
@@ -98,6 +100,7 @@ class WatchedMission(StackMission):
         return own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joins_s", [1.9, 3.3])
 def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same(joins_s: float) -> None:
     """Also in the search for the first plan, while the stack coasts."""
@@ -146,6 +149,7 @@ def test_a_thruster_that_an_operator_restores_fires_again() -> None:
     assert found.failed == {(0, 2), (1, 7)}
 
 
+@pytest.mark.slow
 def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
     flight = fly_controlled(
         stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)),

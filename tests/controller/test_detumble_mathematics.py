@@ -94,6 +94,7 @@ def test_a_stack_turned_and_shifted_in_trf_has_turned_wrenches(seed: int) -> Non
     assert v[3:] == pytest.approx(turn @ w[3:], abs=1e-12)
 
 
+@pytest.mark.slow
 @settings(deadline=None, derandomize=True)
 @given(SETS, SEEDS)
 @example((0, 1), 467506)
@@ -130,6 +131,7 @@ def test_allocation_solves_the_linear_programme(chasers: tuple[int, ...], seed: 
     assert found.impulse_N_s == pytest.approx(cheapest.fun, rel=1e-3)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(SETS, SEEDS, st.floats(1e-4, 10.0))
 def test_feedback_is_exact_in_direction_and_within_limits(
@@ -152,6 +154,7 @@ def test_feedback_is_exact_in_direction_and_within_limits(
         assert found.scale == pytest.approx(min(1.0, 0.5 / shortest.time_s), rel=1e-3)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(SEEDS)
 def test_allocation_does_not_depend_on_the_order_of_the_thrusters(seed: int) -> None:

@@ -91,6 +91,7 @@ def test_a_plan_stops_the_stack_cheaply_within_the_time(
     assert plan.impulse_N_s < 0.85 * least.impulse_N_s
 
 
+@pytest.mark.slow
 def test_a_first_plan_leaves_a_local_minimum() -> None:
     """From no thrust this tumble's programme ends in a minimum that is 1.6 times as expensive."""
     p = problem(0, (0, 3))
@@ -100,6 +101,7 @@ def test_a_first_plan_leaves_a_local_minimum() -> None:
     assert np.linalg.norm(active.plan.remaining) < 0.02 * np.linalg.norm(at_begin.momentum)
 
 
+@pytest.mark.slow
 def test_a_plan_in_flight_leaves_a_local_minimum() -> None:
     planner = StackPlanner(14.0, RATE_HZ)
     p, active, now_ns = first_plan(planner, problem(0, (0, 3)))
@@ -117,6 +119,7 @@ def test_a_plan_in_flight_leaves_a_local_minimum() -> None:
     assert spent + planner.active.plan.cost_N_s < 0.9 * dear.cost_N_s
 
 
+@pytest.mark.slow
 def test_a_tick_solves_few_programmes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first plan, its renewals, and a plan without a thruster that is lost: no tick takes
     longer than ten programmes.

@@ -15,8 +15,9 @@ from chaserdock_controller.guidance.reference import (
     reference_trajectory,
 )
 from chaserdock_controller.nmpc import NmpcParameters
-from chaserdock_controller.nmpc.kernels import model_of, roll
-from chaserdock_controller.nmpc.problem import derivative, dynamics
+from chaserdock_controller.nmpc.casadi_model import derivative, dynamics
+from chaserdock_controller.nmpc.kernels import roll
+from chaserdock_controller.nmpc.problem import model_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from hypothesis import given, settings
@@ -175,6 +176,7 @@ def test_derivative_equals_an_independent_one(seed: int) -> None:
     np.testing.assert_allclose(value, newton_euler(x, u), rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_rk4_is_of_fourth_and_euler_of_first_order(seed: int) -> None:
     x, u = random_point(seed, rate=0.5)

@@ -28,7 +28,7 @@ from flights.measured_poses import measurement_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 GOOD = np.diag([2e-3**2] * 3 + [2e-5**2] * 3)
 KEEP_OUT_M = 2.0
@@ -70,6 +70,7 @@ def relative(state: np.ndarray, covariance: np.ndarray = GOOD) -> RelativeState:
     return RelativeState(state, covariance, at_rest())
 
 
+@pytest.mark.slow
 @given(
     st.floats(0.0, 2.0 * math.pi),
     st.floats(-0.5, 0.5),
@@ -221,6 +222,7 @@ def test_motion_seen_from_a_turning_target_is_the_same_motion() -> None:
     np.testing.assert_allclose((seen[1][2] - seen[1][0]) / (2 * h), seen[2][1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_flight_publishes_certificates_and_its_abort_coasts() -> None:
     """A chaser on V-bar is ordered to abort; after the burn its thrusters give next to nothing."""
     s = scenario(duration_s=14.0, navigation={"grade": "exact"})

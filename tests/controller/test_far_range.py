@@ -135,6 +135,7 @@ def test_invalid_scenarios_are_refused_in_one_clear_line(
     assert str(caught.value).count("\n") <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["v-bar", "r-bar"])
 def test_aborts_of_the_rendezvous_stay_out_of_the_keep_out(name: str) -> None:
     found = study(load_shipped(name), 6, seed=2)

@@ -41,6 +41,7 @@ def tumble() -> TumbleOutcome:
     return watch_tumble(scenario_of([8.0, -6.0, 10.0]), 20.0)
 
 
+@pytest.mark.slow
 def test_a_tumble_shows_ratios_and_centre(tumble: TumbleOutcome) -> None:
     assert tumble.stated_error > 0.1
     assert tumble.ratio_error < 0.3 * tumble.stated_error

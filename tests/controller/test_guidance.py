@@ -19,9 +19,13 @@ from chaserdock_controller.guidance.phases import (
     next_phase,
     permitted_commands,
 )
+from chaserdock_controller.guidance.stage import GuidanceStage
+from chaserdock_controller.guidance.thruster_commands import THRUSTER_COMMANDS
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import OperatorCommand, PhaseName
+from chaserdock_protocol.messages import OperatorCommand, OperatorCommandName, PhaseName
+from chaserdock_protocol.scenario import Scenario
+from docking_cases import scenario as capture_scenario
 from flight_cases import (
     at,
     drain,
@@ -440,6 +444,19 @@ def test_every_transition_is_unique() -> None:
         for kind in ((False, True) if t.by_capture is None else (t.by_capture,))
     ]
     assert len(keys) == len(set(keys))
+
+
+@pytest.mark.parametrize("mission", [scenario(), capture_scenario()])
+def test_every_phase_and_command_belongs_to_one_activity(mission: Scenario) -> None:
+    """Of those that a kind of docking leads to; isolating and restoring thrusters change no phase."""
+    stage = GuidanceStage(mission)
+    kinds = (None, stage.chasers[0].by_capture)
+    activities = [a for a in stage.activities if a.by_capture in kinds]
+    phases = [phase for a in activities for phase in a.phases]
+    commands = [command for a in activities for command in a.commands]
+    assert {t.target for t in TRANSITIONS if t.by_capture in kinds} | {Phase.ACQUIRE} <= set(phases)
+    assert len(phases) == len(set(phases))
+    assert sorted((*commands, *THRUSTER_COMMANDS)) == sorted(get_args(OperatorCommandName))
 
 
 def test_every_phase_can_be_entered_and_left() -> None:

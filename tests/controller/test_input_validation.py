@@ -25,7 +25,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.scenario import Scenario, ScenarioError, parse_scenario
 from flight_cases import odometry, scenario, tick_inputs
 
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 AT_START = [
     ({"controller": {"weight_position": -65.0}}, "controller.weight_position: "),

@@ -214,6 +214,7 @@ def test_gates_are_quantiles_of_chi_square() -> None:
     assert pytest.approx(chi2.ppf(0.9999, 6), rel=1e-12) == GATE_CHI_SQUARE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("grade", "chasers"), [("lab", 1), ("lab", 4), ("orbit", 2)])
 def test_relative_poses_are_consistent(grade: str, chasers: int) -> None:
     """The mean NEES over flights is 6; errors that are constant in a flight make single flights
@@ -462,6 +463,7 @@ def test_odometry_noisier_than_stated_is_reported() -> None:
     assert not any("overconfident" in text for text in honest.texts)
 
 
+@pytest.mark.slow
 def test_target_without_sightings_stays_predicted() -> None:
     """After 20 s without sight the relative position is still within a few millimetres, and its
     covariance says so.

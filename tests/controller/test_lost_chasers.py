@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,9 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from flight_cases import tick_inputs
+from nmpc_cases import PARAMS
 
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 ROOT = Path(__file__).resolve().parents[2]
 Q = (1.0, 0.0, 0.0, 0.0)
@@ -113,12 +115,13 @@ def test_short_interruption_is_not_a_loss() -> None:
 
 def test_problem_is_unchanged_without_lost_chasers() -> None:
     problem: Any = object()
-    assert with_lost_chasers(problem, (), 0, 0.1) is problem
+    assert with_lost_chasers(problem, PARAMS, (), 0) is problem
 
 
 @pytest.mark.parametrize("between", [0.35, np.array([[0.0, 0.4], [0.4, 0.0]])])
 def test_lost_chaser_becomes_a_row_without_constraints_of_its_own(between: Any) -> None:
-    stages, n = 5, 2
+    params, n = replace(PARAMS, horizon_s=0.5), 2
+    stages = params.stages
     problem = NmpcInput(
         states=np.zeros((n, 13)),
         references=np.zeros((n, stages + 1, 7)),
@@ -130,7 +133,7 @@ def test_lost_chaser_becomes_a_row_without_constraints_of_its_own(between: Any) 
         corridors=np.ones((n, stages + 1, 5)),
     )
     last = odometry(7, 1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0))
-    extended = with_lost_chasers(problem, (last,), 2_000_000_000, 0.1)
+    extended = with_lost_chasers(problem, params, (last,), 2_000_000_000)
     assert extended.states.shape == (3, 13)
     np.testing.assert_allclose(extended.states[2, :6], [1.1, 0.0, 0.0, 0.1, 0.0, 0.0])
     np.testing.assert_allclose(extended.references[2, -1, :3], [1.15, 0.0, 0.0])
@@ -188,6 +191,7 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
     return near_m, events
 
 
+@pytest.mark.slow
 def test_other_chasers_avoid_the_lost_chaser() -> None:
     scenario = load_scenario(
         ROOT / "scenarios" / "two-chaser-tracking.toml", (*STILL, "timeline=[]")

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
-from chaserdock_controller.nmpc.checks import check_input
 from chaserdock_controller.nmpc.kernels import plan_cost
+from chaserdock_controller.nmpc.problem import check_input, model_of, native_problem
 from chaserdock_controller.nmpc.slack import SLACK_L1, SLACK_L2
 from chaserdock_controller.nmpc.types import IntArray
 from chaserdock_models import rotations
@@ -23,6 +24,7 @@ from nmpc_cases import (
     fresh,
     solver,
     tumbling,
+    with_settings,
 )
 from nmpc_kernels import (
     CONVERGED,
@@ -36,7 +38,7 @@ from nmpc_kernels import (
 )
 
 Model = tuple[Array, ...]  # as `quadratic_model` returns it
-MODEL, WEIGHTS = kernels.model_of(PARAMS), kernels.Weights(PARAMS)
+MODEL = model_of(PARAMS)
 
 
 @dataclass
@@ -58,12 +60,10 @@ def qp_data(problem: NmpcInput, u: Array) -> list[Qp]:
     x, mats = np.empty((n, d + 1, 13)), np.empty((n, d, 12, 12))
     x[:, 0] = problem.states
     roll_linearized(MODEL, x, u, problem.input_max, mats)
-    rows = build_rows(problem, x, 25.0, np.full((n, d + 1), 10.0))
+    rows = build_rows(problem, PARAMS, x, np.full((n, d + 1), 10.0))
     out = []
     for i in range(n):
-        model = quadratic_model(
-            WEIGHTS, x[i], u[i], problem.references[i], problem.u_ref[i], problem.input_max[i]
-        )
+        model = quadratic_model(problem, PARAMS, i, x[i], u[i])
         m = rows.n_rows[i]
         out.append(Qp(mats[i], model, rows.stage[i, :m], rows.a[i, :m], rows.c[i, :m]))
     return out
@@ -73,7 +73,7 @@ def condensed(qp: Qp) -> tuple[Array, Array, Array]:
     """Dense gradient, Hessian (6 D) and the maps (D+1, 12, 6 D) from inputs to states, by brute
     force.
     """
-    mats, (q_pos, q_att, qx, r_diag, r, _) = qp.mats, qp.model
+    mats, (blocks, qx, r_diag, r, _) = qp.mats, qp.model
     d = len(mats)
     maps = np.zeros((d + 1, 12, 6 * d))
     for k in range(d):
@@ -86,7 +86,7 @@ def condensed(qp: Qp) -> tuple[Array, Array, Array]:
     hessian, gradient = np.diag(r_diag.ravel()), r.ravel().copy()
     for k in range(d + 1):
         q = np.zeros((12, 12))
-        q[:3, :3], q[6:9, 6:9] = q_pos[k], q_att[k]
+        q[:6, :6], q[6:, 6:] = blocks[k]
         hessian += maps[k].T @ q @ maps[k]
         gradient += maps[k].T @ qx[k]
     return gradient, hessian, maps
@@ -119,12 +119,13 @@ def test_quadratic_model_is_the_costs_first_order() -> None:
     states[0, 6:10] = rotations.multiply(states[0, 6:10], rotations.exp([0.8, -0.5, 0.4]))
     problem, u = problem_at(states, 0.0), random_inputs(3, 1, 0.5)
     gradient, _, _ = condensed(qp_data(problem, u)[0])
+    checked = check_input(problem, PARAMS, 1)
 
     def cost(inputs: Array) -> float:
         x = np.empty((1, 31, 13))
         x[:, 0] = states
         kernels.roll(MODEL, x, inputs)
-        return float(plan_cost(WEIGHTS, x, inputs, problem.references, problem.u_ref)[0])
+        return float(plan_cost(native_problem(checked, PARAMS), x, inputs)[0])
 
     limits = PARAMS.input_limits()
     for k in (0, 7, 29):
@@ -156,7 +157,7 @@ def test_interior_point_meets_the_kkt_conditions(seed: int) -> None:
         lam, _, low, high = np.split(answer.multipliers, np.cumsum([n_rows, n_rows, len(w)]))
         stationarity = gradient + hessian @ dw - low + high
         for j in range(n_rows):
-            normal = maps[qp.stage[j]][:3].T @ qp.a[j]
+            normal = maps[qp.stage[j]][:6].T @ qp.a[j]
             stationarity -= lam[j] * normal
             gap = normal @ dw - qp.c[j]
             slack = max(-gap, 0.0)
@@ -203,9 +204,9 @@ def test_free_solution_needs_no_interior_point() -> None:
         ({"inertia_kg_m2": ((1.0, 0.1, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))}, "symmetric"),
     ],
 )
-def test_parameters_are_checked(change: dict[str, object], word: str) -> None:
+def test_parameters_are_checked(change: dict[str, Any], word: str) -> None:
     with pytest.raises(ValueError, match=word):
-        replace(PARAMS, **change)  # pyright: ignore[reportArgumentType]
+        with_settings(PARAMS, **change)
 
 
 @pytest.mark.parametrize("name", ["rti", "ipopt"])

@@ -10,9 +10,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from chaserdock_controller.interfaces import ChaserEstimate, TargetEstimation
-from chaserdock_controller.nmpc import coast_rows, rti
-from chaserdock_controller.nmpc.coast_rows import COASTS
+from chaserdock_controller.nmpc import rti
 from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
+from chaserdock_controller.nmpc.terms import coast as coast_term
 from chaserdock_controller.nmpc.types import CoastSafety, NmpcPlan
 from chaserdock_models.passive_safety import CoastModel
 from chaserdock_protocol.scenario import (
@@ -21,7 +21,7 @@ from chaserdock_protocol.scenario import (
     flight_scenario,
     parse_scenario,
 )
-from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
+from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh, with_settings
 
 
 def mission(limits: dict[str, Any], **changes: Any) -> FlightScenario:
@@ -116,7 +116,7 @@ def test_chaser_that_never_was_safe_has_to_abort_after_a_minute() -> None:
 
 SIGMAS = 3.0
 ORBIT_RAD_S, TWO_ORBITS_S = 1.13e-3, 11120.0
-WITH_COASTS = replace(PARAMS, coasts=COASTS, max_reference_distance_m=300.0)
+WITH_COASTS = with_settings(PARAMS, max_reference_distance_m=300.0)
 
 
 def fly(
@@ -175,7 +175,7 @@ def test_only_plans_that_are_not_safe_without_them_have_rows(
     be computed again.
     """
     coast, covariance = CoastModel(0.0, 600.0), np.diag([1e-6] * 3 + [1e-8] * 3)
-    rows, restricted = coast_rows.coast_rows, []
+    rows, restricted = coast_term.coast_rows, []
 
     def counted(safety: CoastSafety, *rest: Any) -> np.ndarray:
         restricted.append(sorted(safety.covariances))
@@ -215,7 +215,9 @@ def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:
     states = np.concatenate(
         [rng.normal(0.0, 60.0, (40, 3)), rng.normal(0.0, 0.05, (40, 3))], axis=1
     )
-    planes, wider = (coast.tangent_planes(states, covariance, 0.75, k, COASTS) for k in (0.0, 1.0))
+    planes, wider = (
+        coast.tangent_planes(states, covariance, 0.75, k, coast_term.COASTS) for k in (0.0, 1.0)
+    )
     used = np.abs(planes[..., :6]).max(axis=2) > 0.0
     assert used[:, 0].all()
     room = np.einsum("mcj,mj->mc", planes[..., :6], states) - planes[..., 6]

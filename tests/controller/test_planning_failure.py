@@ -16,7 +16,7 @@ from chaserdock_controller.nmpc.types import NmpcInput, NmpcPlan, NmpcSolver
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 
-from chaserdock.evaluation.in_process import InProcessMission, TickRecord
+from chaserdock.experiments.in_process import InProcessMission, TickRecord
 
 DRIFT_M_S = (-0.034, 0.0, 0.0)
 """Towards chaser 0."""
@@ -168,6 +168,7 @@ def test_a_failed_solve_flies_the_shifted_plan(flight: InProcessMission, change:
     assert "chaser 0: planned again" in [text for _, _, text in flight.events]
 
 
+@pytest.mark.slow
 def test_a_chaser_without_plans_retreats_with_a_drifting_target(flight: InProcessMission) -> None:
     solver = install(flight, breaks)
     fly_until(flight, FAILS_AT_S)
@@ -192,6 +193,7 @@ def test_a_failed_row_leaves_the_others_planned(flight: InProcessMission) -> Non
     assert (flight.phase(0), flight.phase(1)) == ("retreat", "hold")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", ["infeasible_relaxed", "budget"])
 def test_lasting_degraded_plans_make_a_chaser_retreat(
     flight: InProcessMission, status: str
@@ -253,6 +255,7 @@ def test_commands_without_a_plan_are_refused_with_the_reason(flight: InProcessMi
     assert aborted[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

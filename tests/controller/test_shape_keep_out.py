@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.nmpc.checks import check_input
+from chaserdock_controller.nmpc import NmpcInput
 from chaserdock_controller.nmpc.kernels import plan_violation
+from chaserdock_controller.nmpc.problem import check_input, native_problem
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
@@ -30,21 +31,27 @@ from chaserdock_protocol.scenario import ScenarioError, parse_scenario
 from chaserdock_protocol.scenario.checks import shape_distance_m
 from flight_cases import fleet_of, order
 from flights.shape_gaps import separations
-from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
+from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh, with_settings
 from nmpc_kernels import build_rows
 
 CLEARANCE_M = 0.3
 PANEL_M = (0.02, 1.0, 0.8)
 # Two panels side by side, with a gap of 0.8 m between them.
 PANELS = (Box(PANEL_M, (0.0, 0.9, 0.0)), Box(PANEL_M, (0.0, -0.9, 0.0)))
-WITH_BOXES = replace(PARAMS, boxes=2)
+UNBOUNDED = with_settings(PARAMS, max_reference_distance_m=1e6)
+
+
+def violation(problem: NmpcInput, states: Array) -> Array:
+    """Return the deepest violation (N,) of the distances by plans ``states`` (N, D+1, 13)."""
+    checked = check_input(problem, UNBOUNDED, len(states))
+    return plan_violation(native_problem(checked, UNBOUNDED), states)
 
 
 def fly(start: Array, goal: Array, ticks: int, omega_rad_s: Array) -> tuple[Array, float]:
     """Return the last position (3,) and the least distance from the panels, which turn at a
     constant rate about the origin.
     """
-    solver, state = fresh("rti", 1, WITH_BOXES), at_rest(start)
+    solver, state = fresh("rti", 1), at_rest(start)
     table, times = box_table(PANELS), PARAMS.dt_s * np.arange(PARAMS.stages + 1)
     nearest = np.inf
     for tick in range(ticks):
@@ -86,7 +93,7 @@ def test_signed_distance_and_gradient_agree_with_differences_and_with_the_kernel
         np.testing.assert_allclose(gradient, slopes, atol=1e-5)
     problem = fixed_problem(states[:1], states[:1, :3], d_target=0.0)
     problem = replace(problem, boxes=table, box_clearance_m=np.array([CLEARANCE_M]))
-    found = plan_violation(check_input(problem, WITH_BOXES, 1), states[None], 1e6)
+    found = violation(problem, states[None])
     assert deepest > 0.1
     np.testing.assert_allclose(found, [deepest], rtol=1e-12)
 
@@ -105,7 +112,7 @@ def test_gaps_of_shapes_agree_with_the_kernel_and_are_at_most_the_distance() -> 
         chaser_shape=SHAPE,
         min_distance_shapes_m=np.full((2, 2), 0.2),
     )
-    found = plan_violation(check_input(problem, WITH_BOXES, 2), states, 1e6)
+    found = violation(problem, states)
     poses = [[(s[:3], s[6:10]) for s in plan] for plan in states]
     between = [distance_between(SHAPE, one, other) for one, other in zip(*poses, strict=True)]
     from_panels = [distance_from_cuboids(table[0], SHAPE, *pose) for pose in poses[0]]
@@ -176,7 +183,7 @@ def test_shapes_of_chasers_pass_each_other_at_their_distance() -> None:
 
 
 def test_probe_keeps_its_distance_from_a_panel() -> None:
-    solver, state = fresh("rti", 1, WITH_BOXES), at_rest(np.array([-1.0, 0.9, 0.0]))
+    solver, state = fresh("rti", 1), at_rest(np.array([-1.0, 0.9, 0.0]))
     boxes = np.repeat(box_table(PANELS)[None], PARAMS.stages + 1, axis=0)
     least = np.inf
     for tick in range(150):
@@ -210,7 +217,7 @@ def test_planes_move_away_from_a_chaser_that_cannot_keep_its_own_distance() -> N
         )
         nodes = PARAMS.stages + 1
         rollout = np.repeat(problem.states[:, None], nodes, axis=1)
-        rows = build_rows(problem, rollout, 25.0, np.full((2, nodes), 10.0))
+        rows = build_rows(problem, PARAMS, rollout, np.full((2, nodes), 10.0))
         between = [rows.c[i, rows.n_rows[i] - PARAMS.stages : rows.n_rows[i]] for i in range(2)]
         needed[limit_m] = np.array(between)
     np.testing.assert_allclose(needed[0.35][0] - needed[0.0][0], -0.01, atol=1e-12)

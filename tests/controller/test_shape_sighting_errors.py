@@ -89,6 +89,7 @@ def target_nees(flight: ShapeFlight, noise: SightingNoise) -> tuple[float, float
     return position, rotation
 
 
+@pytest.mark.slow
 def test_persistent_errors_are_expected_while_the_stated_covariance_changes() -> None:
     """Six flights with three slow components each: three standard deviations of the mean."""
     nees = [target_nees(ShapeFlight(seed), SHAPE) for seed in range(FLIGHTS)]
@@ -97,6 +98,7 @@ def test_persistent_errors_are_expected_while_the_stated_covariance_changes() ->
     assert np.mean(nees, axis=0).min() > 1.0
 
 
+@pytest.mark.slow
 def test_an_error_in_units_of_each_image_would_seem_observable() -> None:
     newest = SHAPE._replace(units_time_s=0.0)
     nees = [target_nees(ShapeFlight(seed), newest)[1] for seed in range(FLIGHTS)]
@@ -122,6 +124,7 @@ def test_an_invalid_covariance_does_not_change_the_units() -> None:
     assert not np.array_equal(after.view_units[1], before.view_units[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigmas", "follows"), [(3.0, True), (40.0, False)])
 def test_error_that_jumps_as_with_a_new_view_is_followed(sigmas: float, follows: bool) -> None:
     """A jump by some stated sigmas per axis is a new view; a far larger one is a fault of the
@@ -145,6 +148,7 @@ def test_error_that_jumps_as_with_a_new_view_is_followed(sigmas: float, follows:
     assert warnings == ([] if follows else ["chaser 1 gated out: 5 in a row"])
 
 
+@pytest.mark.slow
 def test_pushed_target_is_no_new_view() -> None:
     """Where most cameras disagree with the estimate, the target has moved: its motion is followed
     as without this rule.

@@ -76,7 +76,7 @@ def test_mission_over_four_hosts_with_shipped_configuration(
         "chaser/0": ("sat-a", ["chaser", "0", "-c", str(file)]),
         "chaser/1": ("sat-b", ["chaser", "1", "-c", str(file)]),
         "recorder": ("hub", ["record", "--out", str(runs), "--by-run", "-c", str(file)]),
-        "judge": ("hub", ["judge", str(runs), "-c", str(file)]),
+        "judge": ("hub", ["judge", str(runs), "--live", "-c", str(file)]),
     }
     processes: dict[str, subprocess.Popen[bytes]] = {}
     try:

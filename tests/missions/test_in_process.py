@@ -17,8 +17,8 @@ from chaserdock_world.rendering.cameras import States
 from flights.measured_poses import measurement_model
 from harness import ROOT, SHORT
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 from chaserdock.logs import open_log
 
 SMALL = (
@@ -41,6 +41,7 @@ ERRORS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overrides", [SHORT, ERRORS], ids=["ideal", "errors"])
 def test_truth_equals_lockstep_mission(
     overrides: tuple[str, ...], shared_flight: Callable[..., Path]

@@ -18,7 +18,7 @@ from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.rendering.pose_cameras import make_cameras
 
-from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.experiments.in_process import InProcessMission
 
 ROOT = Path(__file__).parents[2]
 INSPECT = tuple(OperatorCommand(command="inspect", chaser=i) for i in (0, 1))

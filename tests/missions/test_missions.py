@@ -22,6 +22,7 @@ from chaserdock.analysis.flight import load_flight
 TWO = "two-chaser-tracking"
 
 
+@pytest.mark.slow
 def test_other_seed_gives_another_digest(short_flight: Path, tmp_path: Path) -> None:
     status, output = run(TWO, tmp_path / "other", *SHORT, arguments=["--seed", "7"])
     assert status == 0, output
@@ -29,6 +30,7 @@ def test_other_seed_gives_another_digest(short_flight: Path, tmp_path: Path) -> 
     assert summary(tmp_path / "other")["digest"] != summary(short_flight)["digest"]
 
 
+@pytest.mark.slow
 def test_digest_is_independent_of_start_order(short_flight: Path, tmp_path: Path) -> None:
     """Recorder and chasers first, the world last, each started by its own command."""
     by_hand = ByHand.at_free_port("by-hand")
@@ -119,6 +121,7 @@ def test_log_is_readable_with_mcap_and_msgpack(short_flight: Path) -> None:
     assert "version.numpy" in metadata["chaserdock"]
 
 
+@pytest.mark.slow
 def test_interrupted_world_names_missing_processes(tmp_path: Path) -> None:
     """SIGINT ends a world that waits for processes, and its message lists them."""
     by_hand = ByHand.at_free_port("waiting")

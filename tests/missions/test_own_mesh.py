@@ -8,14 +8,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from chaserdock_models.satellites import satellite
-from chaserdock_protocol.scenario.mesh_files import write_mesh
 from harness import run, summary
 
 from chaserdock import open_log
 from chaserdock.analysis.scene import scene_of
+from chaserdock.targets.mesh_writer import write_mesh
 
 
+@pytest.mark.slow
 def test_own_mesh_is_acquired_by_a_single_chaser_and_drawn(tmp_path: Path) -> None:
     write_mesh(satellite("geo_servicer", 2e-3), tmp_path / "own-servicer.glb")
     status, text = run(

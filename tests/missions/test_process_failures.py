@@ -52,6 +52,7 @@ LONG = (*SHORT, "duration_s=60.0")
 GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 
 
+@pytest.mark.slow
 def test_existing_log_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mission.mcap").write_bytes(b"precious")
     status, output = run("single", tmp_path, timeout_s=30)
@@ -71,10 +72,11 @@ def test_world_reports_port_in_use() -> None:
     assert endpoint in output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("log", "play", str(GOLDEN), "-m", "client"),
+        ("play", str(GOLDEN), "-m", "client"),
         ("ros2", "-m", "client"),
         ("world", "single", "-m", "client"),
     ],
@@ -94,6 +96,7 @@ def test_interrupt_ends_the_wait_for_a_router(arguments: tuple[str, ...]) -> Non
         process.communicate()
 
 
+@pytest.mark.slow
 def test_chaser_and_operator_time_out_without_peers() -> None:
     """A chaser without a world and an operator without a controller end with status 2 after
     ``--timeout``.
@@ -150,6 +153,7 @@ def malformed_messages() -> list[tuple[str, bytes, str]]:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path: Path) -> None:
     """A second world, a duplicate or unknown chaser, malformed messages and invalid commands do not
     disturb the flight.
@@ -207,6 +211,7 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
     } <= reasons
 
 
+@pytest.mark.slow
 def test_killed_recorder_leaves_readable_log(tmp_path: Path) -> None:
     """SIGKILL of the recorder loses at most the last second; the flight completes."""
     mission = chaserdock(
@@ -231,6 +236,7 @@ def test_killed_recorder_leaves_readable_log(tmp_path: Path) -> None:
     assert result["failures"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("victim", "duration_s"), [(("controller",), 25.0), (("chaser", "1"), 14.0)]
 )
@@ -279,6 +285,7 @@ def test_flight_continues_after_process_is_killed(
         assert result["target_estimate"]["max_position_error_m"] < 0.01
 
 
+@pytest.mark.slow
 def test_realtime_chaser_survives_frozen_controller(tmp_path: Path) -> None:
     """The chaser enters fallback without commands, rejects stale ones and follows new ones."""
     out = tmp_path / "run"
@@ -319,6 +326,7 @@ def test_realtime_chaser_survives_frozen_controller(tmp_path: Path) -> None:
             assert newest_ns - record.message.sim_time_ns < 0.5e9 + 0.5e9
 
 
+@pytest.mark.slow
 def test_frozen_chaser_that_was_replaced_ends_when_it_wakes(tmp_path: Path) -> None:
     """It commands no actuators beside its successor."""
     hand, lease = ByHand.at_free_port("replaced"), ("--lease", "2")
@@ -361,6 +369,7 @@ def test_frozen_chaser_that_was_replaced_ends_when_it_wakes(tmp_path: Path) -> N
     assert instances[instances.index(last) :].count(first) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_closes_log(how: signal.Signals, tmp_path: Path) -> None:
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), *sets(*LONG))
@@ -380,6 +389,7 @@ def test_interrupted_run_closes_log(how: signal.Signals, tmp_path: Path) -> None
     assert result["ticks"] > 0
 
 
+@pytest.mark.slow
 def test_killed_launcher_leaves_no_processes(tmp_path: Path) -> None:
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*LONG))
     log = tmp_path / "run" / "mission.mcap"
@@ -398,6 +408,7 @@ def test_killed_launcher_leaves_no_processes(tmp_path: Path) -> None:
     assert log.read_bytes().endswith(b"\x89MCAP0\r\n")
 
 
+@pytest.mark.slow
 def test_process_lost_before_first_tick_ends_run(tmp_path: Path) -> None:
     """The run ends with status 1 when a process fails before the first tick."""
     out = tmp_path / "run"
@@ -412,6 +423,7 @@ def test_process_lost_before_first_tick_ends_run(tmp_path: Path) -> None:
     assert status == 1
 
 
+@pytest.mark.slow
 def test_world_names_the_processes_that_do_not_connect() -> None:
     endpoint = f"tcp/127.0.0.1:{launcher.free_port()}"
     status, output = finished("world", "single", "-l", endpoint, "--timeout", "1.5", timeout_s=60)
@@ -419,6 +431,7 @@ def test_world_names_the_processes_that_do_not_connect() -> None:
     assert "not connected within 1.5 s: chaser/0, controller, recorder" in output
 
 
+@pytest.mark.slow
 def test_process_that_hangs_before_the_first_tick_ends_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,8 +10,8 @@ import pytest
 from flights import load_shipped
 from flights.rendezvous import last_leg, rendezvous
 
-from chaserdock.evaluation.in_process import InProcessMission
-from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.experiments.in_process import InProcessMission
+from chaserdock.experiments.perception import RenderedImages
 
 
 def test_last_leg_starts_at_the_last_hold_point() -> None:

@@ -6,11 +6,12 @@ the limit.
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
 
-from chaserdock.evaluation.flight_record import record_flight
-from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.experiments.flight_record import record_flight
+from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
 PATH = ROOT / "scenarios" / "sixteen-chasers.toml"
 
@@ -23,6 +24,7 @@ def test_formation_is_two_rings_of_eight() -> None:
     assert (places[:, 2] > 0.0).sum() == 8
 
 
+@pytest.mark.slow
 def test_sixteen_chasers_converge_without_close_approaches() -> None:
     """From scattered starts every chaser converges on its position; perfect target state."""
     mission = load_scenario(PATH, ("duration_s=8.0", "settling_s=1.0"))

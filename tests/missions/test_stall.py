@@ -227,7 +227,7 @@ def test_foreign_messages_are_ignored_and_their_publisher_is_named(tmp_path: Pat
         changes = (*SHORT, "duration_s=60.0", "perception.name='statistical'")
         by_hand.start("world", "world", "two-chaser-tracking", *sets(*changes), "--stall-s", "20")
         by_hand.start("recorder", "record", "--by-run", "--out", str(tmp_path))
-        by_hand.start("judge", "judge", str(tmp_path), "--timeout", "60")
+        by_hand.start("judge", "judge", str(tmp_path), "--live", "--timeout", "60")
         by_hand.start("controller", "controller")
         until(lambda: list(tmp_path.glob("*/mission.mcap")))
         (log,) = tmp_path.glob("*/mission.mcap")

@@ -88,6 +88,7 @@ def both() -> tuple[Measured, Measured]:
     return measured
 
 
+@pytest.mark.slow
 def test_statistical_perception_sees_the_target_where_images_show_it(
     both: tuple[Measured, Measured],
 ) -> None:

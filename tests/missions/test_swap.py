@@ -13,6 +13,7 @@ from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.guidance.reference import predict_target
 from chaserdock_controller.interfaces import TargetState
 from chaserdock_controller.nmpc import kernels
+from chaserdock_controller.nmpc.problem import model_of
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_models import rotations
 from chaserdock_models.attitude_reference import facing_attitudes
@@ -44,7 +45,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         p, q = scenario.start_pose(i)
         states[i, :3] = p + (0.05 * rng.normal(size=3) if seed else 0.0)
         states[i, 6:10] = q
-    model = kernels.model_of(nmpc_parameters(scenario), TICK_S / 4)
+    model = model_of(nmpc_parameters(scenario), TICK_S / 4)
     least, nearest, ends = np.inf, np.inf, states[:, :3]
     at = np.zeros(3)
     for tick in range(round(time_s / TICK_S)):

@@ -28,6 +28,7 @@ def stuck_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_stuck_thruster_is_detected_isolated_and_reported(stuck_flight: Path) -> None:
     result = summary(stuck_flight)
     reported = [e for e in result["events"] if "thruster 5 stuck on" in e["what"]]
@@ -65,5 +66,6 @@ def test_log_contains_valve_commands_and_force_limits(stuck_flight: Path) -> Non
     assert all(thrusters[5] == 0.0 and thrusters[7] == 0.0 for thrusters in after)
 
 
+@pytest.mark.slow
 def test_simulated_thruster_flight_has_equal_digest(stuck_flight: Path, tmp_path: Path) -> None:
     assert simulated_digest("thruster-failure", tmp_path, *STUCK) == summary(stuck_flight)["digest"]

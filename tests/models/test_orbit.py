@@ -179,7 +179,7 @@ def test_integrated_clohessy_wiltshire_agrees_with_its_closed_form() -> None:
 
 
 def test_relative_motion_agrees_with_basilisk() -> None:
-    """Reference: ``python benchmarks/relative_orbit.py --basilisk PYTHON --write``."""
+    """Reference: ``python benchmarks/physics.py --only orbit --basilisk PYTHON --write``."""
     chosen = {"circular_j2_radial", "eccentric_j2_along"}
     for case in json.loads(BASILISK.read_text())["cases"]:
         if case["name"] not in chosen:

@@ -1,13 +1,14 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Seeded random inputs for the kernels of one library, to be run under sanitizers (tests/sanitizers.py).
+/* Seeded random inputs for the kernels of one library, to be run under sanitizers
+ * (tests/sanitizers.py).
  *
  *     PROGRAM                              lists the targets
  *     PROGRAM TARGET FIRST COUNT SEED      runs a target on inputs FIRST .. FIRST + COUNT - 1
  *
- * An input depends on target, seed and number only. What a sanitizer finds, a failed CHECK and an input that takes more than
- * 10 s of processor time abort; the last line on stderr then names target, input and seed. Arrays have their exact size, so
- * that every access beyond them is found.
- */
+ * An input depends on target, seed and number only. What a sanitizer finds, a failed CHECK and an
+ * input that takes more than 10 s of processor time abort; the last line on stderr then names
+ * target, input and seed. Arrays have their exact size, so that every access beyond them is
+ * found. */
 #ifndef CHASERDOCK_FUZZ_H
 #define CHASERDOCK_FUZZ_H
 
@@ -52,7 +53,9 @@ static uint64_t random_bits(void) {
 }
 
 /* A whole number from low to high, both included. */
-static int64_t whole(int64_t low, int64_t high) { return low + (int64_t)(random_bits() % (uint64_t)(high - low + 1)); }
+static int64_t whole(int64_t low, int64_t high) {
+    return low + (int64_t)(random_bits() % (uint64_t)(high - low + 1));
+}
 
 static double uniform(double low, double high) {
     return low + (high - low) * ((double)(random_bits() >> 11) * 0x1p-53);
@@ -63,11 +66,15 @@ static int chance(double share) { return uniform(0.0, 1.0) < share; }
 /* NaN, infinities, zeros, denormals, the ends of ranges, and any bits. */
 static double special(void) {
     static const uint64_t patterns[] = {
-        0x7ff8000000000000u, 0xfff8000000000001u, 0x7ff0000000000000u, 0xfff0000000000000u, /* NaN, infinity */
-        0x0000000000000000u, 0x8000000000000000u, 0x0000000000000001u, 0x800000000000abcdu, /* zero, denormal */
-        0x0010000000000000u, 0x7fefffffffffffffu, 0xffefffffffffffffu,                     /* smallest, largest */
-        0x43e0000000000000u, 0xc3e0000000000001u, 0x41e0000000000000u, 0xc1e0000000200000u, /* 2^63, 2^31 */
-        0x3ff0000000000000u, 0xbff0000000000000u, 0x01a56e1fc2f8f359u, 0x7e37e43c8800759cu, /* 1, 1e-300, 1e300 */
+        0x7ff8000000000000u, 0xfff8000000000001u, 0x7ff0000000000000u,
+        0xfff0000000000000u, /* NaN, infinity */
+        0x0000000000000000u, 0x8000000000000000u, 0x0000000000000001u,
+        0x800000000000abcdu,                                           /* zero, denormal */
+        0x0010000000000000u, 0x7fefffffffffffffu, 0xffefffffffffffffu, /* smallest, largest */
+        0x43e0000000000000u, 0xc3e0000000000001u, 0x41e0000000000000u,
+        0xc1e0000000200000u, /* 2^63, 2^31 */
+        0x3ff0000000000000u, 0xbff0000000000000u, 0x01a56e1fc2f8f359u,
+        0x7e37e43c8800759cu, /* 1, 1e-300, 1e300 */
     };
     uint64_t bits = chance(0.8) ? patterns[whole(0, COUNT_OF(patterns) - 1)] : random_bits();
     double value;
@@ -76,7 +83,9 @@ static double special(void) {
     return value;
 }
 
-static double value(double low, double high) { return chance(special_share) ? special() : uniform(low, high); }
+static double value(double low, double high) {
+    return chance(special_share) ? special() : uniform(low, high);
+}
 
 /* Memory of exactly this size until the end of the input. */
 static void *block(size_t size) {
@@ -108,7 +117,8 @@ static uint8_t *bytes(int64_t count) {
 static void fill_quaternion(double *q) {
     double square = 0.0;
     for (int i = 0; i < 4; i++) q[i] = uniform(-1.0, 1.0), square += q[i] * q[i];
-    for (int i = 0; i < 4; i++) q[i] = chance(special_share) ? special() : q[i] / sqrt_of(square + 1e-9);
+    for (int i = 0; i < 4; i++)
+        q[i] = chance(special_share) ? special() : q[i] / sqrt_of(square + 1e-9);
 }
 
 /* An inertia tensor (3, 3) in its main axes, and its inverse. */
@@ -137,8 +147,10 @@ static double *copy_of(const double *a, int64_t count) {
 
 static void report_input(int number) {
     char line[200];
-    int length = snprintf(line, sizeof line, "%s: %s, input %llu, seed %llu\n", number == SIGPROF ? "no end after 10 s of processor time" : "aborted",
-                          target_name, (unsigned long long)input_number, (unsigned long long)input_seed);
+    int length =
+        snprintf(line, sizeof line, "%s: %s, input %llu, seed %llu\n",
+                 number == SIGPROF ? "no end after 10 s of processor time" : "aborted", target_name,
+                 (unsigned long long)input_number, (unsigned long long)input_seed);
     if (length > 0 && write(2, line, (size_t)length) < 0) _exit(2);
     _exit(1);
 }

@@ -6,7 +6,8 @@
 static double *means(int64_t n) {
     double *mean = doubles(TARGET_MEAN + CHASER_MEAN * n, -0.2, 0.2);
     fill_quaternion(mean + QUATERNION);
-    for (int64_t i = 0; i < n; i++) fill_quaternion(mean + TARGET_MEAN + CHASER_MEAN * i + QUATERNION);
+    for (int64_t i = 0; i < n; i++)
+        fill_quaternion(mean + TARGET_MEAN + CHASER_MEAN * i + QUATERNION);
     return mean;
 }
 
@@ -23,13 +24,25 @@ static double *covariances(int64_t d) {
 static Measurement *measurement_of(int64_t n) {
     Measurement *z = block(sizeof *z);
     const int kind = (int)whole(1, 3);
-    double *camera = outputs(4), *odometry = doubles(13, -0.2, 0.2), *sighting = doubles(7, -0.2, 0.2);
+    double *camera = outputs(4), *odometry = doubles(13, -0.2, 0.2),
+           *sighting = doubles(7, -0.2, 0.2);
     fill_quaternion(camera);
     fill_quaternion(odometry + QUATERNION);
     fill_quaternion(sighting + 3);
-    double *axes = doubles(9, -1.0, 1.0), *stated = covariances(6), *view = whole(0, 1) ? stated : covariances(6);
-    *z = (Measurement){n, whole(0, n - 1), doubles(3, -0.1, 0.1), axes, camera, kind & 1 ? odometry : NULL, covariances(12),
-                       kind & 2 ? sighting : NULL, stated, view, value(0.5, 2.0), value(0.2, 2.0)};
+    double *axes = doubles(9, -1.0, 1.0), *stated = covariances(6),
+           *view = whole(0, 1) ? stated : covariances(6);
+    *z = (Measurement){n,
+                       whole(0, n - 1),
+                       doubles(3, -0.1, 0.1),
+                       axes,
+                       camera,
+                       kind & 1 ? odometry : NULL,
+                       covariances(12),
+                       kind & 2 ? sighting : NULL,
+                       stated,
+                       view,
+                       value(0.5, 2.0),
+                       value(0.2, 2.0)};
     return z;
 }
 
@@ -39,14 +52,22 @@ static int64_t any_size(int64_t n) { return size_of(n) + 8 * whole(0, 1); }
 static Innovation *innovation_of(int64_t d) {
     const int64_t stride = (d + 7) / 8 * 8;
     Innovation *out = block(sizeof *out);
-    *out = (Innovation){outputs(MOST_ROWS), outputs(MOST_ROWS * SEEN), outputs(MOST_ROWS * MOST_ROWS),
-                        outputs(MOST_ROWS * MOST_ROWS), outputs(MOST_ROWS * stride), outputs(MOST_ROWS * stride), outputs(d),
-                        outputs(CHANNELS + 1), stride, d};
+    *out = (Innovation){outputs(MOST_ROWS),
+                        outputs(MOST_ROWS * SEEN),
+                        outputs(MOST_ROWS * MOST_ROWS),
+                        outputs(MOST_ROWS * MOST_ROWS),
+                        outputs(MOST_ROWS * stride),
+                        outputs(MOST_ROWS * stride),
+                        outputs(d),
+                        outputs(CHANNELS + 1),
+                        stride,
+                        d};
     return out;
 }
 
 static void wrench_at_origin(void) {
-    double *wrench = doubles(6, -1.0, 1.0), *centre = doubles(3, -0.1, 0.1), *omega = doubles(3, -1.0, 1.0);
+    double *wrench = doubles(6, -1.0, 1.0), *centre = doubles(3, -0.1, 0.1),
+           *omega = doubles(3, -1.0, 1.0);
     double *inertia = doubles(3, 0.3, 1.0), *out = outputs(6);
     NAME(wrench_at_origin)(wrench, centre, omega, value(5.0, 20.0), inertia, out);
     if (!special_drawn) CHECK(all_finite(out, 6));
@@ -59,10 +80,12 @@ static void predict(void) {
     int64_t *alive = block((size_t)n * 8), *latched = block((size_t)n * 8);
     for (int64_t i = 0; i < n; i++) alive[i] = whole(0, 1), latched[i] = whole(0, 1);
     double *mean = means(n), *out = outputs(d * d);
-    NAME(predict)(m, n, d, doubles(144, -1.0, 1.0), covariances(12), doubles(6 * n, -0.1, 0.1), doubles(6 * n, -0.1, 0.1),
-                  doubles(n, 0.0, 1.0), doubles(CHASER - 12, 0.0, 1.0), alive, latched, mean, covariances(d), out,
+    NAME(predict)(m, n, d, doubles(144, -1.0, 1.0), covariances(12), doubles(6 * n, -0.1, 0.1),
+                  doubles(6 * n, -0.1, 0.1), doubles(n, 0.0, 1.0), doubles(CHASER - 12, 0.0, 1.0),
+                  alive, latched, mean, covariances(d), out,
                   outputs(NAME(predict_workspace)(n, d)));
-    if (!special_drawn) CHECK(all_finite(out, d * d) && all_finite(mean, TARGET_MEAN + CHASER_MEAN * n));
+    if (!special_drawn)
+        CHECK(all_finite(out, d * d) && all_finite(mean, TARGET_MEAN + CHASER_MEAN * n));
     for (int64_t i = 0; i < d; i++)
         for (int64_t j = 0; j < i; j++) CHECK(same_bits(out + d * i + j, out + d * j + i, 1));
 }
@@ -73,14 +96,16 @@ static void linearize(void) {
     const int k = rows_of(z);
     double *residual = outputs(k), *h = outputs(k * SEEN), *noise = outputs(k * k);
     NAME(linearize)(z, means(n), residual, h, noise);
-    if (!special_drawn) CHECK(all_finite(residual, k) && all_finite(h, k * SEEN) && all_finite(noise, k * k));
+    if (!special_drawn)
+        CHECK(all_finite(residual, k) && all_finite(h, k * SEEN) && all_finite(noise, k * k));
 }
 
 static void predict_sighting(void) {
     const int64_t n = whole(1, 2);
     double *camera = outputs(4), *pose = outputs(7), *h = outputs(SIGHTING_ROWS * SEEN);
     fill_quaternion(camera);
-    NAME(predict_sighting)(means(n), whole(0, n - 1), doubles(3, -0.1, 0.1), doubles(9, -1.0, 1.0), camera, pose, h);
+    NAME(predict_sighting)(means(n), whole(0, n - 1), doubles(3, -0.1, 0.1), doubles(9, -1.0, 1.0),
+                           camera, pose, h);
     if (!special_drawn) CHECK(all_finite(pose, 7) && all_finite(h, SIGHTING_ROWS * SEEN));
 }
 
@@ -109,7 +134,8 @@ static void innovate(void) {
     NAME(innovate)(z, mean, prior, covariances(d), out, outputs(NAME(innovate_workspace)(d)));
     if (!special_drawn) CHECK(all_finite(out->s, k * k) && all_finite(out->cross, k * out->stride));
     if (!special_drawn && z->sighting) CHECK(out->values[0] >= 0.0 && out->values[CHANNELS] > 0.0);
-    for (int c = 0; c < CHANNELS; c++) CHECK(out->values[c] >= 0.0 || out->values[c] != out->values[c]);
+    for (int c = 0; c < CHANNELS; c++)
+        CHECK(out->values[c] >= 0.0 || out->values[c] != out->values[c]);
 }
 
 /* Random rows of a random innovation, by a covariance that is not always positive definite. */
@@ -124,7 +150,8 @@ static void correct(void) {
     fill(z->cross, k * z->stride, -0.1, 0.1);
     double *mean = outputs(size), *given = copy_of(mean, size);
     const int64_t valid = NAME(correct)(n, k, used, m, z, means(n), mean);
-    CHECK(valid ? special_drawn || all_finite(mean, size) : special_drawn && same_bits(mean, given, size));
+    CHECK(valid ? special_drawn || all_finite(mean, size)
+                : special_drawn && same_bits(mean, given, size));
 }
 
 static void reduce(void) {
@@ -146,8 +173,15 @@ static void complete(void) {
 }
 
 static const Target TARGETS[] = {
-    {"predict", predict},     {"linearize", linearize}, {"difference", difference}, {"inject", inject},
-    {"innovate", innovate},   {"correct", correct},     {"reduce", reduce},         {"complete", complete},
-    {"wrench_at_origin", wrench_at_origin},             {"predict_sighting", predict_sighting},
+    {"predict", predict},
+    {"linearize", linearize},
+    {"difference", difference},
+    {"inject", inject},
+    {"innovate", innovate},
+    {"correct", correct},
+    {"reduce", reduce},
+    {"complete", complete},
+    {"wrench_at_origin", wrench_at_origin},
+    {"predict_sighting", predict_sighting},
 };
 FUZZ_MAIN(TARGETS)

@@ -13,7 +13,8 @@ static double *lens_of_camera(void) {
 static uint8_t *image_of(int64_t height, int64_t width) {
     uint8_t *image = bytes(height * width);
     if (chance(0.3)) return image;
-    const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height), slope = uniform(-1.0, 1.0);
+    const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height),
+                 slope = uniform(-1.0, 1.0);
     for (int64_t i = 0; i < height * width; i++) {
         double column = (double)(i % width), row = (double)(i / width);
         image[i] = column + slope * row > x && row - slope * column > y ? 230 : 20;
@@ -25,13 +26,19 @@ static Settings settings(void) {
     Settings s = {0};
     s.first = uniform(0.0, 0.4), s.last = uniform(0.6, 1.0);
     s.reach_cells = uniform(0.1, 1.0), s.reach_least_px = uniform(0.5, 2.0);
-    s.min_contrast = uniform(0.0, 20.0), s.min_rows_share = uniform(0.0, 1.0), s.max_move_px = uniform(0.5, 8.0);
-    s.rows = (double)whole(2, ROWS_MOST), s.taps = (double)whole(2, TAPS_MOST), s.coarse_reach_px = uniform(1.0, 5.0);
-    s.border_share = uniform(0.1, 1.0), s.columns = (double)whole(1, COLUMNS_MOST), s.end_px = uniform(0.0, 5.0);
+    s.min_contrast = uniform(0.0, 20.0), s.min_rows_share = uniform(0.0, 1.0),
+    s.max_move_px = uniform(0.5, 8.0);
+    s.rows = (double)whole(2, ROWS_MOST), s.taps = (double)whole(2, TAPS_MOST),
+    s.coarse_reach_px = uniform(1.0, 5.0);
+    s.border_share = uniform(0.1, 1.0), s.columns = (double)whole(1, COLUMNS_MOST),
+    s.end_px = uniform(0.0, 5.0);
     s.end_share = uniform(0.0, 0.4), s.reach_px = uniform(1.0, 5.0), s.clear_px = uniform(0.0, 2.0);
-    s.beyond_px = uniform(0.1, 2.0), s.strip_px = uniform(0.0, 20.0), s.partial_px = uniform(0.0, 20.0), s.least_fall = uniform(-1.0, 1.0);
-    s.agreement_px = uniform(0.0, 1.0), s.log_edge_sigma = uniform(-1.0, 1.0), s.edge_sigma_spread = uniform(0.05, 0.5);
-    s.rounds = (double)whole(0, 3), s.iterations = (double)whole(1, 4), s.strip_iterations = (double)whole(1, 5);
+    s.beyond_px = uniform(0.1, 2.0), s.strip_px = uniform(0.0, 20.0),
+    s.partial_px = uniform(0.0, 20.0), s.least_fall = uniform(-1.0, 1.0);
+    s.agreement_px = uniform(0.0, 1.0), s.log_edge_sigma = uniform(-1.0, 1.0),
+    s.edge_sigma_spread = uniform(0.05, 0.5);
+    s.rounds = (double)whole(0, 3), s.iterations = (double)whole(1, 4),
+    s.strip_iterations = (double)whole(1, 5);
     s.uncertain_px = uniform(0.5, 4.0), s.uncertain_level = uniform(0.0, 200.0);
     return s;
 }
@@ -40,17 +47,22 @@ static void refine_corners(void) {
     static const double around[8] = {-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0};
     const int64_t height = whole(2, 40), width = whole(2, 40), n = whole(0, 2);
     const uint8_t *image = image_of(height, width);
-    double *lens = doubles(9, -0.2, 0.2), *margin = doubles(n, 0.0, 0.3), *corners = outputs(8 * n), *sigma = outputs(n);
+    double *lens = doubles(9, -0.2, 0.2), *margin = doubles(n, 0.0, 0.3), *corners = outputs(8 * n),
+           *sigma = outputs(n);
     uint8_t *good = bytes(n), *outlined = bytes(n);
     Settings set = settings();
     for (int i = 0; i < 2; i++) lens[i] = value(20.0, 60.0), lens[2 + i] = value(0.0, 40.0);
     for (int64_t m = 0; m < n; m++) {
-        const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height), half = uniform(1.0, 15.0);
+        const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height),
+                     half = uniform(1.0, 15.0);
         for (int i = 0; i < 8; i++)
-            corners[8 * m + i] = chance(special_share) ? special() : (i % 2 ? y : x) + half * around[i] + uniform(-1.0, 1.0);
+            corners[8 * m + i] = chance(special_share)
+                                     ? special()
+                                     : (i % 2 ? y : x) + half * around[i] + uniform(-1.0, 1.0);
     }
     double *given = copy_of(corners, 8 * n);
-    NAME(refine_corners)(image, height, width, lens, whole(0, 1), &set, (double)whole(3, 9), n, margin, outlined, corners, good, sigma);
+    NAME(refine_corners)(image, height, width, lens, whole(0, 1), &set, (double)whole(3, 9), n,
+                         margin, outlined, corners, good, sigma);
     for (int64_t m = 0; m < n; m++) {
         CHECK(good[m] <= 1 && sigma[m] >= 1.0 && finite(sigma[m]));
         if (good[m]) CHECK(all_finite(corners + 8 * m, 8) && all_finite(given + 8 * m, 8));
@@ -60,7 +72,8 @@ static void refine_corners(void) {
 
 static void refine_pose(void) {
     const int64_t n = whole(0, 8);
-    double *lens = lens_of_camera(), *points = doubles(3 * n, -0.3, 0.3), *pixels = doubles(2 * n, 0.0, 640.0);
+    double *lens = lens_of_camera(), *points = doubles(3 * n, -0.3, 0.3),
+           *pixels = doubles(2 * n, 0.0, 640.0);
     double *weight = doubles(2 * n, 0.0, 2.0), *pose = doubles(12, -1.0, 1.0);
     pose[2] = value(0.2, 3.0);
     if (chance(0.5)) /* near a solution */
@@ -68,7 +81,8 @@ static void refine_pose(void) {
             double at[3];
             multiply3(pose + 3, points + 3 * i, at);
             for (int k = 0; k < 2; k++)
-                pixels[2 * i + k] = lens[k] * (at[k] + pose[k]) / (at[2] + pose[2]) + lens[2 + k] + value(-1.0, 1.0);
+                pixels[2 * i + k] = lens[k] * (at[k] + pose[k]) / (at[2] + pose[2]) + lens[2 + k] +
+                                    value(-1.0, 1.0);
         }
     int64_t found = NAME(refine_pose)(lens, points, pixels, weight, n, pose);
     CHECK(found == 0 || found == 1);
@@ -77,7 +91,8 @@ static void refine_pose(void) {
 
 static void squared_errors(void) {
     const int64_t n = whole(0, 9);
-    double *lens = lens_of_camera(), *at = doubles(3 * n, -1.0, 3.0), *pixels = doubles(2 * n, 0.0, 640.0), *square = outputs(n);
+    double *lens = lens_of_camera(), *at = doubles(3 * n, -1.0, 3.0),
+           *pixels = doubles(2 * n, 0.0, 640.0), *square = outputs(n);
     NAME(squared_errors)(lens, at, pixels, n, square);
     for (int64_t i = 0; i < n; i++) {
         CHECK(square[i] >= 0.0 || square[i] != square[i]);
@@ -87,20 +102,24 @@ static void squared_errors(void) {
 
 static void marker_errors(void) {
     const int64_t n = whole(0, 5);
-    double *lens = lens_of_camera(), *at = doubles(12 * n, -1.0, 3.0), *pixels = doubles(8 * n, 0.0, 640.0);
+    double *lens = lens_of_camera(), *at = doubles(12 * n, -1.0, 3.0),
+           *pixels = doubles(8 * n, 0.0, 640.0);
     double *outwards = doubles(3 * n, -1.0, 0.2), *error = outputs(n);
     NAME(marker_errors)(lens, at, pixels, outwards, n, error);
     for (int64_t i = 0; i < n; i++) {
         CHECK(error[i] >= 0.0);
-        if (any_nan(at + 12 * i, 12) || any_nan(outwards + 3 * i, 3) || any_nan(pixels + 8 * i, 8)) CHECK(!finite(error[i]));
+        if (any_nan(at + 12 * i, 12) || any_nan(outwards + 3 * i, 3) || any_nan(pixels + 8 * i, 8))
+            CHECK(!finite(error[i]));
     }
 }
 
 static void count_visible_markers(void) {
     const int64_t markers = whole(1, 6), row = whole(0, markers - 1);
-    double *lens = lens_of_camera(), *frame = doubles(3, 0.0, 640.0), *surface = doubles(18 * markers, -1.0, 1.0);
+    double *lens = lens_of_camera(), *frame = doubles(3, 0.0, 640.0),
+           *surface = doubles(18 * markers, -1.0, 1.0);
     double *position = doubles(3, -0.5, 3.0), *size = outputs(markers), *cosine = outputs(markers);
-    int64_t count = NAME(count_visible_markers)(lens, frame, surface, position, markers, row, size, cosine);
+    int64_t count =
+        NAME(count_visible_markers)(lens, frame, surface, position, markers, row, size, cosine);
     CHECK(0 <= count && count < markers);
     if (size[row] != size[row]) CHECK(count == 0); /* it is behind the camera, or at NaN */
 }
@@ -138,16 +157,23 @@ static void shadow_map(void) {
 }
 
 static void render_mesh(void) {
-    const int64_t height = whole(1, 24), width = whole(1, 24), samples = whole(1, 3), all = height * width;
+    const int64_t height = whole(1, 24), width = whole(1, 24), samples = whole(1, 3),
+                  all = height * width;
     Mesh m = any_mesh();
     ShadowMap map = shadow_settings();
-    MeshLight light = {{value(-1.0, 1.0), value(-1.0, 1.0), value(-1.0, 1.0)}, value(0.0, 1.0), value(0.0, 1.0), (double)whole(0, 1)};
+    MeshLight light = {{value(-1.0, 1.0), value(-1.0, 1.0), value(-1.0, 1.0)},
+                       value(0.0, 1.0),
+                       value(0.0, 1.0),
+                       (double)whole(0, 1)};
     double *lens = lens_of_camera();
-    float *depth = floats((int64_t)map.size * (int64_t)map.size), *grey = floats(all), *coverage = floats(all), *nearest = floats(all);
+    float *depth = floats((int64_t)map.size * (int64_t)map.size), *grey = floats(all),
+          *coverage = floats(all), *nearest = floats(all);
     int32_t *owner = block((size_t)(all) * sizeof(int32_t));
-    for (int64_t i = 0; i < (int64_t)map.size * (int64_t)map.size; i++) depth[i] = (float)value(-1.0, 1.0);
-    NAME(render_mesh)(lens, height, width, samples, m.pose, m.at, m.triangles, m.normals, doubles(3 * m.n, 0.0, 1.0), m.n, &light, &map,
-                      depth, grey, coverage, nearest, owner, outputs(3 * m.n), floats(3 * samples * samples * all));
+    for (int64_t i = 0; i < (int64_t)map.size * (int64_t)map.size; i++)
+        depth[i] = (float)value(-1.0, 1.0);
+    NAME(render_mesh)(lens, height, width, samples, m.pose, m.at, m.triangles, m.normals,
+                      doubles(3 * m.n, 0.0, 1.0), m.n, &light, &map, depth, grey, coverage, nearest,
+                      owner, outputs(3 * m.n), floats(3 * samples * samples * all));
     for (int64_t i = 0; i < all; i++) {
         CHECK(coverage[i] >= 0.0f && coverage[i] <= 1.0f && owner[i] >= -1 && owner[i] < m.n);
         CHECK((owner[i] >= 0) == (coverage[i] > 0.0f) && nearest[i] >= 0.0f);
@@ -158,13 +184,17 @@ static void rate_suns(void) {
     const int64_t n = whole(0, 20), k = whole(0, 4);
     const ShadowMap any = shadow_settings();
     const int64_t texels = (int64_t)any.size * (int64_t)any.size;
-    double *points = doubles(14 * n, -1.0, 1.0), *directions = doubles(3 * k, -1.0, 1.0), *out = outputs(3 * k);
+    double *points = doubles(14 * n, -1.0, 1.0), *directions = doubles(3 * k, -1.0, 1.0),
+           *out = outputs(3 * k);
     ShadowMap *maps = block((size_t)k * sizeof(ShadowMap));
     float *depths = floats(k * texels);
     for (int64_t j = 0; j < k; j++) maps[j] = any;
     for (int64_t i = 0; i < k * texels; i++) depths[i] = (float)value(-1.0, 1.0);
-    for (int64_t i = 0; i < n; i++) points[14 * i + 11] = value(0.0, 60.0), points[14 * i + 12] = value(0.0, 255.0), points[14 * i + 13] = value(2.0, 80.0);
-    NAME(rate_suns)((const LitPoint *)points, n, directions, maps, depths, k, value(0.0, 0.1), out, outputs(2 * n));
+    for (int64_t i = 0; i < n; i++)
+        points[14 * i + 11] = value(0.0, 60.0), points[14 * i + 12] = value(0.0, 255.0),
+                        points[14 * i + 13] = value(2.0, 80.0);
+    NAME(rate_suns)((const LitPoint *)points, n, directions, maps, depths, k, value(0.0, 0.1), out,
+                    outputs(2 * n));
     for (int64_t j = 0; j < k; j++) CHECK(!(out[3 * j] < 0.0));
 }
 
@@ -175,7 +205,9 @@ static void direct_light(void) {
     double *points = doubles(14 * n, -1.0, 1.0), *sun = doubles(3, -1.0, 1.0);
     float *depth = floats(texels), *out = floats(n);
     for (int64_t i = 0; i < texels; i++) depth[i] = (float)value(-1.0, 1.0);
-    for (int64_t i = 0; i < n; i++) points[14 * i + 9] = value(0.0, 1.0), points[14 * i + 10] = value(0.0, 1.0), points[14 * i + 11] = value(0.0, 60.0);
+    for (int64_t i = 0; i < n; i++)
+        points[14 * i + 9] = value(0.0, 1.0), points[14 * i + 10] = value(0.0, 1.0),
+                        points[14 * i + 11] = value(0.0, 60.0);
     NAME(direct_light)((const LitPoint *)points, n, sun, &map, depth, out);
 }
 
@@ -183,7 +215,8 @@ static void control_points(void) {
     const int64_t height = whole(1, 40), width = whole(1, 40), all = height * width;
     Mesh m = any_mesh();
     PointChoice choice = {(double)whole(2, 12), (double)whole(1, PER_CELL_MOST), value(0.0, 10.0)};
-    const int64_t cell = (int64_t)choice.cell_px, cells = (width + cell - 1) / cell * ((height + cell - 1) / cell);
+    const int64_t cell = (int64_t)choice.cell_px,
+                  cells = (width + cell - 1) / cell * ((height + cell - 1) / cell);
     const int64_t most = cells * (int64_t)choice.per_cell;
     float *view = floats(all), *nearest = floats(all);
     int32_t *owner = block((size_t)(all) * sizeof(int32_t));
@@ -191,28 +224,36 @@ static void control_points(void) {
         view[i] = (float)value(0.0, 255.0), nearest[i] = (float)value(0.1, 2.0);
         owner[i] = m.n ? (int32_t)whole(-1, m.n - 1) : -1;
     }
-    double *points = outputs(3 * most), *ahead = outputs(3 * most), *profiles = outputs(PROFILE * most);
+    double *points = outputs(3 * most), *ahead = outputs(3 * most),
+           *profiles = outputs(PROFILE * most);
     int64_t *owners = block((size_t)(most) * sizeof(int64_t));
-    int64_t n = NAME(control_points)(view, nearest, owner, height, width, lens_of_camera(), m.pose, m.at, m.triangles, &choice, points,
-                                     ahead, profiles, owners, outputs(all + cells * 5 * PER_CELL_MOST));
+    int64_t n = NAME(control_points)(view, nearest, owner, height, width, lens_of_camera(), m.pose,
+                                     m.at, m.triangles, &choice, points, ahead, profiles, owners,
+                                     outputs(all + cells * 5 * PER_CELL_MOST));
     CHECK(n >= 0 && n <= most);
     for (int64_t i = 0; i < n; i++) CHECK(owners[i] >= 0 && owners[i] < m.n);
 }
 
 static void align_points(void) {
     const int64_t height = whole(2, 60), width = whole(2, 60), n = whole(0, 60);
-    LevelCamera camera = {value(20.0, 90.0), value(20.0, 90.0), value(0.0, 60.0), value(0.0, 60.0), {0}, (double)height, (double)width};
-    AlignSettings set = {(double)whole(0, 30), (double)whole(0, 6), value(0.0, 0.5), value(0.5, 4.0), value(0.5, 3.0)};
+    LevelCamera camera = {
+        value(20.0, 90.0), value(20.0, 90.0), value(0.0, 60.0), value(0.0, 60.0), {0},
+        (double)height,    (double)width};
+    AlignSettings set = {(double)whole(0, 30), (double)whole(0, 6), value(0.0, 0.5),
+                         value(0.5, 4.0), value(0.5, 3.0)};
     for (int i = 0; i < 5; i++) camera.distortion[i] = value(-0.2, 0.2);
     float *image = floats(height * width);
     for (int64_t i = 0; i < height * width; i++) image[i] = (float)value(0.0, 255.0);
-    double *points = doubles(3 * n, -0.5, 0.5), *ahead = outputs(3 * n), *profiles = doubles(PROFILE * n, 0.0, 255.0);
-    double *pose = doubles(12, -0.1, 0.1), *residual = outputs(n), *weight = outputs(n), *correlation = outputs(n);
+    double *points = doubles(3 * n, -0.5, 0.5), *ahead = outputs(3 * n),
+           *profiles = doubles(PROFILE * n, 0.0, 255.0);
+    double *pose = doubles(12, -0.1, 0.1), *residual = outputs(n), *weight = outputs(n),
+           *correlation = outputs(n);
     for (int64_t i = 0; i < 3 * n; i++) ahead[i] = points[i] + value(0.0, 0.02);
     for (int i = 0; i < 3; i++) pose[3 + 4 * i] += 1.0;
     pose[2] += 1.5;
-    int64_t inside = NAME(align_points)(&camera, image, &set, points, ahead, profiles, doubles(n, 0.0, 0.002), n, pose, residual, weight, correlation,
-                                        outputs(6 * n), outputs(2 * n));
+    int64_t inside =
+        NAME(align_points)(&camera, image, &set, points, ahead, profiles, doubles(n, 0.0, 0.002), n,
+                           pose, residual, weight, correlation, outputs(6 * n), outputs(2 * n));
     CHECK(inside >= 0 && inside <= n);
     if (inside) CHECK(all_finite(pose, 12));
 }
@@ -221,15 +262,23 @@ static void measure_pose(void) {
     const int64_t m = whole(0, 6);
     PinholeCamera *lens = block(sizeof *lens);
     MarkerLimits *limits = block(sizeof *limits);
-    *lens = (PinholeCamera){value(200.0, 400.0), value(200.0, 400.0), value(200.0, 280.0), value(100.0, 160.0), 480.0, 270.0};
-    *limits = (MarkerLimits){value(0.01, 0.1), value(10.0, 30.0), value(1.0, 10.0), value(0.0, 0.4), value(0.0, 0.8), value(0.0, 3.0)};
+    *lens = (PinholeCamera){value(200.0, 400.0),
+                            value(200.0, 400.0),
+                            value(200.0, 280.0),
+                            value(100.0, 160.0),
+                            480.0,
+                            270.0};
+    *limits = (MarkerLimits){value(0.01, 0.1), value(10.0, 30.0), value(1.0, 10.0),
+                             value(0.0, 0.4),  value(0.0, 0.8),   value(0.0, 3.0)};
     double *pose = doubles(12, -0.1, 0.1), *covariance = outputs(36), *error = outputs(6);
     for (int i = 0; i < 3; i++) pose[3 + 4 * i] = value(0.9, 1.0);
     pose[2] = value(0.3, 2.0);
     int64_t *seen = block((size_t)m * 8);
-    double *corners = doubles(12 * m, -0.2, 0.2), *origins = doubles(3 * m, -0.2, 0.2), *normals = doubles(3 * m, -1.0, 1.0);
-    int64_t count = NAME(measure_pose)(lens, limits, corners, origins, normals, m, pose, doubles(6, -3.0, 3.0), seen,
-                                       outputs(8 * m), covariance, error);
+    double *corners = doubles(12 * m, -0.2, 0.2), *origins = doubles(3 * m, -0.2, 0.2),
+           *normals = doubles(3 * m, -1.0, 1.0);
+    int64_t count =
+        NAME(measure_pose)(lens, limits, corners, origins, normals, m, pose, doubles(6, -3.0, 3.0),
+                           seen, outputs(8 * m), covariance, error);
     CHECK(count >= -1 && count <= m);
     if (count > 0) CHECK(all_finite(covariance, 36));
     for (int i = 0; i < 6 && count > 0; i++) CHECK(covariance[7 * i] >= 0.0);

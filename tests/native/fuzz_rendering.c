@@ -22,9 +22,14 @@ static void add_noise(void) {
 static Frustum *frustum(void) {
     Frustum *f = block(sizeof *f);
     const double left = -33.0, top = -25.0, right = 33.0, bottom = 25.0;
-    f->fx = value(20.0, 80.0), f->fy = value(20.0, 80.0), f->cx = value(30.0, 34.0), f->cy = value(22.0, 26.0);
+    f->fx = value(20.0, 80.0), f->fy = value(20.0, 80.0), f->cx = value(30.0, 34.0),
+    f->cy = value(22.0, 26.0);
     f->origin[0] = value(-2.0, 2.0), f->origin[1] = value(-2.0, 2.0), f->near_m = 0.01;
-    const double planes[5][4] = {{0, 0, 1, -0.01}, {f->fx, 0, -left, 0}, {-f->fx, 0, right, 0}, {0, f->fy, -top, 0}, {0, -f->fy, bottom, 0}};
+    const double planes[5][4] = {{0, 0, 1, -0.01},
+                                 {f->fx, 0, -left, 0},
+                                 {-f->fx, 0, right, 0},
+                                 {0, f->fy, -top, 0},
+                                 {0, -f->fy, bottom, 0}};
     copy(planes[0], f->planes[0], 20);
     for (int i = 0; i < 4; i++) {
         copy(planes[1 + i], f->borders[i], 3);
@@ -44,7 +49,8 @@ static double *sides_of_boxes(void) {
     double *sides = doubles(54, 0.0, 0.0);
     for (int side = 0; side < 6; side++)
         for (int column = 0; column < 3; column++)
-            sides[9 * side + 3 * ((side / 2 + 1 + column) % 3) + column] = column == 2 && side % 2 ? -1.0 : 1.0;
+            sides[9 * side + 3 * ((side / 2 + 1 + column) % 3) + column] =
+                column == 2 && side % 2 ? -1.0 : 1.0;
     return sides;
 }
 
@@ -75,7 +81,8 @@ static void visible_faces(void) {
     VisibleBox *boxes = block((size_t)shapes * sizeof *boxes);
     int64_t *counts = block(16);
     Face *faces = seen_faces(f, shapes, boxes, counts);
-    CHECK(0 <= counts[0] && counts[0] <= shapes && counts[0] <= counts[1] && counts[1] <= 6 * shapes);
+    CHECK(0 <= counts[0] && counts[0] <= shapes && counts[0] <= counts[1] &&
+          counts[1] <= 6 * shapes);
     for (int64_t i = 0; i < counts[0]; i++) CHECK(!any_nan(boxes[i].centre, 3));
     for (int64_t i = 0; i < counts[1]; i++) {
         CHECK(faces[i].count >= 3.0 && faces[i].count <= OUTLINE_MOST);
@@ -109,7 +116,8 @@ static void paint_order(void) {
 static void place_texture(void) {
     const Frustum *f = frustum();
     VisibleBox *boxes = block(sizeof *boxes);
-    int64_t *counts = block(16), *patch = block(16), *finest = block(16), *region = block(32), *halved = block(16);
+    int64_t *counts = block(16), *patch = block(16), *finest = block(16), *region = block(32),
+            *halved = block(16);
     Face *face = seen_faces(f, 1, boxes, counts);
     if (!counts[1] || chance(0.2)) {
         fill((double *)face, (int64_t)(sizeof *face / sizeof(double)), -3.0, 60.0);
@@ -117,8 +125,8 @@ static void place_texture(void) {
     }
     for (int k = 0; k < 2; k++) patch[k] = whole(1, 80), finest[k] = whole(1, 400);
     double *matrix = outputs(9), samples = (double)whole(1, 4);
-    int64_t placed = NAME(place_texture)(f, face, samples, value(0.0, 20.0), value(0.0, 20.0), patch, finest, value(0.001, 0.01),
-                                         region, halved, matrix);
+    int64_t placed = NAME(place_texture)(f, face, samples, value(0.0, 20.0), value(0.0, 20.0),
+                                         patch, finest, value(0.001, 0.01), region, halved, matrix);
     if (!placed) return;
     for (int k = 0; k < 2; k++) {
         CHECK(0 <= region[k] && region[k] < region[2 + k] && region[2 + k] <= patch[k]);
@@ -140,15 +148,18 @@ static void draw_stars(void) {
 }
 
 static void draw_meshes(void) {
-    const int64_t bodies = whole(1, 2), each = whole(0, 4), m = bodies * each, width = whole(1, 70), height = whole(1, 20), n = whole(1, 3);
+    const int64_t bodies = whole(1, 2), each = whole(0, 4), m = bodies * each, width = whole(1, 70),
+                  height = whole(1, 20), n = whole(1, 3);
     const Frustum *f = frustum();
     double *camera = outputs(7), *poses = outputs(7 * bodies), *corners = doubles(9 * m, -0.5, 0.5);
     double *normals = doubles(9 * m, -1.0, 1.0), *uv = doubles(6 * m, -1.0, 1.0);
-    int64_t *first = block((size_t)(bodies + 1) * 8), *surface = block((size_t)m * 8), depth_size = 0;
+    int64_t *first = block((size_t)(bodies + 1) * 8), *surface = block((size_t)m * 8),
+            depth_size = 0;
     Surface *surfaces = block(2 * sizeof *surfaces);
     Illumination *light = block(sizeof *light);
     ShadowMap *maps = block((size_t)bodies * sizeof *maps);
-    float *wrinkles = block((size_t)(3 * n * n) * sizeof *wrinkles), *samples = block((size_t)(BAND * width * SAMPLES * 2) * 4);
+    float *wrinkles = block((size_t)(3 * n * n) * sizeof *wrinkles),
+          *samples = block((size_t)(BAND * width * SAMPLES * 2) * 4);
     fill_pose(camera, -0.1, 0.1);
     if (chance(0.7)) camera[3] = 1.0, camera[4] = camera[5] = camera[6] = 0.0;
     for (int64_t i = 0; i < bodies; i++) fill_pose(poses + 7 * i, -0.5, 3.0);
@@ -159,7 +170,8 @@ static void draw_meshes(void) {
     if (chance(0.8)) light->sun_share = 0.8;
     for (int64_t i = 0; i < 3 * n * n; i++) wrinkles[i] = (float)value(-0.5, 0.5);
     for (int64_t i = 0; i < bodies; i++) {
-        maps[i].width = 8 * whole(1, 3), maps[i].height = whole(1, 20), maps[i].offset = depth_size, maps[i].padding = 0;
+        maps[i].width = 8 * whole(1, 3), maps[i].height = whole(1, 20), maps[i].offset = depth_size,
+        maps[i].padding = 0;
         fill(maps[i].low, 2, -1.0, 1.0);
         maps[i].texel_m = value(0.01, 0.2), maps[i].used = (double)chance(0.9);
         depth_size += maps[i].width * maps[i].height;
@@ -169,17 +181,20 @@ static void draw_meshes(void) {
     memset(depth, 0, (size_t)depth_size * sizeof *depth);
     BodyPose *placed = block((size_t)bodies * sizeof *placed);
     Triangle *triangles = block((size_t)(6 * m) * sizeof *triangles);
-    int32_t *spans = block((size_t)(12 * m + 2 * (6 * m / GROUP + 1) + 2 * (height / BAND + 1)) * sizeof *spans);
+    int32_t *spans =
+        block((size_t)(12 * m + 2 * (6 * m / GROUP + 1) + 2 * (height / BAND + 1)) * sizeof *spans);
     uint8_t *canvas = bytes(width * height);
     memset(canvas, 4, (size_t)(width * height));
-    NAME(draw_meshes)(f, width, height, camera, bodies, poses, first, corners, normals, uv, surface, surfaces, light, wrinkles, n, maps,
-                      depth, placed, triangles, spans, samples, canvas);
+    NAME(draw_meshes)(f, width, height, camera, bodies, poses, first, corners, normals, uv, surface,
+                      surfaces, light, wrinkles, n, maps, depth, placed, triangles, spans, samples,
+                      canvas);
     if (!m)
         for (int64_t i = 0; i < width * height; i++) CHECK(canvas[i] == 4);
 }
 
 static const Target TARGETS[] = {
-    {"add_noise", add_noise},         {"visible_faces", visible_faces}, {"paint_order", paint_order},
-    {"place_texture", place_texture}, {"draw_stars", draw_stars},       {"draw_meshes", draw_meshes},
+    {"add_noise", add_noise},     {"visible_faces", visible_faces},
+    {"paint_order", paint_order}, {"place_texture", place_texture},
+    {"draw_stars", draw_stars},   {"draw_meshes", draw_meshes},
 };
 FUZZ_MAIN(TARGETS)

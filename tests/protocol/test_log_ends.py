@@ -68,6 +68,7 @@ def test_without_time_passing_nothing_is_flushed_and_flush_does(tmp_path: Path) 
     writer.close()
 
 
+@pytest.mark.slow
 def test_a_log_cut_off_anywhere_yields_the_messages_before(tmp_path: Path) -> None:
     """Cut at many places, inside and between records: never an error, never a wrong or repeated
     message.

@@ -20,8 +20,10 @@ from chaserdock_protocol.scenario import (
     parse_scenario,
     scenario_from_json,
 )
-from chaserdock_protocol.scenario.mesh_files import read_mesh, write_mesh
+from chaserdock_protocol.scenario.mesh_files import read_mesh
 from scenario_samples import good
+
+from chaserdock.targets.mesh_writer import write_mesh
 
 MODEL = 'perception.name="model"'
 
@@ -152,6 +154,7 @@ def servicer_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_flight_software_receives_the_simplified_surface_only(servicer_file: Path) -> None:
     scenario = with_file(
         servicer_file,
@@ -184,6 +187,7 @@ def test_scenario_does_not_need_the_file_any_more(servicer_file: Path, tmp_path:
     assert again.target.model == "copy"
 
 
+@pytest.mark.slow
 def test_markers_lie_on_shipped_and_own_meshes(servicer_file: Path) -> None:
     marker = "{id=3, side_m=0.1, position_m=[0.21, 0.0, 0.0], q_wxyz=[0.5, 0.5, 0.5, 0.5]}"
     for mesh in (str(servicer_file), "geo_servicer"):

@@ -238,6 +238,19 @@ def test_scenario_of_the_present_format_stays_as_it_is() -> None:
         assert migrated(text) == text
 
 
+def test_removed_keys_are_accepted_with_the_value_that_holds_now() -> None:
+    tables = {"docking": {"settle_s": 2.0, "pull_N": 0.4}, "detumble": {"response_s": 0.7}}
+    values = json.loads(json.dumps(tables))
+    drop_removed_keys(values)
+    assert values == {"docking": {"pull_N": 0.4}, "detumble": {"response_s": 0.7}}
+    assert old_keys(values) == [
+        "detumble.response_s: it is 0.5 in every flight now; remove the key"
+    ]
+    assert json.loads(migrated(json.dumps({"format": FORMAT, **tables}))) == {
+        "format": FORMAT, "docking": {"pull_N": 0.4}, "detumble": {},
+    }  # fmt: skip
+
+
 def test_old_keys_are_named_with_their_present_names() -> None:
     assert old_keys(FORMAT_3) == []
     lines = old_keys(FORMAT_1)

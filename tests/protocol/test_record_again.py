@@ -55,7 +55,7 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
     recorder = start_recorder(tmp_path / "again", port, "again", *options)
     try:
         arguments = ("--namespace", "again", "-l", f"tcp/127.0.0.1:{port}")
-        status, said = finished("log", "play", str(GOLDEN), *arguments)
+        status, said = finished("play", str(GOLDEN), *arguments)
         assert status == 0, said
         assert recorder.wait(timeout=60) == 0
     finally:
@@ -77,7 +77,7 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
 
 def test_play_without_a_recorder_is_refused(tmp_path: Path) -> None:
     arguments = ("--namespace", "nobody", "-l", "tcp/127.0.0.1:0", "--timeout", "0.5")
-    status, said = finished("log", "play", str(GOLDEN), *arguments)
+    status, said = finished("play", str(GOLDEN), *arguments)
     assert (status, "Traceback" in said) == (2, False)
     assert "no recorder joined within 0.5 s" in said
 

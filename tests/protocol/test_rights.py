@@ -90,6 +90,7 @@ def test_every_wrong_identity_on_every_key_is_dropped(mission: Mission) -> None:
     assert arrived - own == allowed - own
 
 
+@pytest.mark.slow
 def test_every_key_reaches_its_readers_only(mission: Mission) -> None:
     arrived: dict[str, set[str]] = {w.process: set() for w in EVERYONE}
     subscribers = []

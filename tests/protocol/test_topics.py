@@ -89,6 +89,7 @@ def test_foreign_keys_belong_to_no_topic(key: str) -> None:
     assert topics.topic_of_key(key) is None
 
 
+@pytest.mark.slow
 @given(st.text(max_size=40))
 @quick
 def test_any_text_is_a_foreign_key_or_leads_back(key: str) -> None:

@@ -43,6 +43,7 @@ def taken(*changes, omega=(0.0, 0.0, 0.0), time_ns=0):
     return Cameras(scenario).render(0, 0, time_ns, states_of(scenario, omega)).astype(float)
 
 
+@pytest.mark.slow
 def test_concurrent_rendering_equals_sequential_rendering():
     scenario = load_scenario(SINGLE.with_name("four-chaser-docking.toml"))
     physics, cameras = Physics(scenario), Cameras(scenario)
@@ -52,6 +53,7 @@ def test_concurrent_rendering_equals_sequential_rendering():
         assert cameras.images(chasers, 7, 7, 70_000_000, states) == one_by_one
 
 
+@pytest.mark.slow
 def test_motion_blur_is_the_mean_over_the_exposure():
     omega, exposure_s = (0.0, 0.0, 0.4), 0.1
     scenario = scenario_with()

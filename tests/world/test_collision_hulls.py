@@ -61,6 +61,7 @@ def test_ring_becomes_arcs() -> None:
     assert true * 0.98 < sum(ConvexHull(h).volume for h in arcs) < 1.6 * true
 
 
+@pytest.mark.slow
 def test_rays_find_the_ring_and_pass_through_it() -> None:
     """Bullet's shape of ``geo_servicer``: its adapter ring is hollow around the nozzle."""
     physics = Physics(

@@ -86,6 +86,7 @@ def test_closing_does_not_count_for_the_strength(worlds: Any) -> None:
 # -- play ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_play_lets_the_chaser_move_that_far_and_no_farther(worlds: Any) -> None:
     physics = worlds(omega_rad_s=STILL, truth={"latch": {"play_m": 0.003}})
     latch(physics)
@@ -128,6 +129,7 @@ def test_load_of_a_latch_with_play_is_what_the_chaser_lacks(worlds: Any, wrench:
         assert np.linalg.norm(rotations.rotate(q_port, loads.torque_N_m) - torque) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_stack_with_play_conserves_momentum(worlds: Any) -> None:
     physics = worlds(truth={"latch": {"play_m": 0.001, "play_deg": 0.2}})
     latch(physics)

@@ -22,6 +22,7 @@ pytest.importorskip("embreex", reason="embreex (development requirement) is not 
 from embree_images import compare, displacements
 
 
+@pytest.mark.slow
 def test_image_equals_that_of_embree() -> None:
     camera = Camera.from_hfov(240, 160, np.deg2rad(60.0))
     q = rotations.normalize((0.3, 0.8, 0.45, 0.25))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.camera import Camera
@@ -114,6 +115,7 @@ def looking_at_origin(position: Array) -> Array:
     return rotations.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
 
 
+@pytest.mark.slow
 def test_images_equal_those_of_a_ray_tracer() -> None:
     """Grey levels inside surfaces, and the whole image with its silhouettes and shadow edges."""
     mesh = satellite("cubesat_12u", 2e-2)

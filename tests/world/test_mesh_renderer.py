@@ -85,6 +85,7 @@ def test_silhouette_is_exact_to_a_tenth_of_a_pixel(turn_deg: float) -> None:
         assert abs((share * rows).sum() / share.sum() - (119.5 - 300.0 * centre[2])) < 0.068
 
 
+@pytest.mark.slow
 def test_no_background_shows_between_triangles() -> None:
     ball = lathe("ball", GREY, [(0.0, -0.3), *[(0.3 * np.sin(a), -0.3 * np.cos(a)) for a in np.linspace(0.1, 3.0, 40)], (0.0, 0.3)],
                  (0.0, 0.0, 0.0), (0.3, 0.2, 1.0), 1e-4)  # fmt: skip
@@ -165,6 +166,7 @@ def test_mesh_partly_behind_the_camera_is_clipped() -> None:
     assert image[round(edge) - 3, 159] < 40
 
 
+@pytest.mark.slow
 def test_cameras_draw_the_true_mesh_and_the_chasers_mesh() -> None:
     values = {
         "target": {"model": "cubesat_12u"},

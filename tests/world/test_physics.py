@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcParameters
-from chaserdock_controller.nmpc.problem import dynamics
+from chaserdock_controller.nmpc.casadi_model import dynamics
 from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array

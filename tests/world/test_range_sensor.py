@@ -126,6 +126,7 @@ def test_of_bearing_and_markers_the_more_accurate_position_is_used() -> None:
     assert used == [False, True]
 
 
+@pytest.mark.slow
 def test_bearing_is_measured_in_the_image_with_the_stated_errors() -> None:
     rng, squares = np.random.default_rng(24), []
     for sun in ([1.0, 0.3, 0.2], [-1.0, 0.3, 0.5], [0.0, 0.0, 1.0], [-0.2, 1.0, 0.1]):

@@ -211,6 +211,7 @@ def test_boxes_on_opposite_sides_of_the_camera_do_not_occlude():
         assert paint_order(placed(*(([0.0, 0.0, z], [0.5, 0.5, 0.5]) for z in ends))) == [0, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 def test_target_outside_the_field_of_view_is_not_drawn(camera):
     renderer = Renderer(camera, target_model("servicer"))

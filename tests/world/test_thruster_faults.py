@@ -111,10 +111,13 @@ def test_chaser_detects_a_commanded_thruster_fault_in_a_mission(tmp_path: Path) 
         by_hand.start("chaser/0", "chaser", "0")
         wait_for_log(log, 200_000)
         status, said = finished(
-            "thruster-fault", "0", "5", "stuck_on", "--operator", "test", *reach
+            *("command", "thruster-fault", "0", "--thruster", "5", "--fault", "stuck_on"),
+            *("--operator", "test", *reach),
         )
         assert (status, "accepted" in said) == (0, True), said
-        status, said = finished("thruster-fault", "0", "44", "stuck_on", *reach)
+        status, said = finished(
+            *("command", "thruster-fault", "0", "--thruster", "44", "--fault", "stuck_on"), *reach
+        )
         assert (status, "there is no thruster 44" in said) == (1, True), said
         for name in by_hand.processes:
             status, said = by_hand.output_of(name)

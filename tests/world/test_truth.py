@@ -415,6 +415,7 @@ def test_thrusters_have_their_own_thrust_and_direction() -> None:
     assert np.linalg.norm(turned - stated[:3]) > 1e-3 * np.linalg.norm(stated[:3])
 
 
+@pytest.mark.slow
 def test_pulses_scatter_in_width_but_not_below_the_minimum() -> None:
     nominal = np.linalg.norm(impulse_of(mission())[:3])
     widths = [

@@ -24,6 +24,9 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.orbit import Orbit
 
 _GRID_S = 10.0
+"""Interval of the stored states, s (chosen). A state follows from the last stored one, whatever was
+asked before, so that it depends only on its time.
+"""
 
 
 class TargetOrbit:

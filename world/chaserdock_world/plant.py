@@ -23,6 +23,9 @@ from .random_draws import TARGET_KEY, Stream, generator
 
 Moments = tuple[float, float, float]
 _LARGEST_SIGMA = 3.0
+"""Draws are limited to so many standard deviations, so that shares stay positive; 0.3 % of a normal
+distribution lie beyond.
+"""
 
 
 @dataclass(frozen=True, eq=False)

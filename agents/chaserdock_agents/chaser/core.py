@@ -44,7 +44,8 @@ class ChaserCore:
 
     ``realtime``: the world waits for no reply, and a command stays valid for its lifetime.
     ``instance``: identity of the process, which its actuator commands state. ``failures``: those
-    that the test bed reports in place of the thrusters' hardware.
+    that the test bed reports in place of the thrusters' hardware. ``vision`` replaces the
+    scenario's perception.
     """
 
     def __init__(
@@ -54,12 +55,13 @@ class ChaserCore:
         realtime: bool = False,
         instance: str = "",
         failures: Iterable[ThrusterFailure] = (),
+        vision: Vision | None = None,
     ) -> None:
         self.scenario, self.number = scenario, number
         self.realtime, self.instance = realtime, instance
         self.outbox = Outbox(number)
         self.inbox = ChaserInbox()
-        self.vision = Vision(make_perception(scenario))
+        self.vision = vision or Vision(make_perception(scenario))
         self.gate = CommandGate(scenario, number, realtime, self.outbox)
         self.fallback = FallbackControl(scenario, number, self.outbox)
         has_thrusters = scenario.chaser.actuation == "thrusters"

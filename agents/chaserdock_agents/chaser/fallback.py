@@ -40,7 +40,7 @@ REST_PULSES = 2.0
 thruster change.
 """
 CLEARANCE_MARGIN_M = 0.05
-"""Distance of the hold position beyond the entry of the corridor."""
+"""Distance of the hold position beyond the entry of the corridor (chosen; docs/redundancy.md)."""
 _KNOWN = ("tracking", "predicting")
 
 

@@ -18,7 +18,7 @@ from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 
 FIRST_COMMAND_S = 1.0
-"""Lease of a new holder, which may need longer for its first command."""
+"""Lease of a new holder, s (chosen), which may need longer for its first command."""
 BACKOFF_RESET_S = 20.0
 """A lease that runs out again within this time doubles, up to ``leases.LEASE_MAX_S``: repeated
 expiry means that the machine is overloaded, and a change of commander does not help."""

@@ -11,6 +11,7 @@ several chasers together do not overshoot; below a deadband nothing fires.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models import rotations
@@ -21,20 +22,32 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.mounting import plume_free_thrusters
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 
-_GAIN_N_S_PER_M = 60.0
-"""Thrust per velocity of a thruster's place. Of 20, 60 and 120 the one that stopped two, three and
-four chasers soonest.
-"""
-_FIRES_M_S, _CLOSES_M_S = 0.0005, 0.0001
-"""A thruster begins to fire above the first velocity of its place, and ends below the second."""
-_NOISE_SHARE = 5.0
-"""The deadband is at least so many standard deviations of the filtered velocity, so that noise
-fires nothing.
-"""
-_SLOW_M_S, _SLOW_S, _FAST_S = 0.005, 0.8, 0.3
-"""Time constants of the filter: long below a velocity, where noise matters, short above, where the
-delay does.
-"""
+
+@dataclass(frozen=True)
+class DampingParameters:
+    """Numbers of the damping law."""
+
+    # Thrust per velocity of a thruster's place. Of 20, 60 and 120 the one that stopped two, three
+    # and four chasers soonest.
+    gain_N_s_per_m: float = 60.0
+    # A thruster begins to fire above this velocity of its place, unless noise asks for more: at 0.4
+    # m, 0.07 degrees/s;
+    fires_m_s: float = 0.0005
+    # and ends below this one.
+    closes_m_s: float = 0.0001
+    # The deadband is at least so many standard deviations of the filtered velocity, so that noise
+    # fires nothing.
+    noise_share: float = 5.0
+    # The filter is slow below this velocity, where noise matters, and fast above, where the delay
+    # does.
+    slow_m_s: float = 0.005
+    # Time constants of the slow
+    slow_s: float = 0.8
+    # and of the fast filter.
+    fast_s: float = 0.3
+
+
+_LAW = DampingParameters()
 
 
 class LocalDamping:
@@ -51,10 +64,10 @@ class LocalDamping:
         self._full_N = thrusts_max(body.thrusters)
         arm_m = max(math.hypot(*t.position_m) for t in body.thrusters)
         noise_m_s = math.hypot(errors.velocity_noise_m_s, arm_m * errors.omega_noise_rad_s)
-        share = _share(1.0 / scenario.time.rate_hz, _SLOW_S)
+        share = _share(1.0 / scenario.time.rate_hz, _LAW.slow_s)
         filtered_m_s = noise_m_s * math.sqrt(share / (2.0 - share)) + arm_m * errors.gyro_bias_rad_s
-        self.fires_m_s = max(_FIRES_M_S, _NOISE_SHARE * filtered_m_s)
-        self._closes_m_s = self.fires_m_s * _CLOSES_M_S / _FIRES_M_S
+        self.fires_m_s = max(_LAW.fires_m_s, _LAW.noise_share * filtered_m_s)
+        self._closes_m_s = self.fires_m_s * _LAW.closes_m_s / _LAW.fires_m_s
         self.reset()
 
     def reset(self) -> None:
@@ -70,9 +83,9 @@ class LocalDamping:
         velocity = rotations.rotate_inverse(odometry.q_wxyz, odometry.velocity_m_s)
         rates = np.concatenate([velocity, odometry.omega_rad_s])
         if self._rates is not None:
-            moving = float(np.abs(self._wrenches.T @ self._rates).max()) > _SLOW_M_S
+            moving = float(np.abs(self._wrenches.T @ self._rates).max()) > _LAW.slow_m_s
             elapsed_s = (odometry.sim_time_ns - self._time_ns) * 1e-9
-            share = _share(elapsed_s, _FAST_S if moving else _SLOW_S)
+            share = _share(elapsed_s, _LAW.fast_s if moving else _LAW.slow_s)
             rates = self._rates + share * (rates - self._rates)
         # A force d at r does work on d . (v + omega x r): the transpose of the wrench of unit
         # thrusts.
@@ -80,7 +93,9 @@ class LocalDamping:
         self._firing = self._free & (
             speeds > np.where(self._firing, self._closes_m_s, self.fires_m_s)
         )
-        thrusts = np.where(self._firing, np.minimum(_GAIN_N_S_PER_M * speeds, self._full_N), 0.0)
+        thrusts = np.where(
+            self._firing, np.minimum(_LAW.gain_N_s_per_m * speeds, self._full_N), 0.0
+        )
         self._rates, self._time_ns, self._thrusts_N = rates, odometry.sim_time_ns, thrusts
         return thrusts
 

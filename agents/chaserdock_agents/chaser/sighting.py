@@ -35,7 +35,9 @@ Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Predicted pose of the target: position (3,) in IRF and rotation (4,) TRF to IRF."""
 
 _EXPECTED_FOR_NS = 300_000_000
-"""Age at which an expected pose is not used any more."""
+"""Age at which an expected pose is not used any more, ns (chosen): four images at 15 Hz, in which a
+target that turns by 10 degrees/s has turned by 3, the reach of a start (``tracking``).
+"""
 
 
 class BadImage(Exception):
@@ -180,7 +182,9 @@ def geometry_message(found: GeometryInformation) -> GeometryMeasurement:
     )
 
 
-def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | None) -> str | None:
+def apply_geometry(
+    perception: PerceptionMethod | None, estimate: GeometryEstimate | None
+) -> str | None:
     """Correct what a perception knows of the target's geometry, if it uses it; return why that was
     refused.
     """

@@ -19,9 +19,11 @@ by a few ticks at most; the number only bounds the memory.
 class Vision:
     """Turns the images of one chaser into sightings; each is searched near the last ``sighting``
     or where the controller expects the target.
+
+    ``perception``: None for a chaser that gets no images, as in studies with drawn sightings.
     """
 
-    def __init__(self, perception: PerceptionMethod) -> None:
+    def __init__(self, perception: PerceptionMethod | None) -> None:
         self.perception = perception
         self.sighting: Sighting | None = None
         self._expected: ExpectedPose | None = None
@@ -31,6 +33,7 @@ class Vision:
         """Return the sighting in an image; None if the image of its tick was processed before."""
         if self.has_processed(image.tick):
             return None
+        assert self.perception is not None
         self._processed.append(image.tick)
         predicted = prediction_from(self.sighting, self._expected, image.sim_time_ns)
         self.sighting = look(self.perception, image, predicted)

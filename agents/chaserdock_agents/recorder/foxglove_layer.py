@@ -60,11 +60,13 @@ SHOWN = frozenset(
 _LATEST_NS = (2**32 - 1) * 1_000_000_000  # maximum of a viewer's time stamp
 
 _LEVELS = {"info": fox.LogLevel.Info, "warning": fox.LogLevel.Warning, "error": fox.LogLevel.Error}
+# Colours of the viewer layer, chosen to be told apart on dark ground.
 _CAMERA_COLOUR = fox.Color(r=0.35, g=0.86, b=0.35, a=1.0)
 _TARGET_COLOUR = fox.Color(r=0.85, g=0.65, b=0.25, a=0.9)
 _CHASER_COLOUR = fox.Color(r=0.35, g=0.55, b=0.85, a=0.6)
 _SPACING_M = 0.01
 """Distance of the points on the edges of a body."""
+# Layout of a point cloud's points.
 _POINT_FIELDS = [
     fox.PackedElementField(name=name, offset=4 * k, type=fox.PackedElementFieldNumericType.Float32)
     for k, name in enumerate("xyz")

@@ -44,12 +44,19 @@ from .foxglove_layer import SHOWN
 from .rotation import Recording
 
 _DRAIN_S = 10.0
+"""Longest wall time for which the recorder waits, after the mission's end, for messages that
+publishers have counted (chosen); those that are missing then are lost and reported.
+"""
 _HEALTH_TICKS = 15
+"""Ticks between two health messages: one second at the tick rate of most scenarios."""
 _BATCH = 64
 """Most messages that are written before the recorder looks for a signal and for the world."""
 # glibc's malloc.h
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
 _MAPPED_FROM_BYTES = 1 << 18
+"""Blocks of at least this size, 256 KiB, go back to the system when they are freed: images and
+chunks, but not messages.
+"""
 
 
 def main(options: ProcessOptions) -> int:
@@ -65,7 +72,7 @@ def _limit_heap() -> None:
     """Make glibc return large blocks (images, chunks, indices) to the system when they are freed.
 
     By default glibc keeps blocks up to the largest one freed so far, in one heap per thread, and a
-    recorder grows for hours (``benchmarks/endurance.py``). No effect with other C libraries.
+    recorder grows for hours (``benchmarks/mission.py``). No effect with other C libraries.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

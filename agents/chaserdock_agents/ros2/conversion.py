@@ -23,12 +23,15 @@ from chaserdock_protocol.scenario import FlightScenario
 from rosbags.typesys.stores import ros2_jazzy as ros
 
 WORLD, TARGET_FRAME = "world", "target"
+# Colours, 0 to 1, as those of the viewer.
 _TARGET_RGB, _CHASER_RGB, _PLAN_RGB = (
     (0.875, 0.625, 0.25),
     (0.375, 0.5, 0.875),
     (0.375, 0.875, 0.375),
 )
+# visualization_msgs/Marker
 _CUBE, _LINE_STRIP, _ADD, _DELETE = 1, 4, 0, 2
+# Origin and no rotation (scalar first).
 _ZERO, _IDENTITY = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
 
 

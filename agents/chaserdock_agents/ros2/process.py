@@ -26,6 +26,9 @@ from .services import handler, services
 NAME = "bridge"
 ROS_NODE = "chaserdock"
 _REPLY_TIMEOUT_S = 5.0
+"""Longest wait for the controller's reply to an operator command, s of wall time: it replies in the
+next tick, unless a standby is taking over.
+"""
 SOURCES = (
     topics.TICK,
     topics.IMAGE,

@@ -32,7 +32,11 @@ DEFAULT_QOS = "::,10:,:,:,,"
 lifespan : liveliness. An empty field is the default of rmw_zenoh."""
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
+"""Bytes of the identity of a publisher (rmw.h, ``RMW_GID_STORAGE_SIZE``)."""
 _WORKERS = 4
+"""Service calls that are served at once. Each waits for a reply of the controller; further calls
+wait for their turn.
+"""
 
 
 def dds_name(type_name: str) -> str:

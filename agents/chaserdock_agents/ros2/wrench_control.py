@@ -35,7 +35,9 @@ NAME = "controller"
 ROS_NODE = "chaserdock_control"
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
 _LIFETIME_NS = 500_000_000
+"""Lifetime of a wrench, ns: the default of ``controller.command_lifetime_s``."""
 _RECEIVE_S = 0.1
+"""Longest wait for a message, s, before the process looks whether it was stopped."""
 _PATIENCE_TICKS = 0.5
 """Share of a tick's period after which chasers without a wrench get a message without command."""
 

@@ -26,7 +26,11 @@ MAX_DISTINCT = 4096
 ever new keys.
 """
 _MAX_KEY_LENGTH = 200
+"""Characters of a denied key that are printed: longer than all keys of ours; bounds the log."""
 _PIPE_BYTES = 1 << 20
+"""Size of the pipe of Zenoh's log, 1 MiB, the largest that Linux allows without privileges: it must
+hold the lines of ``_POLL_S``.
+"""
 _POLL_S = 0.02
 """Interval at which the pipe is read: waking the reader for every line costs more than the lines.
 """

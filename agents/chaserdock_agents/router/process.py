@@ -21,7 +21,11 @@ from .acl_audit import DenialCounter, ZenohLog
 
 NAME = "router"
 MAX_CHASERS = 256
+"""Chasers for which access rules are made: they do not know the mission; more than any machine
+flies.
+"""
 POLL_S = 0.2
+"""Interval at which the router looks whether it was stopped or is alone, s."""
 GRACE_S = 5.0
 """Delay between the departure of the process that it waits for and its own end: the process may
 return after a cut link, and with Compose its exit status must be available before the router's."""

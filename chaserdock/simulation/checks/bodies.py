@@ -97,8 +97,6 @@ class KeepOutZone(Check):
         "the target, for a chaser whose probe touches it",
     )
 
-    _newest_tick: int = -1
-
     def begin(self) -> None:
         s = self.scenario
         chasers = range(len(s.chasers))
@@ -107,19 +105,18 @@ class KeepOutZone(Check):
 
     @reads(Tick)
     def judge(self, tick: Tick) -> None:
-        if tick.tick <= self._newest_tick:
-            return
-        self._newest_tick = tick.tick
         view, target = self.view, self.view.states.get("target")
+        if not view.opens_tick:
+            return
         chasers = {
-            name: np.array(state.position_m)
+            name: state.position_m
             for name, state in view.states.items()
             if name != "target" and name not in view.unreachable
         }
 
         limit_m = self.scenario.limits.min_distance_chasers_m - KEEP_OUT_SLACK_M
         for (a, at), (b, bt) in itertools.combinations(chasers.items(), 2):
-            if (distance_m := _distance(at, bt)) < limit_m:
+            if (distance_m := math.dist(at, bt)) < limit_m:
                 self.violate(f"{a} and {b}", f"{distance_m:.3f} m apart")
 
         if target is None or view.causes.misleads(view.time_s):
@@ -127,7 +124,7 @@ class KeepOutZone(Check):
         for name, at in chasers.items():
             if name in view.touching:
                 continue
-            offset = rotations.rotate_inverse(target.q_wxyz, at - target.position_m)
+            offset = rotations.rotate_inverse(target.q_wxyz, np.subtract(at, target.position_m))
             distance_m = length(offset)
             if distance_m < self._nearest_allowed_m(name, offset) - KEEP_OUT_SLACK_M:
                 self.violate(name, f"{distance_m:.3f} m from the target")
@@ -158,7 +155,7 @@ class InitialState(Check):
             if name in self.view.touching or (name == "target" and self.view.touching):
                 continue
             position, q = self._start_pose(name)
-            error_m = _distance(position, np.array(body.position_m))
+            error_m = math.dist(position, body.position_m)
             error_rad = float(rotations.angle_between(q, np.array(body.q_wxyz)))
             if max(error_m, error_rad) > POSE_ROUNDING:
                 error = f"{error_m:.2e} m and {error_rad:.2e} rad"
@@ -183,10 +180,11 @@ class Displacement(Check):
     def judge(self, step: FreeStep) -> None:
         before, after, dt_s = step.before, step.after, step.dt_s
         mean = np.add(before.velocity_m_s, after.velocity_m_s) / 2.0
-        error_m = _distance(np.array(after.position_m), np.array(before.position_m) + mean * dt_s)
+        expected_m = np.array(before.position_m) + mean * dt_s
+        error_m = math.dist(after.position_m, expected_m.tolist())
 
         # The origin of a body turns about its centre of mass.
-        gained_m_s = _distance(np.array(before.velocity_m_s), np.array(after.velocity_m_s))
+        gained_m_s = math.dist(before.velocity_m_s, after.velocity_m_s)
         pushed_m_s, off_m = 0.0, 0.0
         if step.drawn is not None:
             pushed_m_s = after.absolute_impulse_N_s / step.drawn.mass_kg
@@ -218,7 +216,7 @@ def _judged(step: FreeStep, view: FlightView) -> DrawnBody | None:
 
 
 @dataclass
-class Momentum(_OfChasers, Check):
+class LinearMomentum(_OfChasers, Check):
     """The momentum of a chaser changes by the impulses of its actuators, disturbances and orbit."""
 
     name = "momentum"
@@ -359,7 +357,7 @@ class TumbleFalls(Check):
 
 
 def angular_momentum(bodies: Sequence[tuple[BodyTruth, DrawnBody]]) -> Array:
-    """Return the angular momentum (3,), WRF, of bodies about their common centre of mass (N m s)."""
+    """Return the angular momentum (3,), WRF, N m s, of bodies about their common centre of mass."""
     mass = np.array([drawn.mass_kg for _, drawn in bodies])
     spin = np.zeros(3)
     at, velocity = np.zeros((len(bodies), 3)), np.zeros((len(bodies), 3))
@@ -371,7 +369,3 @@ def angular_momentum(bodies: Sequence[tuple[BodyTruth, DrawnBody]]) -> Array:
         spin += rotations.rotate(q, inertia_of(drawn) @ omega)
     about = at - mass @ at / mass.sum()
     return spin + (mass[:, None] * np.cross(about, velocity)).sum(axis=0)
-
-
-def _distance(a: Array, b: Array) -> float:
-    return math.dist(a.tolist(), b.tolist())

@@ -36,7 +36,6 @@ class NoStaleCommand(Check):
     name = "no stale command"
 
     _opened: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=OPENED_TICKS))
-    _newest_tick: int = -1
     _flown: dict[int, int] = field(default_factory=dict)
 
     def begin(self) -> None:
@@ -45,8 +44,7 @@ class NoStaleCommand(Check):
 
     @reads(Tick)
     def note_tick(self, tick: Tick) -> None:
-        if tick.tick > self._newest_tick:
-            self._newest_tick = tick.tick
+        if self.view.opens_tick:
             self._opened.append((self.view.sent_s, tick.tick))
 
     @reads(ActuatorCommand)
@@ -96,7 +94,6 @@ class OneCommander(Check):
     name = "one commander"
     exceptions = ("in a tick in which a controller is lost: chasers may have flown its command",)
 
-    _tick: int = -1
     _controllers: int = 0
     _controller_lost: set[int] = field(default_factory=set)
     _term_ticks: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -104,10 +101,11 @@ class OneCommander(Check):
 
     @reads(Tick)
     def note_tick(self, tick: Tick) -> None:
-        if tick.tick == self._tick and len(tick.controllers) < self._controllers:
+        number = len(tick.controllers)
+        if self.view.opens_tick:
+            self._controllers = number
+        elif tick.tick == self.view.tick and number < self._controllers:
             self._controller_lost.add(tick.tick)
-        if tick.tick > self._tick:
-            self._tick, self._controllers = tick.tick, len(tick.controllers)
 
     @reads(ActuatorCommand)
     def judge(self, command: ActuatorCommand) -> None:

@@ -215,10 +215,10 @@ class UndisturbedDocks(Check):
 
 @dataclass
 class DockedOrSafe(Check):
-    """At the end each chaser that is to dock and is commanded to approach has docked, or no command
-    reaches it, or it keeps its distance, by its phase or by its own control without a controller,
-    and a warning, command, or phase with a reason names why: of the chaser itself, or of world or
-    controllers about it or about all."""
+    """At the end each chaser that is to dock, and is commanded to approach, has docked or is safe:
+    no command reaches it, or it keeps its distance, by its phase or by its own control, and a
+    warning, a command or a phase names the reason. Reasons count that the chaser itself states, or
+    world or controllers about it or about all."""
 
     name = "liveness"
     exceptions = (

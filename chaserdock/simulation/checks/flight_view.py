@@ -56,7 +56,7 @@ class FreeStep:
         q, omega = np.array(self.before.q_wxyz), np.array(self.before.omega_rad_s)
         return rotations.integrate(q, omega, 0.5 * self.dt_s)
 
-    @cached_property
+    @property
     def turned_rad(self) -> float:
         """Angle (rad) by which the body turns in a tick, at its rate after it."""
         return math.hypot(*self.after.omega_rad_s) * self.dt_s
@@ -93,7 +93,8 @@ class FlightView(MessageReader):
 
     ``sender``, ``key``, ``sent_ns``: of the present message. ``published``: messages from the first
     tick on, by key, as the recorder should have them. ``tick``, ``state_tick``: newest tick that
-    is open, and whose true states are known. ``states``, ``drawn``: truth of each body, and its
+    is open, and whose true states are known. ``opens_tick``: the newest ``Tick`` did not repeat
+    one. ``states``, ``drawn``: truth of each body, and its
     mass properties. ``steps``: of the bodies that nothing touched in the newest tick.
     ``touching``: bodies that touch another one, or are latched to it. ``latched``: chasers whose
     latch is truly closed.
@@ -110,6 +111,7 @@ class FlightView(MessageReader):
     sent_ns: int = EPOCH_NS
     published: Counter[str] = field(default_factory=Counter)
     tick: int = -1
+    opens_tick: bool = False
     state_tick: int = -1
     states: dict[str, BodyTruth] = field(default_factory=dict)
     drawn: dict[str, DrawnBody] = field(default_factory=dict)
@@ -173,10 +175,11 @@ class FlightView(MessageReader):
 
     @reads(Tick)
     def _on_tick(self, tick: Tick) -> None:
+        self.opens_tick = tick.tick > self.tick
         self.tick = max(self.tick, tick.tick)
         self.lost.difference_update(f"chaser/{i}" for i in tick.chasers)
 
-    # -- bodies: the world publishes probes, then bodies, then its own state ------------------------
+    # -- bodies: the world publishes probes, then bodies, then its own state -----------------------
 
     @reads(DrawnTruth)
     def _on_drawn(self, drawn: DrawnTruth) -> None:

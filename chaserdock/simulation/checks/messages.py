@@ -93,7 +93,7 @@ def covariance_defect(values: Sequence[float]) -> str:
 def _is_covariance_3(
     a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
 ) -> bool:
-    """Return whether a row-major matrix (3, 3) is exactly symmetric and has only positive pivots."""
+    """Return whether a row-major matrix (3, 3) is exactly symmetric, with positive pivots only."""
     if not (b == d and c == g and f == h and a > 0.0):
         return False
     e, f, i = e - b * b / a, f - b * c / a, i - c * c / a

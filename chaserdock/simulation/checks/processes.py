@@ -68,7 +68,7 @@ class NoLossWithoutCause(Check):
     name = "no loss without a cause"
     exceptions = (
         "after the first fault of any process",
-        f"{IN_LATE_NETWORK} (see [seeds flown](simulation.md#seeds-flown))",
+        f"{IN_LATE_NETWORK} (see [seeds flown](evidence/simulation.md#seeds-flown))",
         "in one with partitions or slow readers",
     )
 

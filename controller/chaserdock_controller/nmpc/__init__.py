@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Centralized nonlinear MPC: one problem (`problem`), solved by a back end selected by name."""
+"""Centralized nonlinear MPC: one problem, solved by a back end selected by name.
+
+In the order of a tick: `stage` states the problem, `terms` and `problem` check it, `warm_start`
+shifts the last plans, a back end linearizes and solves it (`rti` in C: native/problem.c and
+planes.c, then ipm.c), and `plan_monitor` keeps what may be flown.
+"""
 
 from __future__ import annotations
 
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import SOLVERS
 
-from .types import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver
+from .problem import NmpcParameters
+from .types import NmpcInput, NmpcPlan, NmpcSolver
 
 __all__ = ["BACK_ENDS", "NmpcInput", "NmpcParameters", "NmpcPlan", "NmpcSolver", "make_solver"]
 
@@ -28,14 +34,10 @@ def make_solver(
         from .rti import RtiSolver
 
         return RtiSolver(params, n, max_iterations)
-    if name in ("ipopt", "fatrop"):
-        from .casadi_nlp import NlpSolver
+    if name == "ipopt":
+        from .casadi_nlp import IpoptSolver
 
-        return NlpSolver(name, params, n, max_iterations)
-    if name == "alpaqa":
-        from .alpaqa_backend import AlpaqaSolver
-
-        return AlpaqaSolver(params, n, max_iterations)
+        return IpoptSolver(params, n, max_iterations)
     if name == "open":
         from .open_backend import OpenSolver
 

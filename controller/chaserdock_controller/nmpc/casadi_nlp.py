@@ -1,84 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Back ends `ipopt` and `fatrop`: the problem of `problem.build_nlp`, coupled, by CasADi and
-solvers in its wheel.
+"""Back end `ipopt`, and bases of back ends that solve the problem of `casadi_problem` for all
+chasers at once.
 
-ipopt with MUMPS converges in tens of milliseconds; it is the reference for faster back ends, not a
-real-time controller. fatrop is an interior-point method with a Riccati recursion over the stages.
-Limited by iterations, never by time.
+ipopt with MUMPS, from CasADi's wheel, converges in tens of milliseconds; it is the reference for
+faster back ends, not a real-time controller. Limited by iterations, never by time.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from .problem import Nlp, build_nlp
-from .slack import slack_l1_weight
-from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, PreparedProblem, status_of
+from .casadi_problem import Nlp, build_nlp, pack, row_floor
+from .problem import NmpcParameters
+from .types import Array, NmpcInput, NmpcPlan
+from .warm_start import Frame, status_of
 
 MAX_ITERATIONS = 200
-# Return codes for a usable solution, and for the iteration limit.
-_GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-_LIMIT = ("Maximum_Iterations_Exceeded", "1")  # ipopt's and fatrop's
-
-
-def pack(params: NmpcParameters, task: PreparedProblem) -> Array:
-    """Return the parameter vector p of `Nlp`."""
-    p = task.problem
-    parts: list[Any] = []
-    for i in range(len(p.states)):
-        parts += [p.states[i], p.references[i].ravel(), p.u_ref[i].ravel()]
-        parts += [p.min_distance_target_m[i], task.corridors[i].ravel()]
-    farthest_m = np.max(
-        np.linalg.norm(p.states[:, :3] - p.references[:, -1, :3], axis=-1), keepdims=True
-    )
-    upper = task.between[np.triu_indices(len(p.states), 1)]
-    parts += [p.target_positions.ravel(), upper, slack_l1_weight(params, farthest_m)]
-    return np.concatenate(parts)
-
-
-def row_floor(nlp: Nlp, task: PreparedProblem) -> Array:
-    """Return the lower bounds (D, rows) of the distances: zero, and inactive where there is no
-    corridor.
-    """
-    floor = np.zeros((nlp.stages, nlp.rows))
-    used = np.any(task.corridors[:, 1:, :3] != 0.0, axis=-1)
-    floor[:, 2 : 3 * nlp.n : 3][~used.T] = -1e4
-    return floor
-
-
-def _options(name: str, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
-    shared: dict[str, Any] = {"print_time": False, "error_on_fail": False}
-    if name == "ipopt":
-        # ipopt relaxes bounds by default, which would violate the input box by 1e-8.
-        own = {
-            "print_level": 0,
-            "sb": "yes",
-            "max_iter": max_iterations,
-            "tol": 1e-6,
-            "mu_init": 1e-2,
-        }
-        return {**shared, "ipopt": {**own, "bound_relax_factor": 0.0}}
-    states, inputs, rows = zip(*nlp.stage_sizes, strict=True)
-    equality: list[bool] = []
-    for k in range(nlp.stages + 1):
-        following = states[k + 1] if k < nlp.stages else 0
-        equality += [True] * following + [k == 0] * rows[k]
-    return {
-        **shared,
-        "structure_detection": "manual",
-        "N": nlp.stages,
-        "nx": list(states),
-        "nu": list(inputs),
-        "ng": list(rows),
-        "equality": equality,
-        "fatrop": {"print_level": 0, "max_iter": max_iterations, "tol": 1e-6, "mu_init": 1e-2},
-    }
+"""Most iterations of a solve: far starts and swaps in closed loop take 89 at most, so that only
+failures meet it.
+"""
 
 
 class CoupledSolver:
@@ -122,11 +67,10 @@ class SingleShootingSolver(CoupledSolver, ABC):
         n, d = len(u), frame.params.stages
         nlp, program = self._programs[n]
         scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
-        parameters = np.concatenate([pack(frame.params, task), limits.ravel()])
+        parameters = np.concatenate([pack(frame.params, task.problem), limits.ravel()])
         start = (u / scale).transpose(1, 0, 2).ravel()
-        w, converged, late, iterations = self._run(
-            nlp, program, parameters, row_floor(nlp, task).ravel(), start
-        )
+        floor = row_floor(nlp, frame.params, task.problem).ravel()
+        w, converged, late, iterations = self._run(nlp, program, parameters, floor, start)
         usable = (converged or late) and bool(np.isfinite(w).all())
         if usable:
             solution = np.asarray(w).reshape(d, n, 6).transpose(1, 0, 2)
@@ -136,25 +80,35 @@ class SingleShootingSolver(CoupledSolver, ABC):
         )
 
 
-class NlpSolver(CoupledSolver):
-    """Solve with `ipopt` or `fatrop` (``name``) for up to ``n_chasers`` chasers, warm-started from
-    the last plans.
+class MultipleShootingSolver(CoupledSolver, ABC):
+    """Base of the back ends with states, by a solver that CasADi calls ``PLUGIN``, for up to
+    ``n_chasers`` chasers, warm-started from the last plans.
 
     The constructor builds a program for every number of chasers, so that a change of the number
     delays no tick. ``max_iterations`` bounds a solve, MAX_ITERATIONS if None. Raises ValueError for
     n_chasers < 1.
     """
 
+    PLUGIN: ClassVar[str]
+    SOLVED: ClassVar[tuple[str, ...]] = ()
+    LIMITED: ClassVar[tuple[str, ...]] = ()
+    """The solver's return codes for a usable solution, and for the iteration limit."""
+
     def __init__(
-        self, name: str, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
+        self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
     ) -> None:
         limit = MAX_ITERATIONS if max_iterations is None else max_iterations
 
         def program(n: int) -> tuple[Nlp, Any]:
             nlp = build_nlp(n, params)
-            return nlp, ca.nlpsol("nmpc", name, nlp.problem, _options(name, nlp, limit))
+            options = {"print_time": False, "error_on_fail": False, **self._options(nlp, limit)}
+            return nlp, ca.nlpsol("nmpc", self.PLUGIN, nlp.problem, options)
 
         super().__init__(params, n_chasers, program)
+
+    @abstractmethod
+    def _options(self, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
+        """Return the options of CasADi for this solver."""
 
     def solve(
         self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
@@ -170,7 +124,8 @@ class NlpSolver(CoupledSolver):
         u = task.start.copy()
         n, d = len(u), frame.params.stages
         nlp, program = self._programs[n]
-        x, limits, floor = frame.rolled(task, u), task.problem.input_max, row_floor(nlp, task)
+        x, limits = frame.rolled(task, u), task.problem.input_max
+        floor = row_floor(nlp, frame.params, task.problem)
         start, low, high, bottom, top = [], [], [], [], []
         input_columns = []
         for k in range(d + 1):
@@ -186,7 +141,7 @@ class NlpSolver(CoupledSolver):
             top += [defects, slack + np.inf]
         result = program(
             x0=np.concatenate(start),
-            p=pack(frame.params, task),
+            p=pack(frame.params, task.problem),
             lbx=np.concatenate(low),
             ubx=np.concatenate(high),
             lbg=np.concatenate(bottom),
@@ -198,10 +153,10 @@ class NlpSolver(CoupledSolver):
             [flat[at : at + 6 * n].reshape(n, 6) for at in input_columns[:d]], axis=1
         )
         code = str(stats.get("return_status", ""))
-        solved = bool(stats["success"]) or code in _GOOD
+        solved = bool(stats["success"]) or code in self.SOLVED
         iterations = int(stats.get("iter_count", 0))
         late = not solved and (
-            code in _LIMIT or stats.get("unified_return_status") == "SOLVER_RET_LIMITED"
+            code in self.LIMITED or stats.get("unified_return_status") == "SOLVER_RET_LIMITED"
         )
         usable = (solved or late) and bool(np.isfinite(solution).all())
         if usable:
@@ -209,3 +164,24 @@ class NlpSolver(CoupledSolver):
         return frame.finish(
             task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64)
         )
+
+
+class IpoptSolver(MultipleShootingSolver):
+    """The interior point method of Waechter and Biegler, Math. Program. 106 (2006)."""
+
+    PLUGIN = "ipopt"
+    SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+    LIMITED = ("Maximum_Iterations_Exceeded",)
+
+    def _options(self, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
+        # ipopt relaxes bounds by default, which would violate the input box by 1e-8.
+        return {
+            "ipopt": {
+                "print_level": 0,
+                "sb": "yes",
+                "max_iter": max_iterations,
+                "tol": 1e-6,
+                "mu_init": 1e-2,
+                "bound_relax_factor": 0.0,
+            }
+        }

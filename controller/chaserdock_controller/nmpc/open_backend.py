@@ -27,15 +27,22 @@ import casadi as ca
 import numpy as np
 
 from .casadi_nlp import SingleShootingSolver
-from .problem import Nlp, build_nlp
-from .types import Array, NmpcParameters
+from .casadi_problem import Nlp, build_nlp
+from .problem import NmpcParameters
+from .types import Array
 
 MAX_INNER = 500
+"""Most iterations of PANOC in a solve. Chosen; half and twice were not tried, as OpEn takes minutes to
+compile.
+"""
 TOLERANCE = 1e-3
-# Twice the cost of one square metre of violation: 1 mm for a multiplier of 1e3.
+"""Norm of the fixed-point residual at which PANOC stops, for inputs scaled by their limits. Chosen
+likewise.
+"""
 PENALTY = 1e6
-# OpEn requires a time limit; this one is never reached, since iterations limit a solve.
+"""Twice the cost of one square metre of violation, 1/m^2: 1 mm for a multiplier of 1e3."""
 _NEVER_US = 60_000_000
+"""OpEn requires a time limit, us; this one is never reached, since iterations limit a solve."""
 # Suffixes of shared libraries from cargo, and of Python extension modules.
 _LIBRARY_SUFFIXES = (".so", ".dylib", ".dll")
 _SUFFIX = {"win32": ".pyd"}

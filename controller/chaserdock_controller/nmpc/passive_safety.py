@@ -17,7 +17,13 @@ from chaserdock_controller.interfaces import LogEntry, PlanCertificate, TargetEs
 from .types import CoastSafety
 
 ORBITS = 2.0
+"""Length of a coast in an orbit, in its periods, unless the scenario states one. Chosen: the drift of
+a coast repeats with the orbit.
+"""
 FREE_SPACE_S = 600.0
+"""Length of a coast without an orbit, s, unless the scenario states one. Chosen: 18 m at the 3 cm/s
+of an approach.
+"""
 PERSISTENT_S = 1.0
 """Time for which plans must be safe, or not, to count as such in the log and for an abort."""
 CONVERGED_S, ARMED_AFTER_S = 10.0, 60.0

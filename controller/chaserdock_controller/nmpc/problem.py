@@ -1,254 +1,225 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The optimal control problem in CasADi, following the paper (section 4, eq. 6 and 7).
+"""The optimal control problem of a tick: the sum of its terms (`terms`).
 
-State x = [p (3, WRF), v (3, WRF), q_wxyz (4, body to world), omega (3, body)], input u = [F (3),
-tau (3)] in body axes. Every back end solves this problem: `ipopt` this graph, `rti` the same
-functions in C (`native`), which the tests compare with these.
+From here it goes to a solver. `rti`: linearization, quadratic programme and interior point in C
+(native/problem.c, planes.c, dynamics.c, ipm.c). `ipopt`: the same terms in CasADi
+(`casadi_problem`). Then `plan_monitor`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from ctypes import Structure, c_double, c_int64
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, TypeVar
 
-import casadi as ca
 import numpy as np
-from chaserdock_models.scalar_rotations import product_components, rotated_components
+from chaserdock_models.arrays import Array, Matrix3
 
-from .slack import SLACK_L2
-from .types import INTEGRATORS, NmpcParameters
+from .kernels import Model, normalize_rows
+from .native import LIBRARY
+from .term import (
+    Constraint,
+    CostTerm,
+    Term,
+    address_of,
+    checked_array,
+    pointer,
+    require_not_negative,
+    require_positive,
+)
+from .terms import TERMS
+from .types import INTEGRATORS, NmpcInput
 
-
-def multiply(a: Any, b: Any) -> Any:
-    """Return the Hamilton product of CasADi quaternions (4)."""
-    return ca.vertcat(*product_components(*ca.vertsplit(a), *ca.vertsplit(b)))
-
-
-def conjugate(q: Any) -> Any:
-    """Return the conjugate of a CasADi quaternion (4)."""
-    return ca.vertcat(q[0], -q[1:4])
-
-
-def rotate(q: Any, v: Any) -> Any:
-    """Return the body vector ``v`` (3) in world axes; ``q`` (4) body to world."""
-    return ca.vertcat(*rotated_components(*ca.vertsplit(q), *ca.vertsplit(v)))
-
-
-def derivative(x: Any, u: Any, params: NmpcParameters) -> Any:
-    """Return x' (13) from the Newton-Euler equations (paper, eq. 1 and 2, with q' in the
-    body-to-world convention).
-    """
-    inertia = ca.DM(np.array(params.inertia_kg_m2))
-    v, q, omega = x[3:6], x[6:10], x[10:13]
-    force, torque = u[0:3], u[3:6]
-    return ca.vertcat(
-        v,
-        rotate(q, force) / params.mass_kg,
-        0.5 * multiply(q, ca.vertcat(0, omega)),
-        ca.inv(inertia) @ (torque - ca.cross(omega, inertia @ omega)),
-    )
+QUATERNION_NORM_TOLERANCE = 0.1
+"""Largest deviation of a quaternion's length from 1: measured quaternions are normalized, so that a
+larger one is an error, not rounding.
+"""
 
 
-def dynamics(params: NmpcParameters, integrator: str | None = None) -> ca.Function:
-    """Return the discrete dynamics (x (13), u (6)) -> x_next (13) over ``params.dt_s``, the input
-    held.
+RK_NODES = {"euler": (0.0,), "rk4": (0.0, 0.5, 0.5, 1.0)}
+RK_WEIGHTS = {"euler": (1.0,), "rk4": (1.0 / 6.0, 2.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0)}
+"""Explicit Runge-Kutta tableaus with one subdiagonal: nodes and weights of each integrator."""
 
-    ``integrator``: "euler" (the paper's) or "rk4"; ``params.integrator`` if None. The quaternion is
-    normalized after the step. Raises ValueError for another integrator.
-    """
-    integrator = params.integrator if integrator is None else integrator
-    if integrator not in INTEGRATORS:
-        raise ValueError(f"integrator must be one of {', '.join(INTEGRATORS)}, not {integrator!r}")
-    x, u, h = ca.SX.sym("x", 13), ca.SX.sym("u", 6), params.dt_s
-    k1 = derivative(x, u, params)
-    if integrator == "euler":
-        x_next = x + h * k1
-    else:
-        k2 = derivative(x + h / 2 * k1, u, params)
-        k3 = derivative(x + h / 2 * k2, u, params)
-        k4 = derivative(x + h * k3, u, params)
-        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    q = x_next[6:10]
-    x_next = ca.vertcat(x_next[0:6], q / ca.norm_2(q), x_next[10:13])
-    return ca.Function("step", [x, u], [x_next], ["x", "u"], ["x_next"])
-
-
-def pose_cost(x: Any, reference: Any, weight_position: Any, weight_orientation: Any) -> Any:
-    """Return Q_p |p_ref - p|^2 + Q_q |vec(q (x) q_ref*)|^2; ``reference`` (7) is p, q_wxyz.
-
-    The paper weights all four components of q (x) q_ref*, whose norm is always one. The vector part
-    vanishes on the reference, and both signs of a quaternion cost the same.
-    """
-    error = multiply(x[6:10], conjugate(reference[3:7]))[1:4]
-    return weight_position * ca.sumsqr(reference[0:3] - x[0:3]) + weight_orientation * ca.sumsqr(
-        error
-    )
+T = TypeVar("T", bound=Term)
 
 
 @dataclass(frozen=True)
-class Nlp:
-    """The nonlinear program of ``n`` chasers over ``stages``, and its layout stage by stage.
+class NmpcParameters:
+    """Constant parameters of the problem. SI units, radians.
 
-    ``problem``: CasADi dictionary x, p, f, g. Multiple shooting: x = for k = 0..D: states of all
-    chasers (13 each), inputs of all (6 each; not at D), slacks of the stage's distances (not at 0).
-    g = for k = 0..D: the defects to stage k + 1 (not at D), the distances of the stage with slack;
-    at 0 instead x - x_0. Single shooting: x is the inputs, stage by stage, chaser by chaser, and g
-    the distances without slack. p = per chaser: x_0 (13), references (7 (D+1)), u_ref (6 D), target
-    distances (D+1), corridors (5 (D+1)); then target positions (3 (D+1)), chaser distances (upper
-    triangle, row by row), L1 weight (1). ``rows``: distances a stage: per chaser target, outer
-    bound, corridor; then the pairs. ``stage_sizes``: (states, inputs and slacks, constraints
-    besides the defects) of stages 0..D.
+    ``inertia_kg_m2`` is the full matrix about the centre of mass in body axes. ``force_max_N`` and
+    ``torque_max_N_m`` are per body axis. ``falloff`` is alpha of eq. 6, 0 to 1. ``terms``: costs
+    and constraints with their settings, as `terms_of` makes them. Raises ValueError, naming
+    the field, for an invalid value.
     """
 
-    n: int
-    stages: int
-    problem: dict[str, Any]
-    rows: int
-    stage_sizes: tuple[tuple[int, int, int], ...]
+    mass_kg: float
+    inertia_kg_m2: Matrix3
+    force_max_N: float
+    torque_max_N_m: float
+    horizon_s: float
+    dt_s: float
+    falloff: float
+    integrator: str
+    terms: tuple[Term, ...]
+
+    def __post_init__(self) -> None:
+        require_positive(self, "mass_kg", "dt_s")
+        require_not_negative(self, "force_max_N", "torque_max_N_m")
+        if not (math.isfinite(self.horizon_s) and round(self.horizon_s / self.dt_s) >= 1):
+            raise ValueError(
+                f"horizon_s={self.horizon_s!r} is shorter than one step of dt_s={self.dt_s!r}"
+            )
+        if not 0.0 <= self.falloff <= 1.0:
+            raise ValueError(f"falloff must lie between 0 and 1, not {self.falloff!r}")
+        if self.integrator not in INTEGRATORS:
+            raise ValueError(
+                f"integrator must be one of {', '.join(INTEGRATORS)}, not {self.integrator!r}"
+            )
+        self._check_inertia()
+
+    def _check_inertia(self) -> None:
+        inertia = np.asarray(self.inertia_kg_m2, dtype=float)
+        if inertia.shape != (3, 3) or not np.all(np.isfinite(inertia)):
+            raise ValueError("inertia_kg_m2 must be a finite 3 x 3 matrix")
+        if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
+            raise ValueError("inertia_kg_m2 must be symmetric")
+        if np.linalg.eigvalsh(inertia)[0] <= 0.0:
+            raise ValueError("inertia_kg_m2 must be positive definite")
+
+    @property
+    def stages(self) -> int:
+        """Number of prediction steps D = round(T / dt)."""
+        return round(self.horizon_s / self.dt_s)
+
+    @cached_property
+    def weights(self) -> Mapping[CostTerm, Array]:
+        """Weights (D+1,) or (D+1, W) of each term of the cost; C reads these arrays."""
+        costs = self.of_kind(CostTerm)
+        falling = self.falling()
+        return {t: np.ascontiguousarray(t.weights(falling), dtype=np.float64) for t in costs}
+
+    def of_kind(self, kind: type[T]) -> tuple[T, ...]:
+        """Return the terms of a kind, in order."""
+        return tuple(t for t in self.terms if isinstance(t, kind))
+
+    def falling(self) -> Array:
+        """Return the factors (D+1,) by which stage weights fall off along the horizon (eq. 6)."""
+        return 1.0 - self.falloff * np.arange(self.stages + 1) / self.stages
+
+    def input_limits(self) -> Array:
+        """Return the input box (6,): force (N) and torque (N m) per body axis."""
+        return np.array([self.force_max_N] * 3 + [self.torque_max_N_m] * 3)
 
 
-def _norm(a: Any) -> Any:
-    # The constant keeps the gradient finite where two points coincide; it changes 0.35 m by 1e-12
-    # m.
-    return ca.sqrt(ca.sumsqr(a) + 1e-12)
-
-
-def _corridor(r: Any, corridor: Any) -> Any:
-    """Return the distance from the surface of the corridor's cone, positive inside (`corridor_room`
-    in native/planes.c)."""
-    axis, half_angle, apex = corridor[0:3], corridor[3], corridor[4]
-    along = ca.dot(axis, r)
-    return ca.sin(half_angle) * (along - apex) - ca.cos(half_angle) * _norm(r - along * axis)
-
-
-def _pose_cost_function() -> ca.Function:
-    x, reference, weights = ca.SX.sym("x", 13), ca.SX.sym("reference", 7), ca.SX.sym("weights", 2)
-    return ca.Function(
-        "pose", [x, reference, weights], [pose_cost(x, reference, weights[0], weights[1])]
-    )
-
-
-def _distances(n: int, params: NmpcParameters) -> ca.Function:
-    """Return the constraints of one stage: states (13, n), positions of references (3, n) and
-    target (3), keep-out radii (n), corridors (5, n), pair distances -> margins; per chaser target,
-    outer bound, corridor; then the pairs."""
-    pairs = [(i, j) for i in range(n) for j in range(i + 1, n)]
-    x, p_ref, target = ca.SX.sym("x", 13, n), ca.SX.sym("p_ref", 3, n), ca.SX.sym("target", 3)
-    to_target, corridors, apart = (
-        ca.SX.sym("d", n),
-        ca.SX.sym("corridor", 5, n),
-        ca.SX.sym("pair", len(pairs)),
-    )
-    out = []
-    for i in range(n):
-        r = x[0:3, i] - target
-        out.append(_norm(r) - to_target[i])
-        out.append(params.max_reference_distance_m - _norm(x[0:3, i] - p_ref[:, i]))
-        out.append(_corridor(r, corridors[:, i]))
-    for row, (i, j) in enumerate(pairs):
-        out.append(_norm(x[0:3, i] - x[0:3, j]) - apart[row])
-    return ca.Function(
-        "distances", [x, p_ref, target, to_target, corridors, apart], [ca.vertcat(*out)]
-    )
-
-
-def _stage_sizes(n: int, k: int, stages: int, rows: int, multiple: bool) -> tuple[int, int, int]:
-    """Return the numbers of states, inputs with slacks, and constraints besides the defects of
-    stage ``k``.
+def terms_of(settings: Mapping[str, float]) -> tuple[Term, ...]:
+    """Return all terms with these settings. Raises ValueError for one that is missing, is out of
+    range, or that no term has.
     """
-    inputs = 6 * n if k < stages else 0
-    if not multiple:
-        return 0, inputs, rows if k > 0 else 0
-    return (13 * n, inputs + rows, rows) if k > 0 else (13 * n, inputs, 13 * n)
+    names = {f.name for term in TERMS for f in fields(term)}
+    if unread := settings.keys() - names:
+        raise ValueError(f"no term of the NMPC reads {', '.join(sorted(unread))}")
+    if missing := names - settings.keys():
+        raise ValueError(f"the NMPC needs {', '.join(sorted(missing))}")
+    return tuple(term(**{f.name: settings[f.name] for f in fields(term)}) for term in TERMS)
 
 
-def build_nlp(
-    n: int, params: NmpcParameters, shooting: str = "multiple", symbol: Any = ca.SX.sym
-) -> Nlp:
-    """Build eq. 6 and 7 for ``n`` chasers. Raises ValueError for n < 1.
+def settings_of(terms: Sequence[Term]) -> dict[str, float]:
+    """Return the settings of terms, the inverse of `terms_of`."""
+    return {f.name: getattr(term, f.name) for term in terms for f in fields(term)}
 
-    ``symbol``: ``ca.SX.sym`` for one graph of scalars, ``ca.MX.sym`` for calls of one function per
-    stage, which generates much shorter C.
 
-    The variable bounds contain the input box (4a). The distances (4b to 4d) apply at stages 1..D,
-    as stage 0 cannot be changed. With ``shooting`` "multiple" each has a slack; with "single", for
-    augmented-Lagrangian methods with their own penalty, they have none.
+def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
+    """Return body and discretization, with step ``params.dt_s`` by default."""
+    inertia = np.array(params.inertia_kg_m2, dtype=float)
+    nodes, weights = RK_NODES[params.integrator], RK_WEIGHTS[params.integrator]
+    return Model(
+        params.dt_s if step_s is None else step_s, params.mass_kg, 1.0 / params.mass_kg,
+        (c_double * 9)(*inertia.ravel()),
+        (c_double * 9)(*np.linalg.inv(inertia).ravel()), (c_double * 4)(*nodes), (c_double * 4)(*weights), len(nodes),
+    )  # fmt: skip
+
+
+@LIBRARY.structure("Problem")
+class NativeProblem(Structure):
+    """`Problem` of native/problem.c: what all terms use, and each term's members."""
+
+    n_boxes: int
+    n_coasts: int
+    _fields_ = [
+        ("n", c_int64),
+        ("stages", c_int64),
+        ("step_s", c_double),
+        pointer("references"),
+        pointer("targets"),
+        pointer("u_ref"),
+        *(member for term in TERMS for member in term.MEMBERS),
+    ]
+
+
+def native_problem(problem: NmpcInput, params: NmpcParameters) -> NativeProblem:
+    """Return a checked problem for C; it holds addresses of arrays of ``problem`` and ``params``."""
+    values: list[Any] = [len(problem.states), params.stages, params.dt_s]
+    values += map(address_of, (problem.references, problem.target_positions, problem.u_ref))
+    for term in params.terms:
+        if isinstance(term, CostTerm):
+            values.append(address_of(params.weights[term]))
+        elif isinstance(term, Constraint):
+            values += term.native(problem)
+    return NativeProblem(*values)
+
+
+def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
+    """Return a copy of ``problem`` with contiguous arrays, unit quaternions and all optional values
+    expanded by their terms.
+
+    Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off
+    unit length, a negative distance or limit, an asymmetric distance matrix, an invalid corridor,
+    or more than ``n_max`` chasers.
     """
-    if n < 1:
-        raise ValueError(f"n must be at least 1, not {n}")
-    d, step = params.stages, dynamics(params)
-    multiple = shooting == "multiple"
-    position_weight, orientation_weight = params.stage_weights()
-    input_weight = ca.DM([params.weight_force] * 3 + [params.weight_torque] * 3)
-    n_pairs = n * (n - 1) // 2
-    rows = 3 * n + n_pairs
+    states = np.asarray(problem.states, dtype=np.float64)
+    if states.ndim != 2 or not 1 <= len(states) <= n_max:
+        raise ValueError(
+            f"states must have shape (N, 13) with N from 1 to {n_max}, not {states.shape}"
+        )
+    n, d = len(states), params.stages
+    checked = {
+        "states": checked_array("states", states, (n, 13), negative=True),
+        "references": checked_array("references", problem.references, (n, d + 1, 7), negative=True),
+        "target_positions": checked_array(
+            "target_positions", problem.target_positions, (d + 1, 3), negative=True
+        ),
+        "u_ref": checked_array("u_ref", problem.u_ref, (n, d, 6), negative=True),
+    }
+    for name, first in (("states", 6), ("references", 3)):
+        if normalize_rows(checked[name], first, QUATERNION_NORM_TOLERANCE):
+            raise ValueError(f"{name} holds a quaternion that is not of unit length")
+    for term in params.terms:
+        checked |= term.check(problem, n, d)
+    return replace(problem, coasts=None, **checked)
 
-    x0 = [symbol(f"x0_{i}", 13) for i in range(n)]
-    references = [symbol(f"ref_{i}", 7, d + 1) for i in range(n)]
-    u_ref = [symbol(f"u_ref_{i}", 6, d) for i in range(n)]
-    to_target = [symbol(f"d_target_{i}", d + 1) for i in range(n)]
-    corridors = [symbol(f"corridor_{i}", 5, d + 1) for i in range(n)]
-    targets = symbol("p_tar", 3, d + 1)
-    pair_distance = symbol("d_pair", n_pairs)
-    slack_l1 = symbol("w1")
 
-    pose_term, distance_terms = _pose_cost_function(), _distances(n, params)
+def with_obstacles(
+    problem: NmpcInput,
+    params: NmpcParameters,
+    states: Array,
+    references: Array,
+    margins_m: Sequence[float],
+) -> NmpcInput:
+    """Return a problem that is not checked yet with a row after the others for each lost chaser:
+    its state (13,), and where it is expected at the stages (D+1, 7).
 
-    def distances(k: int, x: list[Any]) -> Any:
-        return distance_terms(
-            ca.horzcat(*x), ca.horzcat(*(r[0:3, k] for r in references)), targets[:, k],
-            ca.vertcat(*(d[k] for d in to_target)), ca.horzcat(*(c[:, k] for c in corridors)), pair_distance,
-        )  # fmt: skip
-
-    variables: list[Any] = []
-    constraints: list[Any] = []
-    cost: Any = 0
-    x = [symbol(f"x_{i}_0", 13) for i in range(n)] if multiple else x0
-    for k in range(d + 1):
-        state = x
-        variables += state if multiple else []
-        for i in range(n):
-            weights = ca.DM([position_weight[k], orientation_weight[k]])
-            cost += pose_term(state[i], references[i][:, k], weights)
-        if k < d:
-            inputs = [symbol(f"u_{i}_{k}", 6) for i in range(n)]
-            variables += inputs
-            for i in range(n):
-                cost += ca.dot(input_weight, (u_ref[i][:, k] - inputs[i]) ** 2)
-            x = [step(a, u) for a, u in zip(state, inputs, strict=True)]
-            if multiple:
-                propagated, x = x, [symbol(f"x_{i}_{k + 1}", 13) for i in range(n)]
-                # fatrop requires the next state first, with positive sign.
-                constraints += [b - a for a, b in zip(propagated, x, strict=True)]
-                if k == 0:
-                    constraints += [a - b for a, b in zip(state, x0, strict=True)]
-        if k > 0:
-            margin = distances(k, state)
-            if multiple:
-                s = symbol(f"s_{k}", rows)
-                variables.append(s)
-                cost += slack_l1 * ca.sum1(s) + 0.5 * SLACK_L2 * ca.sumsqr(s)
-                margin += s
-            constraints.append(margin)
-
-    parameters: list[Any] = []
-    for i in range(n):
-        parameters += [
-            x0[i],
-            ca.vec(references[i]),
-            ca.vec(u_ref[i]),
-            to_target[i],
-            ca.vec(corridors[i]),
-        ]
-    return Nlp(
-        n=n,
-        stages=d,
-        problem={
-            "x": ca.vertcat(*variables),
-            "p": ca.vertcat(*parameters, ca.vec(targets), pair_distance, slack_l1),
-            "f": cost,
-            "g": ca.vertcat(*constraints),
-        },
-        rows=rows,
-        stage_sizes=tuple(_stage_sizes(n, k, d, rows, multiple) for k in range(d + 1)),
-    )
+    ``margins_m``: added to the others' distances from it, as each term states.
+    """
+    u_ref = problem.u_ref
+    extended: dict[str, Any] = {
+        "states": np.concatenate([problem.states, states]),
+        "references": np.concatenate([problem.references, references]),
+        "u_ref": np.concatenate([u_ref, np.zeros((len(states), *u_ref.shape[1:]))]),
+    }
+    for term in params.terms:
+        extended |= term.of_lost(problem, margins_m)
+    return replace(problem, **extended)

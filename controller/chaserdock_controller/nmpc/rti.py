@@ -15,14 +15,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from .coast_rows import certify, coast_rows, unsafe_rows
 from .kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick, tick_workspace
+from .problem import NativeProblem, NmpcParameters, native_problem
 from .slack import SLACK_L2, slack_l1_weight
-from .types import BUDGET, Array, IntArray, NmpcInput, NmpcParameters, NmpcPlan
+from .terms.coast import certify, coast_rows, unsafe_rows
+from .types import BUDGET, Array, IntArray, NmpcInput, NmpcPlan
 from .warm_start import Frame, status_of
 
-# Rows that no admissible input can reach are omitted; safety factor of that bound.
 REACH_SAFETY = 1.5
+"""Safety factor of the bound by which rows that no admissible input can reach are omitted: the bound
+holds for the nonlinear model, rows are linear. 0.75 and 3 keep the same distances.
+"""
 
 
 class RtiSolver:
@@ -43,9 +46,11 @@ class RtiSolver:
         if max_iterations is not None and max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, not {max_iterations}")
         self.max_iterations = max_iterations
-        self._workspace = tick_workspace(n_chasers, params.stages, params.boxes + params.coasts)
+        self._extra = 0
+        self._workspace = tick_workspace(n_chasers, params.stages, self._extra)
         # Largest displacement of a chaser by stage k for a change of the inputs by 1 N.
         times = params.dt_s * np.arange(params.stages + 1)
+        self._horizon_s = params.stages * params.dt_s
         self._reach = REACH_SAFETY * np.sqrt(3.0) / params.mass_kg * times**2
 
     def reset(self) -> None:
@@ -68,15 +73,20 @@ class RtiSolver:
             if self.max_iterations is not None
             else len(task.start) * MAX_ITERATIONS
         )
-        u, code, iterations = self._iterate(task.problem, task.start, budget)
+        u, code, iterations = self._iterate(task.problem, task.native, task.start, budget)
         safety, certificates = task.problem.coast_safety, {}
         if safety is not None:
             targets = task.problem.target_positions
             certificates = certify(safety, frame.rolled(task, u), targets)
             if (unsafe := unsafe_rows(safety, certificates)) is not None:
-                rows = coast_rows(unsafe, frame.rolled(task, task.start), targets, frame.params)
+                rows = coast_rows(unsafe, frame.rolled(task, task.start), targets, self._horizon_s)
                 bent = replace(task.problem, coasts=rows)
-                u, code, more = self._iterate(bent, task.start, budget - int(iterations.sum()))
+                u, code, more = self._iterate(
+                    bent,
+                    native_problem(bent, frame.params),
+                    task.start,
+                    budget - int(iterations.sum()),
+                )
                 iterations = iterations + more
                 certificates |= certify(unsafe, frame.rolled(task, u), targets)
         plan = frame.finish(task, u, [status_of(c != BROKEN, c == LIMIT) for c in code], iterations)
@@ -84,20 +94,24 @@ class RtiSolver:
         status = [BUDGET if cut else code for cut, code in zip(cut_short, plan.status, strict=True)]
         return replace(plan, status=tuple(status), coasts=certificates)
 
-    def _iterate(self, p: NmpcInput, start: Array, budget: int) -> tuple[Array, IntArray, IntArray]:
+    def _iterate(
+        self, problem: NmpcInput, native: NativeProblem, start: Array, budget: int
+    ) -> tuple[Array, IntArray, IntArray]:
         """Return inputs (N, D, 6), codes and iterations (N,) of one iteration from ``start`` (N, D,
         6).
         """
-        params, u = self._frame.params, start.copy()
-        away = p.states[:, :3] - p.references[:, -1, :3]
-        w1 = slack_l1_weight(params, np.sqrt((away * away).sum(axis=1)))
-        outer_m = params.max_reference_distance_m
+        frame, u = self._frame, start.copy()
+        extra = native.n_boxes + native.n_coasts
+        if extra > self._extra:
+            self._extra = extra
+            self._workspace = tick_workspace(frame.n_max, frame.params.stages, extra)
+        away = problem.states[:, :3] - problem.references[:, -1, :3]
+        w1 = slack_l1_weight(frame.params, np.sqrt((away * away).sum(axis=1)))
         code, iterations = solve_tick(
-            self._frame.model,
-            self._frame.weights,
-            p,
+            frame.model,
+            native,
+            problem.states,
             u,
-            outer_m,
             self._reach,
             w1,
             SLACK_L2,

@@ -31,13 +31,19 @@ from chaserdock_controller.interfaces import (
 
 from . import make_solver
 from .budget import Bounded, SolveBudget
-from .checks import check_plan
 from .lost_chasers import with_lost_chasers
 from .passive_safety import PassiveSafetyMonitor
 from .plan_monitor import PlanMonitor
-from .types import FAILED, NmpcInput, NmpcParameters, NmpcPlan
+from .problem import NmpcParameters
+from .types import FAILED, NmpcInput, NmpcPlan
+from .warm_start import check_plan
 
-_ATTACHED_FACTOR, _ATTACHED_MARGIN = 1.2, 1e-3
+_ATTACHED_FACTOR = 1.2
+"""Input limit of an attached chaser, in terms of the largest input that following the target needs:
+room for feedback. 0.6 and 2.4 change no bit of `docking-contact`.
+"""
+_ATTACHED_MARGIN = 1e-3
+"""Added to that limit, N and N m: the solver needs some where the target does not move."""
 _CANCELLED_SHARE = 0.5
 """Largest share of an input limit that cancels a disturbance."""
 
@@ -118,7 +124,7 @@ class PlanningStage:
         problem = self.problem(horizon, states, limits - np.abs(disturbances))
         lost = {c.chaser: c.lost for c in observation.chasers if c.lost is not None}
         problem = with_lost_chasers(
-            problem, tuple(lost.values()), observation.effective_ns, self._parameters.dt_s
+            problem, self._parameters, tuple(lost.values()), observation.effective_ns
         )
         enforced = {d.chaser for d in guidance.directives if d.abort_margin is not None}
         if self._passive_safety is not None and enforced:

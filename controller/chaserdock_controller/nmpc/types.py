@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs and outputs of the NMPC, independent of the back end."""
+"""Inputs and outputs of a solve, independent of the back end."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-import numpy as np
-from chaserdock_models.arrays import Array, IntArray, Matrix3
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.passive_safety import CoastCertificate, CoastModel
 
 INTEGRATORS = ("rk4", "euler")
@@ -19,96 +17,6 @@ SOLVED, ITERATION_LIMIT, BUDGET, INFEASIBLE_RELAXED, FAILED = STATUSES
 
 # A plan that enters a keep-out ball or leaves the outer bound by more than this is relaxed.
 VIOLATION_TOLERANCE_M = 1e-4
-
-
-_POSITIVE = ("mass_kg", "dt_s", "weight_force", "weight_torque", "max_reference_distance_m")
-_NOT_NEGATIVE = (
-    "force_max_N",
-    "torque_max_N_m",
-    "weight_position",
-    "weight_orientation",
-    "weight_final_position",
-    "weight_final_orientation",
-)
-
-
-@dataclass(frozen=True)
-class NmpcParameters:
-    """Constant parameters of the problem. SI units, radians.
-
-    The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2,
-    ``weight_orientation`` on the squared vector part of q_err (dimensionless), ``weight_force`` per
-    N^2, ``weight_torque`` per (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full
-    matrix about the centre of mass in body axes. ``boxes``, ``coasts``: most cuboids of the
-    target's shape, and most approaches of a coast, in a problem. ``force_max_N`` and
-    ``torque_max_N_m`` are per body axis. Raises ValueError, naming the field, for an invalid value.
-    """
-
-    mass_kg: float
-    inertia_kg_m2: Matrix3
-    force_max_N: float
-    torque_max_N_m: float
-    horizon_s: float
-    dt_s: float
-    falloff: float
-    weight_position: float
-    weight_orientation: float
-    weight_force: float
-    weight_torque: float
-    weight_final_position: float
-    weight_final_orientation: float
-    max_reference_distance_m: float
-    integrator: str
-    boxes: int = 0
-    coasts: int = 0
-
-    def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ValueError(f"{name} must be positive and finite, not {getattr(self, name)!r}")
-        for name in _NOT_NEGATIVE:
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ValueError(
-                    f"{name} must be finite and not negative, not {getattr(self, name)!r}"
-                )
-        if not (math.isfinite(self.horizon_s) and round(self.horizon_s / self.dt_s) >= 1):
-            raise ValueError(
-                f"horizon_s={self.horizon_s!r} is shorter than one step of dt_s={self.dt_s!r}"
-            )
-        if not 0.0 <= self.falloff <= 1.0:
-            raise ValueError(f"falloff must lie between 0 and 1, not {self.falloff!r}")
-        if self.integrator not in INTEGRATORS:
-            raise ValueError(
-                f"integrator must be one of {', '.join(INTEGRATORS)}, not {self.integrator!r}"
-            )
-        self._check_inertia()
-
-    def _check_inertia(self) -> None:
-        inertia = np.asarray(self.inertia_kg_m2, dtype=float)
-        if inertia.shape != (3, 3) or not np.all(np.isfinite(inertia)):
-            raise ValueError("inertia_kg_m2 must be a finite 3 x 3 matrix")
-        if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
-            raise ValueError("inertia_kg_m2 must be symmetric")
-        if np.linalg.eigvalsh(inertia)[0] <= 0.0:
-            raise ValueError("inertia_kg_m2 must be positive definite")
-
-    @property
-    def stages(self) -> int:
-        """Number of prediction steps D = round(T / dt)."""
-        return round(self.horizon_s / self.dt_s)
-
-    def stage_weights(self) -> tuple[Array, Array]:
-        """Return the weights of position and orientation at stages 0..D, each (D+1,), the final
-        ones included (eq. 6)."""
-        scale = 1.0 - self.falloff * np.arange(self.stages + 1) / self.stages
-        position, orientation = self.weight_position * scale, self.weight_orientation * scale
-        position[-1] += self.weight_final_position
-        orientation[-1] += self.weight_final_orientation
-        return position, orientation
-
-    def input_limits(self) -> Array:
-        """Return the input box (6,): force (N) and torque (N m) per body axis."""
-        return np.array([self.force_max_N] * 3 + [self.torque_max_N_m] * 3)
 
 
 @dataclass(frozen=True)
@@ -149,7 +57,7 @@ class NmpcInput:
     `rti` keeps these. coast_safety: passive safety to keep, or None. Where a plan without it is not
     safe, the back end `rti` linearizes it about its start into coasts (N, D+1, C, 7): half-spaces
     a' p + b' v >= d of position and velocity at a stage, [a (3), b (3), d]; a and b zero for none
-    (`coast_rows`). Other back ends do not keep it.
+    (`terms.coast`). Other back ends do not keep it.
     """
 
     states: Array

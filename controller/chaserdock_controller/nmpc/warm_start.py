@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps common to all back ends: validation, warm start, and evaluation of the plan."""
+"""Steps common to all back ends: checks of a call, warm start, and evaluation of the plan."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from .checks import check_ids, check_input, check_shift, warm_start
-from .kernels import Weights, model_of, plan_cost, plan_violation, roll
+from .kernels import plan_cost, plan_violation, roll, shifted
 from .native import function
+from .problem import NativeProblem, NmpcParameters, check_input, model_of, native_problem
 from .slack import SLACK_L1
+from .term import checked_array
 from .types import (
     FAILED,
     INFEASIBLE_RELAXED,
@@ -21,27 +23,20 @@ from .types import (
     Array,
     IntArray,
     NmpcInput,
-    NmpcParameters,
     NmpcPlan,
 )
 
 
 @dataclass(frozen=True)
 class PreparedProblem:
-    """A checked problem, the ids of its rows, and the initial inputs (N, D, 6) within the box."""
+    """A checked problem, the same for C, the ids of its rows, and the initial inputs (N, D, 6)
+    within the box.
+    """
 
     problem: NmpcInput
+    native: NativeProblem
     names: tuple[int, ...]
     start: Array
-
-    @property
-    def corridors(self) -> Array:
-        assert self.problem.corridors is not None  # check_input fills them in
-        return self.problem.corridors
-
-    @property
-    def between(self) -> Array:
-        return np.asarray(self.problem.min_distance_chasers_m)
 
 
 @dataclass
@@ -59,18 +54,18 @@ class Frame:
         if self.n_max < 1:
             raise ValueError(f"n_chasers must be at least 1, not {self.n_max}")
         function("solve_tick")  # load the library before the first tick
-        self.model, self.weights = model_of(self.params), Weights(self.params)
+        self.model = model_of(self.params)
 
     def begin(
         self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None
     ) -> PreparedProblem:
-        """Check the problem and compute the warm start. Raises ValueError as the checks in
-        `checks`.
+        """Check the problem and compute the warm start. Raises ValueError as `check_input`,
+        `check_ids` and `check_shift`.
         """
         checked = check_input(problem, self.params, self.n_max)
         names = check_ids(ids, len(checked.states))
         start = warm_start(self.plans, names, checked, check_shift(shift_s), self.params.dt_s)
-        return PreparedProblem(checked, names, start)
+        return PreparedProblem(checked, native_problem(checked, self.params), names, start)
 
     def rolled(self, task: PreparedProblem, u: Array) -> Array:
         """Return the states (N, D+1, 13) of inputs ``u`` (N, D, 6) through the nonlinear model."""
@@ -81,9 +76,7 @@ class Frame:
 
     def evaluate(self, task: PreparedProblem, x: Array, u: Array) -> tuple[Array, Array]:
         """Return the cost (eq. 6) (N,) and the deepest violation, m (N,), of a plan."""
-        p = task.problem
-        cost = plan_cost(self.weights, x, u, p.references, p.u_ref)
-        return cost, plan_violation(p, x, self.params.max_reference_distance_m)
+        return plan_cost(task.native, x, u), plan_violation(task.native, x)
 
     def finish(
         self, task: PreparedProblem, u: Array, status: Sequence[str], iterations: IntArray
@@ -122,3 +115,59 @@ class Frame:
 def status_of(usable: bool, at_limit: bool) -> str:
     """Return the status before violations are considered."""
     return FAILED if not usable else (ITERATION_LIMIT if at_limit else SOLVED)
+
+
+def check_plan(plan: NmpcPlan, n: int, d: int) -> None:
+    """Raise ValueError for a plan of other than ``n`` chasers or ``d`` stages, or with a value that
+    is not finite.
+    """
+    for name, value, shape in (
+        ("inputs", plan.inputs, (n, d, 6)),
+        ("states", plan.states, (n, d + 1, 13)),
+    ):
+        checked_array(name, value, shape, negative=True)
+    if len(plan.status) != n:
+        raise ValueError(f"status must be of {n} chasers, not {len(plan.status)}")
+
+
+def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
+    """Return the chasers' ids, 0..N-1 by default. Raises ValueError for a wrong number or a
+    repetition.
+    """
+    chosen = tuple(range(n)) if ids is None else tuple(int(i) for i in ids)
+    if len(chosen) != n or len(set(chosen)) != n:
+        raise ValueError(f"ids must be {n} different numbers, not {chosen}")
+    return chosen
+
+
+def check_shift(shift_s: float) -> float:
+    """Return the time since the previous solve, s. Raises ValueError if it is negative or not
+    finite.
+    """
+    if not (math.isfinite(shift_s) and shift_s >= 0.0):
+        raise ValueError(f"shift_s must be finite and not negative, not {shift_s!r}")
+    return float(shift_s)
+
+
+def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
+    """Shift piecewise constant inputs (..., D, 6) by ``shift_s`` on the same grid.
+
+    Each new value is the mean of the old plan over its interval, which preserves the impulse. The
+    last value is held beyond the old horizon.
+    """
+    whole, part = divmod(shift_s / dt_s, 1.0)
+    return shifted(inputs, int(min(whole, inputs.shape[-2])), part)
+
+
+def warm_start(
+    plans: dict[int, Array], names: tuple[int, ...], problem: NmpcInput, shift_s: float, dt_s: float
+) -> Array:
+    """Return the initial inputs (N, D, 6) within the box: each chaser's shifted plan, or u_ref
+    without a plan.
+    """
+    start = problem.u_ref.copy()
+    known = [row for row, name in enumerate(names) if name in plans]
+    if known:
+        start[known] = shift_inputs(np.array([plans[names[row]] for row in known]), shift_s, dt_s)
+    limits = problem.input_max[:, None, :]
+    return np.minimum(np.maximum(start, -limits), limits)

@@ -15,17 +15,26 @@ arrays.
 from __future__ import annotations
 
 import ctypes
+import itertools
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .build import LIBRARY_NAME, source_digest
 
+S = TypeVar("S", bound=type[ctypes.Structure])
+
 _INSTALL = "reinstall chaserdock (in a clone: pip install --no-deps -e .), which compiles it"
+
+
+class _Member(ctypes.Structure):
+    """`Member` of base.h, the one structure that nothing checks."""
+
+    _fields_ = [("name", ctypes.c_char_p), ("size", ctypes.c_int64), ("offset", ctypes.c_int64)]
 
 
 class KernelLibrary:
@@ -36,6 +45,48 @@ class KernelLibrary:
     def __init__(self, file: str) -> None:
         self.path = Path(file).with_name(LIBRARY_NAME)
         self._functions: dict[str, Any] = {}
+        self._structures: dict[str, type[ctypes.Structure]] = {}
+
+    def structure(self, name: str) -> Callable[[S], S]:
+        """Return a class decorator for the ctypes structure that C calls ``name``, which states its
+        members by LAYOUT (base.h).
+
+        Names, sizes and offsets of the members are compared when the library is loaded, or at once
+        if it is: a structure that differs would pass C other values than Python wrote. Raises
+        ImportError for the first difference.
+        """
+
+        def register(structure: S) -> S:
+            self._structures[name] = structure
+            if "library" in vars(self):
+                self._check(self.library, name, structure)
+            return structure
+
+        return register
+
+    def _check(self, library: ctypes.CDLL, name: str, own: type[ctypes.Structure]) -> None:
+        try:
+            layout = library[f"v{int(library.level())}_layout_{name}"]
+        except AttributeError:
+            raise ImportError(
+                f"{self.path}: no LAYOUT({name}, ...) stands in its sources"
+            ) from None
+        layout.restype = ctypes.POINTER(_Member)
+        table = layout()
+        theirs = []
+        while table[len(theirs)].name is not None:
+            member = table[len(theirs)]
+            theirs.append((member.name.decode(), member.size, member.offset))
+        ours = [(name, ctypes.sizeof(own), 0)]
+        for field in own._fields_:
+            descriptor = getattr(own, field[0])
+            ours.append((field[0], descriptor.size, descriptor.offset))
+        for c, python in itertools.zip_longest(theirs, ours):
+            if c != python:
+                raise ImportError(
+                    f"{self.path}: structure {name} of C and {own.__name__} of Python differ: "
+                    f"{_describe(c)} in C, {_describe(python)} in Python"
+                )
 
     @cached_property
     def library(self) -> ctypes.CDLL:
@@ -55,6 +106,8 @@ class KernelLibrary:
             raise ImportError(
                 f"{self.path}: compiled from other sources than those beside it; {_INSTALL}"
             )
+        for name, structure in self._structures.items():
+            self._check(library, name, structure)
         return library
 
     @cached_property
@@ -73,6 +126,12 @@ class KernelLibrary:
             if at_level is None:
                 self._functions[name] = kernel
         return kernel
+
+
+def _describe(member: tuple[str, int, int] | None) -> str:
+    if member is None:
+        return "nothing more"
+    return f"{member[0]} of {member[1]} bytes at byte {member[2]}"
 
 
 address: Callable[[Any], ctypes.Array[ctypes.c_char]] = (ctypes.c_char * 0).from_buffer

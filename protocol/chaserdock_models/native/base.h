@@ -1,18 +1,21 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Shared by all kernels: vectors of doubles, three-vectors, exported names, working memory.
  *
- * Results are the same to the last bit on every processor. The compiler does not contract or reorder expressions
- * (-ffp-contract=off, no fast-math), the source fixes the order of every sum, and vectors are four wide on every
- * processor. Only operations that IEEE 754 defines exactly are used: + - * / and the square root. Fused multiply-add
- * is exact as well, but it gained 15 % with hardware support and cost a factor of twenty without.
+ * Results are the same to the last bit on every processor. The compiler does not contract or
+ * reorder expressions (-ffp-contract=off, no fast-math), the source fixes the order of every sum,
+ * and vectors are four wide on every processor. Only operations that IEEE 754 defines exactly are used: + - * / and the
+ * square root. Fused multiply-add is exact as well, but it gained 15 % with hardware support and
+ * cost a factor of twenty without.
  *
- * Counts, indices and array sizes must be right; a floating-point argument may be anything. Whatever it is, a kernel stays
- * within its arrays, converts no number to an integer that cannot hold it, and ends. NaN passes through arithmetic to the
- * result; a kernel that decides counts it as a failure, and says so in its comment.
+ * Counts, indices and array sizes must be right; a floating-point argument may be anything.
+ * Whatever it is, a kernel stays within its arrays, converts no number to an integer that cannot
+ * hold it, and ends. NaN passes through arithmetic to the result; a kernel that decides counts it
+ * as a failure, and says so in its comment.
  */
 #ifndef CHASERDOCK_BASE_H
 #define CHASERDOCK_BASE_H
 
+#include <stddef.h>
 #include <stdint.h>
 
 #define PASTE_(a, b) a##b
@@ -20,6 +23,32 @@
 /* LEVEL: prefix of the exported names for the instruction set of this copy, e.g. v3_. */
 #define NAME(name) PASTE(LEVEL, name)
 #define EXPORT __attribute__((visibility("default")))
+
+/* Layout of a structure that Python fills: export a table that `KernelLibrary.structure` compares
+ * with the ctypes structure when the library is loaded. First the structure's size, then each
+ * member's name, size and offset, in order; a name of NULL ends it. LAYOUT(Point, x, y) stands
+ * after Point. */
+typedef struct {
+    const char *name;
+    int64_t size, offset;
+} Member;
+#define LAYOUT(type, ...)                                                                  \
+    EXPORT const Member *NAME(layout_##type)(void) {                                       \
+        static const Member members[] = {                                                  \
+            {#type, sizeof(type), 0}, REPEAT(MEMBERS(type, __VA_ARGS__)){0, 0, 0}};        \
+        return members;                                                                    \
+    }
+#define MEMBERS(type, member, ...)                                            \
+    {#member, sizeof(((type *)0)->member), offsetof(type, member)},           \
+        __VA_OPT__(MEMBERS_AGAIN NOTHING(type, __VA_ARGS__))
+#define MEMBERS_AGAIN() MEMBERS
+#define NOTHING ()
+/* Expand again and again: each time MEMBERS takes the next of at most 81 members. */
+#define REPEAT(...) REPEAT_27(REPEAT_27(REPEAT_27(__VA_ARGS__)))
+#define REPEAT_27(...) REPEAT_9(REPEAT_9(REPEAT_9(__VA_ARGS__)))
+#define REPEAT_9(...) REPEAT_3(REPEAT_3(REPEAT_3(__VA_ARGS__)))
+#define REPEAT_3(...) AGAIN(AGAIN(AGAIN(__VA_ARGS__)))
+#define AGAIN(...) __VA_ARGS__
 
 typedef double v4 __attribute__((vector_size(32), aligned(8), may_alias));
 typedef double row12[12];
@@ -65,7 +94,9 @@ static inline double dot12(const double *a, const double *b) {
     return (s[0] + s[2]) + (s[1] + s[3]);
 }
 
-static inline double dot3(const double *a, const double *b) { return madd(a[2], b[2], madd(a[1], b[1], a[0] * b[0])); }
+static inline double dot3(const double *a, const double *b) {
+    return madd(a[2], b[2], madd(a[1], b[1], a[0] * b[0]));
+}
 static inline void subtract3(const double *a, const double *b, double *out) {
     for (int i = 0; i < 3; i++) out[i] = a[i] - b[i];
 }

@@ -35,9 +35,17 @@ _SHARED = ("base.h", "elementary.h", "dispatch.c", "build.py")
 
 # No floating-point optimizations that change results (see base.h), and no calls into a C library.
 FLAGS = (
-    "-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-ffreestanding", "-fno-builtin", "-fvisibility=hidden",
-    "-Wall", "-Wextra", "-Werror",
-)  # fmt: skip
+    "-std=c11",
+    "-O3",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-ffreestanding",
+    "-fno-builtin",
+    "-fvisibility=hidden",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+)
 # One copy of the kernels for each instruction set, numbered as `level` in dispatch.c.
 X86_64 = ((2, "-mcpu=x86_64_v2"), (3, "-mcpu=x86_64_v3"))
 OTHER = ((0, "-mcpu=baseline"),)
@@ -123,7 +131,8 @@ def compile_kernels(
             )
             if completed.returncode:
                 raise RuntimeError(
-                    f"the kernels do not compile: {' '.join(command)}\n{completed.stdout}{completed.stderr}"
+                    "the kernels do not compile: "
+                    f"{' '.join(command)}\n{completed.stdout}{completed.stderr}"
                 )
 
         include = f"-I{HERE}"

@@ -2,7 +2,8 @@
 /* Lower bounds on the distance of coasts from the target (passive_safety.py). */
 #include "base.h"
 
-/* out (6) = the state after a transition of Clohessy-Wiltshire or of free motion: the motion out of the plane is by itself. */
+/* out (6) = the state after a transition of Clohessy-Wiltshire or of free motion: the motion out of
+ * the plane is by itself. */
 static inline void coasted(const double *phi, const v4 *x, v4 *out) {
     static const int plane[4] = {0, 1, 3, 4};
     for (int i = 0; i < 4; i++) {
@@ -11,17 +12,20 @@ static inline void coasted(const double *phi, const v4 *x, v4 *out) {
         for (int j = 1; j < 4; j++) s = madd4(splat(row[plane[j]]), x[plane[j]], s);
         out[plane[i]] = s;
     }
-    for (int i = 2; i < 6; i += 3) out[i] = madd4(splat(phi[6 * i + 5]), x[5], splat(phi[6 * i + 2]) * x[2]);
+    for (int i = 2; i < 6; i += 3)
+        out[i] = madd4(splat(phi[6 * i + 5]), x[5], splat(phi[6 * i + 2]) * x[2]);
 }
 
-static inline v4 square_of(const v4 *a) { return madd4(a[2], a[2], madd4(a[1], a[1], a[0] * a[0])); }
+static inline v4 square_of(const v4 *a) {
+    return madd4(a[2], a[2], madd4(a[1], a[1], a[0] * a[0]));
+}
 static inline double greatest4(v4 a) { return max_of(max_of(a[0], a[1]), max_of(a[2], a[3])); }
 
-/* room (T,): in each step between the T + 1 transitions (T + 1, 6, 6), no coast comes nearer to the origin than this, m: the
- * nearest end, less half of the longest step and `bulge_s` times the greatest change of velocity. states (6, M): M a multiple of
- * four; work: 6 M doubles. */
-EXPORT void NAME(coast_room)(int64_t steps, const double *transitions, int64_t m, const double *states, double bulge_s,
-                             double *room, double *work) {
+/* room (T,): in each step between the T + 1 transitions (T + 1, 6, 6), no coast comes nearer to the
+ * origin than this, m: the nearest end, less half of the longest step and `bulge_s` times the
+ * greatest change of velocity. states (6, M): M a multiple of four; work: 6 M doubles. */
+EXPORT void NAME(coast_room)(int64_t steps, const double *transitions, int64_t m,
+                             const double *states, double bulge_s, double *room, double *work) {
     double nearest_before = 0.0;
     zero(work, 6 * m);
     for (int64_t k = 0; k <= steps; k++) {
@@ -40,20 +44,24 @@ EXPORT void NAME(coast_room)(int64_t steps, const double *transitions, int64_t m
         }
         double nearest = sqrt_of(-greatest4(far));
         if (k)
-            room[k - 1] = min_of(nearest_before, nearest) - 0.5 * sqrt_of(greatest4(step)) - bulge_s * sqrt_of(greatest4(change));
+            room[k - 1] = min_of(nearest_before, nearest) - 0.5 * sqrt_of(greatest4(step)) -
+                          bulge_s * sqrt_of(greatest4(change));
         nearest_before = nearest;
     }
 }
 
-/* Covariance (3, 3) of the position after a transition phi (6, 6) of a state with this covariance (6, 6). */
+/* Covariance (3, 3) of the position after a transition phi (6, 6) of a state with this covariance
+ * (6, 6). */
 static void spread(const double *phi, const double *covariance, double *out) {
     for (int i = 0; i < 3; i++) {
         double row[6] = {0};
         for (int n = 0; n < 6; n++)
-            for (int m = 0; m < 6; m++) row[n] = madd(phi[6 * i + m], covariance[6 * m + n], row[n]);
+            for (int m = 0; m < 6; m++)
+                row[n] = madd(phi[6 * i + m], covariance[6 * m + n], row[n]);
         for (int j = 0; j < 3; j++) {
             out[3 * i + j] = 0.0;
-            for (int n = 0; n < 6; n++) out[3 * i + j] = madd(row[n], phi[6 * j + n], out[3 * i + j]);
+            for (int n = 0; n < 6; n++)
+                out[3 * i + j] = madd(row[n], phi[6 * j + n], out[3 * i + j]);
         }
     }
 }
@@ -65,12 +73,15 @@ static double variance_along(const double *line, const double *covariance) {
 }
 
 typedef struct {
-    double *margin, *away, *moment; /* each (M,): smallest margin, distance there (m), and its moment in steps */
+    double *margin, *away,
+        *moment; /* each (M,): smallest margin, distance there (m), and its moment in steps */
 } Approaches;
 
-/* Approach of one coast between the states begin and end (6) of step k; `covariances` (2, 9): of the positions there. */
-static void approach(int64_t k, const double *begin, const double *end, const double *covariances, double keep_out, double bulge_s,
-                     double *margin, double *away, double *moment) {
+/* Approach of one coast between the states begin and end (6) of step k; `covariances` (2, 9): of
+ * the positions there. */
+static void approach(int64_t k, const double *begin, const double *end, const double *covariances,
+                     double keep_out, double bulge_s, double *margin, double *away,
+                     double *moment) {
     double step[3], change[3], nearest[3], line[3];
     subtract3(end, begin, step);
     subtract3(end + 3, begin + 3, change);
@@ -78,7 +89,8 @@ static void approach(int64_t k, const double *begin, const double *end, const do
     for (int i = 0; i < 3; i++) nearest[i] = madd(share, step[i], begin[i]);
     double chord = sqrt_of(dot3(nearest, nearest));
     for (int i = 0; i < 3; i++) line[i] = nearest[i] / max_of(chord, 1e-9);
-    double variance = max_of(variance_along(line, covariances), variance_along(line, covariances + 9));
+    double variance =
+        max_of(variance_along(line, covariances), variance_along(line, covariances + 9));
     double distance = chord - bulge_s * sqrt_of(dot3(change, change));
     distance = distance < 0.0 ? 0.0 : distance;
     double found = (distance - keep_out) / sqrt_of(max_of(variance, 1e-18));
@@ -88,10 +100,12 @@ static void approach(int64_t k, const double *begin, const double *end, const do
     *moment = (double)k + share;
 }
 
-/* Closest approach, by the margin in standard deviations, of the coasts from states (6, M) within `count` steps (columns);
- * transitions, states and bulge_s as in `coast_room`, covariance (6, 6) of a state. NaN in a state gives a margin of NaN. */
-EXPORT void NAME(coast_closest)(int64_t count, const int64_t *columns, const double *transitions, int64_t m, const double *states,
-                                const double *covariance, double keep_out, double bulge_s, const Approaches *found) {
+/* Closest approach, by the margin in standard deviations, of the coasts from states (6, M) within
+ * `count` steps (columns); transitions, states and bulge_s as in `coast_room`, covariance (6, 6) of
+ * a state. NaN in a state gives a margin of NaN. */
+EXPORT void NAME(coast_closest)(int64_t count, const int64_t *columns, const double *transitions,
+                                int64_t m, const double *states, const double *covariance,
+                                double keep_out, double bulge_s, const Approaches *found) {
     for (int64_t n = 0; n < m; n++) {
         found->margin[n] = 1e300;
         found->away[n] = found->moment[n] = 0.0;
@@ -112,7 +126,8 @@ EXPORT void NAME(coast_closest)(int64_t count, const int64_t *columns, const dou
                     from[i] = begin[i][lane];
                     to[i] = end[i][lane];
                 }
-                approach(columns[c], from, to, covariances, keep_out, bulge_s, found->margin + n + lane, found->away + n + lane,
+                approach(columns[c], from, to, covariances, keep_out, bulge_s,
+                         found->margin + n + lane, found->away + n + lane,
                          found->moment + n + lane);
             }
         }

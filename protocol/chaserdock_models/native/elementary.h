@@ -5,13 +5,15 @@
 
 #include "base.h"
 
-/* Return e^x to about one unit in the last place; 0 below -700. Powers of two and a Taylor series on |r| <= ln(2) / 2. */
+/* Return e^x to about one unit in the last place; 0 below -700. Powers of two and a Taylor series
+ * on |r| <= ln(2) / 2. */
 static inline double exponential(double x) {
     if (!(x > -700.0)) return x <= -700.0 ? 0.0 : x;
     if (x > 700.0) x = 700.0;
     double n = x * 1.4426950408889634 + (x < 0.0 ? -0.5 : 0.5);
     int64_t k = (int64_t)n;
-    /* ln(2) in two parts, the first short enough for exact products (W. J. Cody, W. Waite, 1980). */
+    /* ln(2) in two parts, the first short enough for exact products (W. J. Cody, W. Waite,
+     * 1980). */
     double r = (x - (double)k * 0.693145751953125) - (double)k * 1.4286068203094172e-06;
     double sum = 1.0;
     for (int i = 13; i >= 1; i--) sum = madd(sum, r / (double)i, 1.0);
@@ -22,11 +24,14 @@ static inline double exponential(double x) {
     return sum * power.value;
 }
 
-/* Compute sine and cosine of a non-negative angle with an error of 2e-16 (within half a turn): Taylor series at a quarter
- * of the angle, doubled twice. C libraries differ between versions and processors. */
+/* Compute sine and cosine of a non-negative angle with an error of 2e-16 (within half a turn):
+ * Taylor series at a quarter of the angle, doubled twice. C libraries differ between versions and
+ * processors. */
 static inline void sine_cosine(double angle, double *sine, double *cosine) {
     if (angle > 3.141592653589793)
-        angle = angle < 1e9 ? angle - (double)(int64_t)(angle * 0.15915494309189535 + 0.5) * 6.283185307179586 : 0.0;
+        angle = angle < 1e9 ? angle - (double)(int64_t)(angle * 0.15915494309189535 + 0.5) *
+                                          6.283185307179586
+                            : 0.0;
     double x = 0.25 * angle, y = x * x, s = 0.0, c = 0.0;
     for (int i = 15; i >= 3; i -= 2) {
         s = y / (i * (i - 1)) * (1.0 - s);
@@ -43,7 +48,8 @@ static inline void sine_cosine(double angle, double *sine, double *cosine) {
     *cosine = c;
 }
 
-/* Solve A x = b in place (A (n, n) by rows, b (n) becomes x) with row pivoting. Return 0 if A is singular. */
+/* Solve A x = b in place (A (n, n) by rows, b (n) becomes x) with row pivoting. Return 0 if A is
+ * singular. */
 static inline int solve_rows(double *a, double *b, int n) {
     for (int j = 0; j < n; j++) {
         int p = j;

@@ -2,11 +2,15 @@
 /* Motion of a rigid body. */
 #include "base.h"
 
-/* Derivative (13) of position, velocity (WRF), attitude and rate (body axes) under force and torque in body axes. */
-static void newton_euler(const double *y, const double *wrench, double mass, const double *inertia, double *out) {
+/* Derivative (13) of position, velocity (WRF), attitude and rate (body axes) under force and torque
+ * in body axes. */
+static void newton_euler(const double *y, const double *wrench, double mass, const double *inertia,
+                         double *out) {
     const double w = y[6], i = y[7], j = y[8], k = y[9], a = y[10], b = y[11], c = y[12];
-    const double fx = wrench[0], fy = wrench[1], fz = wrench[2], ia = inertia[0], ib = inertia[1], ic = inertia[2];
-    const double cx = 2.0 * (j * fz - k * fy), cy = 2.0 * (k * fx - i * fz), cz = 2.0 * (i * fy - j * fx);
+    const double fx = wrench[0], fy = wrench[1], fz = wrench[2], ia = inertia[0], ib = inertia[1],
+                 ic = inertia[2];
+    const double cx = 2.0 * (j * fz - k * fy), cy = 2.0 * (k * fx - i * fz),
+                 cz = 2.0 * (i * fy - j * fx);
     copy(y + 3, out, 3);
     out[3] = (fx + w * cx + (j * cz - k * cy)) / mass;
     out[4] = (fy + w * cy + (k * cx - i * cz)) / mass;
@@ -21,7 +25,8 @@ static void newton_euler(const double *y, const double *wrench, double mass, con
 }
 
 /* Step of ``h`` by RK4 of a state (13), in place, without normalization of its attitude. */
-EXPORT void NAME(rigid_step)(double *y, const double *wrench, double mass, const double *inertia, double h) {
+EXPORT void NAME(rigid_step)(double *y, const double *wrench, double mass, const double *inertia,
+                             double h) {
     double k[4][13], at[13];
     newton_euler(y, wrench, mass, inertia, k[0]);
     for (int s = 1; s < 4; s++) {
@@ -29,12 +34,13 @@ EXPORT void NAME(rigid_step)(double *y, const double *wrench, double mass, const
         for (int n = 0; n < 13; n++) at[n] = y[n] + c * k[s - 1][n];
         newton_euler(at, wrench, mass, inertia, k[s]);
     }
-    for (int n = 0; n < 13; n++) y[n] += h / 6.0 * (k[0][n] + 2.0 * k[1][n] + 2.0 * k[2][n] + k[3][n]);
+    for (int n = 0; n < 13; n++)
+        y[n] += h / 6.0 * (k[0][n] + 2.0 * k[1][n] + 2.0 * k[2][n] + k[3][n]);
 }
 
 /* q' = 1/2 q (0, w) and Euler's equations I w' = (I w) x w. */
-static void derivative(const double *q, const double *w, const double *inertia, const double *inverse, double *dq,
-                       double *dw) {
+static void derivative(const double *q, const double *w, const double *inertia,
+                       const double *inverse, double *dq, double *dw) {
     double momentum[3], torque[3], cross[3];
     multiply3(inertia, w, momentum);
     cross3(momentum, w, torque);
@@ -44,10 +50,11 @@ static void derivative(const double *q, const double *w, const double *inertia, 
     for (int i = 0; i < 3; i++) dq[1 + i] = 0.5 * madd(q[0], w[i], cross[i]);
 }
 
-/* Attitudes (count, 4), rates and angular accelerations (count, 3) in body axes at 0, h, 2 h, ... from q (4) and
- * omega (3), by RK4 with step h. inertia and its inverse: (3, 3). */
-EXPORT void NAME(free_rotation)(const double *q, const double *omega, const double *inertia, const double *inverse,
-                    double h, int64_t count, double *attitudes, double *rates, double *accelerations) {
+/* Attitudes (count, 4), rates and angular accelerations (count, 3) in body axes at 0, h, 2 h, ...
+ * from q (4) and omega (3), by RK4 with step h. inertia and its inverse: (3, 3). */
+EXPORT void NAME(free_rotation)(const double *q, const double *omega, const double *inertia,
+                                const double *inverse, double h, int64_t count, double *attitudes,
+                                double *rates, double *accelerations) {
     double y[7], k[4][7], at[7];
     copy(q, y, 4);
     copy(omega, y + 4, 3);

@@ -46,6 +46,8 @@ from .scan import (
 from .schema_migrations import decode_logged
 
 _FLUSH_S = 0.5
+"""Longest time (wall or simulated, s) between writes to disk: a killed recorder loses less than a
+second (tests/protocol/test_record_again.py)."""
 SCENARIO_ATTACHMENT = "scenario.json"
 LOCK_ATTACHMENT = "uv.lock.gz"
 VERSIONS_ATTACHMENT = "versions.json"

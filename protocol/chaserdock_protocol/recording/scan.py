@@ -228,7 +228,8 @@ def stored_messages(
             expected = following.get(channel.id, message.sequence if state.recovered else 0)
             if message.sequence != expected and not state.recovered:
                 raise LogError(
-                    f"{path}: damaged: {channel.topic}: message {message.sequence} follows where {expected} belongs"
+                    f"{path}: damaged: {channel.topic}: message {message.sequence} follows where "
+                    f"{expected} belongs"
                 )
             following[channel.id] = message.sequence + 1
             yield channel, message

@@ -37,20 +37,23 @@ class MeshKnowledge(Section):
 
     simplification_m: Annotated[float, Field(ge=2e-4, le=0.02, allow_inf_nan=False)] = Field(
         default=0.001,
-        description="Largest deviation of the known mesh's facets from curved surfaces, or from the surface of a file, m.",
+        description="Largest deviation of the known mesh's facets from curved surfaces, or from "
+        "the surface of a file, m.",
     )
     panel_deg: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = Field(
         default=0.5,
-        description="Standard deviation of the rotation of each joint (rotation vector, per axis), such as of a solar panel, "
-        "degrees.",
+        description="Standard deviation of the rotation of each joint (rotation vector, per "
+        "axis), such as of a solar panel, degrees.",
     )
     scale_share: Annotated[float, Field(ge=0, le=0.05, allow_inf_nan=False)] = Field(
         default=0.003,
-        description="Standard deviation of the relative size of the body without what moves on joints.",
+        description="Standard deviation of the relative size of the body without what moves on "
+        "joints.",
     )
     missing: tuple[Name, ...] = Field(
         default=(),
-        description="Parts that the satellite has and the known mesh lacks, such as `antenna_whip`.",
+        description="Parts that the satellite has and the known mesh lacks, such as "
+        "`antenna_whip`.",
     )
 
 
@@ -62,27 +65,31 @@ class FlightTarget(Section):
 
     model: Name = Field(
         default="paper",
-        description="Name of a known target: `paper`, `servicer`, `client` with markers, `geo_servicer`, `cubesat_12u` "
-        "without; or, in a file, the path relative to it of a target file (`….toml`) or of a mesh (`….glb`, "
-        "`.gltf`, `.obj`, `.stl`, `.ply`). With `geometry`: the name of that geometry.",
+        description="Name of a known target: `paper`, `servicer`, `client` with markers, "
+        "`geo_servicer`, `cubesat_12u` without; or, in a file, the path relative to it of a "
+        "target file (`….toml`) or of a mesh (`….glb`, `.gltf`, `.obj`, `.stl`, `.ply`). "
+        "With `geometry`: the name of that geometry.",
     )
     geometry: Geometry | None = Field(
         default=None, description="Shape and markers, in place of those of a known `model`."
     )
     motion: Literal["constant_rates", "static", "torque_free"] = Field(
         default="constant_rates",
-        description="`constant_rates`: prescribed constant velocity and angular velocity, as in the paper. `static`: "
-        "prescribed, at rest. `torque_free`: a rigid body, which contact forces can move.",
+        description="`constant_rates`: prescribed constant velocity and angular velocity, as in "
+        "the paper. `static`: prescribed, at rest. `torque_free`: a rigid body, which "
+        "contact forces can move.",
     )
     mass_kg: Positive = Field(default=1.25, description="Mass, kg. Used by `torque_free` only.")
     inertia_kg_m2: PositiveVector | None = Field(
         default=None,
-        description="Moments of inertia about the axes of TRF through the centre of mass, kg m². Used by `torque_free` only. "
-        "Without it: those of the model's mesh, or of a homogeneous cuboid of its size.",
+        description="Moments of inertia about the axes of TRF through the centre of mass, kg m². "
+        "Used by `torque_free` only. Without it: those of the model's mesh, or of a "
+        "homogeneous cuboid of its size.",
     )
     inertia_products_kg_m2: Vector = Field(
         default=(0.0, 0.0, 0.0),
-        description="Elements xy, xz, yz of the inertia tensor (TRF), kg m². Used by `torque_free` only.",
+        description="Elements xy, xz, yz of the inertia tensor (TRF), kg m². Used by "
+        "`torque_free` only.",
     )
     centre_of_mass_m: Vector = Field(
         default=(0.0, 0.0, 0.0), description="Centre of mass (TRF), m. Used by `torque_free` only."
@@ -90,16 +97,18 @@ class FlightTarget(Section):
 
     mass_sigma_share: Sigma = Field(
         default=0.1,
-        description="Standard deviation of the stated mass, as a share of it. Used by `torque_free` only.",
+        description="Standard deviation of the stated mass, as a share of it. Used by "
+        "`torque_free` only.",
     )
     inertia_sigma_share: Sigma = Field(
         default=0.15,
-        description="Standard deviation of each element of the stated inertia tensor, as a share of the mean moment. Used by "
-        "`torque_free` only.",
+        description="Standard deviation of each element of the stated inertia tensor, as a share "
+        "of the mean moment. Used by `torque_free` only.",
     )
     centre_of_mass_sigma_m: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = Field(
         default=0.005,
-        description="Standard deviation of the stated centre of mass per axis, m. Used by `torque_free` only.",
+        description="Standard deviation of the stated centre of mass per axis, m. Used by "
+        "`torque_free` only.",
     )
     knowledge: MeshKnowledge = MeshKnowledge()
 
@@ -109,13 +118,15 @@ class FlightTarget(Section):
             target_model(self.model)
         elif self.model in target_names():
             raise ValueError(
-                f"model: {self.model!r} is the name of a known target; choose another one for this geometry"
+                f"model: {self.model!r} is the name of a known target; choose another one for "
+                "this geometry"
             )
         if self.inertia_kg_m2 is not None:
             a, b, c = np.linalg.eigvalsh(self.inertia_tensor).tolist()
             if a <= 0.0:
                 raise ValueError(
-                    f"inertia_products_kg_m2 {self.inertia_products_kg_m2}: too large for a body's inertia"
+                    f"inertia_products_kg_m2 {self.inertia_products_kg_m2}: too large for a "
+                    "body's inertia"
                 )
             _check_inertia((a, b, c) if any(self.inertia_products_kg_m2) else self.inertia_kg_m2)
         elif any(self.inertia_products_kg_m2):
@@ -262,8 +273,8 @@ class Body(Section):
 
     body: Literal["slider", "tetra12"] | None = Field(
         default=None,
-        description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters) or `tetra12` (12 thrusters). "
-        "Its values replace the defaults below.",
+        description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters) or "
+        "`tetra12` (12 thrusters). Its values replace the defaults below.",
     )
     mass_kg: Positive = Field(default=30.0, description="Mass, kg.")
     size_m: PositiveVector = Field(
@@ -271,13 +282,15 @@ class Body(Section):
     )
     inertia_kg_m2: PositiveVector | None = Field(
         default=None,
-        description="Principal moments of inertia about the axes of CRF, kg m². Without it: those of a homogeneous cuboid.",
+        description="Principal moments of inertia about the axes of CRF, kg m². Without it: "
+        "those of a homogeneous cuboid.",
     )
     force_max_N: Positive = Field(default=2.0, description="Largest force per body axis, N.")
     torque_max_N_m: Positive = Field(default=0.05, description="Largest torque per body axis, N m.")
     mesh: Literal["", "chaser_body"] = Field(
         default="",
-        description="Mesh that the cameras see in place of the body's cuboid, scaled to `size_m`; without it, the cuboid.",
+        description="Mesh that the cameras see in place of the body's cuboid, scaled to "
+        "`size_m`; without it, the cuboid.",
     )
     probe_reach_m: Positive = Field(
         default=0.35,
@@ -285,7 +298,8 @@ class Body(Section):
     )
     actuation: Literal["ideal", "thrusters"] = Field(
         default="ideal",
-        description="`ideal`: the commanded force and torque act on the body. `thrusters`: pulses of `thrusters` do.",
+        description="`ideal`: the commanded force and torque act on the body. `thrusters`: "
+        "pulses of `thrusters` do.",
     )
     thrusters: tuple[Thruster, ...] = Field(
         default=(),
@@ -295,12 +309,13 @@ class Body(Section):
     modulation: Modulation = Modulation()
     thruster_test_s: NotNegative = Field(
         default=10.0,
-        description="A thruster whose function has not been confirmed for this long is tested when it is safe to do so, "
-        "s. 0: no tests.",
+        description="A thruster whose function has not been confirmed for this long is tested "
+        "when it is safe to do so, s. 0: no tests.",
     )
     thruster_faults_by_command: bool = Field(
         default=False,
-        description="Whether operators may inject thruster faults (`chaserdock thruster-fault`).",
+        description="Whether operators may inject thruster faults (`chaserdock command "
+        "thruster-fault`).",
     )
 
     @model_validator(mode="before")

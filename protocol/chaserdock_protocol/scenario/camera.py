@@ -25,8 +25,8 @@ class Effects(Section):
         ge=0,
         le=255,
         allow_inf_nan=False,
-        description="Grey level that the brightest hundredth of each image is exposed to, in place of `gain`, by a factor of "
-        "1/8 to 8. 0: off.",
+        description="Grey level that the brightest hundredth of each image is exposed to, in "
+        "place of `gain`, by a factor of 1/8 to 8. 0: off.",
     )
     point_spread_px: NotNegative = Field(
         default=0.6, description="Standard deviation of the lens' Gaussian blur, pixels."
@@ -42,13 +42,13 @@ class Effects(Section):
         ge=0,
         le=0.5,
         allow_inf_nan=False,
-        description="Time for which the shutter is open, centred on the image's time, s. It blurs moving edges; the "
-        "brightness depends on `gain` alone.",
+        description="Time for which the shutter is open, centred on the image's time, s. It "
+        "blurs moving edges; the brightness depends on `gain` alone.",
     )
     glare: NotNegative = Field(
         default=0.0,
-        description="Stray light at one degree from the sun, grey levels; it falls with the angle. Above 0, the sun's "
-        "disc is drawn, too.",
+        description="Stray light at one degree from the sun, grey levels; it falls with the "
+        "angle. Above 0, the sun's disc is drawn, too.",
     )
     jpeg_quality: int = Field(
         default=85,
@@ -135,7 +135,8 @@ class FlightCamera(Section):
     )
     mounting_rotation_deg: Vector = Field(
         default=(0.0, 0.0, 0.0),
-        description="Rotation from looking along +X to the camera's mounting: rotation vector (CRF), degrees.",
+        description="Rotation from looking along +X to the camera's mounting: rotation vector "
+        "(CRF), degrees.",
     )
 
     def model(self) -> Camera:
@@ -175,8 +176,8 @@ class CameraSection(FlightCamera):
     calibration: str | None = Field(
         default=None,
         exclude=True,
-        description="Path, relative to the scenario file, of an OpenCV calibration file (YAML, JSON or XML) to read "
-        "`intrinsics` from.",
+        description="Path, relative to the scenario file, of an OpenCV calibration file (YAML, "
+        "JSON or XML) to read `intrinsics` from.",
     )
     sun_direction: Vector = Field(
         default=(-0.4, -0.5, 0.77), description="Direction to the sun (WRF), any length but 0."
@@ -189,7 +190,8 @@ class CameraSection(FlightCamera):
     )
     lamp: NotNegative = Field(
         default=0.0,
-        description="Light of the camera's own lamp: grey level of a white surface at 1 m distance.",
+        description="Light of the camera's own lamp: grey level of a white surface at 1 m "
+        "distance.",
     )
     eclipses: tuple[Eclipse, ...] = ()
     earth: EarthSection | None = None

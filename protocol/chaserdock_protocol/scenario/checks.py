@@ -50,7 +50,8 @@ def check_flight(scenario: FlightScenario) -> None:
     _check_approach_cone(scenario)
     if scenario.ranging is not None and scenario.perception.name not in MARKER_PERCEPTIONS:
         raise ValueError(
-            f"ranging: needs a perception by markers ({', '.join(MARKER_PERCEPTIONS)}), not {scenario.perception.name!r}"
+            f"ranging: needs a perception by markers ({', '.join(MARKER_PERCEPTIONS)}), not "
+            f"{scenario.perception.name!r}"
         )
     if scenario.plume is not None and scenario.chaser.actuation != "thrusters":
         raise ValueError(
@@ -91,8 +92,8 @@ def _check_start_positions(scenario: Scenario) -> None:
             distance = math.dist(a, starts[j])
             if distance < width:
                 raise ValueError(
-                    f"chasers.{j} and chasers.{i} start {distance:.3f} m apart, inside one another; "
-                    f"their bodies need {width:.3f} m"
+                    f"chasers.{j} and chasers.{i} start {distance:.3f} m apart, inside one "
+                    f"another; their bodies need {width:.3f} m"
                 )
 
 
@@ -103,7 +104,8 @@ def _check_orbit(scenario: Scenario) -> None:
     for key in ("position_m", "velocity_m_s"):
         if any(getattr(target, key)) and not (key == "velocity_m_s" and target.motion == "static"):
             raise ValueError(
-                f"target.{key}: with [orbit], WRF is the target's Hill frame: the target starts at rest in its origin, so "
+                f"target.{key}: with [orbit], WRF is the target's Hill frame: the target starts "
+                "at rest in its origin, so "
                 "this must be [0, 0, 0]"
             )
     given = {"sun_direction", "eclipses", "earth"} & camera.model_fields_set
@@ -124,15 +126,16 @@ def _check_references(scenario: FlightScenario) -> None:
         ):
             if wrong:
                 raise ValueError(
-                    f"chasers.{i}.position_m: {distance:.3g} m from the target, {comparison} than limits.{name} "
-                    f"({getattr(limits, name):g} m) allows"
+                    f"chasers.{i}.position_m: {distance:.3g} m from the target, {comparison} "
+                    f"than limits.{name} ({getattr(limits, name):g} m) allows"
                 )
         for j, other in enumerate(scenario.chasers[:i]):
             distance = math.dist(c.position_m, other.position_m)
             if distance < limits.min_distance_chasers_m:
                 raise ValueError(
-                    f"the positions of chasers.{j} and chasers.{i} are {distance:.3g} m apart, nearer than "
-                    f"limits.min_distance_chasers_m ({limits.min_distance_chasers_m:g} m) allows"
+                    f"the positions of chasers.{j} and chasers.{i} are {distance:.3g} m apart, "
+                    "nearer than limits.min_distance_chasers_m "
+                    f"({limits.min_distance_chasers_m:g} m) allows"
                 )
 
 
@@ -170,7 +173,8 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
         return
     if scenario.controller.solver != "rti":
         raise ValueError(
-            f'limits.min_distance_shape_m: needs controller.solver = "rti", not {scenario.controller.solver!r}'
+            'limits.min_distance_shape_m: needs controller.solver = "rti", not '
+            f"{scenario.controller.solver!r}"
         )
     places = [(f"chasers.{i}.position_m", i, c.position_m) for i, c in enumerate(scenario.chasers)]
     places += [
@@ -182,14 +186,14 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
     for name, i, offset_m in places:
         if (distance_m := shape_distance_m(scenario, i, offset_m)) < least_m:
             raise ValueError(
-                f"{name}: chaser {i} is {distance_m:.3g} m from the target's shape there, nearer than "
-                f"limits.min_distance_shape_m ({least_m:g} m) allows"
+                f"{name}: chaser {i} is {distance_m:.3g} m from the target's shape there, nearer "
+                f"than limits.min_distance_shape_m ({least_m:g} m) allows"
             )
     for (i, a), (j, b) in combinations(enumerate(c.position_m for c in scenario.chasers), 2):
         if (distance_m := shapes_apart_m(scenario, (i, a), (j, b))) < least_m:
             raise ValueError(
-                f"chasers.{i} and chasers.{j} at their positions: {distance_m:.3g} m between their shapes, nearer than "
-                f"limits.min_distance_shape_m ({least_m:g} m) allows"
+                f"chasers.{i} and chasers.{j} at their positions: {distance_m:.3g} m between "
+                f"their shapes, nearer than limits.min_distance_shape_m ({least_m:g} m) allows"
             )
 
 
@@ -201,13 +205,13 @@ def _check_hold_points(scenario: FlightScenario) -> None:
         distance_m = math.hypot(*entry.offset_m)
         if distance_m <= limits.min_distance_target_m:
             raise ValueError(
-                f"timeline.{k}.offset_m: {distance_m:.3g} m from the target, inside the keep-out of "
-                f"limits.min_distance_target_m ({limits.min_distance_target_m:g} m)"
+                f"timeline.{k}.offset_m: {distance_m:.3g} m from the target, inside the keep-out "
+                f"of limits.min_distance_target_m ({limits.min_distance_target_m:g} m)"
             )
         if distance_m > limits.max_reference_distance_m:
             raise ValueError(
-                f"timeline.{k}.offset_m: {distance_m:.3g} m from the target, farther than limits.max_reference_distance_m "
-                f"({limits.max_reference_distance_m:g} m) allows"
+                f"timeline.{k}.offset_m: {distance_m:.3g} m from the target, farther than "
+                f"limits.max_reference_distance_m ({limits.max_reference_distance_m:g} m) allows"
             )
         for i in entry.chasers:
             _check_in_cone(scenario, f"timeline.{k}.offset_m", i, entry.offset_m)
@@ -222,7 +226,8 @@ def _check_in_cone(
     off_deg = angle_deg(scenario.chasers[chaser].position_m, offset_m)
     if off_deg > cone_deg:
         raise ValueError(
-            f"{path}: {off_deg:.3g} degrees off the approach axis of chaser {chaser}, outside approach.cone_deg ({cone_deg:g} degrees)"
+            f"{path}: {off_deg:.3g} degrees off the approach axis of chaser {chaser}, outside "
+            f"approach.cone_deg ({cone_deg:g} degrees)"
         )
 
 
@@ -251,8 +256,9 @@ def _check_approach_cone(scenario: FlightScenario) -> None:
         off_deg = cone_deg + angle_deg(-np.asarray(c.position_m), forward)
         if off_deg > half_deg:
             raise ValueError(
-                f"approach.cone_deg: from the edge of the cone the target is {off_deg:.3g} degrees off the view of chaser {i}, whose "
-                f"camera sees {half_deg:.3g} degrees to the nearest edge; make the cone narrower, or set approach.face_target"
+                f"approach.cone_deg: from the edge of the cone the target is {off_deg:.3g} "
+                f"degrees off the view of chaser {i}, whose camera sees {half_deg:.3g} degrees "
+                "to the nearest edge; make the cone narrower, or set approach.face_target"
             )
 
 
@@ -262,7 +268,8 @@ def _check_mesh(scenario: Scenario) -> None:
         _check_mesh_file(scenario, geometry)
     if scenario.chaser.mesh and not scenario.target_model().satellite:
         raise ValueError(
-            f"chaser.mesh: drawn only with a target that has a mesh; {scenario.target.model!r} has none"
+            f"chaser.mesh: drawn only with a target that has a mesh; {scenario.target.model!r} "
+            "has none"
         )
 
 
@@ -283,15 +290,17 @@ def _check_mesh_file(scenario: Scenario, geometry: Geometry) -> None:
         if np.linalg.norm(centre - target.centre_of_mass_m) > 0.01 * np.linalg.norm(high - low):
             at = ", ".join(f"{v:.4g}" for v in centre + geometry.mesh_origin_m)
             raise ValueError(
-                f"target.centre_of_mass_m: that of the mesh is ({', '.join(f'{v:.4g}' for v in centre)}); state it, or move "
-                f"the origin there by target.geometry.mesh_origin_m = [{at}], or state inertia_kg_m2 too"
+                "target.centre_of_mass_m: that of the mesh is "
+                f"({', '.join(f'{v:.4g}' for v in centre)}); state it, or move the origin there "
+                f"by target.geometry.mesh_origin_m = [{at}], or state inertia_kg_m2 too"
             )
 
 
 def _check_perception(scenario: FlightScenario) -> None:
     if scenario.perception.name in MARKER_PERCEPTIONS and not scenario.target_model().markers:
         raise ValueError(
-            f"perception.name: {scenario.perception.name!r} needs markers; the target {scenario.target.model!r} has none"
+            f"perception.name: {scenario.perception.name!r} needs markers; the target "
+            f"{scenario.target.model!r} has none"
         )
 
 
@@ -340,11 +349,13 @@ def _check_thruster_failures(scenario: Scenario) -> None:
         path = f"thruster_failure.{k}"
         if failure.chaser >= chasers:
             raise ValueError(
-                f"{path}.chaser: there is no chaser {failure.chaser}; this mission has 0 to {chasers - 1}"
+                f"{path}.chaser: there is no chaser {failure.chaser}; this mission has 0 to "
+                f"{chasers - 1}"
             )
         if failure.thruster >= thrusters:
             raise ValueError(
-                f"{path}.thruster: there is no thruster {failure.thruster}; the body has 0 to {thrusters - 1}"
+                f"{path}.thruster: there is no thruster {failure.thruster}; the body has 0 to "
+                f"{thrusters - 1}"
             )
         if (failure.chaser, failure.thruster) in failed:
             raise ValueError(
@@ -417,8 +428,9 @@ def _check_load_limits(scenario: Scenario) -> None:
         ):
             if limit is not None and (exerted := float(np.linalg.norm(load))) > limit:
                 raise ValueError(
-                    f"docking.ports.{k}.{key}: {limit:g} {unit} is less than the {exerted:.3g} {unit} that the tumble of "
-                    f"{rate_deg_s:.3g} degrees/s alone exerts on the port of chaser {port.chaser}"
+                    f"docking.ports.{k}.{key}: {limit:g} {unit} is less than the {exerted:.3g} "
+                    f"{unit} that the tumble of {rate_deg_s:.3g} degrees/s alone exerts on the "
+                    f"port of chaser {port.chaser}"
                 )
 
 
@@ -431,7 +443,8 @@ def _check_detumble(scenario: FlightScenario) -> None:
     detumble = scenario.detumble
     if detumble.plan_s is not None and detumble.plan_s >= detumble.timeout_s:
         raise ValueError(
-            f"detumble.plan_s: a plan of {detumble.plan_s:g} s does not end before detumble.timeout_s, {detumble.timeout_s:g} s, "
+            f"detumble.plan_s: a plan of {detumble.plan_s:g} s does not end before "
+            f"detumble.timeout_s, {detumble.timeout_s:g} s, "
             "when the thrusters close"
         )
     for k, entry in enumerate(scenario.timeline):
@@ -448,8 +461,10 @@ def _check_detumble(scenario: FlightScenario) -> None:
         for i, free in plume_free_thrusters(scenario, set(entry.chasers)).items():
             if not free.any():
                 raise ValueError(
-                    f"timeline.{k}: none of the {len(free)} thrusters of chaser {i} may fire at its port: every plume "
-                    f"(half angle detumble.plume_deg, {scenario.detumble.plume_deg:g} degrees) hits the target, a port or a chaser"
+                    f"timeline.{k}: none of the {len(free)} thrusters of chaser {i} may fire at "
+                    "its port: every plume (half angle detumble.plume_deg, "
+                    f"{scenario.detumble.plume_deg:g} degrees) hits the target, a port or a "
+                    "chaser"
                 )
 
 
@@ -464,8 +479,9 @@ def _check_stopping_time(scenario: Scenario) -> None:
         least_s = max(linear / force_N, angular / torque_N_m)
         if least_s > scenario.detumble.timeout_s:
             raise ValueError(
-                f"timeline.{k}: stopping the stack of {mass_kg:.4g} kg takes at least {least_s:.3g} s, with {linear:.3g} N s and "
-                f"{angular:.3g} N m s against at most {force_N:.3g} N and {torque_N_m:.3g} N m; detumble.timeout_s is "
+                f"timeline.{k}: stopping the stack of {mass_kg:.4g} kg takes at least "
+                f"{least_s:.3g} s, with {linear:.3g} N s and {angular:.3g} N m s against at most "
+                f"{force_N:.3g} N and {torque_N_m:.3g} N m; detumble.timeout_s is "
                 f"{scenario.detumble.timeout_s:g} s"
             )
 
@@ -537,12 +553,14 @@ def _check_capture(scenario: FlightScenario) -> None:
         )
         if entry_m <= nearest_m:
             raise ValueError(
-                f"docking.ports.{k}: its corridor begins {entry_m:.3g} m from the target's centre, inside "
-                f"limits.min_distance_target_m ({nearest_m:g} m); make docking.entry_m longer"
+                f"docking.ports.{k}: its corridor begins {entry_m:.3g} m from the target's "
+                f"centre, inside limits.min_distance_target_m ({nearest_m:g} m); make "
+                "docking.entry_m longer"
             )
         off_deg = axis_error_deg(port, np.asarray(scenario.chasers[port.chaser].q_wxyz))
         if off_deg > 0.1:
             raise ValueError(
-                f"docking.ports.{k}.axis: the +X axis of chaser {port.chaser} is {off_deg:.3g} degrees off the "
+                f"docking.ports.{k}.axis: the +X axis of chaser {port.chaser} is {off_deg:.3g} "
+                "degrees off the "
                 "axis into the port; change the attitude of the chaser or the axis"
             )

@@ -5,6 +5,8 @@ counts as stopped.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
 
 from .fields import NotNegative, Positive, Section, UnitQuaternion
@@ -26,8 +28,8 @@ class Identification(Section):
 
     enabled: bool = Field(
         default=False,
-        description="Whether mass, centre of mass and inertia are identified, and used by the control of the stack. Without it "
-        "those of `[target]` are taken as exact.",
+        description="Whether mass, centre of mass and inertia are identified, and used by the "
+        "control of the stack. Without it those of `[target]` are taken as exact.",
     )
     duration_s: Positive = Field(
         default=10.0, description="Length of the manoeuvre that the command `identify` begins, s."
@@ -46,30 +48,32 @@ class Detumble(RestLimits):
     ([detumble.md](detumble.md)).
     """
 
-    response_s: Positive = Field(
-        default=0.5,
-        description="Time in which the feedback would stop the stack with unlimited thrust, s.",
-    )
+    response_s: ClassVar[float] = 0.5
+    """Time in which the feedback would stop the stack with unlimited thrust, s: some ticks of the
+    default rate. Thrusters are far from unlimited, so that it only matters near rest."""
     timeout_s: Positive = Field(
         default=60.0,
-        description="Longest time to stop the stack, s. A command that needs longer is refused; after it the thrusters close.",
+        description="Longest time to stop the stack, s. A command that needs longer is refused; "
+        "after it the thrusters close.",
     )
     plume_deg: float = Field(
         default=20.0,
         gt=0.0,
         lt=90.0,
         allow_inf_nan=False,
-        description="Half angle of a thruster's plume, degrees. A thruster whose plume hits the target, a port or a latched "
-        "chaser does not fire.",
+        description="Half angle of a thruster's plume, degrees. A thruster whose plume hits the "
+        "target, a port or a latched chaser does not fire.",
     )
     plan_s: Positive | None = Field(
         default=None,
-        description="Time in which a plan of least propellant stops the stack, s. Without it the feedback stops it as fast as it can.",
+        description="Time in which a plan of least propellant stops the stack, s. Without it the "
+        "feedback stops it as fast as it can.",
     )
     attitude_wxyz: UnitQuaternion | None = Field(
         default=None,
-        description="Attitude that the stopped stack turns to and keeps, TRF to WRF: unit quaternion, scalar first. Without it the "
-        "stack keeps the attitude in which it stopped, within the limits of its rate.",
+        description="Attitude that the stopped stack turns to and keeps, TRF to WRF: unit "
+        "quaternion, scalar first. Without it the stack keeps the attitude in which it "
+        "stopped, within the limits of its rate.",
     )
     slew_deg_s: Positive = Field(default=1.0, description="Largest rate of that turn, degrees/s.")
     identification: Identification = Identification()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -61,7 +61,8 @@ bound is not checked); it states nothing else."""
 
 Preset = Literal["none", "idss", "atv", "soyuz"]
 _PRESET_TEXT = (
-    "Contact conditions of a docking system, in place of the defaults of the keys that it states; keys that are given override it "
+    "Contact conditions of a docking system, in place of the defaults of the keys that it "
+    "states; keys that are given override it "
     "([docking.md](docking.md#contact-conditions-of-docking-systems))."
 )
 
@@ -83,7 +84,9 @@ class _ContactConditions(Corridor):
 
 
 class Final(_ContactConditions):
-    """Limits over the last `final_m`. The closing speed is checked once the chaser has slowed down."""
+    """Limits over the last `final_m`. The closing speed is checked once the chaser has slowed
+    down.
+    """
 
     lateral_m: Positive = Field(default=0.008, description="Lateral offset of the probe's tip, m.")
     angle_deg: Positive = Field(default=2.0, description="Attitude error, degrees.")
@@ -105,12 +108,34 @@ class Tolerances(_ContactConditions):
 
 
 class Docking(Section):
-    """How docking ends. Distances are between the probe's tip and the port, along the port's axis."""
+    """How docking ends. Distances are between the probe's tip and the port, along the port's
+    axis.
+    """
+
+    # Figures of the procedure that are no keys: flight software and its checks share them.
+    overdrive_m: ClassVar[float] = 0.03
+    """How far the reference continues behind the port, m: three times the lateral tolerance at
+    contact, so that an error along the axis does not end the approach before the port."""
+    approach_timeout_s: ClassVar[float] = 60.0
+    """Longest approach to the last part, s: six times 0.25 m at 0.025 m/s."""
+    final_timeout_s: ClassVar[float] = 30.0
+    """Longest last part, s: about twice 0.13 m, with the overdrive, at 0.01 m/s."""
+    contact_timeout_s: ClassVar[float] = 5.0
+    """Longest contact without a latch, s: some rebounds of the probe of 1 cm at 0.01 m/s."""
+    settle_s: ClassVar[float] = 2.0
+    """Wait between the latch and the pull test, s: 30 ticks of the default rate for estimates."""
+    pull_s: ClassVar[float] = 1.0
+    """Duration of the pull, and of the push that follows it, s: 0.5 N move 30 kg by 8 mm if the
+    latch is open, more than `verify_position_m`."""
+    verify_position_m: ClassVar[float] = 0.005
+    """Largest displacement in the pull test, m: half of the lateral tolerance at contact."""
+    verify_angle_deg: ClassVar[float] = 0.5
+    """Largest rotation in the pull test, degrees: a sixth of the tolerance at contact."""
 
     kind: Literal["held", "capture"] = Field(
         default="held",
-        description="`held`: the chaser holds at a distance, within the tolerances of `[approach]`, as in the paper. "
-        "`capture`: it flies into its port and is latched.",
+        description="`held`: the chaser holds at a distance, within the tolerances of "
+        "`[approach]`, as in the paper. `capture`: it flies into its port and is latched.",
     )
     ports: tuple[Port, ...] = ()
     entry_m: Positive = Field(
@@ -118,9 +143,6 @@ class Docking(Section):
     )
     final_m: Positive = Field(
         default=0.10, description="Length of the last part, flown at `contact_speed_m_s`, m."
-    )
-    overdrive_m: Positive = Field(
-        default=0.03, description="How far the reference continues behind the port, m."
     )
     approach_speed_m_s: Positive = Field(
         default=0.025, description="Speed of the reference before the last part, m/s."
@@ -135,14 +157,16 @@ class Docking(Section):
         gt=0.0,
         lt=90.0,
         allow_inf_nan=False,
-        description="Half angle of the cone about the corridor's axis in which a chaser on its way in or out is planned, "
-        "degrees. It replaces `limits.min_distance_target_m` for that chaser.",
+        description="Half angle of the cone about the corridor's axis in which a chaser on its "
+        "way in or out is planned, degrees. It replaces `limits.min_distance_target_m` for "
+        "that chaser.",
     )
     final: Final = Final()
     tolerances: Tolerances = Tolerances()
     clearance_m: NotNegative = Field(
         default=0.45,
-        description="A chaser waits if its corridor comes this near to one in use, between body centres, m.",
+        description="A chaser waits if its corridor comes this near to one in use, between body "
+        "centres, m.",
     )
     at_once: int = Field(
         default=2, ge=1, description="Most chasers on their way in at the same time; others wait."
@@ -151,26 +175,7 @@ class Docking(Section):
     align_timeout_s: Positive = Field(
         default=60.0, description="Longest alignment before the corridor, s."
     )
-    approach_timeout_s: Positive = Field(
-        default=60.0, description="Longest approach to the last part, s."
-    )
-    final_timeout_s: Positive = Field(default=30.0, description="Longest last part, s.")
-    contact_timeout_s: Positive = Field(
-        default=5.0, description="Longest contact without a latch, s."
-    )
-    settle_s: Positive = Field(
-        default=2.0, description="Wait between the latch and the pull test, s."
-    )
     pull_N: Positive = Field(default=0.5, description="Force of the pull test, N.")
-    pull_s: Positive = Field(
-        default=1.0, description="Duration of the pull, and of the push that follows it, s."
-    )
-    verify_position_m: Positive = Field(
-        default=0.005, description="Largest displacement in the pull test, m."
-    )
-    verify_angle_deg: Positive = Field(
-        default=0.5, description="Largest rotation in the pull test, degrees."
-    )
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Docking:
@@ -186,8 +191,8 @@ class Docking(Section):
             )
         if self.contact_speed_m_s > self.approach_speed_m_s:
             raise ValueError(
-                f"contact_speed_m_s ({self.contact_speed_m_s:g}) must not exceed approach_speed_m_s "
-                f"({self.approach_speed_m_s:g})"
+                f"contact_speed_m_s ({self.contact_speed_m_s:g}) must not exceed "
+                f"approach_speed_m_s ({self.approach_speed_m_s:g})"
             )
         return self
 

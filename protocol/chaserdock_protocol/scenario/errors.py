@@ -16,12 +16,22 @@ from chaserdock_protocol.errors import ChaserdockError
 from .fields import LARGEST
 from .json_schema import SchemaNode, expected_text, key_paths, node_at, schema_of
 
-_LONGEST_VALUE = 60
+_LONGEST_VALUE = 60  # characters of a value in an error, so that it stays one line
 _WITH_BOUNDS = ("greater_than_equal", "less_than_equal")
 _FROM_SCHEMA = (
-    "float_type", "int_type", "bool_type", "string_type", "tuple_type", "model_type", "literal_error",
-    "greater_than", "less_than", *_WITH_BOUNDS, "too_short", "too_long",
-)  # fmt: skip
+    "float_type",
+    "int_type",
+    "bool_type",
+    "string_type",
+    "tuple_type",
+    "model_type",
+    "literal_error",
+    "greater_than",
+    "less_than",
+    *_WITH_BOUNDS,
+    "too_short",
+    "too_long",
+)
 """Kinds of errors (pydantic's names) whose text is what the schema expects."""
 
 
@@ -60,7 +70,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
 
 
 def invalid(error: ValidationError, model: type[BaseModel], source: object) -> ScenarioError:
-    """Return the error of validating ``model`` with values of ``source``, which begins each line."""
+    """Return the error of validating ``model`` with values of ``source``, which begins each
+    line.
+    """
     return ScenarioError("\n".join(f"{source}: {line}" for line in explain(error, model)))
 
 
@@ -80,7 +92,10 @@ def _line(error: Any, root: SchemaNode) -> str:
     if kind == "finite_number":
         message = "must be a finite number"
     elif kind == "string_pattern_mismatch":
-        message = "must begin with a letter or digit, and have only letters, digits, '.', '_' and '-', at most 64 in all"
+        message = (
+            "must begin with a letter or digit, and have only letters, digits, '.', '_' and '-', "
+            "at most 64 in all"
+        )
     elif kind in _FROM_SCHEMA and expected:
         message = f"must be {expected}"
     else:

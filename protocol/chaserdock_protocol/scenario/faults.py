@@ -111,7 +111,8 @@ def role_of(process: str) -> Role:
 def _check_process_name(name: str) -> str:
     if not topics.is_member_name(name) or name == "operator":
         raise ValueError(
-            f"{name!r} is no process of a mission; valid: world, controller, standby, chaser/NUMBER, recorder"
+            f"{name!r} is no process of a mission; valid: world, controller, standby, "
+            "chaser/NUMBER, recorder"
         )
     return name
 
@@ -129,9 +130,10 @@ class Fault(Section):
         description="Duration, s of mission time; of wall time for `freeze`. `kill` has none.",
     )
     process: Process = Field(
-        description="Process that is affected: `world`, `controller`, `standby`, `chaser/NUMBER` or `recorder`. Faults of "
-        "messages affect what it receives; `flood`, `clock_jump`, `lying_sensor` and `odometry_lie` what it publishes; "
-        "`latch_slip`, `latch_open` and `latch_stuck` its latch."
+        description="Process that is affected: `world`, `controller`, `standby`, `chaser/NUMBER` "
+        "or `recorder`. Faults of messages affect what it receives; `flood`, `clock_jump`, "
+        "`lying_sensor` and `odometry_lie` what it publishes; `latch_slip`, `latch_open` and "
+        "`latch_stuck` its latch."
     )
     peer: Process | None = Field(
         default=None, description="Limits the fault to messages from this process."
@@ -142,7 +144,8 @@ class Fault(Section):
         gt=0,
         le=1,
         allow_inf_nan=False,
-        description="Share of the messages that are affected, drawn from the scenario's seed. Without it: all.",
+        description="Share of the messages that are affected, drawn from the scenario's seed. "
+        "Without it: all.",
     )
     delay_s: Positive | None = Field(default=None, description="Delay of each message, s.")
     copies: int | None = Field(
@@ -157,7 +160,8 @@ class Fault(Section):
     )
     rotation_deg: Vector | None = Field(
         default=None,
-        description="Error of the attitude, rotation vector, degrees: of sightings in IRF, of odometry in CRF.",
+        description="Error of the attitude, rotation vector, degrees: of sightings in IRF, of "
+        "odometry in CRF.",
     )
 
     force_N: Positive | None = Field(
@@ -275,7 +279,8 @@ def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:
             head, _, number = name.partition("/")
             if head == "chaser" and int(number) >= chasers:
                 raise ValueError(
-                    f"fault.{k}: there is no {name}; this mission has chaser/0 to chaser/{chasers - 1}"
+                    f"fault.{k}: there is no {name}; this mission has chaser/0 to "
+                    f"chaser/{chasers - 1}"
                 )
         if fault.topic == "thrusters" and scenario.chaser.actuation != "thrusters":
             raise ValueError(
@@ -290,6 +295,7 @@ def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:
             and scenario.docking.port_of(int(fault.process.partition("/")[2])) is None
         ):
             raise ValueError(
-                f"fault.{k}: {fault.kind} cannot happen to {fault.process}, which has no port; see docking.kind and "
+                f"fault.{k}: {fault.kind} cannot happen to {fault.process}, which has no port; "
+                "see docking.kind and "
                 "[[docking.ports]]"
             )

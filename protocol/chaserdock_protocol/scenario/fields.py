@@ -145,7 +145,8 @@ class Oriented(Section):
     attitude_deg: EulerAngles | None = Field(
         default=None,
         exclude=True,
-        description="Alternative to `q_wxyz`: Euler angles `{ roll, pitch, yaw }` in degrees, intrinsic z-y-x.",
+        description="Alternative to `q_wxyz`: Euler angles `{ roll, pitch, yaw }` in degrees, "
+        "intrinsic z-y-x.",
     )
 
     @model_validator(mode="before")

@@ -163,7 +163,8 @@ def read_calibration(path: Path) -> dict[str, Any]:
         coefficients.pop()
     if len(coefficients) not in (0, 4, 5):
         raise ScenarioError(
-            f"{path}: distortion_coefficients must be k1, k2, p1, p2[, k3]; these are {len(coefficients)}"
+            f"{path}: distortion_coefficients must be k1, k2, p1, p2[, k3]; these are "
+            f"{len(coefficients)}"
         )
     return {
         "width_px": int(width),

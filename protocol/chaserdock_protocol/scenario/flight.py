@@ -114,7 +114,9 @@ _FLIGHT: TypeAdapter[FlightScenario] = TypeAdapter(FlightScenario)
 
 
 def flight_scenario(scenario: FlightScenario) -> FlightScenario:
-    """Return the part of a scenario that flight software receives; the object holds nothing else."""
+    """Return the part of a scenario that flight software receives; the object holds nothing
+    else.
+    """
     return FlightScenario.model_validate_json(flight_scenario_json(scenario))
 
 

@@ -21,7 +21,8 @@ class Inspection(Section):
     )
     axis: Vector = Field(
         default=(1.0, 1.0, 1.0),
-        description="Axis of the turn (TRF), any length but 0. Chasers that are commanded together keep their angles to each other.",
+        description="Axis of the turn (TRF), any length but 0. Chasers that are commanded "
+        "together keep their angles to each other.",
     )
 
     @model_validator(mode="after")

@@ -131,7 +131,8 @@ def _check_camera(before: Values, after: Values, source: str) -> None:
     for key in REPLACED_BY_INTRINSICS if now.get("intrinsics") else ():
         if now.get(key) != was.get(key):
             raise ScenarioError(
-                f"{source}: camera.{key}: not used with camera.intrinsics; change camera.intrinsics instead"
+                f"{source}: camera.{key}: not used with camera.intrinsics; change "
+                "camera.intrinsics instead"
             )
         now.pop(key, None)
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mesh files (GLB, glTF, OBJ, STL, PLY), read and written through trimesh; every problem is one
-line that says what would be right.
+"""Read mesh files (GLB, glTF, OBJ, STL, PLY) through trimesh; every problem is one line that says
+what would be right.
 
 A part is a node of the file with its material. What the format cannot say (texture, density,
-joints) is in the extras of nodes and scene under ``chaserdock``, as `write_mesh` leaves it.
+joints) is in the extras of nodes and scene under ``EXTRAS``, as `chaserdock target --mesh` writes
+them.
 """
 
 from __future__ import annotations
@@ -24,11 +25,15 @@ from pydantic import ValidationError
 from .errors import ScenarioError
 from .surface import MAX_PARTS, MAX_TRIANGLES, SUFFIXES, Surface, SurfaceJoint, SurfaceMaterial
 
-EXPORT_SUFFIXES = (".glb", ".obj")
-_EXTRAS = "chaserdock"
+EXTRAS = "chaserdock"
+"""Key of a node's extras, and of a scene's, with what the format itself cannot say."""
 _SMALLEST_M, _LARGEST_M = 0.02, 50.0
+"""Sizes of a target: from a pocket satellite to half a space station. Others are a wrong unit."""
 _MOST_READ = 5_000_000
+"""Triangles of a file, 250 for each that is drawn: bounds time and memory of reading it."""
 _WELD_SHARE = 1e-7
+"""Vertices nearer than this share of the size are one: the rounding of single precision, in which
+most formats store them."""
 _UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (1000.0, "kilometres"))
 
 
@@ -76,61 +81,15 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
     mesh, deviation_m = decimation.limited(mesh, MAX_TRIANGLES)
     if before > MAX_TRIANGLES:
         notes.append(
-            f"decimated from {before:,} to {mesh.triangle_count:,} triangles; largest deviation {1e3 * deviation_m:.2f} mm"
+            f"decimated from {before:,} to {mesh.triangle_count:,} triangles; largest deviation "
+            f"{1e3 * deviation_m:.2f} mm"
         )
         if mesh.triangle_count > 2 * MAX_TRIANGLES:
             raise ScenarioError(
-                f"{path}: {before:,} triangles in many parts or with many handles; simplify it to {MAX_TRIANGLES:,}"
+                f"{path}: {before:,} triangles in many parts or with many handles; simplify it "
+                f"to {MAX_TRIANGLES:,}"
             )
     return MeshFile(mesh, tuple(notes), deviation_m)
-
-
-def write_mesh(mesh: TriangleMesh, path: Path) -> None:
-    """Write a mesh as GLB, or as OBJ with its materials beside it. Raises OSError, and ValueError
-    for another ending.
-    """
-    import trimesh
-    from trimesh.exchange.gltf import export_glb
-    from trimesh.exchange.obj import export_obj
-    from trimesh.visual import TextureVisuals
-
-    if path.suffix.lower() not in EXPORT_SUFFIXES:
-        raise ValueError(f"must end in {' or '.join(EXPORT_SUFFIXES)}")
-    scene = trimesh.Scene()
-    scene.metadata[_EXTRAS] = {"joints": {name: list(at) for name, at in mesh.joints.items()}}
-    for part in mesh.parts:
-        solid = trimesh.Trimesh(part.vertices_m, part.triangles, process=False)
-        material = _pbr(part.material) if path.suffix.lower() == ".glb" else _phong(part.material)
-        solid.visual = TextureVisuals(material=material)
-        extras = {"material": SurfaceMaterial.of(part.material).model_dump(), "joint": part.joint}
-        solid.metadata[_EXTRAS] = extras
-        scene.add_geometry(solid, node_name=part.name, geom_name=part.name)
-    if path.suffix.lower() == ".glb":
-        path.write_bytes(export_glb(scene))
-        return
-    text, files = export_obj(scene, return_texture=True, mtl_name=f"{path.stem}.mtl")
-    for name, data in files.items():
-        (path.parent / name).write_bytes(data)
-    path.write_text(text)
-
-
-def _pbr(m: Material) -> Any:
-    from trimesh.visual.material import PBRMaterial
-
-    grey = [m.diffuse] * 3
-    roughness = (2.0 / (m.shininess + 2.0)) ** 0.25
-    return PBRMaterial(
-        name=m.name, baseColorFactor=[*grey, 1.0], metallicFactor=0.0, roughnessFactor=roughness
-    )
-
-
-def _phong(m: Material) -> Any:
-    from trimesh.visual.material import SimpleMaterial
-
-    grey, gloss = [round(255 * m.diffuse)] * 3, [round(255 * m.specular)] * 3
-    return SimpleMaterial(
-        name=m.name.replace(" ", "_"), diffuse=[*grey, 255], ambient=[*grey, 255], specular=[*gloss, 255], glossiness=m.shininess
-    )  # fmt: skip
 
 
 def _load(path: Path) -> Any:
@@ -188,14 +147,15 @@ def _part(
     if not np.all(np.isfinite(vertices)):
         raise ScenarioError(f"{path}: part {plain!r} has a vertex that is not a number")
     vertices, triangles = _welded(vertices, triangles)
-    extras = geometry.metadata.get(_EXTRAS) if isinstance(geometry.metadata, dict) else None
+    extras = geometry.metadata.get(EXTRAS) if isinstance(geometry.metadata, dict) else None
     if extras is None:
         return MeshPart(plain, _material(plain, geometry, notes), vertices, triangles)
     try:
         material = SurfaceMaterial.model_validate(extras.get("material", {})).material()
     except (ValidationError, AttributeError):
         raise ScenarioError(
-            f"{path}: part {plain!r}: its extras {_EXTRAS!r} must be as `chaserdock mesh export` writes them"
+            f"{path}: part {plain!r}: its extras {EXTRAS!r} must be as `chaserdock target "
+            "--mesh` writes them"
         ) from None
     return MeshPart(plain, material, vertices, triangles, str(extras.get("joint", "")))
 
@@ -225,14 +185,14 @@ def _with_unique_names(parts: list[MeshPart]) -> list[MeshPart]:
 
 
 def _joints(path: Path, scene: Any, scale: float, origin_m: Array) -> dict[str, Vector3]:
-    extras = scene.metadata.get(_EXTRAS, {}) if isinstance(scene.metadata, dict) else {}
+    extras = scene.metadata.get(EXTRAS, {}) if isinstance(scene.metadata, dict) else {}
     try:
         joints = [
             SurfaceJoint(name=k, position_m=tuple(at)) for k, at in extras.get("joints", {}).items()
         ]
     except (ValidationError, AttributeError, TypeError):
         raise ScenarioError(
-            f"{path}: its extras {_EXTRAS!r} must be as `chaserdock mesh export` writes them"
+            f"{path}: its extras {EXTRAS!r} must be as `chaserdock target --mesh` writes them"
         ) from None
     return {j.name: tuple((scale * np.array(j.position_m) - origin_m).tolist()) for j in joints}
 
@@ -323,14 +283,17 @@ def _check_size(path: Path, mesh: TriangleMesh, scale: float) -> None:
 
 
 def _closed(path: Path, part: MeshPart, notes: list[str]) -> MeshPart:
-    """Return a part with its triangles counter-clockwise. Raises ScenarioError for one with holes."""
+    """Return a part with its triangles counter-clockwise. Raises ScenarioError for one with
+    holes.
+    """
     if open_edges(part):
         part = _consistent(part)
     at = hole_m(part)
     if at is not None:
         x, y, z = at.tolist()
         raise ScenarioError(
-            f"{path}: part {part.name!r} has a hole: {open_edges(part)} open edges, one near ({x:.3f}, {y:.3f}, {z:.3f}) m; "
+            f"{path}: part {part.name!r} has a hole: {open_edges(part)} open edges, one near "
+            f"({x:.3f}, {y:.3f}, {z:.3f}) m; "
             "close its surface (a sheet needs a thickness)"
         )
     volume = volume_m3(part)

@@ -57,9 +57,25 @@ _MOVED_KEYS: dict[tuple[str, ...], str] = {
 
 _REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
     ("camera", "renderer"): ("exact", "PyBullet's renderer is not a part of chaserdock any more"),
+    **{
+        path: (value, f"it is {value:g} in every flight now")
+        for path, value in {
+            ("docking", "overdrive_m"): 0.03,
+            ("docking", "approach_timeout_s"): 60.0,
+            ("docking", "final_timeout_s"): 30.0,
+            ("docking", "contact_timeout_s"): 5.0,
+            ("docking", "settle_s"): 2.0,
+            ("docking", "pull_s"): 1.0,
+            ("docking", "verify_position_m"): 0.005,
+            ("docking", "verify_angle_deg"): 0.5,
+            ("detumble", "response_s"): 0.5,
+            ("chaser", "modulation", "schmitt_on"): 0.75,
+            ("chaser", "modulation", "schmitt_off"): 0.25,
+        }.items()
+    },
 }
-"""Path of a key of format 3 that was removed -> the value that states what is always done now, and
-what became of the others.
+"""Path of a removed key of format 3 -> the value that every flight has now, which is accepted, and
+why no other is.
 """
 
 
@@ -78,7 +94,7 @@ def _holders(
 
 
 def drop_removed_keys(values: dict[str, Any]) -> None:
-    """Remove, in place, keys that state what is always done now."""
+    """Delete, in place, removed keys that state what every flight does now."""
     for path, (value, _) in _REMOVED_KEYS.items():
         for table, _ in _holders(values, path):
             if table[path[-1]] == value:
@@ -115,14 +131,17 @@ def old_format(values: dict[str, Any]) -> list[str]:
         lines = old_keys(values)
         if "navigation" not in values and "odometry" not in values:
             lines.append(
-                'odometry and cameras are not exact by default any more (navigation.grade = "exact")'
+                "odometry and cameras are not exact by default any more (navigation.grade = "
+                '"exact")'
             )
         changes = "; ".join(lines) or "no key of this file has another name"
         return [
-            f"format: {stated} is not supported any more; set format = {FORMAT} and change: {changes}"
+            f"format: {stated} is not supported any more; set format = {FORMAT} and change: "
+            f"{changes}"
         ]
     return [
-        f"format: must be {FORMAT}, the format that this version of chaserdock reads (got {stated!r})"
+        f"format: must be {FORMAT}, the format that this version of chaserdock reads (got "
+        f"{stated!r})"
     ]
 
 

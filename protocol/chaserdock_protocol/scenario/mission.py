@@ -35,7 +35,8 @@ class Chaser(FlightChaser):
     )
     start_rotation_rad: Vector = Field(
         default=(0.0, 0.0, 0.0),
-        description="Initial attitude relative to the reference attitude: rotation vector (CRF), rad.",
+        description="Initial attitude relative to the reference attitude: rotation vector (CRF), "
+        "rad.",
     )
     start_velocity_m_s: Vector = Field(
         default=(0.0, 0.0, 0.0), description="Initial velocity (WRF), m/s."
@@ -64,15 +65,16 @@ class Success(Section):
     )
     detumbled: RestLimits | None = Field(
         default=None,
-        description="Rates that the stack of target and latched chasers must not exceed at the end.",
+        description="Rates that the stack of target and latched chasers must not exceed at the "
+        "end.",
     )
     speed_limit: SpeedLimit | None = None
     approach_cone: ConeLimit | None = None
     arrival: Arrival | None = None
     abort_clear_m: Positive | None = Field(
         default=None,
-        description="Half edge of the cube about the target's centre, along the axes of TRF, out of which the centre of a chaser must "
-        "stay from its first abort on, m.",
+        description="Half edge of the cube about the target's centre, along the axes of TRF, out "
+        "of which the centre of a chaser must stay from its first abort on, m.",
     )
     max_collisions: int = Field(default=0, ge=0, description="Largest number of collisions.")
     keep_distances: bool = Field(
@@ -80,7 +82,8 @@ class Success(Section):
     )
     keep_load_limits: bool = Field(
         default=True,
-        description="Whether `force_limit_N` and `torque_limit_N_m` of `[[docking.ports]]` must be kept in every physics step.",
+        description="Whether `force_limit_N` and `torque_limit_N_m` of `[[docking.ports]]` must "
+        "be kept in every physics step.",
     )
     steady_position_rms_m: Positive | None = Field(
         default=None,
@@ -110,8 +113,8 @@ class Scenario(FlightScenario):
     extends: str | None = Field(
         default=None,
         exclude=True,
-        description="Scenario that this one is a variant of: the name of a shipped scenario, or the path of a file "
-        "relative to this one.",
+        description="Scenario that this one is a variant of: the name of a shipped scenario, or "
+        "the path of a file relative to this one.",
     )
     description: str = Field(default="", description="One sentence for lists and reports.")
     settling_s: NotNegative = Field(
@@ -119,7 +122,8 @@ class Scenario(FlightScenario):
     )
     steady_until_s: Positive | None = Field(
         default=None,
-        description="End of the steady interval, s of mission time. Without it: the end of the mission.",
+        description="End of the steady interval, s of mission time. Without it: the end of the "
+        "mission.",
     )
     seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of everything random.")
     # Fields are frozen, so that a narrower type than the flight scenario's is sound.

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 
 def nominal_mounting(scenario: FlightScenario, chaser: int) -> MountedChaser:
-    """Return where a chaser is that is latched exactly at its port. Raises ValueError without one."""
+    """Return where a chaser is that is latched exactly at its port. Raises ValueError without
+    one.
+    """
     port = scenario.docking.port_of(chaser)
     if port is None:
         raise ValueError(f"chaser {chaser} has no port")

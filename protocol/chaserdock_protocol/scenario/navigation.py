@@ -115,8 +115,8 @@ class NavigationSection(Section):
 
     grade: Literal["exact", "lab", "orbit", "poor"] = Field(
         default="lab",
-        description="`exact`: no errors. `lab`: motion capture. `orbit`: differential GNSS, star tracker and gyro. "
-        "`poor`: three times `orbit`.",
+        description="`exact`: no errors. `lab`: motion capture. `orbit`: differential GNSS, star "
+        "tracker and gyro. `poor`: three times `orbit`.",
     )
     position_noise_m: Metres | None = Field(
         default=None, description="White noise of the position (WRF), m, drawn each tick."
@@ -133,7 +133,8 @@ class NavigationSection(Section):
     )
     attitude_noise_deg: Degrees | None = Field(
         default=None,
-        description="White noise of the attitude about y and z (rotation vector, CRF), degrees, drawn each tick.",
+        description="White noise of the attitude about y and z (rotation vector, CRF), degrees, "
+        "drawn each tick.",
     )
     attitude_roll_noise_deg: Degrees | None = Field(
         default=None,
@@ -141,7 +142,8 @@ class NavigationSection(Section):
     )
     attitude_drift_deg: Degrees | None = Field(
         default=None,
-        description="Time-correlated error of the attitude (rotation vector, CRF; Gauss-Markov process), degrees.",
+        description="Time-correlated error of the attitude (rotation vector, CRF; Gauss-Markov "
+        "process), degrees.",
     )
     attitude_drift_time_s: Duration | None = Field(
         default=None, description="Correlation time of `attitude_drift_deg`, s. Without it: 300."
@@ -152,7 +154,8 @@ class NavigationSection(Section):
     )
     gyro_bias_deg_s: Degrees | None = Field(
         default=None,
-        description="Constant offset of the angular velocity (CRF), degrees/s, drawn once per mission and chaser.",
+        description="Constant offset of the angular velocity (CRF), degrees/s, drawn once per "
+        "mission and chaser.",
     )
     position_bias_m: Metres | None = Field(
         default=None,
@@ -160,11 +163,13 @@ class NavigationSection(Section):
     )
     attitude_bias_deg: Degrees | None = Field(
         default=None,
-        description="Constant offset of the attitude (rotation vector, CRF), degrees, drawn once per mission and chaser.",
+        description="Constant offset of the attitude (rotation vector, CRF), degrees, drawn once "
+        "per mission and chaser.",
     )
     camera_turn_deg: Degrees | None = Field(
         default=None,
-        description="Rotation of each camera from its calibrated mounting (rotation vector, CRF), degrees.",
+        description="Rotation of each camera from its calibrated mounting (rotation vector, "
+        "CRF), degrees.",
     )
     camera_shift_m: Metres | None = Field(
         default=None, description="Shift of each camera from its calibrated position (CRF), m."

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from .fields import Positive, Section
 
 LOWEST_ALTITUDE_M = 100e3
+"""Where the table of the atmosphere begins; below, no orbit lasts for a revolution."""
 Angle = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
 
 
@@ -54,7 +55,8 @@ class Orbit(Section):
     )
     epoch: Annotated[datetime, BeforeValidator(_moment)] = Field(
         default=datetime(2026, 3, 20, 12, tzinfo=UTC),
-        description="Begin of the mission, with a time zone. The direction to the sun depends on it.",
+        description="Begin of the mission, with a time zone. The direction to the sun depends on "
+        "it.",
     )
     j2: bool = Field(
         default=True,
@@ -62,8 +64,8 @@ class Orbit(Section):
     )
     target_ballistic_coefficient_kg_m2: Positive | None = Field(
         default=None,
-        description="Mass of the target over its drag coefficient and area, kg/m². Without both this and the chasers': no "
-        "differential drag.",
+        description="Mass of the target over its drag coefficient and area, kg/m². Without both "
+        "this and the chasers': no differential drag.",
     )
     chaser_ballistic_coefficient_kg_m2: Positive | None = Field(
         default=None, description="The same of a chaser, kg/m²."
@@ -84,8 +86,8 @@ class Orbit(Section):
         lowest_m = self.elements.perigee_radius_m - EARTH_RADIUS_M
         if lowest_m < 0.0:
             raise ValueError(
-                f"the orbit lies inside the Earth: its perigee is {-lowest_m / 1e3:.1f} km below the surface "
-                f"(radius {EARTH_RADIUS_M / 1e3:.1f} km)"
+                f"the orbit lies inside the Earth: its perigee is {-lowest_m / 1e3:.1f} km below "
+                f"the surface (radius {EARTH_RADIUS_M / 1e3:.1f} km)"
             )
         if lowest_m < LOWEST_ALTITUDE_M:
             raise ValueError(
@@ -95,7 +97,8 @@ class Orbit(Section):
         drag = (self.target_ballistic_coefficient_kg_m2, self.chaser_ballistic_coefficient_kg_m2)
         if drag.count(None) == 1:
             raise ValueError(
-                "target_ballistic_coefficient_kg_m2, chaser_ballistic_coefficient_kg_m2: give both or none"
+                "target_ballistic_coefficient_kg_m2, chaser_ballistic_coefficient_kg_m2: give "
+                "both or none"
             )
         return self
 

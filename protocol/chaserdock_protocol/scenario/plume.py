@@ -29,8 +29,9 @@ class PlumeSection(Section):
     reach_m: Positive = Field(default=10.0, description="Distance up to which a plume acts, m.")
     avoid_factor: NotNegative = Field(
         default=10.0,
-        description="A thruster whose plume hits the target or another chaser within `reach_m` (half angle `detumble.plume_deg`) "
-        "costs so many times more in the allocation, in addition: it fires only where others cannot give the wrench. 0: no avoidance.",
+        description="A thruster whose plume hits the target or another chaser within `reach_m` "
+        "(half angle `detumble.plume_deg`) costs so many times more in the allocation, in "
+        "addition: it fires only where others cannot give the wrench. 0: no avoidance.",
     )
 
     def flux(self) -> PlumeFlux:

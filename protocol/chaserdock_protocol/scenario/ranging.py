@@ -31,7 +31,8 @@ class Ranging(Section):
     bearing_noise_deg: Positive = Field(
         default=0.005,
         lt=10,
-        description="Standard deviation of the bearing per axis, degrees: about a tenth of a pixel. Used by "
+        description="Standard deviation of the bearing per axis, degrees: about a tenth of a "
+        "pixel. Used by "
         '`perception.name = "statistical"` only.',
     )
     attitude_noise_deg: Positive = Field(

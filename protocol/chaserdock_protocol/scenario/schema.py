@@ -29,7 +29,7 @@ from .fields import (
 MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
 PERCEPTIONS = (*MARKER_PERCEPTIONS, "model")
 ESTIMATORS = ("joint", "paper")
-SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
+SOLVERS = ("rti", "ipopt", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see
 ``plugins``).
 """
@@ -60,7 +60,8 @@ class Time(Section):
     )
     latency_s: NotNegative = Field(
         default=1.0 / 30.0,
-        description="Time from a tick to the effect of the commands computed from it, s, rounded to physics steps.",
+        description="Time from a tick to the effect of the commands computed from it, s, rounded "
+        "to physics steps.",
     )
 
     @model_validator(mode="after")
@@ -86,8 +87,9 @@ class EstimatorSection(Section):
     )
     target_acceleration_noise: Positive | None = Field(
         default=None,
-        description="Of `joint`: square root of the spectral density of the target's unmodelled acceleration, m/s²/√Hz. Not set: 1e-5 "
-        "for `torque_free`, otherwise 5e-6. Far away it decides how well the relative velocity is known.",
+        description="Of `joint`: square root of the spectral density of the target's unmodelled "
+        "acceleration, m/s²/√Hz. Not set: 1e-5 for `torque_free`, otherwise 5e-6. Far away "
+        "it decides how well the relative velocity is known.",
     )
     target_angular_noise: Positive | None = Field(
         default=None, description="The same of its angular acceleration, rad/s²/√Hz."
@@ -99,17 +101,16 @@ class PerceptionSection(Section):
 
     name: Name = Field(
         default="default",
-        description="`default`, `paper` (the paper's method, with EPnP), `paper_iterative` (the same with OpenCV's iterative PnP, "
-        "as in the authors' public code), `model` (by the target's shape, without markers: [markerless.md](markerless.md)), "
-        "`statistical` (no images: measurements are drawn around the true pose, [simulation.md](simulation.md)), or an installed "
-        "plugin.",
+        description="`default`, `paper` (the paper's method, with EPnP), `paper_iterative` (the "
+        "same with OpenCV's iterative PnP, as in the authors' public code), `model` (by the "
+        "target's shape, without markers: [markerless.md](markerless.md)), `statistical` (no "
+        "images: measurements are drawn around the true pose, "
+        "[simulation.md](simulation.md)), or an installed plugin.",
     )
 
 
-class Controller(Section):
-    """The NMPC: solver, horizon and weights ([controller.md](controller.md) relates them to the
-    paper's symbols).
-    """
+class ControllerOptions(Section):
+    """Keys of `Controller` that are no part of the NMPC's problem."""
 
     standby: bool = Field(
         default=False,
@@ -122,12 +123,31 @@ class Controller(Section):
     max_iterations: int | None = Field(
         default=None,
         ge=0,
-        description="Most iterations per solve, as the solver counts them. Without it: the solver's default.",
+        description="Most iterations per solve, as the solver counts them. Without it: the "
+        "solver's default.",
     )
     solve_budget_s: Positive | None = Field(
         default=None,
-        description="Wall time per solve, s: in real time, limits the iterations to what fits. Only with the solver `rti`.",
+        description="Wall time per solve, s: in real time, limits the iterations to what fits. "
+        "Only with the solver `rti`.",
     )
+    feed_forward: bool = Field(
+        default=True,
+        description="Count the input cost from the force and torque that the reference motion needs. Otherwise from zero, "
+        "as in the paper.",
+    )
+    command_lifetime_s: Positive = Field(
+        default=0.5, description="Age at which a chaser rejects a command and uses its fallback, s."
+    )
+
+
+class Controller(ControllerOptions):
+    """The NMPC: solver, horizon and weights ([controller.md](controller.md) relates them to the
+    paper's symbols).
+    """
+
+    # Each of these reaches the solver: a parameter of the problem, or a setting of one of its terms
+    # (controller/chaserdock_controller/nmpc/terms), under the same name. Any other is an error.
     horizon_s: Positive = Field(
         default=3.0,
         description=f"Prediction horizon, s: at least one and at most {MAX_STAGES} steps `dt_s`.",
@@ -135,7 +155,8 @@ class Controller(Section):
     dt_s: Positive = Field(default=0.1, description="Step of the prediction, s.")
     falloff: Fraction = Field(
         default=0.0,
-        description="Linear decrease of the stage weights along the horizon: 0 is constant, 1 ends at zero.",
+        description="Linear decrease of the stage weights along the horizon: 0 is constant, 1 "
+        "ends at zero.",
     )
     weight_position: NotNegative = Field(
         default=65.0, description="Weight of the position error, 1/m²."
@@ -156,14 +177,6 @@ class Controller(Section):
     )
     integrator: Literal["rk4", "euler"] = Field(
         default="rk4", description="Integrator of the prediction."
-    )
-    feed_forward: bool = Field(
-        default=True,
-        description="Count the input cost from the force and torque that the reference motion needs. Otherwise from zero, "
-        "as in the paper.",
-    )
-    command_lifetime_s: Positive = Field(
-        default=0.5, description="Age at which a chaser rejects a command and uses its fallback, s."
     )
 
     @model_validator(mode="after")
@@ -190,14 +203,16 @@ class Limits(Section):
     )
     estimate_margin_sigmas: NotNegative = Field(
         default=3.0,
-        description="Standard deviations of a chaser's estimated position relative to the target that are added to "
-        "`min_distance_target_m`, at most 0.1 m in all.",
+        description="Standard deviations of a chaser's estimated position relative to the target "
+        "that are added to `min_distance_target_m`, at most 0.1 m in all.",
     )
     min_distance_shape_m: NotNegative = Field(
         default=0.0,
-        description="Smallest distance of a chaser's shape (body and probe) from each cuboid of the target's shape (bus, panels, "
-        "booms) and from the shapes of other chasers, m, outside of corridors, in addition to `min_distance_target_m` and "
-        "`min_distance_chasers_m`, which may then be smaller or 0. 0: off. Needs the solver `rti`.",
+        description="Smallest distance of a chaser's shape (body and probe) from each cuboid of "
+        "the target's shape (bus, panels, booms) and from the shapes of other chasers, m, "
+        "outside of corridors, in addition to `min_distance_target_m` and "
+        "`min_distance_chasers_m`, which may then be smaller or 0. 0: off. Needs the solver "
+        "`rti`.",
     )
     min_distance_chasers_m: NotNegative = Field(
         default=0.35, description="Smallest distance between chasers, m."
@@ -207,14 +222,17 @@ class Limits(Section):
     )
     passive_safety: Literal["off", "monitor", "enforce"] = Field(
         default="off",
-        description="`monitor`: at every tick, whether the coast after a loss of all thrust at any moment of the plan stays "
-        "outside `min_distance_target_m`; the certificate is published and changes are logged. `enforce`: outside the final corridor, "
-        "plans are kept safe by constraints, moves are as slow as this needs, moves that cannot be safe are refused, and a chaser "
-        "whose plans are not safe aborts onto a safe coast. Needs the estimator `joint`, and `enforce` the solver `rti`.",
+        description="`monitor`: at every tick, whether the coast after a loss of all thrust at "
+        "any moment of the plan stays outside `min_distance_target_m`; the certificate is "
+        "published and changes are logged. `enforce`: outside the final corridor, plans are "
+        "kept safe by constraints, moves are as slow as this needs, moves that cannot be "
+        "safe are refused, and a chaser whose plans are not safe aborts onto a safe coast. "
+        "Needs the estimator `joint`, and `enforce` the solver `rti`.",
     )
     final_corridor_m: NotNegative = Field(
         default=0.0,
-        description='Distance from the target within which `passive_safety = "enforce"` does not apply, m. It never applies in the '
+        description='Distance from the target within which `passive_safety = "enforce"` does not '
+        "apply, m. It never applies in the "
         "corridor of a port.",
     )
     passive_safety_s: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] | None = Field(
@@ -231,17 +249,20 @@ class Approach(Section):
     )
     max_speed_m_s: Positive = Field(
         default=0.03,
-        description="Speed of the reference relative to the target, m/s. `goto` flies at twice this speed.",
+        description="Speed of the reference relative to the target, m/s. `goto` flies at twice "
+        "this speed.",
     )
     closing_per_s: NotNegative = Field(
         default=0.0,
-        description="Increase of the speed limit of `goto` with the distance from the target, 1/s: `goto` flies at most at "
-        "2 `max_speed_m_s` + `closing_per_s` x distance, all along its way.",
+        description="Increase of the speed limit of `goto` with the distance from the target, "
+        "1/s: `goto` flies at most at 2 `max_speed_m_s` + `closing_per_s` x distance, all "
+        "along its way.",
     )
     cone_deg: Annotated[float, Field(gt=0, lt=90, allow_inf_nan=False)] | None = Field(
         default=None,
-        description="Half angle of the approach cone about the direction of a chaser's reference position, apex at the target's "
-        "centre, degrees: a `goto` out of it is refused. The camera must see the target from its edge. Without it: no cone.",
+        description="Half angle of the approach cone about the direction of a chaser's reference "
+        "position, apex at the target's centre, degrees: a `goto` out of it is refused. The "
+        "camera must see the target from its edge. Without it: no cone.",
     )
     docked_position_m: Positive = Field(
         default=0.01, description="Largest position error of a docked chaser, m."
@@ -254,8 +275,8 @@ class Approach(Section):
     )
     face_target: bool = Field(
         default=False,
-        description="Turn the reference attitude with the position, so that a chaser faces the target after a `goto`. "
-        "Otherwise it keeps its attitude in TRF.",
+        description="Turn the reference attitude with the position, so that a chaser faces the "
+        "target after a `goto`. Otherwise it keeps its attitude in TRF.",
     )
 
 
@@ -264,12 +285,14 @@ class FlightChaser(Oriented):
 
     position_m: Vector = Field(description="Reference position (TRF), m. Not the origin.")
     q_wxyz: UnitQuaternion = Field(
-        description="Reference attitude, CRF to TRF: unit quaternion, scalar first. Or give `attitude_deg` or `look_at`."
+        description="Reference attitude, CRF to TRF: unit quaternion, scalar first. Or give "
+        "`attitude_deg` or `look_at`."
     )
     look_at: LookAt | None = Field(
         default=None,
         exclude=True,
-        description="Alternative to `q_wxyz`: point +X, and so the camera, at the target's centre, without roll.",
+        description="Alternative to `q_wxyz`: point +X, and so the camera, at the target's "
+        "centre, without roll.",
     )
 
     @model_validator(mode="after")
@@ -286,10 +309,11 @@ class TimelineEntry(Section):
 
     at_s: NotNegative = Field(description="Mission time, s.")
     command: OperatorCommandName = Field(
-        description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to the reference position. "
-        "`abort`: the same, twice as fast. `goto`: fly to `offset_m`. `calibrate`: manoeuvre to calibrate the camera. "
-        "`inspect`: fly around the target and estimate its geometry. "
-        "`identify`: fire pulses that show the mass properties of the stack. `detumble`: stop the target with latched chasers. "
+        description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to "
+        "the reference position. `abort`: the same, twice as fast. `goto`: fly to "
+        "`offset_m`. `calibrate`: manoeuvre to calibrate the camera. `inspect`: fly around "
+        "the target and estimate its geometry. `identify`: fire pulses that show the mass "
+        "properties of the stack. `detumble`: stop the target with latched chasers. "
         "`isolate`, `restore`: close or open the shut-off valve of `thruster`."
     )
     chasers: tuple[Index, ...] = Field(min_length=1, description="Numbers of the chasers, from 0.")

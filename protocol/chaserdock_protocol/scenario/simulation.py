@@ -62,8 +62,8 @@ class SimulationSection(Section):
 
     mode: Literal["lockstep", "realtime"] = Field(
         default="lockstep",
-        description="Whether simulated time waits for every process. In `lockstep`, as on TCP links, latency and partitions "
-        "delay messages; only in `realtime` are they lost.",
+        description="Whether simulated time waits for every process. In `lockstep`, as on TCP "
+        "links, latency and partitions delay messages; only in `realtime` are they lost.",
     )
     latency_s: Delay = Field(default=0.0, description="Latency of each message, s.")
     jitter_s: Delay = Field(

@@ -24,9 +24,11 @@ from .fields import Fraction, Name, NotNegative, Positive, Section, Vector
 SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply")
 """Endings of mesh files that can be read."""
 MAX_PARTS = 256
+"""Parts of a mesh: each has collision hulls of its own, which physics compares in pairs."""
 MAX_TRIANGLES = 20_000
 """Triangles of a mesh that is drawn; files with more are decimated when they are read."""
 _MAX_BYTES = 64_000_000
+"""Size of unpacked numbers: far above those of `MAX_TRIANGLES`, to stop a decompression bomb."""
 
 
 def _packed(values: NDArray[np.generic]) -> str:
@@ -102,7 +104,8 @@ class SurfacePart(Section):
         description="Vertices (TRF), m: rows x, y, z, 32-bit floats, compressed by zlib, base64."
     )
     triangles: str = Field(
-        description="Vertices of each triangle, counter-clockwise from outside: rows of 32-bit integers, compressed by zlib, base64."
+        description="Vertices of each triangle, counter-clockwise from outside: rows of 32-bit "
+        "integers, compressed by zlib, base64."
     )
 
     def part(self) -> MeshPart:
@@ -138,7 +141,8 @@ class Surface(Section):
     )
     known: bool = Field(
         default=False,
-        description="Whether it is what the flight software knows: simplified, without missing parts.",
+        description="Whether it is what the flight software knows: simplified, without missing "
+        "parts.",
     )
     parts: tuple[SurfacePart, ...] = Field(min_length=1, max_length=MAX_PARTS)
     joints: tuple[SurfaceJoint, ...] = Field(default=(), max_length=MAX_PARTS)

@@ -62,7 +62,8 @@ def dictionary_size(name: str) -> int:
     if name in _FAMILIES:
         return _FAMILIES[name]
     raise ValueError(
-        f"unknown ArUco dictionary {name!r}; known: DICT_4X4_50 … DICT_7X7_1000, {', '.join(_FAMILIES)}"
+        f"unknown ArUco dictionary {name!r}; known: DICT_4X4_50 … DICT_7X7_1000, "
+        f"{', '.join(_FAMILIES)}"
     )
 
 
@@ -132,7 +133,8 @@ class Geometry(Section):
 
     dictionary: Annotated[str, AfterValidator(_check_dictionary)] = Field(
         default=DEFAULT_DICTIONARY,
-        description="OpenCV's name of the ArUco dictionary, such as `DICT_4X4_50`. Needed with markers.",
+        description="OpenCV's name of the ArUco dictionary, such as `DICT_4X4_50`. Needed with "
+        "markers.",
     )
     white_margin_m: NotNegative = Field(
         default=0.005, description="Width of the white border around each marker, m."
@@ -140,8 +142,8 @@ class Geometry(Section):
     cuboids: tuple[Cuboid, ...] = Field(
         default=(),
         max_length=64,
-        description="Body of the target; also used for collisions. Needed without a mesh; with one, collisions use convex "
-        "pieces of the mesh if there are none.",
+        description="Body of the target; also used for collisions. Needed without a mesh; with "
+        "one, collisions use convex pieces of the mesh if there are none.",
     )
     markers: tuple[MarkerSection, ...] = Field(
         default=(),
@@ -150,8 +152,8 @@ class Geometry(Section):
     )
     mesh: str = Field(
         default="",
-        description="Mesh that is drawn in place of the cuboids: path of a file (GLB, glTF, OBJ, STL, PLY), relative to the "
-        "file that names it, or name of a shipped satellite.",
+        description="Mesh that is drawn in place of the cuboids: path of a file (GLB, glTF, OBJ, "
+        "STL, PLY), relative to the file that names it, or name of a shipped satellite.",
     )
     mesh_scale: Positive = Field(
         default=1.0, description="Factor from the mesh's unit of length to m."

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -33,7 +33,8 @@ class Thruster(Section):
     )
     rise_s: NotNegative = Field(
         default=0.002,
-        description="Time of the linear rise of the thrust after the valve opens, s. At most `min_on_s`.",
+        description="Time of the linear rise of the thrust after the valve opens, s. At most "
+        "`min_on_s`.",
     )
     fall_s: NotNegative = Field(
         default=0.002,
@@ -55,8 +56,8 @@ class Modulation(Section):
 
     modulator: Literal["pwm", "schmitt"] = Field(
         default="pwm",
-        description="`pwm`: one pulse per carrier period, its width proportional to the thrust. `schmitt`: open for whole "
-        "periods, with hysteresis.",
+        description="`pwm`: one pulse per carrier period, its width proportional to the thrust. "
+        "`schmitt`: open for whole periods, with hysteresis.",
     )
     carrier_hz: int = Field(
         default=10,
@@ -70,22 +71,13 @@ class Modulation(Section):
     )
     carry_over: bool = Field(
         default=True,
-        description="Add impulse that a period could not give, as below the minimum on-time, to the next one.",
+        description="Add impulse that a period could not give, as below the minimum on-time, to "
+        "the next one.",
     )
-    schmitt_on: float = Field(
-        default=0.75,
-        gt=0,
-        le=1,
-        allow_inf_nan=False,
-        description="Share of full thrust at which `schmitt` opens.",
-    )
-    schmitt_off: float = Field(
-        default=0.25,
-        ge=0,
-        lt=1,
-        allow_inf_nan=False,
-        description="Share of full thrust below which `schmitt` closes. Less than `schmitt_on`.",
-    )
+    schmitt_on: ClassVar[float] = 0.75
+    schmitt_off: ClassVar[float] = 0.25
+    """Shares of full thrust at which `schmitt` opens, and below which it closes: symmetric about
+    one half, so that it has no bias, and half a thrust apart, which bounds its switching."""
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Modulation:
@@ -95,8 +87,6 @@ class Modulation(Section):
             raise ValueError(
                 f"resolution_s ({self.resolution_s}) must be at most half a carrier period"
             )
-        if self.schmitt_off >= self.schmitt_on:
-            raise ValueError("schmitt_off must be less than schmitt_on")
         return self
 
 
@@ -107,7 +97,8 @@ class ThrusterFailure(Section):
     thruster: Index = Field(description="Number of the thruster, from 0.")
     at_s: NotNegative = Field(description="Begin, s of mission time.")
     kind: FailureKind = Field(
-        description="`stuck_off`: it never opens. `stuck_on`: it never closes. `weak`: it gives `factor` of its thrust."
+        description="`stuck_off`: it never opens. `stuck_on`: it never closes. `weak`: it gives "
+        "`factor` of its thrust."
     )
     factor: float | None = Field(
         default=None,
@@ -118,7 +109,8 @@ class ThrusterFailure(Section):
     )
     reported: bool = Field(
         default=False,
-        description="Whether the chaser is informed at once. Otherwise it has to detect the failure.",
+        description="Whether the chaser is informed at once. Otherwise it has to detect the "
+        "failure.",
     )
 
     @model_validator(mode="after")
@@ -148,8 +140,8 @@ def check_layout(thrusters: Sequence[Thruster], wrench_max: Array) -> None:
         )
     if scale < 1.0:
         raise ValueError(
-            f"force_max_N {wrench_max[0]:g} and torque_max_N_m {wrench_max[3]:g} on all axes at once are more than "
-            f"the thrusters can give; at most {scale:.3f} of both"
+            f"force_max_N {wrench_max[0]:g} and torque_max_N_m {wrench_max[3]:g} on all axes at "
+            f"once are more than the thrusters can give; at most {scale:.3f} of both"
         )
 
 
@@ -160,11 +152,12 @@ def check_pulses(thrusters: Sequence[Thruster], modulation: Modulation, physics_
     carrier = modulation.carrier_hz
     if physics_hz % carrier:
         raise ValueError(
-            f"time.physics_hz must be a multiple of chaser.modulation.carrier_hz ({physics_hz}, {carrier})"
+            f"time.physics_hz must be a multiple of chaser.modulation.carrier_hz ({physics_hz}, "
+            f"{carrier})"
         )
     longest = max(t.min_on_s + t.fall_s for t in thrusters)
     if longest > 1.0 / carrier:
         raise ValueError(
-            f"chaser.modulation.carrier_hz: a period of {1.0 / carrier:g} s is shorter than the shortest pulse "
-            f"including its fall, {longest:g} s"
+            f"chaser.modulation.carrier_hz: a period of {1.0 / carrier:g} s is shorter than the "
+            f"shortest pulse including its fall, {longest:g} s"
         )

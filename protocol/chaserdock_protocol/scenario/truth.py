@@ -58,16 +58,18 @@ class ChaserTruth(Section):
     )
     thrust_share: MismatchShare | None = Field(
         default=None,
-        description="Relative error of each thruster's thrust; with ideal actuation, of force and torque per axis.",
+        description="Relative error of each thruster's thrust; with ideal actuation, of force "
+        "and torque per axis.",
     )
     thrust_turn_deg: Degrees | None = Field(
         default=None,
-        description="Error of each thruster's direction; with ideal actuation, of force and torque (rotation vector), degrees.",
+        description="Error of each thruster's direction; with ideal actuation, of force and "
+        "torque (rotation vector), degrees.",
     )
     pulse_scatter_share: MismatchShare | None = Field(
         default=None,
-        description="Relative scatter of each pulse's width, not below the minimum on-time; with ideal actuation, of each "
-        "command per axis.",
+        description="Relative scatter of each pulse's width, not below the minimum on-time; with "
+        "ideal actuation, of each command per axis.",
     )
     force_N: Force | None = Field(
         default=None, description="Constant disturbance force at CRF's origin (body axes), N."
@@ -93,8 +95,8 @@ class ChaserTruth(Section):
     )
     clock_offset_s: Seconds | None = Field(
         default=None,
-        description="Standard deviation of the chaser's clock against the world's, s: its actuators act earlier or later, "
-        "but not before a command arrives.",
+        description="Standard deviation of the chaser's clock against the world's, s: its "
+        "actuators act earlier or later, but not before a command arrives.",
     )
 
 
@@ -169,8 +171,8 @@ class TruthValues(Section):
     mass_kg: Positive | None = Field(default=None, description="Mass, kg.")
     inertia_kg_m2: Numbers6 | None = Field(
         default=None,
-        description="Inertia tensor about the centre of mass in body axes, kg m²: xx, yy, zz, xy, xz, yz; or a symmetric "
-        "3 x 3 matrix.",
+        description="Inertia tensor about the centre of mass in body axes, kg m²: xx, yy, zz, "
+        "xy, xz, yz; or a symmetric 3 x 3 matrix.",
     )
     centre_of_mass_m: Vector | None = Field(
         default=None, description="Centre of mass (CRF or TRF), m."
@@ -181,7 +183,8 @@ class TruthValues(Section):
     torque_N_m: Vector | None = Field(default=None, description="Constant torque (body axes), N m.")
     thrust_share: tuple[Annotated[float, Field(gt=-1, le=1)], ...] | None = Field(
         default=None,
-        description="Relative error of every thruster's thrust; with ideal actuation, of force and torque (6).",
+        description="Relative error of every thruster's thrust; with ideal actuation, of force "
+        "and torque (6).",
     )
     clock_offset_s: Annotated[float, Field(ge=-1, le=1)] | None = Field(
         default=None, description="The chaser's clock minus the world's, s."
@@ -219,8 +222,10 @@ class TruthValues(Section):
         if (inertia := self.inertia) is not None:
             moments = np.linalg.eigvalsh(inertia)
             if moments[0] <= 0 or 2 * moments[2] > moments.sum() * (1 + 1e-9):
-                raise ValueError("inertia_kg_m2: no body has this inertia: its principal moments are "
-                                 f"{', '.join(f'{m:.4g}' for m in moments)}")  # fmt: skip
+                raise ValueError(
+                    "inertia_kg_m2: no body has this inertia: its principal moments are "
+                    f"{', '.join(f'{m:.4g}' for m in moments)}"
+                )
         return self
 
     @property
@@ -234,7 +239,7 @@ class TruthValues(Section):
         return matrix
 
 
-_OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
+_OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))  # places of the products of inertia xy, xz, yz
 
 
 @dataclass(frozen=True)
@@ -268,8 +273,9 @@ class TruthSection(Section):
 
     preset: Literal["nominal", "mismatch"] = Field(
         default="nominal",
-        description="`nominal`: no differences. `mismatch`: mass 10 %, inertia 15 %, thrust 5 % and 1 degree, centre of mass "
-        "5 mm, force 5 mN, torque 0.5 mN m; target's inertia 15 %.",
+        description="`nominal`: no differences. `mismatch`: mass 10 %, inertia 15 %, thrust 5 % "
+        "and 1 degree, centre of mass 5 mm, force 5 mN, torque 0.5 mN m; target's inertia 15 "
+        "%.",
     )
     chaser: ChaserTruth = ChaserTruth()
     target: TargetTruth = TargetTruth()

@@ -15,6 +15,7 @@ class WorldSection(Section):
 
     engine: Literal["pybullet", "mujoco"] = Field(
         default="pybullet",
-        description="Physics engine: `pybullet` (Python 3.11 on Linux x86_64), or `mujoco` (all platforms; needs "
-        "`chaserdock[mujoco]`). Both integrate alike; they differ in contacts and joints ([world.md](world.md)).",
+        description="Physics engine: `pybullet` (Python 3.11 on Linux x86_64), or `mujoco` (all "
+        "platforms; needs `chaserdock[mujoco]`). Both integrate alike; they differ in "
+        "contacts and joints ([world.md](world.md)).",
     )

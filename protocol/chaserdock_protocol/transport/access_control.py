@@ -68,7 +68,9 @@ def identities(chasers: int) -> tuple[Identity, ...]:
 
 
 def _expression(topic: Topic, who: Identity, *, writes: bool) -> str:
-    """Return the key expression of a topic, limited to the keys that the process may write or read."""
+    """Return the key expression of a topic, limited to the keys that the process may write or
+    read.
+    """
     if "{chaser}" in topic.key:
         return topic.key_of(who.process.partition("/")[2] if who.role == "chaser" else "*")
     if "{process}" in topic.key:

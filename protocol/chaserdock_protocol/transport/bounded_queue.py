@@ -10,11 +10,16 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 MAX_BYTES = 256_000_000
+"""A quarter of the memory of a process in compose.yaml: ten seconds of 1280 x 720 JPEG images of 16
+chasers at 15 Hz."""
 MAX_ITEMS = 200_000
+"""Small messages for which Python's objects would take more memory than their bytes."""
 
 
 class BoundedQueue(Generic[T]):
-    """FIFO queue between threads that drops items when it is full, and counts them in ``dropped``."""
+    """FIFO queue between threads that drops items when it is full, and counts them in
+    ``dropped``.
+    """
 
     def __init__(self, max_bytes: int = MAX_BYTES, max_items: int = MAX_ITEMS) -> None:
         self.dropped = 0

@@ -18,8 +18,15 @@ from .network import Network
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_NAMESPACE = "chaserdock"
 _QUEUES = (
-    "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
-)  # fmt: skip
+    "control",
+    "real_time",
+    "interactive_high",
+    "interactive_low",
+    "data_high",
+    "data",
+    "data_low",
+    "background",
+)
 QUEUE_OPTIONS: dict[str, Any] = {
     # Zenoh's maximum: droppable messages are dropped for a reader when 16 batches (1 MB) wait for
     # it, instead of 2.
@@ -56,7 +63,9 @@ class Tls:
 
     @classmethod
     def in_folder(cls, folder: Path) -> Tls:
-        """Return the files of one process in the layout that ``chaserdock keys init`` writes."""
+        """Return the files of one process in the layout that ``chaserdock deploy --keys``
+        writes.
+        """
         return cls(folder / "ca.pem", folder / "cert.pem", folder / "key.pem")
 
 
@@ -109,5 +118,8 @@ def open_error(error: Exception, link: Link) -> str:
         keys = ", and are the keys valid and of its mission" if link.tls is not None else ""
         return f"no router at {connect} accepts the connection; is it running{keys}?"
     if "in use" in text.lower():
-        return f"cannot listen on {listen}: the port is in use; stop its owner or choose another with --listen"
+        return (
+            f"cannot listen on {listen}: the port is in use; stop its owner or choose another "
+            "with --listen"
+        )
     return f"cannot open the Zenoh session (listen {listen}, connect {connect}): {text}"

@@ -106,7 +106,9 @@ class Reply:
 
 
 class Connection(Protocol):
-    """One node's access to the network. Callbacks run on threads of the network and must not block."""
+    """One node's access to the network. Callbacks run on threads of the network and must not
+    block.
+    """
 
     @property
     def source(self) -> str:

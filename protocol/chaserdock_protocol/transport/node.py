@@ -147,7 +147,9 @@ class Node:
             send(payload)
 
     def publish_raw(self, raw: RawSample) -> None:
-        """Send a recorded message unchanged, with a new time stamp. Only for the role ``analysis``."""
+        """Send a recorded message unchanged, with a new time stamp. Only for the role
+        ``analysis``.
+        """
         if self.role != "analysis":
             raise PermissionError(f"{self.role} may not write raw samples ({raw.key})")
         self._connection.put(raw)

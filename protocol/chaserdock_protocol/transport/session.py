@@ -36,7 +36,13 @@ from chaserdock_protocol.topics import Role
 from . import Node, ReceivedMessage
 
 EARLY_PERIOD_S = 0.05
+"""Interval of presence before the first tick, s: the discovery barrier ends about two of them after
+the last declaration.
+"""
 STEADY_PERIOD_S = 1.0
+"""Interval of presence in flight, s: a fifth of ``stall.SILENT_S``, after which a process counts as
+silent.
+"""
 
 
 class JoinRefused(ChaserdockError):
@@ -62,7 +68,8 @@ def join(
             return reply
         if patience_s is not None and node.host.now_s() - begun > patience_s:
             raise JoinRefused(
-                f"no world answered within {patience_s:.0f} s; is it running, and on the same namespace?"
+                f"no world answered within {patience_s:.0f} s; is it running, and on the same "
+                "namespace?"
             )
         node.host.sleep(0.02)
     return None
@@ -85,7 +92,8 @@ def request_scenario(
             return reply.scenario_json
         if node.host.now_s() - begun > patience_s:
             raise JoinRefused(
-                f"the world gave no scenario on {topics.SCENARIO_KEY} within {patience_s:.0f} s; may {node.name} read it?"
+                f"the world gave no scenario on {topics.SCENARIO_KEY} within {patience_s:.0f} s; "
+                f"may {node.name} read it?"
             )
         node.host.sleep(0.02)
     return None

@@ -23,6 +23,9 @@ from chaserdock_world.plant import ActuationErrors, actuation_errors
 from .ideal import ActuatorOutput, Actuators, IdealActuators
 
 _LOOK_AHEAD_STEPS = 32
+"""Physics steps for which wrenches are computed at once: 32 take 32 us, two take 38 us; a change of
+the pulses discards the rest.
+"""
 
 
 class ThrusterActuators:

@@ -14,6 +14,7 @@ from chaserdock_protocol import topics
 SILENT_S = 5.0
 """A process whose last presence is older has stopped running, or is cut off."""
 _MOST_NAMED = 12
+"""Sentences of an explanation; the causes come first, and the rest is counted."""
 
 
 @dataclass(frozen=True)

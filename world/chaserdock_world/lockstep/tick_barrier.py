@@ -28,7 +28,9 @@ LONGEST_STEP_S = 5.0
 were gone.
 """
 _STATUS_INTERVAL_S = 5.0
+"""Wall time after which the world prints again what it waits for, s."""
 _POLL_S = 0.02
+"""Longest wait for one message, s: as soon is a departed process noticed."""
 _REPEAT_S, _MOST_REPEATS = 2.0, 3
 """The first tick after all processes have returned is repeated after this wall time without a
 reply: chasers then state their leases again, which the network may have lost while it came up."""

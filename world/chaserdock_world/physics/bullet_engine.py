@@ -31,7 +31,7 @@ from .engine import (
 )
 from .gyroscopic import advance_free
 
-_NO_LOAD = (0.0, 0.0, 0.0)
+_NO_LOAD = (0.0, 0.0, 0.0)  # N or N m
 
 
 class BulletEngine:

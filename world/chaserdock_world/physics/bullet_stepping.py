@@ -51,8 +51,9 @@ def _addresses() -> IntArray | None:
     return np.array(found, dtype=np.int64)
 
 
+@LIBRARY.structure("Path")
 class _Path(ctypes.Structure):
-    """``Path`` of native/bullet.c."""
+    """`Path` of native/bullet.c."""
 
     _fields_ = [(name, ctypes.c_int64) for name in ("body", "next", "every")] + [
         ("motion", ctypes.c_void_p)

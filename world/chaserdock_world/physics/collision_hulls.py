@@ -21,10 +21,15 @@ if TYPE_CHECKING:  # as slow to import as the whole world, and needed for target
     from scipy.spatial import ConvexHull
 
 MOST_PIECES = 16
+"""Largest number of convex pieces of a surface (chosen): bounds the contacts of a step."""
 _WITHIN = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / np.array([[3], [6], [6], [6]])
 """Barycentric coordinates of the points of a triangle at which a gap is measured."""
 _MOST_VERTICES = 128
+"""Largest number of vertices of a piece (chosen): Bullet searches all of them in a contact."""
 _MOST_TRIANGLES = 1500
+"""Triangles of a surface, beyond which it is simplified before it is cut (chosen): the time to cut
+it grows with them.
+"""
 _UNCUT = 10.0
 """Pieces shorter than this many tolerances are not cut."""
 

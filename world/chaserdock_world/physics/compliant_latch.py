@@ -18,7 +18,13 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
 
 STIFFNESS_N_M, DAMPING_N_S_M = 1e4, 200.0
+"""Of the end of the play: as stiff as a contact (``definitions.ContactParameters``), with the
+damping of both bodies of one.
+"""
 TURN_STIFFNESS_N_M_RAD, TURN_DAMPING_N_M_S_RAD = 1000.0, 20.0
+"""The same about the tip: that stiffness and damping at an arm of 0.32 m, as of a body of that
+length.
+"""
 ENGAGED_M = 0.02
 """A probe that has slipped farther than this is out of its port."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 
-_HALF_TURN_ABOUT_Z = (0.0, 0.0, 0.0, 1.0)
+_HALF_TURN_ABOUT_Z = (0.0, 0.0, 0.0, 1.0)  # a quaternion, scalar first
 
 
 def port_attitude(q_off_wxyz: Array) -> Array:

@@ -30,7 +30,7 @@ from .plume_loads import PlumeLoads
 from .port_loads import PortLoadRecorder
 from .target_motion import PrescribedMotion, prescribed_state
 
-_ZERO = (0.0, 0.0, 0.0)
+_ZERO = (0.0, 0.0, 0.0)  # N or N m
 _NO_WRENCH = np.zeros(6)
 
 

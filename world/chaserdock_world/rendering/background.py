@@ -24,12 +24,16 @@ WHITE_LEVEL = 235.0
 """Grey level of reflectance 1 in full sun: below 255, so that noise does not clip on white."""
 
 SPACE_LEVEL = 4
+"""Grey level of empty space: a sensor's black level, above 0 so that noise does not clip on it."""
 _STARS = 400
+"""Stars on the whole sky: some 20 in an image of 60 degrees."""
 # The Earth has no fine detail: it is computed on a grid of this step and interpolated.
 _EARTH_STEP_PX = 4
 # Reflectance of the sea, and the additional reflectance of the thickest clouds.
 _SEA, _CLOUDS = 0.12, 0.6
+# Clouds by latitude and longitude: 0.7 degrees a texel.
 _MAP_ROWS, _MAP_COLUMNS = 256, 512
+# Sky and clouds are the same in all missions.
 _SEED = 20230619
 
 

@@ -24,6 +24,9 @@ _SPARE_ROWS, _SPARE_COLUMNS = 251, 256
 # Fixed-point steps per unit of white noise: 16 bits hold eight standard deviations.
 _NOISE_STEPS = 4096.0
 _METERED_SHARE, _LARGEST_GAIN = 0.01, 8.0
+"""Automatic exposure: share of the brightest pixels that it is set by, and its largest gain, 18 dB
+(both chosen; docs/cameras.md).
+"""
 
 
 def exposure_gain(image: NDArray[np.uint8], level: float) -> float:

@@ -34,11 +34,17 @@ from .scene_geometry import NEAR_M, Frustum, Obstacle
 
 DAYLIGHT = Light()
 
-_TEXTURES = {"": 0.0, "insulation": 1.0, "cells": 2.0}
+_TEXTURES = {"": 0.0, "insulation": 1.0, "cells": 2.0}  # native/mesh.c
 _MAP_TEXELS = 2_000_000
+"""Texels of a shadow map, at which its resolution is limited: 8 MB a body."""
 _TEXEL_PX = 0.7
+"""Width of a texel in pixels at the nearest point of a body: with it shadow edges are displaced by
+0.2 px (docs/evidence/cameras.md).
+"""
 _BAND_ROWS, _SAMPLES, _GROUP = 8, 8, 32  # native/mesh.c
 _WRINKLES = 256
+"""Side of the periodic map of wrinkles, texels: 0.4 m of foil (``WRINKLE_PER_M`` in native/mesh.c).
+"""
 
 # native/mesh.c: Illumination, ShadowMap; bytes of a BodyPose and of a Triangle.
 _ILLUMINATION = np.dtype(
@@ -53,6 +59,7 @@ _SHADOW_MAP = np.dtype(
         ("low", float, 2), ("texel_m", float), ("used", float),
     ]
 )  # fmt: skip
+# Sizes of BodyPose and Triangle in native/mesh.c.
 _POSE_BYTES, _TRIANGLE_BYTES = 96, 156
 
 

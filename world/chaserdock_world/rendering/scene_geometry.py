@@ -20,7 +20,7 @@ from chaserdock_models.native import address
 from chaserdock_models.targets import Box, face_rotation
 from numpy.typing import ArrayLike, NDArray
 
-from .native import function
+from .native import LIBRARY, function
 from .textures import FINEST_TEXEL_M
 
 NEAR_M = 0.01
@@ -66,8 +66,9 @@ it is ``in_front`` of the camera, and its clipped outline, ``count`` points in p
 _FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in range(6)])
 
 
+@LIBRARY.structure("Frustum")
 class _Frustum(Structure):
-    """native/scene.c."""
+    """`Frustum` of native/scene.c."""
 
     _fields_ = [
         ("planes", c_double * 20), ("borders", c_double * 12),

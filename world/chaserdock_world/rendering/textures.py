@@ -17,6 +17,9 @@ from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, fac
 from numpy.typing import NDArray
 
 FINEST_TEXEL_M = 0.00025
+"""Width of a texel of a face: half a pixel of the default camera at 0.5 m; nearer, texels are
+interpolated.
+"""
 # Reflectance of the printed white and black.
 WHITE, BLACK = 0.95, 0.05
 

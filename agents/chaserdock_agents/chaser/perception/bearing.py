@@ -9,6 +9,7 @@ where the silhouette's centroid is that of the spot.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
@@ -23,39 +24,59 @@ from .pnp import TargetPose
 
 POINT_SPREAD_PX = 0.65
 """Standard deviation per axis of the image of a point."""
-_LEVELS, _SIGMAS = 6.0, 5.0
-"""A spot is brighter than the background by so many grey levels and standard deviations of the
-noise.
-"""
-_MARGIN_PX = 2
-"""Pixels around a spot that belong to it."""
-_SATURATION_PX, _SATURATION_MIN, _SATURATION_MAX, _SATURATION_LEVELS = 0.6, 0.1, 0.8, 8.0
-"""Grey levels count up to a share of the spot's brightness: the first, divided by the radius,
-within the next two; at least the last. So differently lit faces of a large spot count alike, and
-pixels of a small one in proportion to what they show of the target."""
-_GRID_SHARE_PX, _LIGHT_SHARE = 0.2, 0.013
-"""Standard deviation of the centroid by pixel grid and compression (at a radius of 1 px; falls with
-its square root), and by markers and light (as a share of the radius). Measured:
-``benchmarks/vision.py --only bearing``."""
-_SIZE_SHARE, _SIZE_SIGMAS = 0.25, 5.0
-"""A spot's radius may differ from the expected one by this share and so many standard deviations by
-noise.
-"""
-_LEVEL_MIN, _LEVEL_MAX = 10.0, 255.0
-"""Grey level of the target above the background, on an average over its silhouette."""
-_NEAR_PX = 8.0
-"""Greatest distance of the target from the predicted place."""
-_CLEAR_RATIO = 1.5
-"""Without a prediction, the target is the brightest spot of its size, by this ratio to the next
-one.
-"""
-_STAR_PX, _AIM_RAD = 1.2, math.radians(2.0)
-"""Below this expected radius stars are as bright, and a first sighting must be within this angle of
-the optical axis.
-"""
-_NEAREST, _FARTHEST = 2.0, 1e4
-"""Least and greatest range, in radii of the target."""
-_RASTER = 256
+
+
+@dataclass(frozen=True)
+class BearingParameters:
+    """Numbers of the search for a spot, measured by benchmarks/perception.py (markers-bearing)."""
+
+    # A spot is brighter than the background by so many grey levels
+    levels: float = 6.0
+    # and standard deviations of the noise: 1 pixel in 3.5 million without a spot.
+    sigmas: float = 5.0
+    # Pixels around a spot that belong to it: three standard deviations of the point spread.
+    margin_px: int = 2
+    # Grey levels count up to a share of the spot's brightness: this, divided by the radius,
+    saturation_px: float = 0.6
+    # within this share
+    saturation_min: float = 0.1
+    # and this one;
+    saturation_max: float = 0.8
+    # at least so many. So differently lit faces of a large spot count alike, and pixels of a small
+    # one in proportion to what they show of the target.
+    saturation_levels: float = 8.0
+    # Standard deviation of the centroid by pixel grid and compression (at a radius of 1 px; falls
+    # with its square root),
+    grid_share_px: float = 0.2
+    # and by markers and light (as a share of the radius). Both measured.
+    light_share: float = 0.013
+    # A spot's radius may differ from the expected one by this share,
+    size_share: float = 0.25
+    # and so many standard deviations by noise.
+    size_sigmas: float = 5.0
+    # Least grey level of the target above the background, on an average over its silhouette,
+    level_min: float = 10.0
+    # and greatest: that of the sensor.
+    level_max: float = 255.0
+    # Greatest distance of the target from the predicted place, px.
+    near_px: float = 8.0
+    # Without a prediction, the target is the brightest spot of its size, by this ratio to the next
+    # one (docs/estimation.md).
+    clear_ratio: float = 1.5
+    # Below this expected radius, px, stars are as bright (the servicer beyond some 120 m),
+    star_px: float = 1.2
+    # and a first sighting must be within this angle of the optical axis.
+    aim_rad: float = math.radians(2.0)
+    # Least range, in radii of the target: nearer, it does not look like a spot,
+    nearest: float = 2.0
+    # and greatest: farther, it is a fifth of a pixel wide.
+    farthest: float = 1e4
+    # Side of the raster that a silhouette is drawn on, px: its radius is exact to half a raster
+    # pixel of some 100, far below ``size_share``.
+    raster: int = 256
+
+
+_SPOT = BearingParameters()
 
 
 class BearingError(Exception):
@@ -119,7 +140,7 @@ class BearingFinder:
 
         Raises BearingError if no spot is clearly the target.
         """
-        if not _NEAREST * self._reach_m < target.range_m < _FARTHEST * self._reach_m:
+        if not _SPOT.nearest * self._reach_m < target.range_m < _SPOT.farthest * self._reach_m:
             raise BearingError(
                 f"a range of {target.range_m:.3g} m is too near or too far for a bearing"
             )
@@ -134,7 +155,7 @@ class BearingFinder:
                 f"no spot of the target's size, a radius of {_blurred(expected.radius_px):.1f} px at {target.range_m:.1f} m"
                 + (f"; the brightest have {sizes} px" if spots else "")
             )
-        spot, seen = self._choose(plausible, predicted_irf_m, expected.radius_px < _STAR_PX)
+        spot, seen = self._choose(plausible, predicted_irf_m, expected.radius_px < _SPOT.star_px)
         ideal = self._camera.undistort(spot.centroid_px)
         place = self._along(ideal, target.range_m)
         centre = ideal - (seen.centroid_px - self._camera.project_ideal(place))
@@ -152,15 +173,18 @@ class BearingFinder:
             near = min(
                 plausible, key=lambda found: float(np.linalg.norm(found[0].centroid_px - place))
             )
-            if float(np.linalg.norm(near[0].centroid_px - place)) < _NEAR_PX + near[1].radius_px:
+            if (
+                float(np.linalg.norm(near[0].centroid_px - place))
+                < _SPOT.near_px + near[1].radius_px
+            ):
                 return near
-        found = [p for p in plausible if not starlike or self._off_axis(p[0]) < _AIM_RAD]
+        found = [p for p in plausible if not starlike or self._off_axis(p[0]) < _SPOT.aim_rad]
         if not found:
             raise BearingError(
                 "spots of the target's size may be stars, away from the optical axis"
             )
         first, *others = sorted(found, key=lambda candidate: -candidate[0].flux)
-        if others and first[0].flux < _CLEAR_RATIO * others[0][0].flux:
+        if others and first[0].flux < _SPOT.clear_ratio * others[0][0].flux:
             raise BearingError(
                 f"{len(found)} spots of the target's size, none much brighter than the others"
             )
@@ -181,9 +205,12 @@ class BearingFinder:
             return None
         expected = self._silhouette(self._along(ideal, target.range_m), target.q_wxyz)
         radius = _blurred(expected.radius_px)
-        fits = abs(spot.radius_px - radius) <= _SIZE_SHARE * radius + _SIZE_SIGMAS * spot.noise_px
+        fits = (
+            abs(spot.radius_px - radius)
+            <= _SPOT.size_share * radius + _SPOT.size_sigmas * spot.noise_px
+        )
         level = spot.flux / expected.area_px2
-        return expected if fits and _LEVEL_MIN <= level <= _LEVEL_MAX else None
+        return expected if fits and _SPOT.level_min <= level <= _SPOT.level_max else None
 
     def _silhouette(self, position_irf_m: Array, q_wxyz: Array) -> Silhouette:
         return silhouette(self._camera, self._corners, q_wxyz, position_irf_m)
@@ -215,7 +242,9 @@ def bias_px(radius_px: float) -> float:
     """Return the standard deviation per axis of a spot's centroid by pixel grid, compression,
     markers and light.
     """
-    return math.hypot(_GRID_SHARE_PX / math.sqrt(max(radius_px, 1.0)), _LIGHT_SHARE * radius_px)
+    return math.hypot(
+        _SPOT.grid_share_px / math.sqrt(max(radius_px, 1.0)), _SPOT.light_share * radius_px
+    )
 
 
 def _blurred(radius_px: float) -> float:
@@ -230,8 +259,8 @@ def silhouette(
     """
     px = camera.project_ideal(rotations.rotate(q_wxyz, corners_trf_m) + position_irf_m)
     low = px.min(axis=(0, 1))
-    scale = (_RASTER - 3) / float((px.max(axis=(0, 1)) - low).max())
-    canvas = np.zeros((_RASTER, _RASTER), dtype=np.uint8)
+    scale = (_SPOT.raster - 3) / float((px.max(axis=(0, 1)) - low).max())
+    canvas = np.zeros((_SPOT.raster, _SPOT.raster), dtype=np.uint8)
     for cuboid in np.round(((px - low) * scale + 1.0) * 16.0).astype(np.int32):
         cv2.fillConvexPoly(canvas, cv2.convexHull(cuboid), 1, shift=4)
     m = cv2.moments(canvas, binaryImage=True)
@@ -245,24 +274,29 @@ def find_spots(image: NDArray[np.uint8], radius_px: float) -> list[Spot]:
     root mean square radius.
     """
     # No shape extends beyond four times its radius; ``_shape_at`` decides.
-    largest = 4.0 * _blurred(radius_px) + 2.0 * _MARGIN_PX
-    share = min(max(_SATURATION_PX / radius_px, _SATURATION_MIN), _SATURATION_MAX)
+    largest = 4.0 * _blurred(radius_px) + 2.0 * _SPOT.margin_px
+    share = min(max(_SPOT.saturation_px / radius_px, _SPOT.saturation_min), _SPOT.saturation_max)
     level = float(np.median(image))
     sigma = max(1.4826 * float(np.median(np.abs(image - level))), 1.0)
-    _, bright = cv2.threshold(image, level + max(_LEVELS, _SIGMAS * sigma), 1, cv2.THRESH_BINARY)
+    _, bright = cv2.threshold(
+        image, level + max(_SPOT.levels, _SPOT.sigmas * sigma), 1, cv2.THRESH_BINARY
+    )
     _, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
     height, width = image.shape
     spots = []
     for label, (x, y, w, h, area) in enumerate(stats.tolist()):
         inside = (
-            x > _MARGIN_PX
-            and y > _MARGIN_PX
-            and x + w + _MARGIN_PX < width
-            and y + h + _MARGIN_PX < height
+            x > _SPOT.margin_px
+            and y > _SPOT.margin_px
+            and x + w + _SPOT.margin_px < width
+            and y + h + _SPOT.margin_px < height
         )
         if label == 0 or area < 2 or max(w, h) > largest or not inside:
             continue
-        part = slice(y - _MARGIN_PX, y + h + _MARGIN_PX), slice(x - _MARGIN_PX, x + w + _MARGIN_PX)
+        part = (
+            slice(y - _SPOT.margin_px, y + h + _SPOT.margin_px),
+            slice(x - _SPOT.margin_px, x + w + _SPOT.margin_px),
+        )
         spot = _measure(image[part] - level, labels[part] == label, sigma, share)
         first = np.array([part[1].start, part[0].start])
         spots.append(spot._replace(centroid_px=spot.centroid_px + first))
@@ -273,10 +307,10 @@ def _measure(above: Any, mask: NDArray[np.bool_], sigma: float, share: float) ->
     """Return the spot of a mask in grey levels above the background (h, w), with noise ``sigma``;
     ``share``: saturation.
     """
-    kernel = np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), dtype=np.uint8)
+    kernel = np.ones((2 * _SPOT.margin_px + 1, 2 * _SPOT.margin_px + 1), dtype=np.uint8)
     around = cv2.dilate(mask.astype(np.uint8), kernel)
     above = above * around
-    limit = max(share * float(np.quantile(above[mask], 0.9)), _SATURATION_LEVELS)
+    limit = max(share * float(np.quantile(above[mask], 0.9)), _SPOT.saturation_levels)
     weights = np.clip(above / limit, -1.0, 1.0)
     total = max(float(weights.sum()), 1.0)
     y, x = np.indices(above.shape)

@@ -24,11 +24,12 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 from numpy.typing import NDArray
 
-from .native import function
+from .native import LIBRARY, function
 
 
+@LIBRARY.structure("Settings")
 class _Settings(Structure):
-    """native/corners.c: fields in the order of the C struct."""
+    """`Settings` of native/corners.c."""
 
     _fields_ = [
         (name, c_double) for name in (
@@ -62,6 +63,7 @@ class _Settings(Structure):
     ]  # fmt: skip
 
 
+# Chosen by the corner errors in rendered images (benchmarks/perception.py, ``markers``).
 SETTINGS = _Settings(
     0.45, 1.25,
     8.0, 0.4, 4.0,
@@ -74,6 +76,7 @@ SETTINGS = _Settings(
     2.0, 120.0,
 )  # fmt: skip
 
+# Corners of a unit square, as those of a marker.
 _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 
 

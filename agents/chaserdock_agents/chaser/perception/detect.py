@@ -50,6 +50,9 @@ class _Windows(NamedTuple):
 
 # OpenCV's own distance is 0.125.
 _WINDOWS = (_Windows(7, 7, 16, 0.125), _Windows(7, 23, 16, 0.125))
+# A second look, where nothing was found, at twice the cost (9.5 instead of 4.4 ms at 1280 x 960): a
+# window of 3 px for small markers, and candidates inside of each other, such as outer edges of white
+# borders, kept apart.
 _THOROUGH = _Windows(3, 23, 10, 0.01)
 
 NOTHING = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))

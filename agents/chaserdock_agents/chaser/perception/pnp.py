@@ -37,11 +37,17 @@ COMMON_PER_MARKER = 4.0
 MIN_SINGLE_COSINE = 0.25
 # Largest corner error of an inlier of a coarse candidate, and of a refined pose.
 _COARSE_GATE_PX, _FINE_GATE_PX = 6.0, 1.5
+# The fine gate grows to so many medians of the markers' errors, as far as the coarse one: in a
+# blurred or noisy image all corners err alike.
 _FINE_GATE_SIGMAS = 5.0
+# A pose with a larger reprojection error is rejected, px: 50 times the error of a corner in a sharp
+# image, so that only wrong poses are.
 MAX_RMS_PX = 2.0
 # The second solution of a plane is kept if its -2 log likelihood exceeds the first's by at most
 # this.
 _AMBIGUITY_LIMIT = 25.0
+# Poses are tried from all markers together and from so many of the largest; each costs a solution
+# by IPPE, and with six there is one right marker unless most are false.
 _CANDIDATE_MARKERS = 6
 # A coarse pose of a plane with a larger error is rejected.
 _PLANE_RMS_PX = 1.0
@@ -50,6 +56,8 @@ _PLANE_RMS_PX = 1.0
 _SAME_POSE_SHARE = 0.25
 # A single marker is a false id if this many others should be as visible and none is detected.
 _MAX_MISSING = 2
+# Markers nearer to the border of the image count as not visible, px (chosen): their white border,
+# which the detector needs, may be cut.
 _FRAME_MARGIN_PX = 8.0
 
 

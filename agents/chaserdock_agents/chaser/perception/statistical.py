@@ -35,7 +35,11 @@ SMALL_SIDE_PX = 25.0
 MIN_SIDE_PX = 14.0
 """Shortest side of a marker that is detected, pixels."""
 MIN_COSINE = 0.3
+"""Least cosine of the angle at which a marker is seen, above ``MIN_SINGLE_COSINE`` (chosen)."""
 _MARGIN_PX = 2.0
+"""Least distance of a marker from the border of the image, pixels (chosen): as much of its white
+border must be in view.
+"""
 _LIMITS = (c_double * 6)(
     SIGMA_PX, SMALL_SIDE_PX, MIN_SIDE_PX, MIN_COSINE, MIN_SINGLE_COSINE, _MARGIN_PX
 )

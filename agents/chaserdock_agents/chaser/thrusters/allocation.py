@@ -24,8 +24,11 @@ from chaserdock_protocol.scenario.thrusters import Thruster, thrusts_max
 _REGULARIZATION = 1e-2
 """Small enough for the minimum sum (measured to 1e-12), large enough for well-conditioned steps."""
 _SMALL = 1e-6
-_EQUALITY = 5  # daqp's codes for an equality constraint and for success
-_SOLVED = 1
+"""Cost of thrusts where only the distance to the wrench counts (1 per axis): makes the solution
+unique, and changes the wrench by a millionth.
+"""
+# daqp's codes for an equality constraint and for success
+_EQUALITY, _SOLVED = 5, 1
 
 
 @dataclass(frozen=True, eq=False)

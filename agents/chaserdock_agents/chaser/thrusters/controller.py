@@ -34,6 +34,9 @@ _MIN_SCALE = 0.02
 wrench.
 """
 _HISTORY_NS = 1_000_000_000
+"""Time for which past pulses are kept, ns: more than the interval between two odometries, over which
+impulses are summed, and than the delay of a lock-step message.
+"""
 _MAX_PERIOD_NS = 1_000_000_000
 """Upper bound of a carrier period."""
 

@@ -27,27 +27,39 @@ from numpy.typing import NDArray
 
 Flags = NDArray[np.bool_]
 
-_MIN_GAIN = 20.0
-"""Minimum log-likelihood ratio to the fault-free hypothesis: 1 in 5e8, at some thousand tests per
-minute and thruster.
-"""
-_MIN_ENERGY = 1.9 * _MIN_GAIN
+
+@dataclass(frozen=True)
+class DetectionParameters:
+    """Thresholds of the tests (docs/thrusters.md)."""
+
+    # Minimum log-likelihood ratio to the fault-free hypothesis: 1 in 5e8, at some thousand tests
+    # per minute and thruster.
+    min_gain: float = 20.0
+    # Minimum log-likelihood ratio to the second-best thruster: 1 in 3,000.
+    min_margin: float = 8.0
+    # Numbers of consecutive ticks tested for a thruster stuck on; a single one may be a
+    # disturbance.
+    on_windows: tuple[int, ...] = (2, 3, 4, 6, 8)
+    # Numbers of latest ticks with commanded thrust that are tested together: each about half as
+    # many again, as the information adds up.
+    off_windows: tuple[int, ...] = (2, 3, 4, 6, 9, 15, 30)
+    # Loss of thrust, relative, from which on a thruster counts as stuck off: two ``loss_sigma``
+    # below all of it;
+    stuck_off_loss: float = 0.85
+    # and as weak: four, so that scatter and mismatch are not taken for a loss.
+    weak_loss: float = 0.3
+    # Relative uncertainty of the failed thruster's thrust.
+    own_scatter: float = 0.1
+    # Maximum standard deviation of the loss for a decision.
+    loss_sigma: float = 0.07
+
+
+_TEST = DetectionParameters()
+
+_MIN_ENERGY = 1.9 * _TEST.min_gain
 """Energy r'r of whitened residuals below which no hypothesis is accepted: none gains more than half
 of it (Cauchy-Schwarz), and the mismatch only reduces it. 5 % are left for rounding."""
-_MIN_MARGIN = 8.0
-"""Minimum log-likelihood ratio to the second-best thruster."""
-_ON_WINDOWS = (2, 3, 4, 6, 8)
-"""Numbers of consecutive ticks tested for a thruster stuck on; a single one may be a disturbance.
-"""
-_OFF_WINDOWS = (2, 3, 4, 6, 9, 15, 30)
-"""Numbers of latest ticks with commanded thrust that are tested together."""
-_STUCK_OFF_LOSS, _WEAK_LOSS = 0.85, 0.3
-"""Loss of thrust, relative, from which on a thruster counts as stuck off, and as weak."""
-_OWN_SCATTER = 0.1
-"""Relative uncertainty of the failed thruster's thrust."""
-_LOSS_SIGMA = 0.07
-"""Maximum standard deviation of the loss for a decision."""
-SUFFICIENT_INFORMATION = 2.0 / _LOSS_SIGMA**2
+SUFFICIENT_INFORMATION = 2.0 / _TEST.loss_sigma**2
 """Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known
 that well: half of it is lost to the uncertainty of the nominal thrust (5 %)."""
 
@@ -110,7 +122,7 @@ class ThrusterFaultDetector:
         self._on_evidence = _Evidence(len(full_N), differences)
         # The last hypothesis: whole commands are lost.
         self._off_evidence = _Evidence(len(full_N) + 1, differences)
-        self._on: deque[Array] = deque(maxlen=max(_ON_WINDOWS))
+        self._on: deque[Array] = deque(maxlen=max(_TEST.on_windows))
         self._off: list[deque[Array]] = []
         self.information = np.zeros(len(full_N))
         self.reset()
@@ -118,7 +130,7 @@ class ThrusterFaultDetector:
     def reset(self) -> None:
         """Discard the residuals: a change explains them."""
         self._on.clear()
-        self._off = [deque(maxlen=max(_OFF_WINDOWS)) for _ in self._full_N]
+        self._off = [deque(maxlen=max(_TEST.off_windows)) for _ in self._full_N]
 
     def update(
         self,
@@ -152,7 +164,7 @@ class ThrusterFaultDetector:
         )
 
     def _detect_stuck_on(self, suspects: Flags) -> ThrusterFault | None:
-        for length, total in _totals(self._on, _ON_WINDOWS):
+        for length, total in _totals(self._on, _TEST.on_windows):
             energy, along, squared = self._on_evidence.marginal(total)
             gain = np.where(suspects, along - squared / 2.0, -math.inf)
             best = int(np.argmax(gain))
@@ -165,7 +177,7 @@ class ThrusterFaultDetector:
     def _detect_loss(self, fired: list[int], suspects: Flags) -> ThrusterFault | None:
         possible = np.append(suspects, True)
         for thruster in fired:
-            for length, total in _totals(self._off[thruster], _OFF_WINDOWS):
+            for length, total in _totals(self._off[thruster], _TEST.off_windows):
                 energy, along, squared = self._off_evidence.marginal(total)
                 loss = np.where(
                     squared > 0.0,
@@ -173,13 +185,17 @@ class ThrusterFaultDetector:
                     0.0,
                 )
                 gain = np.where(possible, loss * along - loss**2 * squared / 2.0, -math.inf)
-                known = squared[thruster] * _LOSS_SIGMA**2 >= 1.0
-                if not known or loss[thruster] < _WEAK_LOSS or int(np.argmax(gain)) != thruster:
+                known = squared[thruster] * _TEST.loss_sigma**2 >= 1.0
+                if (
+                    not known
+                    or loss[thruster] < _TEST.weak_loss
+                    or int(np.argmax(gain)) != thruster
+                ):
                     continue
                 if _is_distinct(gain, thruster) and is_consistent(
                     energy, float(2.0 * gain[thruster]), float(squared[thruster]), length
                 ):
-                    stuck_off = loss[thruster] > _STUCK_OFF_LOSS
+                    stuck_off = loss[thruster] > _TEST.stuck_off_loss
                     return ThrusterFault(
                         thruster,
                         "stuck_off" if stuck_off else "weak",
@@ -206,7 +222,10 @@ def _totals(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int
 
 def _is_distinct(gain: Array, best: int) -> bool:
     others = np.delete(gain, best)
-    return bool(gain[best] > _MIN_GAIN and gain[best] - others.max(initial=-math.inf) > _MIN_MARGIN)
+    return bool(
+        gain[best] > _TEST.min_gain
+        and gain[best] - others.max(initial=-math.inf) > _TEST.min_margin
+    )
 
 
 def is_consistent(energy: float, explained: float, squared: float, ticks: int) -> bool:
@@ -217,5 +236,6 @@ def is_consistent(energy: float, explained: float, squared: float, ticks: int) -
     """
     freedoms = 6.0 * ticks
     return (
-        energy - explained < freedoms + 5.0 * math.sqrt(2.0 * freedoms) + _OWN_SCATTER**2 * squared
+        energy - explained
+        < freedoms + 5.0 * math.sqrt(2.0 * freedoms) + _TEST.own_scatter**2 * squared
     )

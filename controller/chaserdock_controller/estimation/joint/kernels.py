@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from chaserdock_controller.bodies.body_shape import SHAPE
 
-from .native import function
+from .native import LIBRARY, function
 
 TARGET_MEAN, CHASER_MEAN = 13, 44
 MOST_ROWS = 18
@@ -29,6 +29,7 @@ _SEEN = 55
 _CHANNELS = 5
 
 
+@LIBRARY.structure("Motion")
 class MotionParameters(Structure):
     """`Motion` of native/motion.c."""
 
@@ -47,6 +48,7 @@ class MotionParameters(Structure):
     ]  # fmt: skip
 
 
+@LIBRARY.structure("Measurement")
 class _Measurement(Structure):
     _fields_ = [
         ("n", c_int64),
@@ -69,6 +71,7 @@ class _Measurement(Structure):
     ]
 
 
+@LIBRARY.structure("Innovation")
 class _Innovation(Structure):
     _fields_ = [
         *(

@@ -1,17 +1,19 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Discrete dynamics of a chaser and their Jacobians; the tests compare them with `problem.dynamics`.
+/* Discrete dynamics of a chaser and their Jacobians; the tests compare them with casadi_model.py.
  *
- * The Jacobians share intermediate results with the step itself, so the NMPC has its own integrator beside
- * chaserdock_models.rigid_body.
+ * The Jacobians share intermediate results with the step itself, so the NMPC has its own integrator
+ * beside chaserdock_models.rigid_body.
  *
- * State x (13) = [p, v (WRF), q_wxyz (body to world), omega (body)], input u (6) = [force, torque] (body axes).
- * Jacobians are taken in the tangent space [dp, dv, dtheta, domega] with q_true = q (x) exp(dtheta): A is 12 x 12 and
- * B 12 x 6. The first six columns of A are those of a double integrator (identity and step), so only its last six,
- * C, are computed; M = [C B], 12 x 12, is stored. Its columns: dtheta, domega, force, torque, three each.
+ * State x (13) = [p, v (WRF), q_wxyz (body to world), omega (body)], input u (6) = [force, torque]
+ * (body axes). Jacobians are taken in the tangent space [dp, dv, dtheta, domega] with q_true = q
+ * (x) exp(dtheta): A is 12 x 12 and B 12 x 6. The first six columns of A are those of a double
+ * integrator (identity and step), so only its last six, C, are computed; M = [C B], 12 x 12, is
+ * stored. Its columns: dtheta, domega, force, torque, three each.
  */
 #include "base.h"
 
-/* Rates at y (7) = [q, omega]: q', omega', acceleration (WRF), and the intermediate R(q) / m (9) and I omega (3). */
+/* Rates at y (7) = [q, omega]: q', omega', acceleration (WRF), and the intermediate R(q) / m (9)
+ * and I omega (3). */
 typedef struct {
     double q[4], omega[3], a[3], turn[9], momentum[3];
 } Rates;
@@ -39,14 +41,16 @@ static inline void rates(const Model *model, const double *y, const double *u, R
 }
 
 static inline double normalize_quaternion(double *q) {
-    double length = sqrt_of((q[0] * q[0] + q[2] * q[2]) + (q[1] * q[1] + q[3] * q[3])), f = 1.0 / length;
+    double length = sqrt_of((q[0] * q[0] + q[2] * q[2]) + (q[1] * q[1] + q[3] * q[3])),
+           f = 1.0 / length;
     for (int i = 0; i < 4; i++) q[i] *= f;
     return length;
 }
 
-/* One Runge-Kutta part: rates at x + c k (k: the previous part, unused if c is 0), added with weight b to out. */
-static inline void part(const Model *model, const double *x, const double *u, double b, double c, double *y, Rates *k,
-                        double *out) {
+/* One Runge-Kutta part: rates at x + c k (k: the previous part, unused if c is 0), added with
+ * weight b to out. */
+static inline void part(const Model *model, const double *x, const double *u, double b, double c,
+                        double *y, Rates *k, double *out) {
     for (int i = 0; i < 3; i++) out[i] = madd(b, madd(c, k->a[i], x[3 + i]), out[i]);
     for (int i = 0; i < 4; i++) y[i] = madd(c, k->q[i], x[6 + i]);
     for (int i = 0; i < 3; i++) y[4 + i] = madd(c, k->omega[i], x[10 + i]);
@@ -61,7 +65,8 @@ static void step(const Model *model, const double *x, const double *u, double *o
     double y[7];
     copy(x, out, 13);
     for (int64_t s = 0; s < model->parts; s++)
-        part(model, x, u, model->step_s * model->weights[s], model->step_s * model->nodes[s], y, &k, out);
+        part(model, x, u, model->step_s * model->weights[s], model->step_s * model->nodes[s], y, &k,
+             out);
     normalize_quaternion(out + 6);
 }
 
@@ -76,13 +81,14 @@ static inline void add(Row *out, double f, Row r) {
 }
 static inline double entry(const Row *r, int i) { return i < 4 ? r->a[i] : r->b[i - 4]; }
 
-/* d[q', omega', a] by [omega, torque] at y, whose sensitivities are `here` (7); torque (3): I^-1 in its columns.
+/* d[q', omega', a] by [omega, torque] at y, whose sensitivities are `here` (7); torque (3): I^-1 in
+ * its columns.
  *
- * q' = 1/2 q (0, omega); omega' = I^-1 (tau - omega x I omega); a = (1 - |q|^2) F / m + q F q* / m, so that
- * m da = 2 [ s dv x F + (v . F) dv + v (F . dv) - 2 F (v . dv) + ds v x F ] for q = (s, v).
+ * q' = 1/2 q (0, omega); omega' = I^-1 (tau - omega x I omega); a = (1 - |q|^2) F / m + q F q* / m,
+ * so that m da = 2 [ s dv x F + (v . F) dv + v (F . dv) - 2 F (v . dv) + ds v x F ] for q = (s, v).
  */
-static inline void rate_rows(const Model *model, const double *y, const double *u, const Rates *k, const Row *torque,
-                             const Row *here, Row *rate) {
+static inline void rate_rows(const Model *model, const double *y, const double *u, const Rates *k,
+                             const Row *torque, const Row *here, Row *rate) {
     const double s = y[0], *v = y + 1, *o = y + 4, f = 2.0 * model->per_mass, along = dot3(v, u);
     const Row none = {{0}, {0}};
     for (int i = 0; i < 10; i++) rate[i] = 4 <= i && i < 7 ? torque[i - 4] : none;
@@ -91,7 +97,8 @@ static inline void rate_rows(const Model *model, const double *y, const double *
         int a = (j + 1) % 3, b = (j + 2) % 3;
         for (int i = 0; i < 3; i++) {
             int m = (i + 1) % 3, n = (i + 2) % 3;
-            spin[3 * i + j] = madd(o[n], model->inertia[3 * m + j], -(o[m] * model->inertia[3 * n + j]));
+            spin[3 * i + j] =
+                madd(o[n], model->inertia[3 * m + j], -(o[m] * model->inertia[3 * n + j]));
         }
         spin[3 * a + j] += k->momentum[b];
         spin[3 * b + j] -= k->momentum[a];
@@ -108,7 +115,9 @@ static inline void rate_rows(const Model *model, const double *y, const double *
         add(&rate[1 + i], 0.5 * v[a], here[4 + b]);
         for (int j = 0; j < 3; j++) {
             const double *inverse = model->inverse + 3 * i;
-            add(&rate[4 + i], madd(inverse[2], spin[6 + j], madd(inverse[1], spin[3 + j], inverse[0] * spin[j])), here[4 + j]);
+            add(&rate[4 + i],
+                madd(inverse[2], spin[6 + j], madd(inverse[1], spin[3 + j], inverse[0] * spin[j])),
+                here[4 + j]);
         }
         add(&rate[7 + i], f * madd(v[a], u[b], -(v[b] * u[a])), here[0]);
         add(&rate[7 + i], f * along - f * v[i] * u[i], here[1 + i]);
@@ -117,14 +126,17 @@ static inline void rate_rows(const Model *model, const double *y, const double *
     }
 }
 
-/* One step as in `step`, with its Jacobians m_mat = [C B] (12, 12); B by inputs in shares of `limits` (6).
+/* One step as in `step`, with its Jacobians m_mat = [C B] (12, 12); B by inputs in shares of
+ * `limits` (6).
  *
- * The initial attitude needs no sensitivities: q' = 1/2 q (0, omega) commutes with a rotation from the left, so dtheta
- * propagates as R(q_0* q_1)' dtheta, and the acceleration q F q* rotates as a whole.
+ * The initial attitude needs no sensitivities: q' = 1/2 q (0, omega) commutes with a rotation from
+ * the left, so dtheta propagates as R(q_0* q_1)' dtheta, and the acceleration q F q* rotates as a
+ * whole.
  */
-static void linearize(const Model *model, const double *x, const double *u, const double *limits, double *out,
-                      double *m_mat) {
-    const Row none = {{0}, {0}}, unit[3] = {{{1, 0, 0, 0}, {0}}, {{0, 1, 0, 0}, {0}}, {{0, 0, 1, 0}, {0}}};
+static void linearize(const Model *model, const double *x, const double *u, const double *limits,
+                      double *out, double *m_mat) {
+    const Row none = {{0}, {0}},
+              unit[3] = {{{1, 0, 0, 0}, {0}}, {{0, 1, 0, 0}, {0}}, {{0, 0, 1, 0}, {0}}};
     Rates k = {0};
     Row torque[3], here[7], rate[10], sum[13]; /* sums over the parts: p, v, q, omega */
     double y[7], along_p[3] = {0}, along_v[3] = {0}, turn_0[9], force_p[9] = {0}, force_v[9] = {0};
@@ -138,7 +150,8 @@ static void linearize(const Model *model, const double *x, const double *u, cons
     zero(m_mat, 144);
     copy(x, out, 13);
     for (int64_t s = 0; s < model->parts; s++) {
-        const double c = model->step_s * model->nodes[s], b = model->step_s * model->weights[s], bc = b * c;
+        const double c = model->step_s * model->nodes[s], b = model->step_s * model->weights[s],
+                     bc = b * c;
         for (int i = 0; i < 7; i++) {
             here[i] = i < 4 ? none : unit[i - 4];
             add(&here[i], c, rate[i]);
@@ -146,7 +159,7 @@ static void linearize(const Model *model, const double *x, const double *u, cons
         for (int i = 0; i < 3; i++) {
             add(&sum[i], bc, rate[7 + i]);
         }
-        /* the columns of the force and the rotating acceleration: of the previous part into p ... */
+        /* the columns of the force and the rotating acceleration: of the previous part into p */
         if (s > 0) {
             double excess = 1.0 - ((y[0] * y[0] + y[2] * y[2]) + (y[1] * y[1] + y[3] * y[3]));
             for (int i = 0; i < 9; i++) force_p[i] = madd(bc, k.turn[i], force_p[i]);
@@ -157,7 +170,7 @@ static void linearize(const Model *model, const double *x, const double *u, cons
         if (s == 0)
             for (int i = 0; i < 9; i++) turn_0[i] = model->mass_kg * k.turn[i];
         rate_rows(model, y, u, &k, torque, here, rate);
-        /* ... and of this one into v. */
+        /* and of this one into v */
         double excess = 1.0 - ((y[0] * y[0] + y[2] * y[2]) + (y[1] * y[1] + y[3] * y[3]));
         for (int i = 0; i < 9; i++) force_v[i] = madd(b, k.turn[i], force_v[i]);
         for (int i = 0; i < 3; i++) {
@@ -168,7 +181,8 @@ static void linearize(const Model *model, const double *x, const double *u, cons
         for (int i = 0; i < 4; i++) add(&sum[6 + i], b, rate[i]);
     }
     const double scale = 2.0 / normalize_quaternion(out + 6), *q = out + 6;
-    /* dtheta_next = 2 vec(q_next* (x) dq) / |q|: the projection on the tangent space, normalization included */
+    /* dtheta_next = 2 vec(q_next* (x) dq) / |q|: the projection on the tangent space, normalization
+     * included */
     Row turn[3];
     for (int i = 0; i < 3; i++) {
         int a = (i + 1) % 3, b = (i + 2) % 3;
@@ -184,7 +198,8 @@ static void linearize(const Model *model, const double *x, const double *u, cons
     r[0] = (p[0] * q[0] + p[2] * q[2]) + (p[1] * q[1] + p[3] * q[3]);
     for (int i = 0; i < 3; i++) {
         int a = (i + 1) % 3, b = (i + 2) % 3;
-        r[1 + i] = (p[0] * q[1 + i] - p[1 + i] * q[0]) - (p[1 + a] * q[1 + b] - p[1 + b] * q[1 + a]);
+        r[1 + i] =
+            (p[0] * q[1 + i] - p[1 + i] * q[0]) - (p[1 + a] * q[1 + b] - p[1 + b] * q[1 + a]);
     }
     for (int i = 0; i < 3; i++) {
         int a = (i + 1) % 3, b = (i + 2) % 3;
@@ -194,7 +209,8 @@ static void linearize(const Model *model, const double *x, const double *u, cons
     }
     for (int i = 0; i < 3; i++) {
         int a = (i + 1) % 3, b = (i + 2) % 3;
-        double *rows[4] = {m_mat + 12 * i, m_mat + 12 * (3 + i), m_mat + 12 * (6 + i), m_mat + 12 * (9 + i)};
+        double *rows[4] = {m_mat + 12 * i, m_mat + 12 * (3 + i), m_mat + 12 * (6 + i),
+                           m_mat + 12 * (9 + i)};
         const Row *of[4] = {&sum[i], &sum[3 + i], &turn[i], &sum[10 + i]};
         for (int j = 0; j < 3; j++) {
             /* (R_0 dtheta) x g = -[g]x R_0 dtheta */
@@ -222,11 +238,12 @@ EXPORT void NAME(roll)(const Model *model, int64_t n, int64_t stages, const doub
 }
 
 /* Roll out and linearize: mats (N, D, 12, 12) = [C B], B for inputs scaled by limits (N, 6). */
-EXPORT void NAME(roll_linearized)(const Model *model, int64_t n, int64_t stages, const double *u, const double *limits,
-                             double *x, double *mats) {
+EXPORT void NAME(roll_linearized)(const Model *model, int64_t n, int64_t stages, const double *u,
+                                  const double *limits, double *x, double *mats) {
     for (int64_t i = 0; i < n; i++)
         for (int64_t k = 0; k < stages; k++) {
             double *here = x + 13 * (i * (stages + 1) + k);
-            linearize(model, here, u + 6 * (i * stages + k), limits + 6 * i, here + 13, mats + 144 * (i * stages + k));
+            linearize(model, here, u + 6 * (i * stages + k), limits + 6 * i, here + 13,
+                      mats + 144 * (i * stages + k));
         }
 }

@@ -1,59 +1,75 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Mehrotra's predictor-corrector interior point for one chaser's QP, on top of the Riccati sweeps.
  *
- * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dp_k + b' dv_k >= c (dp_k, dv_k the changes of position
- * and velocity at stage k; b is absent where no coast is restricted) is soft: with a slack s >= 0, priced w1 s + w2/2 s^2,
- * and z = a' dp + b' dv - c + s >= 0, multipliers lam (of z) and pi (of s). Slack and multipliers are eliminated row by row,
- * so a row only adds a rank-one term to the blocks of position and velocity of Q_k and the sparsity of the Riccati sweep stays.
- * Method: S. Mehrotra, SIAM J. Optim. 2 (1992); Nocedal and Wright, "Numerical Optimization", sec. 16.6.
+ * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dr_k >= c (dr_k the changes of
+ * position and velocity at stage k) is soft: with a slack s >= 0, priced w1 s + w2/2 s^2, and
+ * z = a' dr - c + s >= 0, multipliers lam (of z) and pi (of s). Slack and multipliers are
+ * eliminated row by row, so a row only adds a rank-one term to the block of position and velocity
+ * of Q_k and the sparsity of the Riccati sweep stays. Method: S. Mehrotra, SIAM J. Optim. 2 (1992);
+ * Nocedal and Wright, "Numerical Optimization", sec. 16.6.
  *
- * All positive quantities are stored in one vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w (6 D); its
- * multipliers, in that order, in mul: lam, pi, and those of the box.
+ * All positive quantities are stored in one vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w (6
+ * D); its multipliers, in that order, in mul: lam, pi, and those of the box.
  *
- * Most rows are far from the chaser. Only near rows are active. A solution that satisfies the others as well solves the
- * whole problem; otherwise the problem is solved again with the rows it came near.
+ * Most rows are far from the chaser. Only near rows are active. A solution that satisfies the
+ * others as well solves the whole problem; otherwise the problem is solved again with the rows it
+ * came near.
  */
 #include "base.h"
 
+/* Numbers of the method. "Flights": seven closed loops, varied one number at a time
+ * (docs/evidence/controller.md). */
+
 /* Complementarity at which to stop, in units of cost. 1e-2 to 1e-4 fly the same closed loop. */
 #define MU_STOP 1e-3
-/* Complementarity at the start, relative to the largest slope there, and its upper end. */
+/* Complementarity at the start, relative to the largest slope there. With half or twice of it, a
+ * plan in 150 of one flight ends at its limit of iterations. */
 #define MU_START 0.1
+/* Upper end of the complementarity at the start, units of cost: without it, or with 1e3, a plan for
+ * a reference 2 km away ends at its limit of iterations; with 1e5 it takes 17 iterations. */
 #define MU_START_MAX 1e5
-/* Stationarity at which to stop, relative to the gradient at the start. */
+/* Stationarity at which to stop, relative to the gradient at the start. Half takes up to 1 % more
+ * iterations; with twice, one plan ends at its limit. */
 #define GRADIENT_STOP 1e-6
+/* Share of the step to the boundary: below 1, so that all values stay positive. With 0.9 flights
+ * take 20 to 45 % more iterations, with 0.999 up to 4 % fewer, but one plan ends at its limit. */
 #define STEP_TO_BOUNDARY 0.995
-/* Tolerance for rows and bounds of the unconstrained solution (m, or fraction of a limit). */
+/* Tolerance for rows and bounds of the unconstrained solution (m, or fraction of a limit): its
+ * rounding. Half and twice change no bit of the flights. */
 #define FREE_TOLERANCE 1e-9
-/* Initial inputs are limited to this fraction of the box. */
+/* Initial inputs are limited to this fraction of the box, away from the boundary. With 0.99 flights
+ * take up to 56 % more iterations, with 0.8 up to 14 % fewer. */
 #define START_WITHIN 0.9
-/* Rows with less margin than this are active, m. */
+/* Rows with less margin than this are active, m. The solution does not depend on it, as rows that
+ * come near are added; half and twice take up to 2 % more iterations. */
 #define NEAR_M 0.1
 
 enum { FREE, CONVERGED, LIMIT, BROKEN };
 
-/* One chaser's problem. mats (D, 12, 12) = [C B]; q_pos, q_att (D+1, 3, 3); qx (D+1, 12); r_diag, r, w_bar (D, 6);
- * rows: stage (R,), a (R, 3), c (R,), b (R, 3) or NULL if no row has a velocity. */
+/* One chaser's problem. mats (D, 12, 12) = [C B]; q, qx, r_diag, r, w_bar as in `Quadratic`; rows:
+ * stage (R,), a (R, 6), c (R,). */
 typedef struct {
     int64_t stages, n_rows, max_iterations;
     double h, w1, w2;
-    const double *mats, *q_pos, *q_att, *qx, *r_diag, *r, *w_bar;
+    const double *mats, *q, *qx, *r_diag, *r, *w_bar;
     const int64_t *stage;
-    const double *a, *c, *b;
+    const double *a, *c;
 } Qp;
+LAYOUT(Qp, stages, n_rows, max_iterations, h, w1, w2, mats, q, qx, r_diag, r, w_bar, stage, a, c)
 
 /* dx (D+1, 12), dw (D, 6), multipliers mul (2 R + 12 D), scaled stationarity, complementarity. */
 typedef struct {
     double *dx, *dw, *mul, residual, mu;
     int64_t iterations;
 } Answer;
+LAYOUT(Answer, dx, dw, mul, residual, mu, iterations)
 
 /* The active rows, and the working vectors of an iteration. */
 typedef struct {
     int64_t count, n, *stage, *index;
-    double *a, *c, *b;
+    double *a, *c;
     double *val, *mul, *d_val, *d_mul, *res, *inverse, *w;
-    double *gx, *gw, *grad_x, *grad_w, *step_x, *step_w, *r_eff, *q_eff, *q_vel;
+    double *gx, *gw, *grad_x, *grad_w, *step_x, *step_w, *r_eff, *q_eff;
     Factor *factors;
 } Iterate;
 
@@ -61,7 +77,8 @@ static int64_t padded(int64_t count) { return (count + 3) / 4 * 4; }
 
 static int64_t ipm_workspace(int64_t d, int64_t rows) {
     int64_t count = padded(2 * rows + 12 * d), x = 12 * (d + 1), w = 6 * d;
-    return 22 * 8 + 6 * count + 9 * rows + 3 * x + 5 * w + 27 * (d + 1) + d * (int64_t)(sizeof(Factor) / 8);
+    return 22 * 8 + 6 * count + 9 * rows + 3 * x + 5 * w + 72 * (d + 1) +
+           d * (int64_t)(sizeof(Factor) / 8);
 }
 
 static Iterate lay_out(int64_t d, int64_t rows, double *work) {
@@ -74,47 +91,42 @@ static Iterate lay_out(int64_t d, int64_t rows, double *work) {
     for (int i = 0; i < 5; i++) *inputs[i] = allocate(&work, w);
     double **states[] = {&it.gx, &it.grad_x, &it.step_x};
     for (int i = 0; i < 3; i++) *states[i] = allocate(&work, x);
-    it.q_eff = allocate(&work, 9 * (d + 1));
-    it.q_vel = allocate(&work, 18 * (d + 1));
-    it.a = allocate(&work, 3 * rows);
-    it.b = allocate(&work, 3 * rows);
+    it.q_eff = allocate(&work, 72 * (d + 1));
+    it.a = allocate(&work, 6 * rows);
     it.c = allocate(&work, rows);
     it.stage = (int64_t *)allocate(&work, rows);
     it.index = (int64_t *)allocate(&work, rows);
     return it;
 }
 
+static inline double dot6(const double *a, const double *b) {
+    return dot3(a, b) + dot3(a + 3, b + 3);
+}
+
 /* Of the cost: gx (D+1, 12) = Q dx + qx, gw (D, 6) = R dw + r. */
 static void gradients(const Qp *qp, const double *dx, const double *dw, double *gx, double *gw) {
     copy(qp->qx, gx, 12 * (qp->stages + 1));
     for (int64_t k = 0; k <= qp->stages; k++)
-        for (int i = 0; i < 3; i++) {
-            gx[12 * k + i] += dot3(qp->q_pos + 9 * k + 3 * i, dx + 12 * k);
-            gx[12 * k + 6 + i] += dot3(qp->q_att + 9 * k + 3 * i, dx + 12 * k + 6);
+        for (int i = 0; i < 6; i++) {
+            gx[12 * k + i] += dot6(qp->q + 72 * k + 6 * i, dx + 12 * k);
+            gx[12 * k + 6 + i] += dot6(qp->q + 72 * k + 36 + 6 * i, dx + 12 * k + 6);
         }
     for (int64_t i = 0; i < 6 * qp->stages; i++) gw[i] = madd(qp->r_diag[i], dw[i], qp->r[i]);
 }
 
-/* Change of row j: a' dp + b' dv. */
-static inline double row_change(const double *dx, int64_t stage, const double *a, const double *b, int64_t j) {
-    double change = dot3(a + 3 * j, dx + 12 * stage);
-    return b ? change + dot3(b + 3 * j, dx + 12 * stage + 3) : change;
-}
-
 static inline double margin_of(const Qp *qp, const double *dx, int64_t j) {
-    return row_change(dx, qp->stage[j], qp->a, qp->b, j) - qp->c[j];
+    return dot6(qp->a + 6 * j, dx + 12 * qp->stage[j]) - qp->c[j];
 }
 
 /* Margin of the active row j. */
 static inline double active_margin(const Iterate *it, const double *dx, int64_t j) {
-    return row_change(dx, it->stage[j], it->a, it->b, j) - it->c[j];
+    return dot6(it->a + 6 * j, dx + 12 * it->stage[j]) - it->c[j];
 }
 
 /* Add force along the normal of the active row j to the gradient gx. */
 static inline void add_row_force(const Iterate *it, double *gx, int64_t j, double force) {
     double *g = gx + 12 * it->stage[j];
-    for (int i = 0; i < 3; i++) g[i] = madd(force, it->a[3 * j + i], g[i]);
-    for (int i = 0; i < 3 && it->b; i++) g[3 + i] = madd(force, it->b[3 * j + i], g[3 + i]);
+    for (int i = 0; i < 6; i++) g[i] = madd(force, it->a[6 * j + i], g[i]);
 }
 
 static int is_free(const Qp *qp, const double *dx, const double *w) {
@@ -125,14 +137,14 @@ static int is_free(const Qp *qp, const double *dx, const double *w) {
     return 1;
 }
 
-/* Activate the rows that dx (D+1, 12) comes near, in addition to the active ones. `active` marks each (R,). */
+/* Activate the rows that dx (D+1, 12) comes near, in addition to the active ones. `active` marks
+ * each (R,). */
 static void activate_rows(const Qp *qp, const double *dx, double *active, Iterate *it) {
     it->n = 0;
     for (int64_t j = 0; j < qp->n_rows; j++) {
         if (!(margin_of(qp, dx, j) >= NEAR_M)) active[j] = 1.0;
         if (active[j] == 0.0) continue;
-        copy(qp->a + 3 * j, it->a + 3 * it->n, 3);
-        if (qp->b) copy(qp->b + 3 * j, it->b + 3 * it->n, 3);
+        copy(qp->a + 6 * j, it->a + 6 * it->n, 6);
         it->c[it->n] = qp->c[j];
         it->stage[it->n] = qp->stage[j];
         it->index[it->n++] = j;
@@ -153,8 +165,8 @@ static inline void curvature(const Iterate *it, int64_t j, double w2, double *d,
     *e = madd(it->mul[it->n + j], it->inverse[it->n + j], w2);
 }
 
-/* Set the starting point: inputs inside the box, with centred slacks and multipliers. Return the scale of the
- * gradient there. */
+/* Set the starting point: inputs inside the box, with centred slacks and multipliers. Return the
+ * scale of the gradient there. */
 static double set_start(const Qp *qp, Answer *answer, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     for (int64_t i = 0; i < inputs; i++) {
@@ -165,12 +177,15 @@ static double set_start(const Qp *qp, Answer *answer, Iterate *it) {
     }
     advance(qp->stages, qp->mats, qp->h, answer->dx, answer->dw);
     gradients(qp, answer->dx, answer->dw, it->gx, it->gw);
-    double scale = max_of(1.0, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
-    /* Rows violated at the start contribute their full slack weight; a much smaller initial complementarity would start
-     * close to the boundary, where steps are short (27 to 40 iterations instead of 12). */
+    double scale =
+        max_of(1.0, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
+    /* Rows violated at the start contribute their full slack weight; a much smaller initial
+     * complementarity would start close to the boundary, where steps are short (27 to 40 iterations
+     * instead of 12). */
     for (int64_t j = 0; j < it->n; j++)
         if (active_margin(it, answer->dx, j) < 0.0) add_row_force(it, it->gx, j, -qp->w1);
-    double slope = max_of(scale, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
+    double slope =
+        max_of(scale, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
     double mu = min_of(max_of(MU_START * slope, MU_START), MU_START_MAX);
     for (int64_t j = 0; j < it->n; j++) {
         double g = active_margin(it, answer->dx, j);
@@ -202,50 +217,45 @@ static double complementarity(const Iterate *it) {
     return sum4(sum) / (double)it->count;
 }
 
-/* Add f [a; b] [a; b]' to the blocks of velocity, q (2, 3, 3). */
-static inline void add_velocity_blocks(double *q, double f, const double *a, const double *b) {
-    for (int m = 0; m < 3; m++)
-        for (int n = 0; n < 3; n++) {
-            q[3 * m + n] = madd(f * b[m], a[n], q[3 * m + n]);
-            q[9 + 3 * m + n] = madd(f * b[m], b[n], q[9 + 3 * m + n]);
-        }
-}
-
 /* Factor the Newton system: curvatures of rows and box added to those of the cost. */
 static int factor_newton(const Qp *qp, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
-    copy(qp->q_pos, it->q_eff, 9 * (qp->stages + 1));
-    if (it->b) zero(it->q_vel, 18 * (qp->stages + 1));
+    copy(qp->q, it->q_eff, 72 * (qp->stages + 1));
     for (int64_t j = 0; j < it->n; j++) {
-        double d, e, *q = it->q_eff + 9 * it->stage[j];
-        const double *a = it->a + 3 * j;
+        double d, e, *q = it->q_eff + 72 * it->stage[j];
+        const double *a = it->a + 6 * j;
         curvature(it, j, qp->w2, &d, &e);
         double f = d * e / (d + e);
-        for (int m = 0; m < 3; m++)
-            for (int n = 0; n < 3; n++) q[3 * m + n] = madd(f * a[m], a[n], q[3 * m + n]);
-        if (it->b) add_velocity_blocks(it->q_vel + 18 * it->stage[j], f, a, it->b + 3 * j);
+        for (int m = 0; m < 6; m++)
+            for (int n = 0; n < 6; n++) q[6 * m + n] = madd(f * a[m], a[n], q[6 * m + n]);
     }
     for (int64_t i = 0; i < inputs; i++)
-        it->r_eff[i] = qp->r_diag[i] + (it->mul[bottom + i] * it->inverse[bottom + i] + it->mul[top + i] * it->inverse[top + i]);
-    return factor(qp->stages, qp->mats, qp->h, it->q_eff, qp->q_att, it->b ? it->q_vel : 0, it->r_eff, it->factors);
+        it->r_eff[i] = qp->r_diag[i] + (it->mul[bottom + i] * it->inverse[bottom + i] +
+                                        it->mul[top + i] * it->inverse[top + i]);
+    return factor(qp->stages, qp->mats, qp->h, it->q_eff, it->r_eff, it->factors);
 }
 
-/* Compute the step that reduces the products val mul by res; return the largest fraction that keeps all positive. */
+/* Compute the step that reduces the products val mul by res; return the largest fraction that keeps
+ * all positive. */
 static double newton_step(const Qp *qp, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     copy(it->gx, it->grad_x, 12 * (qp->stages + 1));
     for (int64_t j = 0; j < it->n; j++) {
-        double d, e, rz = it->res[j] * it->inverse[j], rs = it->res[it->n + j] * it->inverse[it->n + j];
+        double d, e, rz = it->res[j] * it->inverse[j],
+                     rs = it->res[it->n + j] * it->inverse[it->n + j];
         curvature(it, j, qp->w2, &d, &e);
         add_row_force(it, it->grad_x, j, rz - d * (rs + rz) / (d + e));
     }
     for (int64_t i = 0; i < inputs; i++)
-        it->grad_w[i] = it->gw[i] + (it->res[bottom + i] * it->inverse[bottom + i] - it->res[top + i] * it->inverse[top + i]);
-    minimize(qp->stages, qp->mats, qp->h, it->factors, it->grad_x, it->grad_w, it->step_x, it->step_w);
+        it->grad_w[i] = it->gw[i] + (it->res[bottom + i] * it->inverse[bottom + i] -
+                                     it->res[top + i] * it->inverse[top + i]);
+    minimize(qp->stages, qp->mats, qp->h, it->factors, it->grad_x, it->grad_w, it->step_x,
+             it->step_w);
     for (int64_t j = 0; j < it->n; j++) {
-        double d, e, rz = it->res[j] * it->inverse[j], rs = it->res[it->n + j] * it->inverse[it->n + j];
+        double d, e, rz = it->res[j] * it->inverse[j],
+                     rs = it->res[it->n + j] * it->inverse[it->n + j];
         curvature(it, j, qp->w2, &d, &e);
-        double dg = row_change(it->step_x, it->stage[j], it->a, it->b, j);
+        double dg = dot6(it->a + 6 * j, it->step_x + 12 * it->stage[j]);
         it->d_val[it->n + j] = -(rs + rz + d * dg) / (d + e);
         it->d_val[j] = dg + it->d_val[it->n + j];
     }
@@ -269,7 +279,8 @@ static double newton_step(const Qp *qp, Iterate *it) {
 static double after_step(const Iterate *it, double alpha) {
     v4 sum = splat(0.0);
     for (int64_t j = 0; j < it->count; j += 4)
-        sum += madd4(splat(alpha), load(it->d_val + j), load(it->val + j)) * madd4(splat(alpha), load(it->d_mul + j), load(it->mul + j));
+        sum += madd4(splat(alpha), load(it->d_val + j), load(it->val + j)) *
+               madd4(splat(alpha), load(it->d_mul + j), load(it->mul + j));
     return sum4(sum) / (double)it->count;
 }
 
@@ -284,13 +295,15 @@ static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
         for (int64_t j = 0; j < it->n; j++) add_row_force(it, it->gx, j, -it->mul[j]);
         for (int64_t i = 0; i < inputs; i++) it->gw[i] += it->mul[top + i] - it->mul[bottom + i];
         answer->mu = mu;
-        answer->residual = reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w) / scale;
+        answer->residual =
+            reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w) / scale;
         if (!(finite(mu) && finite(answer->residual))) return BROKEN;
         if (mu <= MU_STOP && answer->residual <= GRADIENT_STOP) return CONVERGED;
         if (answer->iterations >= qp->max_iterations) return LIMIT;
         answer->iterations++;
 
-        for (int64_t j = 0; j < it->count; j += 4) store(it->inverse + j, splat(1.0) / load(it->val + j));
+        for (int64_t j = 0; j < it->count; j += 4)
+            store(it->inverse + j, splat(1.0) / load(it->val + j));
         if (!factor_newton(qp, it)) return BROKEN;
         double after = after_step(it, min_of(1.0, newton_step(qp, it)));
         /* Not far below the stopping point: a smaller value degrades the conditioning. */
@@ -302,8 +315,10 @@ static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
             it->val[j] = madd(alpha, it->d_val[j], it->val[j]);
             it->mul[j] = madd(alpha, it->d_mul[j], it->mul[j]);
         }
-        for (int64_t i = 0; i < 12 * (qp->stages + 1); i++) answer->dx[i] = madd(alpha, it->step_x[i], answer->dx[i]);
-        for (int64_t i = 0; i < inputs; i++) answer->dw[i] = madd(alpha, it->step_w[i], answer->dw[i]);
+        for (int64_t i = 0; i < 12 * (qp->stages + 1); i++)
+            answer->dx[i] = madd(alpha, it->step_x[i], answer->dx[i]);
+        for (int64_t i = 0; i < inputs; i++)
+            answer->dw[i] = madd(alpha, it->step_w[i], answer->dw[i]);
     }
 }
 
@@ -320,17 +335,16 @@ static void expand_multipliers(const Qp *qp, const Iterate *it, double *mul) {
     copy(it->mul + 2 * it->n, mul + 2 * qp->n_rows, 12 * qp->stages);
 }
 
-/* |w_bar + dw| <= 1 always holds up to rounding, for FREE within FREE_TOLERANCE. With CONVERGED and LIMIT the point
- * lies strictly within the box; with LIMIT it is the best of max_iterations. BROKEN: the solution would not be finite.
- * Working memory: `ipm_workspace` doubles, and R more. */
+/* |w_bar + dw| <= 1 always holds up to rounding, for FREE within FREE_TOLERANCE. With CONVERGED and
+ * LIMIT the point lies strictly within the box; with LIMIT it is the best of max_iterations.
+ * BROKEN: the solution would not be finite. Working memory: `ipm_workspace` doubles, and R more. */
 static int solve_one(const Qp *qp, Answer *answer, double *work) {
     const int64_t inputs = 6 * qp->stages;
     double *active = allocate(&work, qp->n_rows);
     Iterate it = lay_out(qp->stages, qp->n_rows, work);
-    if (!qp->b) it.b = 0;
     answer->iterations = 0;
     answer->residual = answer->mu = 0.0;
-    if (!factor(qp->stages, qp->mats, qp->h, qp->q_pos, qp->q_att, 0, qp->r_diag, it.factors)) return BROKEN;
+    if (!factor(qp->stages, qp->mats, qp->h, qp->q, qp->r_diag, it.factors)) return BROKEN;
     minimize(qp->stages, qp->mats, qp->h, it.factors, qp->qx, qp->r, answer->dx, answer->dw);
     for (int64_t i = 0; i < inputs; i++) it.w[i] = qp->w_bar[i] + answer->dw[i];
     if (is_free(qp, answer->dx, it.w)) {
@@ -349,6 +363,10 @@ static int solve_one(const Qp *qp, Answer *answer, double *work) {
     }
 }
 
-EXPORT int64_t NAME(qp_workspace)(int64_t stages, int64_t rows) { return ipm_workspace(stages, rows) + rows + 16; }
+EXPORT int64_t NAME(qp_workspace)(int64_t stages, int64_t rows) {
+    return ipm_workspace(stages, rows) + rows + 16;
+}
 
-EXPORT int NAME(solve_qp)(const Qp *qp, Answer *answer, double *work) { return solve_one(qp, answer, work); }
+EXPORT int NAME(solve_qp)(const Qp *qp, Answer *answer, double *work) {
+    return solve_one(qp, answer, work);
+}

@@ -5,7 +5,7 @@
 #include "model.h"
 #include "checks.c"
 #include "dynamics.c"
-#include "cost.c"
+#include "problem.c"
 #include "planes.c"
 #include "riccati.c"
 #include "ipm.c"

@@ -9,5 +9,6 @@ typedef struct {
     double step_s, mass_kg, per_mass, inertia[9], inverse[9], nodes[4], weights[4];
     int64_t parts;
 } Model;
+LAYOUT(Model, step_s, mass_kg, per_mass, inertia, inverse, nodes, weights, parts)
 
 #endif

@@ -1,54 +1,52 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Distance constraints as half-spaces about a rollout, so that the chasers' problems separate.
+/* Terms that restrict motion, as half-spaces about a rollout, so that the chasers' problems
+ * separate.
  *
- * A chaser-target constraint becomes the plane tangent to the keep-out ball; a chaser-chaser constraint a separating
- * plane at the midpoint, half the distance to each side; the outer bound a plane tangent to the ball about the
- * reference; an approach corridor the plane tangent to its cone where the chaser is nearest; a cuboid of the target's shape the
- * plane that separates it from the chaser's shape, normal to the line from its nearest point to the chaser's centre; for a pair of
- * chasers with shapes the distance is at least what these need along the line between the centres; the coast after a loss of thrust a
- * half-space of position and velocity (nmpc/coast_rows.py). A row of stage k reads a' dp_k + b' dv_k >= c with dp_k and dv_k
- * the changes of the rolled position and velocity.
+ * Keep-out: the plane tangent to the ball about the target. Outer bound: the plane tangent to the
+ * ball about the reference. Corridor: the plane tangent to the cone where the chaser is nearest.
+ * Separation: a plane between two chasers at the midpoint, half the distance to each side; with
+ * shapes, this distance is at least what they need along the line between the centres. Target's
+ * shape: for each cuboid the plane that separates it from the chaser's shape, normal to the line
+ * from its nearest point to the chaser's centre. Passive coasts: half-spaces of position and
+ * velocity as they are given (nmpc/terms/coast.py).
+ *
+ * A row of stage k reads a' dr_k >= c with dr_k the changes of the rolled position and velocity.
  */
 #include "base.h"
 
-/* Linearization can lose 2 mm of a distance; additional margin of the plan. */
+/* Additional margin of the plan, m: linearization can lose 2 mm of a distance. */
 #define MARGIN_M 5e-3
-/* For a chaser heading for the centre within 10 degrees the passing side is undetermined; the normal is tilted by TILT. */
+/* For a chaser that heads for the centre within 10 degrees (its cosine) the passing side is
+ * undetermined. Half and twice the angle: a plan in 150 of one flight ends at its limit of
+ * iterations. */
 #define COS_HEAD_ON 0.984807753012208
+/* Tangent by which the normal is tilted then; without it a symmetric approach goes straight
+ * through. 0.1 and 0.4 pass obstacles as well. */
 #define TILT 0.2
-/* Closer than this fraction of the distance the rollout counts as inside and the last normal is kept, so that a crossing
- * rollout does not get the normal of the far side. */
+/* Closer than this fraction of the distance the rollout counts as inside and the last normal is
+ * kept, so that a crossing rollout does not get the normal of the far side. 0.4 and 0.95 keep the
+ * same distances. */
 #define INSIDE 0.8
-/* A tilted normal sees 1 / sqrt(1 + TILT^2) of the gap: bound for `out_of_reach`, with a small margin. */
+/* Bound for `out_of_reach`: a tilted normal sees 1 / sqrt(1 + TILT^2) = 0.9806 of the gap. */
 #define TILTED_SHARE 0.98
-/* Most by which the planes between chasers move in favour of one that cannot keep its own distances, m. */
+/* Most by which the planes between chasers move in favour of one that cannot keep its own
+ * distances, m: so much a neighbour comes nearer to the common plane, and no more than a small part
+ * of the distance (0.35 m). Half and twice change no flight without shapes. */
 #define RELIEF_MAX_M 0.02
 
-typedef struct {
-    int64_t n, stages;
-    const double *references, *targets, *to_target, *between, *corridors; /* as in `NmpcInput`, all expanded */
-    double outer;
-    int64_t n_boxes;
-    const double *boxes, *clearance; /* (D+1, n_boxes, 15): centre, rotation to WRF, half edges; (N,) */
-    int64_t n_shape;
-    const double *shape, *apart; /* (n_shape, 15): a chaser's cuboids, as boxes but in body axes; (N, N): distance of shapes */
-    int64_t n_coasts;
-    const double *coasts; /* (N, D+1, n_coasts, 7): a (3), b (3), d of a' p + b' v >= d; a and b zero for none */
-    double step_s;
-} Zones;
-
-/* The rows of all chasers, capacity `width` each; reach (N, D+1): how far admissible inputs can move a chaser from its
- * rollout by each stage, m. */
+/* The rows of all chasers, capacity `width` each; reach (N, D+1): how far admissible inputs can
+ * move a chaser from its rollout by each stage, m. */
 typedef struct {
     int64_t width, nodes;
     const double *reach;
     int64_t *stage, *n_rows;
-    double *a, *c, *b; /* b: NULL if no coast is restricted */
-    double *relief;    /* (N,) working memory */
+    double *a, *c;  /* (N, width, 6): of position and velocity; (N, width) */
+    double *relief; /* (N,) working memory */
 } Rows;
+LAYOUT(Rows, width, nodes, reach, stage, n_rows, a, c, relief)
 
-/* Tilt the unit normal n sideways by TILT. Odd in n: both chasers of a pair tilt the same plane. The side is n x e,
- * e the axis with the smallest component of n. */
+/* Tilt the unit normal n sideways by TILT. Odd in n: both chasers of a pair tilt the same plane.
+ * The side is n x e, e the axis with the smallest component of n. */
 static void tilt(double *n) {
     int i = 0;
     for (int c = 1; c < 3; c++)
@@ -64,27 +62,32 @@ static void tilt(double *n) {
 }
 
 /* Add the row sign n' dp_k >= -room of chaser i unless no admissible input can reach it. */
-static inline void push(const Rows *rows, int64_t i, int64_t k, const double *n, double sign, double room) {
+static inline void push(const Rows *rows, int64_t i, int64_t k, const double *n, double sign,
+                        double room) {
     if (!(room <= rows->reach[i * rows->nodes + k])) return;
     int64_t m = i * rows->width + rows->n_rows[i]++;
-    for (int c = 0; c < 3; c++) rows->a[3 * m + c] = sign * n[c];
-    if (rows->b) zero(rows->b + 3 * m, 3);
+    for (int c = 0; c < 3; c++) {
+        rows->a[6 * m + c] = sign * n[c];
+        rows->a[6 * m + 3 + c] = 0.0;
+    }
     rows->c[m] = -room;
     rows->stage[m] = k;
 }
 
 /* Set the normal at stage 0: direction of the relative position, else of the relative reference. */
-static void first_side(const double *here, const double *there, const double *ref, const double *ref_there,
-                       double *last) {
+static void first_side(const double *here, const double *there, const double *ref,
+                       const double *ref_there, double *last) {
     subtract3(here, there, last);
     if (normalize3(last) > 0.0) return;
     subtract3(ref, ref_there, last);
     if (normalize3(last) == 0.0) last[0] = 1.0;
 }
 
-/* Compute the normal n of a stage; last is that of the previous stage and is updated. `held`: the rollout crosses the
- * constraint and keeps the normal of its entry side. The displacement `want` is normalized and its length returned. */
-static double side(double *n, double *want, double d, int *held, double *last, double *gap, double *heading) {
+/* Compute the normal n of a stage; last is that of the previous stage and is updated. `held`: the
+ * rollout crosses the constraint and keeps the normal of its entry side. The displacement `want` is
+ * normalized and its length returned. */
+static double side(double *n, double *want, double d, int *held, double *last, double *gap,
+                   double *heading) {
     *gap = normalize3(n);
     double ahead = dot3(n, last);
     if (*held || *gap < INSIDE * d || ahead < 0.0) {
@@ -98,8 +101,9 @@ static double side(double *n, double *want, double d, int *held, double *last, d
     return length;
 }
 
-/* Distance from the surface of the corridor's cone, m, positive inside; n (3) receives the inward normal. r (3): position
- * from the target; corridor (5): axis (unit), half angle, distance of the apex from the target. */
+/* Distance from the surface of the corridor's cone, m, positive inside; n (3) receives the inward
+ * normal. r (3): position from the target; corridor (5): axis (unit), half angle, distance of the
+ * apex from the target. */
 static double corridor_room(const double *r, const double *corridor, double *n) {
     double s, c, along = dot3(r, corridor);
     sine_cosine(corridor[3], &s, &c);
@@ -113,40 +117,51 @@ static double corridor_room(const double *r, const double *corridor, double *n) 
     return madd(s, along - corridor[4], -(c * aside));
 }
 
-/* How far a chaser's shape reaches from its centre along sign n, n (3) in WRF, m; q (4): body to WRF. 0 without a shape. */
-static double reach_along(const Zones *zones, const double *q, double sign, const double *n) {
+/* How far a chaser's shape reaches from its centre along sign n, n (3) in WRF, m; q (4): body to
+ * WRF. 0 without a shape. */
+static double reach_along(const Problem *problem, const double *q, double sign, const double *n) {
     double t[3], u[3], local[3], furthest = 0.0;
-    if (!zones->n_shape) return 0.0;
+    if (!problem->n_shape) return 0.0;
     cross3(q + 1, n, t);
     cross3(q + 1, t, u);
     for (int c = 0; c < 3; c++) local[c] = sign * madd(2.0, u[c] - q[0] * t[c], n[c]);
-    for (const double *box = zones->shape; box < zones->shape + 15 * zones->n_shape; box += 15) {
+    for (const double *box = problem->shape; box < problem->shape + 15 * problem->n_shape;
+         box += 15) {
         double reach = dot3(box, local);
         for (int c = 0; c < 3; c++)
-            reach = madd(abs_of(madd(box[9 + c], local[2], madd(box[6 + c], local[1], box[3 + c] * local[0]))), box[12 + c], reach);
-        furthest = box == zones->shape ? reach : max_of(furthest, reach);
+            reach = madd(abs_of(madd(box[9 + c], local[2],
+                                     madd(box[6 + c], local[1], box[3 + c] * local[0]))),
+                         box[12 + c], reach);
+        furthest = box == problem->shape ? reach : max_of(furthest, reach);
     }
     return furthest;
 }
 
-/* Distance that the centres of two chasers in states x and y (13) keep along n (3), unit, from the second to the first. */
-static double centre_distance(const Zones *zones, int64_t i, int64_t j, const double *x, const double *y, const double *n) {
-    const double d = zones->between[i * zones->n + j], apart = zones->apart[i * zones->n + j];
+/* Distance that the centres of two chasers in states x and y (13) keep along n (3), unit, from the
+ * second to the first. */
+static double centre_distance(const Problem *problem, int64_t i, int64_t j, const double *x,
+                              const double *y, const double *n) {
+    const double d = problem->between[i * problem->n + j],
+                 apart = problem->apart[i * problem->n + j];
     if (!(apart > 0.0)) return d;
-    return max_of(d, apart + reach_along(zones, x + 6, -1.0, n) + reach_along(zones, y + 6, 1.0, n));
+    return max_of(d, apart + reach_along(problem, x + 6, -1.0, n) +
+                         reach_along(problem, y + 6, 1.0, n));
 }
 
 /* Largest `centre_distance` in any attitude. */
-static double largest_distance(const Zones *zones, int64_t i, int64_t j) {
-    const double d = zones->between[i * zones->n + j], apart = zones->apart[i * zones->n + j];
+static double largest_distance(const Problem *problem, int64_t i, int64_t j) {
+    const double d = problem->between[i * problem->n + j],
+                 apart = problem->apart[i * problem->n + j];
     double radius = 0.0;
     if (!(apart > 0.0)) return d;
-    for (const double *box = zones->shape; box < zones->shape + 15 * zones->n_shape; box += 15)
+    for (const double *box = problem->shape; box < problem->shape + 15 * problem->n_shape;
+         box += 15)
         radius = max_of(radius, sqrt_of(dot3(box, box)) + sqrt_of(dot3(box + 12, box + 12)));
     return max_of(d, apart + 2.0 * radius);
 }
 
-/* Test whether two chasers stay so far apart over the whole rollout that no row between them could be reached. */
+/* Test whether two chasers stay so far apart over the whole rollout that no row between them could
+ * be reached. */
 static int out_of_reach(const Rows *rows, const double *x, const double *y, const double *reach_x,
                         const double *reach_y, double d) {
     double last[3], now[3];
@@ -160,11 +175,16 @@ static int out_of_reach(const Rows *rows, const double *x, const double *y, cons
     return 1;
 }
 
-/* Rows of the separating planes of two chasers; `relief`: how far the planes move away from i, m. */
-static void pair_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t j, const double *x, const double *y, double relief) {
+/* Rows of the separating planes of two chasers; `relief`: how far the planes move away from
+ * i, m. */
+static void pair_rows(const Problem *problem, const Rows *rows, int64_t i, int64_t j,
+                      const double *x, const double *y, double relief) {
     const int64_t nodes = rows->nodes;
-    const double *here = zones->references + 7 * nodes * i, *there = zones->references + 7 * nodes * j;
-    if (out_of_reach(rows, x, y, rows->reach + i * nodes, rows->reach + j * nodes, largest_distance(zones, i, j))) return;
+    const double *here = problem->references + 7 * nodes * i,
+                 *there = problem->references + 7 * nodes * j;
+    if (out_of_reach(rows, x, y, rows->reach + i * nodes, rows->reach + j * nodes,
+                     largest_distance(problem, i, j)))
+        return;
     double last[3] = {0}, n[3], want[3], gap, heading;
     int held = 0;
     first_side(x, y, here, there, last);
@@ -172,11 +192,11 @@ static void pair_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t j
         subtract3(x + 13 * k, y + 13 * k, n);
         copy(n, want, 3);
         normalize3(want);
-        double d = centre_distance(zones, i, j, x + 13 * k, y + 13 * k, want);
+        double d = centre_distance(problem, i, j, x + 13 * k, y + 13 * k, want);
         subtract3(here + 7 * k, there + 7 * k, want);
         double length = side(n, want, d, &held, last, &gap, &heading);
         if (heading > COS_HEAD_ON && length >= d) tilt(n);
-        d = centre_distance(zones, i, j, x + 13 * k, y + 13 * k, n);
+        d = centre_distance(problem, i, j, x + 13 * k, y + 13 * k, n);
         subtract3(x + 13 * k, y + 13 * k, want);
         double room = 0.5 * (dot3(n, want) - d - MARGIN_M);
         push(rows, i, k, n, 1.0, room + relief);
@@ -184,13 +204,15 @@ static void pair_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t j
     }
 }
 
-/* Signed distance of a point (3) from a cuboid (15), m; n (3) receives its gradient (chaserdock_models.shape_distance). */
+/* Signed distance of a point (3) from a cuboid (15), m; n (3) receives its gradient
+ * (chaserdock_models.shape_distance). */
 static double box_distance(const double *point, const double *box, double *n) {
     double r[3], local[3], off[3] = {0}, square = 0.0;
     subtract3(point, box, r);
     for (int i = 0; i < 3; i++) {
         local[i] = madd(box[9 + i], r[2], madd(box[6 + i], r[1], box[3 + i] * r[0]));
-        if (abs_of(local[i]) > box[12 + i]) off[i] = local[i] - (local[i] > 0.0 ? box[12 + i] : -box[12 + i]);
+        if (abs_of(local[i]) > box[12 + i])
+            off[i] = local[i] - (local[i] > 0.0 ? box[12 + i] : -box[12 + i]);
         square = madd(off[i], off[i], square);
     }
     double distance = sqrt_of(square);
@@ -207,80 +229,99 @@ static double box_distance(const double *point, const double *box, double *n) {
     return distance;
 }
 
-/* Signed distance of a chaser's shape from a cuboid along the gradient n (3) of its centre's; x (13): its state. */
-static double shape_gap(const Zones *zones, const double *x, const double *box, double *n) {
+/* Signed distance of a chaser's shape from a cuboid along the gradient n (3) of its centre's; x
+ * (13): its state. */
+static double shape_gap(const Problem *problem, const double *x, const double *box, double *n) {
     double distance = box_distance(x, box, n);
-    return distance - reach_along(zones, x + 6, -1.0, n);
+    return distance - reach_along(problem, x + 6, -1.0, n);
 }
 
-/* Distance of a point (3) from the plane with the unit normal n (3) that touches a cuboid (15) from outside, m. */
+/* Distance of a point (3) from the plane with the unit normal n (3) that touches a cuboid (15) from
+ * outside, m. */
 static double plane_distance(const double *point, const double *box, const double *n) {
     double r[3], support = 0.0;
     subtract3(point, box, r);
     for (int i = 0; i < 3; i++)
-        support = madd(abs_of(madd(box[9 + i], n[2], madd(box[6 + i], n[1], box[3 + i] * n[0]))), box[12 + i], support);
+        support = madd(abs_of(madd(box[9 + i], n[2], madd(box[6 + i], n[1], box[3 + i] * n[0]))),
+                       box[12 + i], support);
     return dot3(n, r) - support;
 }
 
-/* Rows of the separating planes of one cuboid. A rollout that crosses it keeps the normal of its entry side. */
-static void box_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t box, const double *x) {
-    const double clearance = zones->clearance[i];
+/* Rows of the separating planes of one cuboid. A rollout that crosses it keeps the normal of its
+ * entry side. */
+static void box_rows(const Problem *problem, const Rows *rows, int64_t i, int64_t box,
+                     const double *x) {
+    const double clearance = problem->clearance[i];
     double last[3], n[3];
     int held = 0;
-    box_distance(x, zones->boxes + 15 * box, last);
+    box_distance(x, problem->boxes + 15 * box, last);
     for (int64_t k = 1; k < rows->nodes; k++) {
-        const double *at = zones->boxes + 15 * (zones->n_boxes * k + box);
+        const double *at = problem->boxes + 15 * (problem->n_boxes * k + box);
         double gap = box_distance(x + 13 * k, at, n);
-        if (held || gap < INSIDE * (clearance + reach_along(zones, x + 13 * k + 6, -1.0, n)) || dot3(n, last) < 0.0) {
+        if (held || gap < INSIDE * (clearance + reach_along(problem, x + 13 * k + 6, -1.0, n)) ||
+            dot3(n, last) < 0.0) {
             held = 1;
             copy(last, n, 3);
         }
         copy(n, last, 3);
-        double needed = clearance + reach_along(zones, x + 13 * k + 6, -1.0, n);
+        double needed = clearance + reach_along(problem, x + 13 * k + 6, -1.0, n);
         push(rows, i, k, n, 1.0, plane_distance(x + 13 * k, at, n) - needed - MARGIN_M);
     }
 }
 
 /* Rows of the coasts of one chaser, unless no admissible input can reach them. */
-static void coast_rows(const Zones *zones, const Rows *rows, int64_t i, const double *x) {
+static void coast_rows(const Problem *problem, const Rows *rows, int64_t i, const double *x) {
     for (int64_t k = 1; k < rows->nodes; k++)
-        for (int64_t j = 0; j < zones->n_coasts; j++) {
-            const double *row = zones->coasts + 7 * (zones->n_coasts * (rows->nodes * i + k) + j);
+        for (int64_t j = 0; j < problem->n_coasts; j++) {
+            const double *row =
+                problem->coasts + 7 * (problem->n_coasts * (rows->nodes * i + k) + j);
             double a = sqrt_of(dot3(row, row)), b = sqrt_of(dot3(row + 3, row + 3));
             double room = dot3(row, x + 13 * k) + dot3(row + 3, x + 13 * k + 3) - row[6];
-            double reach = rows->reach[i * rows->nodes + k] * (a + b / (zones->step_s * (double)k));
+            double reach =
+                rows->reach[i * rows->nodes + k] * (a + b / (problem->step_s * (double)k));
             if ((a == 0.0 && b == 0.0) || !(room <= reach)) continue;
             int64_t m = i * rows->width + rows->n_rows[i]++;
-            copy(row, rows->a + 3 * m, 3);
-            copy(row + 3, rows->b + 3 * m, 3);
+            copy(row, rows->a + 6 * m, 6);
             rows->c[m] = -room;
             rows->stage[m] = k;
         }
 }
 
-/* How far a chaser's rollout violates its present rows, without their margin, m, up to RELIEF_MAX_M. Its neighbours give way by so
- * much: halves of the gaps between chasers alone could hold one of them inside a keep-out. */
+/* How far a chaser's rollout violates its present rows, without their margin, m, up to
+ * RELIEF_MAX_M. Its neighbours give way by so much: halves of the gaps between chasers alone could
+ * hold one of them inside a keep-out. */
 static double violation(const Rows *rows, int64_t i) {
     double worst = 0.0;
-    for (int64_t m = rows->width * i; m < rows->width * i + rows->n_rows[i]; m++) worst = max_of(worst, rows->c[m] - MARGIN_M);
+    for (int64_t m = rows->width * i; m < rows->width * i + rows->n_rows[i]; m++)
+        worst = max_of(worst, rows->c[m] - MARGIN_M);
     return min_of(worst, RELIEF_MAX_M);
 }
 
-static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const double *x) {
+/* Rows of the outer bound and of the corridor. */
+static void outer_and_corridor_rows(const Problem *problem, const Rows *rows, int64_t i,
+                                    const double *x) {
     const int64_t nodes = rows->nodes;
-    const double *reference = zones->references + 7 * nodes * i, *corridor = zones->corridors + 5 * nodes * i;
-    const double *distance = zones->to_target + nodes * i, *target = zones->targets;
-    double last[3] = {0}, n[3], want[3], gap, heading;
+    const double *reference = problem->references + 7 * nodes * i;
+    const double *corridor = problem->corridors + 5 * nodes * i, *target = problem->targets;
+    double n[3], from_target[3];
     for (int64_t k = 1; k < nodes; k++) {
         subtract3(reference + 7 * k, x + 13 * k, n);
-        gap = normalize3(n);
-        push(rows, i, k, n, 1.0, zones->outer - gap);
+        double gap = normalize3(n);
+        push(rows, i, k, n, 1.0, problem->outer - gap);
         if (dot3(corridor + 5 * k, corridor + 5 * k) > 0.0) {
-            subtract3(x + 13 * k, target + 3 * k, want);
-            double room = corridor_room(want, corridor + 5 * k, n);
+            subtract3(x + 13 * k, target + 3 * k, from_target);
+            double room = corridor_room(from_target, corridor + 5 * k, n);
             push(rows, i, k, n, 1.0, room);
         }
     }
+}
+
+/* Rows of the keep-out. */
+static void keep_out_rows(const Problem *problem, const Rows *rows, int64_t i, const double *x) {
+    const int64_t nodes = rows->nodes;
+    const double *reference = problem->references + 7 * nodes * i;
+    const double *distance = problem->to_target + nodes * i, *target = problem->targets;
+    double last[3] = {0}, n[3], want[3], gap, heading;
     int held = 0;
     first_side(x, target, reference, target, last);
     for (int64_t k = 1; k < nodes; k++) {
@@ -297,48 +338,56 @@ static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const doub
     }
 }
 
-/* Write the rows of all chasers about the rollouts x (N, D+1, 13). stage (N, M), a (N, M, 3), c (N, M), n_rows (N,); M
- * at least D (N + 2 + n_boxes + n_coasts); b (N, M, 3) if there are coasts. None at stage 0, and none whose distance is NaN. */
-EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *rows) {
-    for (int64_t i = 0; i < zones->n; i++) {
+/* Write the rows of all terms about the rollouts x (N, D+1, 13): stage (N, M), a (N, M, 6), c (N,
+ * M), n_rows (N,), with M at least D (N + 2 + n_boxes + n_coasts). None at stage 0, and none whose
+ * distance is NaN. */
+EXPORT void NAME(build_rows)(const Problem *problem, const double *x, const Rows *rows) {
+    const int64_t n = problem->n, size = 13 * rows->nodes;
+    for (int64_t i = 0; i < n; i++) {
         rows->n_rows[i] = 0;
-        own_rows(zones, rows, i, x + 13 * rows->nodes * i);
-        if (zones->clearance[i] > 0.0)
-            for (int64_t b = 0; b < zones->n_boxes; b++) box_rows(zones, rows, i, b, x + 13 * rows->nodes * i);
+        outer_and_corridor_rows(problem, rows, i, x + size * i);
+        keep_out_rows(problem, rows, i, x + size * i);
+        if (problem->clearance[i] > 0.0)
+            for (int64_t b = 0; b < problem->n_boxes; b++)
+                box_rows(problem, rows, i, b, x + size * i);
         rows->relief[i] = violation(rows, i);
-        if (zones->n_coasts) coast_rows(zones, rows, i, x + 13 * rows->nodes * i);
+        if (problem->n_coasts) coast_rows(problem, rows, i, x + size * i);
     }
-    for (int64_t i = 0; i < zones->n; i++)
-        for (int64_t j = i + 1; j < zones->n; j++)
-            if (zones->between[i * zones->n + j] > 0.0 || zones->apart[i * zones->n + j] > 0.0)
-                pair_rows(zones, rows, i, j, x + 13 * rows->nodes * i, x + 13 * rows->nodes * j, rows->relief[i] - rows->relief[j]);
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = i + 1; j < n; j++)
+            if (problem->between[i * n + j] > 0.0 || problem->apart[i * n + j] > 0.0)
+                pair_rows(problem, rows, i, j, x + size * i, x + size * j,
+                          rows->relief[i] - rows->relief[j]);
 }
 
-/* Write the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if none. All stages 0..D
- * count, without margin; NaN if a position is. */
-EXPORT void NAME(plan_violation)(const Zones *zones, const double *x, double *worst) {
-    const int64_t nodes = zones->stages + 1;
+/* Write the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if
+ * none. All stages 0..D count, without margin; NaN if a position is. */
+EXPORT void NAME(plan_violation)(const Problem *problem, const double *x, double *worst) {
+    const int64_t nodes = problem->stages + 1;
     double r[3], n[3];
-    zero(worst, zones->n);
-    for (int64_t i = 0; i < zones->n; i++) {
+    zero(worst, problem->n);
+    for (int64_t i = 0; i < problem->n; i++) {
         const double *at = x + 13 * nodes * i;
         for (int64_t k = 0; k < nodes; k++, at += 13) {
-            const double *corridor = zones->corridors + 5 * (nodes * i + k);
-            subtract3(at, zones->references + 7 * (nodes * i + k), r);
-            worst[i] = max_or_nan(worst[i], sqrt_of(dot3(r, r)) - zones->outer);
-            subtract3(at, zones->targets + 3 * k, r);
-            if (dot3(corridor, corridor) > 0.0) worst[i] = max_or_nan(worst[i], -corridor_room(r, corridor, n));
-            worst[i] = max_or_nan(worst[i], zones->to_target[nodes * i + k] - sqrt_of(dot3(r, r)));
-            for (int64_t b = 0; b < zones->n_boxes && zones->clearance[i] > 0.0; b++) {
-                double gap = shape_gap(zones, at, zones->boxes + 15 * (zones->n_boxes * k + b), n);
-                worst[i] = max_or_nan(worst[i], zones->clearance[i] - gap);
+            const double *corridor = problem->corridors + 5 * (nodes * i + k);
+            subtract3(at, problem->references + 7 * (nodes * i + k), r);
+            worst[i] = max_or_nan(worst[i], sqrt_of(dot3(r, r)) - problem->outer);
+            subtract3(at, problem->targets + 3 * k, r);
+            if (dot3(corridor, corridor) > 0.0)
+                worst[i] = max_or_nan(worst[i], -corridor_room(r, corridor, n));
+            worst[i] =
+                max_or_nan(worst[i], problem->to_target[nodes * i + k] - sqrt_of(dot3(r, r)));
+            for (int64_t b = 0; b < problem->n_boxes && problem->clearance[i] > 0.0; b++) {
+                double gap =
+                    shape_gap(problem, at, problem->boxes + 15 * (problem->n_boxes * k + b), n);
+                worst[i] = max_or_nan(worst[i], problem->clearance[i] - gap);
             }
-            for (int64_t j = i + 1; j < zones->n; j++) {
+            for (int64_t j = i + 1; j < problem->n; j++) {
                 subtract3(at, x + 13 * (nodes * j + k), r);
                 double square = dot3(r, r);
                 copy(r, n, 3);
                 normalize3(n);
-                const double d = centre_distance(zones, i, j, at, x + 13 * (nodes * j + k), n);
+                const double d = centre_distance(problem, i, j, at, x + 13 * (nodes * j + k), n);
                 if (square >= d * d) continue;
                 worst[i] = max_or_nan(worst[i], d - sqrt_of(square));
                 worst[j] = max_or_nan(worst[j], d - sqrt_of(square));

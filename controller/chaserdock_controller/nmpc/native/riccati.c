@@ -4,24 +4,29 @@
  *     minimize  sum_k 1/2 dx_k' Q_k dx_k + qx_k' dx_k + 1/2 dw_k' R_k dw_k + r_k' dw_k
  *     subject to dx_{k+1} = A_k dx_k + B_k dw_k, dx_0 = 0,  k = 0..D-1
  *
- * A_k = [[I, hI], [0, I], [0, 0], [0, 0] | C_k]; M_k = [C_k B_k] (12, 12) is what is stored. Q_k holds a 3 x 3 block
- * for position and one for attitude, and blocks of velocity where rows restrict it; R_k is diagonal. Standard discrete-time recursion, e.g. Rawlings, Mayne and
- * Diehl, "Model Predictive Control", 2nd ed., section 8.8.3.
+ * A_k = [[I, hI], [0, I], [0, 0], [0, 0] | C_k]; M_k = [C_k B_k] (12, 12) is what is stored. Q_k
+ * holds a 6 x 6 block for position and velocity and one for attitude and rate; R_k is diagonal.
+ * Standard discrete-time recursion, e.g. Rawlings, Mayne and Diehl, "Model Predictive Control", 2nd
+ * ed., section 8.8.3.
  */
 #include "base.h"
 
-/* Factors of a stage from `factor`, with Rt = R + B'PB = L D L': -Rt^-1 B'PA, L (unit lower, row by row), 1 / D. */
+/* Factors of a stage from `factor`, with Rt = R + B'PB = L D L': -Rt^-1 B'PA, L (unit lower, row by
+ * row), 1 / D. */
 typedef struct {
     double gain[6][12], low[15], inverse[6], spare[3];
 } Factor;
 
 #define LOW(i, j) low[(i) * ((i) - 1) / 2 + (j)]
 
-/* Rows first.. of out = left' right (12, 12), three rows and `width` vectors of columns at a time. */
-static inline void gram_rows(const row12 *left, const row12 *right, row12 *out, int first, int width) {
+/* Rows first.. of out = left' right (12, 12), three rows and `width` vectors of columns at a
+ * time. */
+static inline void gram_rows(const row12 *left, const row12 *right, row12 *out, int first,
+                             int width) {
     v4 sum[3][3];
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < width; j++) sum[i][j] = splat(left[0][first + i]) * load(right[0] + 4 * j);
+        for (int j = 0; j < width; j++)
+            sum[i][j] = splat(left[0][first + i]) * load(right[0] + 4 * j);
     for (int m = 1; m < 12; m++)
         for (int i = 0; i < 3; i++)
             for (int j = 0; j < width; j++)
@@ -31,10 +36,12 @@ static inline void gram_rows(const row12 *left, const row12 *right, row12 *out, 
 }
 
 /* Rows first.. of out = left right (12, 12). */
-static inline void product_rows(const row12 *left, const row12 *right, row12 *out, int first, int width) {
+static inline void product_rows(const row12 *left, const row12 *right, row12 *out, int first,
+                                int width) {
     v4 sum[3][3];
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < width; j++) sum[i][j] = splat(left[first + i][0]) * load(right[0] + 4 * j);
+        for (int j = 0; j < width; j++)
+            sum[i][j] = splat(left[first + i][0]) * load(right[0] + 4 * j);
     for (int m = 1; m < 12; m++)
         for (int i = 0; i < 3; i++)
             for (int j = 0; j < width; j++)
@@ -61,20 +68,18 @@ static inline int decompose(const row12 *gram, const double *r, double *low, dou
     return 1;
 }
 
-/* Backward sweep over the matrices. q_pos, q_att (D+1, 3, 3), r_diag (D, 6); q_vel (D+1, 2, 3, 3): blocks
- * (velocity, position) and (velocity, velocity) of Q, or NULL if they are zero. Return 0 if Rt is not positive definite. */
-static int factor(int64_t stages, const double *mats, double h, const double *q_pos, const double *q_att,
-                  const double *q_vel, const double *r_diag, Factor *factors) {
+/* Backward sweep over the matrices: q (D+1, 2, 6, 6), r_diag (D, 6). Only the lower triangles of q
+ * count, and at the last stage the blocks on the diagonal. Return 0 if Rt is not positive
+ * definite. */
+static int factor(int64_t stages, const double *mats, double h, const double *q,
+                  const double *r_diag, Factor *factors) {
     row12 p[12], t[12], gram[12], y[6], scaled[6]; /* t = M'P, gram = M'PM, y = L^-1 B'PA */
     zero(p[0], 144);
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) {
-            p[i][j] = q_pos[9 * stages + 3 * i + j];
-            p[6 + i][6 + j] = q_att[9 * stages + 3 * i + j];
-            if (q_vel) {
-                p[3 + i][j] = p[j][3 + i] = q_vel[18 * stages + 3 * i + j];
-                p[3 + i][3 + j] = q_vel[18 * stages + 9 + 3 * i + j];
-            }
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++) {
+            const double *last = q + 72 * stages + (i < 3 && j >= 3 ? 6 * j + i : 6 * i + j);
+            p[i][j] = last[0];
+            p[6 + i][6 + j] = last[36];
         }
     for (int64_t k = stages - 1; k >= 0; k--) {
         const row12 *m_mat = (const row12 *)(mats + 144 * k);
@@ -116,7 +121,8 @@ static int factor(int64_t stages, const double *mats, double h, const double *q_
             }
         }
         for (int i = 0; i < 3; i++)
-            for (int j = 0; j < 3; j++) p[3 + i][3 + j] += h * (madd(h, p[i][j], p[3 + i][j]) + p[3 + j][i]);
+            for (int j = 0; j < 3; j++)
+                p[3 + i][3 + j] += h * (madd(h, p[i][j], p[3 + i][j]) + p[3 + j][i]);
         for (int i = 0; i < 3; i++)
             for (int j = 0; j < 3; j++) p[3 + i][j] = madd(h, p[i][j], p[3 + i][j]);
         for (int i = 0; i < 12; i++)
@@ -125,14 +131,10 @@ static int factor(int64_t stages, const double *mats, double h, const double *q_
                 for (int m = 0; m < 6; m++) s = madd4(splat(-y[m][i]), load(scaled[m] + j), s);
                 store(p[i] + j, s);
             }
-        for (int i = 0; i < 3; i++)
-            for (int j = 0; j < 3; j++) {
-                p[i][j] += q_pos[9 * k + 3 * i + j];
-                p[6 + i][6 + j] += q_att[9 * k + 3 * i + j];
-                if (q_vel) {
-                    p[3 + i][j] += q_vel[18 * k + 3 * i + j];
-                    p[3 + i][3 + j] += q_vel[18 * k + 9 + 3 * i + j];
-                }
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j <= i; j++) {
+                p[i][j] += q[72 * k + 6 * i + j];
+                p[6 + i][6 + j] += q[72 * k + 36 + 6 * i + j];
             }
         for (int i = 0; i < 12; i++)
             for (int j = 0; j < i; j++) p[j][i] = p[i][j];
@@ -160,7 +162,8 @@ static inline void adjoint(const double *m_mat, double h, const double *p, doubl
 }
 
 /* out (12) = A dx + B dw. */
-static inline void forward(const double *m_mat, double h, const double *dx, const double *dw, double *out) {
+static inline void forward(const double *m_mat, double h, const double *dx, const double *dw,
+                           double *out) {
     double v[12], s[12];
     for (int i = 0; i < 6; i++) {
         v[i] = dx[6 + i];
@@ -178,12 +181,14 @@ static inline void forward(const double *m_mat, double h, const double *dx, cons
 /* Propagate dw (D, 6) to dx (D+1, 12) from zero. */
 static void advance(int64_t stages, const double *mats, double h, double *dx, const double *dw) {
     zero(dx, 12);
-    for (int64_t k = 0; k < stages; k++) forward(mats + 144 * k, h, dx + 12 * k, dw + 6 * k, dx + 12 * (k + 1));
+    for (int64_t k = 0; k < stages; k++)
+        forward(mats + 144 * k, h, dx + 12 * k, dw + 6 * k, dx + 12 * (k + 1));
 }
 
-/* Solve with the result of `factor`: the minimizer dx (D+1, 12), dw (D, 6) for the gradients qx (D+1, 12), r (D, 6). */
-static void minimize(int64_t stages, const double *mats, double h, const Factor *factors, const double *qx,
-                     const double *r, double *dx, double *dw) {
+/* Solve with the result of `factor`: the minimizer dx (D+1, 12), dw (D, 6) for the gradients qx
+ * (D+1, 12), r (D, 6). */
+static void minimize(int64_t stages, const double *mats, double h, const Factor *factors,
+                     const double *qx, const double *r, double *dx, double *dw) {
     double p[12], t[18];
     copy(qx + 12 * stages, p, 12);
     for (int64_t k = stages - 1; k >= 0; k--) {
@@ -205,15 +210,16 @@ static void minimize(int64_t stages, const double *mats, double h, const Factor 
     }
     zero(dx, 12);
     for (int64_t k = 0; k < stages; k++) {
-        for (int i = 0; i < 6; i++) dw[6 * k + i] = dot12(factors[k].gain[i], dx + 12 * k) - dw[6 * k + i];
+        for (int i = 0; i < 6; i++)
+            dw[6 * k + i] = dot12(factors[k].gain[i], dx + 12 * k) - dw[6 * k + i];
         forward(mats + 144 * k, h, dx + 12 * k, dw + 6 * k, dx + 12 * (k + 1));
     }
 }
 
-/* Gradient (D, 6) with respect to the inputs alone, states eliminated, for gradients qx and r. Return its largest
- * absolute value; NaN if any value is. */
-static double reduced_gradient(int64_t stages, const double *mats, double h, const double *qx, const double *r,
-                               double *out) {
+/* Gradient (D, 6) with respect to the inputs alone, states eliminated, for gradients qx and r.
+ * Return its largest absolute value; NaN if any value is. */
+static double reduced_gradient(int64_t stages, const double *mats, double h, const double *qx,
+                               const double *r, double *out) {
     double p[12], t[18], greatest = 0.0;
     copy(qx + 12 * stages, p, 12);
     for (int64_t k = stages - 1; k >= 0; k--) {

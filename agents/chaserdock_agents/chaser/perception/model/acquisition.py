@@ -28,39 +28,95 @@ from .rendering import Lighting, PixelWindow, render
 from .steps import Steps, result_of
 from .tracking import is_valid, levels_of, pose_steps, rough_prior_steps, turn_between
 
-_TEMPLATES, _SIDE_PX = 3000, 40
-_SPREAD_PX = 8.0
-"""Root mean square distance of a normalized silhouette's pixels from their centre."""
-_DISTANCES_RADII, _NEAR_RADII = (6.0, 2.2), 3.6
-"""Distances of the templates, far and near ones, in radii of the target: perspective changes near
-silhouettes; distance at which the near ones begin."""
-_BY_SILHOUETTE, _BY_LIGHT, _FULL = 250, 24, 6
-_TEMPLATE_POINTS, _TEMPLATE_SUNS, _BY_LIGHT_WEIGHT = 100, 100, 0.1
-_APPEARANCE_LEVEL = 1
-_SHARP_PER_PX = (1.5, 4.0)
-"""Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over bright
-parts of the Earth.
-"""
+
+@dataclass(frozen=True)
+class AcquisitionParameters:
+    """Numbers of a search without a prior, chosen by benchmarks/perception.py (``shape``).
+
+    Half and twice: what happens to the five views of five that are acquired with these.
+    """
+
+    # Silhouettes at each distance, spread over all attitudes: about 17 degrees apart. Half, twice:
+    # 5 and 5 acquired; half takes twice the time, as more starts fail; twice takes 3.4 instead of
+    # 1.6 s to prepare.
+    templates: int = 3000
+    # Side of a silhouette, px. Half: 4 acquired; twice: 5, with twice the time to prepare.
+    side_px: int = 40
+    # Root mean square distance of the pixels of a normalized silhouette from its centre: with it a
+    # long one fits into ``side_px``.
+    spread_px: float = 8.0
+    # Distances of the templates in radii of the target, far and near ones: perspective changes near
+    # silhouettes.
+    distances_radii: tuple[float, float] = (6.0, 2.2)
+    # Distance in radii from which on the near ones are used: between both, on a logarithmic scale.
+    near_radii: float = 3.6
+    # Attitudes kept by their silhouettes. Half and twice: the same poses.
+    by_silhouette: int = 250
+    # Of these, attitudes kept by how well light explains the grey levels. Half: the same poses;
+    # twice: half as much time again.
+    by_light: int = 24
+    # Of these, most starts that are refined in full. Half and twice: the same poses.
+    full: int = 6
+    # Points of a silhouette that directions of the sun are rated by. Half and twice: the same
+    # poses.
+    template_points: int = 100
+    # Directions of the sun that they are rated for: 20 degrees apart. Half and twice: the same
+    # poses.
+    template_suns: int = 100
+    # Weight of the mean squared residual of grey levels against twice the share of the silhouette
+    # that differs. Half and twice: the same poses.
+    by_light_weight: float = 0.1
+    # Finest level of the pyramid at which appearances are compared: half resolution, at which noise
+    # hardly counts.
+    appearance_level: int = 1
+    # Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over
+    # bright parts of the Earth.
+    sharp_per_px: tuple[float, float] = (1.5, 4.0)
+    # Assumed places of a silhouette that leaves the image: shifts of its centre towards one of
+    # those sides, in rms radii of what is visible,
+    cut_shifts: tuple[float, ...] = (0.3, 0.6)
+    # and ratios of its rms radius to that.
+    cut_sizes: tuple[float, ...] = (1.0, 1.2, 1.4, 1.6)
+    # Common share of two regions of which only one is searched.
+    same_region: float = 0.8
+    # Least area of a region, px: below it, silhouettes of ``side_px`` cannot be told apart. Half
+    # and twice: the same poses.
+    min_area_px: int = 60
+    # Grey levels by which a target is brighter than the median of the image: twice the noise of
+    # dark pixels. Half and twice: 5 acquired.
+    min_contrast: float = 5.0
+    # Poses whose scores differ by less explain the image about equally well. Half and twice: the
+    # same poses.
+    ambiguous_score: float = 0.04
+    # Turn below which two poses are one: half the distance of the templates. Half and twice: the
+    # same poses.
+    distinct_rad: float = math.radians(8.0)
+    # Once a pose has been found, coarse poses with a score lower than its own by this much are not
+    # refined.
+    worse_start: float = 0.2
+    # Attitudes that are rated in one step, and places at which silhouettes are compared in one:
+    rated_at_once: int = 25
+    # they fill the CPU times below.
+    fitted_at_once: int = 9
+    # Pixels of a region by which its place is computed; more change it by less than a pixel. Half
+    # and twice: 5 acquired, in the same time.
+    region_points: int = 10_000
+    # Expected CPU times of steps, ms, measured: to find the region of the target,
+    region_ms: float = 10.0
+    # to compare it with the silhouettes at ``fitted_at_once`` places,
+    silhouettes_ms: float = 20.0
+    # to rate suns for ``rated_at_once`` of them,
+    rate_ms: float = 10.0
+    # to compare a synthetic view with the image.
+    appearance_ms: float = 10.0
+
+
+_SEARCH = AcquisitionParameters()
+
 MIN_APPEARANCE = 0.85
 """Gate of an acquisition: a smaller correlation of the synthetic view with the image rejects a
 pose.
 """
-_CUT_SHIFTS, _CUT_SIZES = (0.3, 0.6), (1.0, 1.2, 1.4, 1.6)
-"""Assumed places of a silhouette that leaves the image: shifts of its centre towards one of those
-sides, in rms radii of what is visible, and ratios of its rms radius to that."""
-_SAME_REGION = 0.8
-"""Common share of two regions of which only one is searched."""
-_MIN_AREA_PX, _MIN_CONTRAST = 60, 5.0
-_AMBIGUOUS_SCORE, _DISTINCT_RAD = 0.04, math.radians(8.0)
-_WORSE_START = 0.2
-"""Once a pose has been found, coarse poses with a score lower than its own by this much are not
-refined.
-"""
-_RATED_AT_ONCE, _FITTED_AT_ONCE, _REGION_POINTS = 25, 9, 10_000
-_REGION_MS, _SILHOUETTES_MS, _RATE_MS, _APPEARANCE_MS = 10.0, 20.0, 10.0, 10.0
-"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes
-at ``_FITTED_AT_ONCE`` places, to rate suns for ``_RATED_AT_ONCE`` of them, to compare a synthetic
-view with the image."""
 
 Found = tuple[Alignment, Lighting]
 """A pose that passes the gate, and its light."""
@@ -112,16 +168,18 @@ class Acquisition:
         self._camera, self._mesh = camera, mesh
         self._templates: tuple[_Templates, ...] = ()
         # Templates are compared without cast shadows.
-        towards = spread_directions(_TEMPLATE_SUNS)
+        towards = spread_directions(_SEARCH.template_suns)
         self._suns = ShadowMaps(
-            towards, np.zeros((_TEMPLATE_SUNS, 12)), np.zeros((_TEMPLATE_SUNS, 0, 0), np.float32)
+            towards,
+            np.zeros((_SEARCH.template_suns, 12)),
+            np.zeros((_SEARCH.template_suns, 0, 0), np.float32),
         )
 
     def prepare(self) -> None:
         """Render the templates, if that has not been done; takes about two seconds."""
         if not self._templates:
             self._templates = tuple(
-                _make_templates(self._mesh, radii) for radii in _DISTANCES_RADII
+                _make_templates(self._mesh, radii) for radii in _SEARCH.distances_radii
             )
 
     def find(self, image: NDArray[np.uint8]) -> tuple[Found, ...]:
@@ -131,7 +189,7 @@ class Acquisition:
 
     def search(self, pyramid: Pyramid) -> Steps[tuple[Found, ...]]:
         """Do what `find` does, in steps."""
-        yield _REGION_MS
+        yield _SEARCH.region_ms
         level = pyramid.level(0)
         found: tuple[Found, ...] = ()
         bright = _brightest_region(level)
@@ -142,12 +200,14 @@ class Acquisition:
         if not behind:
             found = yield from self._search_in(pyramid, bright)
         searched = [] if behind else [bright]
-        for slope in (*_SHARP_PER_PX, *([None] if behind else [])):
+        for slope in (*_SEARCH.sharp_per_px, *([None] if behind else [])):
             if found:
                 break
-            yield _REGION_MS
+            yield _SEARCH.region_ms
             region = bright if slope is None else _sharp_region(level, slope)
-            if region is None or any(_overlap(region, other) > _SAME_REGION for other in searched):
+            if region is None or any(
+                _overlap(region, other) > _SEARCH.same_region for other in searched
+            ):
                 continue
             searched.append(region)
             found = yield from self._search_in(pyramid, region)
@@ -174,35 +234,35 @@ class Acquisition:
         tried: list[PoseInCamera] = []
         least = 0.0
         for start in coarse:
-            if len(tried) == _FULL or start.score < least:
+            if len(tried) == _SEARCH.full or start.score < least:
                 break
-            if any(turn_between(start.pose, other) < _DISTINCT_RAD for other in tried):
+            if any(turn_between(start.pose, other) < _SEARCH.distinct_rad for other in tried):
                 continue
             tried.append(start.pose)
             refined = yield from rough_prior_steps(pyramid, self._mesh, start.pose)
             if refined is None or not is_valid(refined[0]):
                 continue
-            if any(turn_between(refined[0].pose, a.pose) < _DISTINCT_RAD for a, _ in fine):
+            if any(turn_between(refined[0].pose, a.pose) < _SEARCH.distinct_rad for a, _ in fine):
                 continue
-            yield _APPEARANCE_MS
+            yield _SEARCH.appearance_ms
             if self._looks_right(pyramid, *refined):
-                least = max(least, start.score - _WORSE_START)
+                least = max(least, start.score - _SEARCH.worse_start)
                 fine.append(refined)
         fine.sort(key=lambda found: -found[0].score)
-        return tuple(f for f in fine if f[0].score > fine[0][0].score - _AMBIGUOUS_SCORE)
+        return tuple(f for f in fine if f[0].score > fine[0][0].score - _SEARCH.ambiguous_score)
 
     def _looks_right(self, pyramid: Pyramid, found: Alignment, light: Lighting) -> bool:
         levels = levels_of(pyramid, self._mesh, found.pose)
-        level = next((k for k in levels[::-1] if k >= _APPEARANCE_LEVEL), levels[0])
+        level = next((k for k in levels[::-1] if k >= _SEARCH.appearance_level), levels[0])
         return appearance(pyramid, self._mesh, found.pose, level, light) >= MIN_APPEARANCE
 
     def _candidates(self, pyramid: Pyramid, region: NDArray[np.uint8]) -> Steps[list[PoseInCamera]]:
         """Return coarse poses of a target that covers ``region`` (h, w), the most likely first."""
-        yield _SILHOUETTES_MS
+        yield _SEARCH.silhouettes_ms
         self.prepare()
         camera = self._camera
         y, x = np.nonzero(region)
-        y, x = (axis[:: max(1, len(axis) // _REGION_POINTS)] for axis in (y, x))
+        y, x = (axis[:: max(1, len(axis) // _SEARCH.region_points)] for axis in (y, x))
         px = camera.undistort(np.column_stack([x, y]).astype(float))
         ideal = (px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
         ideal = ideal[np.isfinite(ideal).all(axis=1)]
@@ -216,19 +276,21 @@ class Acquisition:
         t = self._templates_at(spread)
         places = self._places(region, towards, middle, spread)
         fits: list[_SilhouetteFit] = []
-        for first in range(0, len(places), _FITTED_AT_ONCE):
+        for first in range(0, len(places), _SEARCH.fitted_at_once):
             if first:
-                yield _SILHOUETTES_MS
-            fits += self._fits(t, pyramid, region, towards, places[first : first + _FITTED_AT_ONCE])
+                yield _SEARCH.silhouettes_ms
+            fits += self._fits(
+                t, pyramid, region, towards, places[first : first + _SEARCH.fitted_at_once]
+            )
         overlaps = np.array([fit.overlap for fit in fits])
         chosen = overlaps.argmax(axis=0)
-        likely = np.argsort(-overlaps.max(axis=0))[:_BY_SILHOUETTE]
+        likely = np.argsort(-overlaps.max(axis=0))[: _SEARCH.by_silhouette]
         errors: list[float] = []
-        for some in np.array_split(likely, _BY_SILHOUETTE // _RATED_AT_ONCE):
-            yield _RATE_MS
+        for some in np.array_split(likely, _SEARCH.by_silhouette // _SEARCH.rated_at_once):
+            yield _SEARCH.rate_ms
             errors += [self._unexplained(t, int(i), fits[chosen[i]]) for i in some]
         poses = []
-        for i in likely[np.argsort(errors)[:_BY_LIGHT]]:
+        for i in likely[np.argsort(errors)[: _SEARCH.by_light]]:
             fit = fits[chosen[i]]
             # The same silhouette at another distance: sizes are inversely proportional to it.
             ratio = t.spread[i] / fit.spread
@@ -241,7 +303,7 @@ class Acquisition:
         """Return the templates for a silhouette of this rms radius, the tangent of an angle."""
         far, near = self._templates
         distance_m = far.distance_m * float(np.median(far.spread)) / spread
-        return near if distance_m < _NEAR_RADII * self._mesh.radius_m else far
+        return near if distance_m < _SEARCH.near_radii * self._mesh.radius_m else far
 
     def _places(
         self, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
@@ -254,8 +316,8 @@ class Acquisition:
         centres = [middle]
         for side in _border_sides(region):
             outwards = (towards @ np.append(side, 0.0))[:2]
-            centres += [middle + shift * spread * outwards for shift in _CUT_SHIFTS]
-        return [(centre, size * spread) for centre in centres for size in _CUT_SIZES]
+            centres += [middle + shift * spread * outwards for shift in _SEARCH.cut_shifts]
+        return [(centre, size * spread) for centre in centres for size in _SEARCH.cut_sizes]
 
     def _fits(
         self, t: _Templates, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, places: list[tuple[Array, float]]
@@ -287,8 +349,8 @@ class Acquisition:
         """Return the region's mask, the image, and a mask of what is inside the image, each
         (pixels,) on the grid of the templates.
         """
-        step = spread / _SPREAD_PX
-        axis = (np.arange(_SIDE_PX) - (_SIDE_PX - 1) / 2.0) * step
+        step = spread / _SEARCH.spread_px
+        axis = (np.arange(_SEARCH.side_px) - (_SEARCH.side_px - 1) / 2.0) * step
         u, v = np.meshgrid(axis + middle[0], axis + middle[1])
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ towards
         px = self._camera.project(rays).astype(np.float32)
@@ -313,14 +375,14 @@ class Acquisition:
     def _unexplained(self, t: _Templates, i: int, fit: _SilhouetteFit) -> float:
         """Return the share of the grey levels that no light explains, plus that of the silhouette."""
         inside = np.flatnonzero((t.owners[i] >= 0) & (fit.mask > 0.0))
-        inside = inside[:: max(1, len(inside) // _TEMPLATE_POINTS)]
+        inside = inside[:: max(1, len(inside) // _SEARCH.template_points)]
         if len(inside) < 30:
             return math.inf
         owners, nowhere = t.owners[i][inside], np.zeros((len(inside), 3))
         points = points_on(
             self._mesh, owners, nowhere, -t.rotations[i][2], fit.grey[inside], t.rotations[i]
         )
-        return float(rate_suns(points, self._suns)[:, 0].min()) * _BY_LIGHT_WEIGHT + 2.0 * (
+        return float(rate_suns(points, self._suns)[:, 0].min()) * _SEARCH.by_light_weight + 2.0 * (
             1.0 - fit.overlap[i]
         )
 
@@ -329,7 +391,7 @@ def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
     """Return the mask (h, w) of what is brighter than the background, in one connected region; None
     without any.
     """
-    level = float(np.median(image)) + _MIN_CONTRAST
+    level = float(np.median(image)) + _SEARCH.min_contrast
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     bright = cv2.morphologyEx(
         (smooth > level).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
@@ -364,7 +426,7 @@ def _largest_region(mask: NDArray[Any]) -> NDArray[np.uint8] | None:
     if count < 2:
         return None
     largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
-    if statistics[largest, cv2.CC_STAT_AREA] < _MIN_AREA_PX:
+    if statistics[largest, cv2.CC_STAT_AREA] < _SEARCH.min_area_px:
         return None
     return (labels == largest).astype(np.uint8)
 
@@ -406,28 +468,33 @@ def _look_at(ray: Array) -> Array:
 
 
 def _make_templates(mesh: TrackerMesh, radii: float) -> _Templates:
-    quaternions = spread_rotations(_TEMPLATES)
+    quaternions = spread_rotations(_SEARCH.templates)
     distance = radii * mesh.radius_m
     light = Lighting(np.array([0.0, 0.0, -1.0]), shadows=False)
-    masks = np.zeros((_TEMPLATES, _SIDE_PX**2), dtype=np.float32)
-    owners = np.full((_TEMPLATES, _SIDE_PX**2), -1, dtype=np.int16)
+    masks = np.zeros((_SEARCH.templates, _SEARCH.side_px**2), dtype=np.float32)
+    owners = np.full((_SEARCH.templates, _SEARCH.side_px**2), -1, dtype=np.int16)
     turns, spread, centre = (
-        np.empty((_TEMPLATES, 3, 3)),
-        np.empty(_TEMPLATES),
-        np.empty((_TEMPLATES, 2)),
+        np.empty((_SEARCH.templates, 3, 3)),
+        np.empty(_SEARCH.templates),
+        np.empty((_SEARCH.templates, 2)),
     )
-    middle, whole = (_SIDE_PX - 1) / 2.0, 0.45 * _SIDE_PX * math.sqrt(radii**2 - 1.0)
+    middle, whole = (_SEARCH.side_px - 1) / 2.0, 0.45 * _SEARCH.side_px * math.sqrt(radii**2 - 1.0)
     for i, q in enumerate(quaternions):
         pose = PoseInCamera(np.array([0.0, 0.0, distance]), rotations.to_matrix(q))
         view = render(
-            mesh, pose, PixelWindow(_SIDE_PX, _SIDE_PX, (whole, whole, middle, middle)), light
+            mesh,
+            pose,
+            PixelWindow(_SEARCH.side_px, _SEARCH.side_px, (whole, whole, middle, middle)),
+            light,
         )
         y, x = np.nonzero(view.coverage > 0.5)
         flat = np.column_stack([x - middle, y - middle]) / whole
         centre[i] = flat.mean(axis=0)
         spread[i] = math.sqrt(float(((flat - centre[i]) ** 2).sum(axis=1).mean()))
-        focal = _SPREAD_PX / spread[i]
+        focal = _SEARCH.spread_px / spread[i]
         lens = (focal, focal, middle - focal * centre[i, 0], middle - focal * centre[i, 1])
-        view = render(mesh, pose, PixelWindow(_SIDE_PX, _SIDE_PX, lens), light, samples=1)
+        view = render(
+            mesh, pose, PixelWindow(_SEARCH.side_px, _SEARCH.side_px, lens), light, samples=1
+        )
         masks[i], owners[i], turns[i] = view.coverage.ravel(), view.owner.ravel(), pose.rotation
     return _Templates(turns, masks, owners, spread, centre, distance)

@@ -26,32 +26,68 @@ from ..refine import PoseInCamera
 from .mesh import NO_PATTERN, WRINKLES, TrackerMesh
 from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 
-_PROFILE, _PER_CELL_MOST = 9, 4
-_CELL_PX, _PER_CELL = 8, 2
-_LEAST_GRADIENT = (0.5, 1.5)
-"""Least gradient of control points, grey levels per pixel, in light from everywhere and in
-estimated light. In a dim image, noise hides weaker edges, which would count as outliers."""
-_MARGIN_PX = 14
-"""Border of a window around the target: reach of the search and half a profile."""
-_MIN_CORRELATION = 0.6
-_NOISE = 2.0
-"""Standard deviation of a grey level by noise and by texture that the mesh does not have."""
+
+@dataclass(frozen=True)
+class AlignmentParameters:
+    """Numbers of the alignment of control points, chosen by benchmarks/perception.py (``shape``).
+
+    Half and twice: median error of twelve views at 0.9 to 4 m from a prior 1 % and 1.5 degrees off,
+    0.106 % of the range with these.
+    """
+
+    # Samples of a profile, and most control points of a cell: PROFILE
+    profile: int = 9
+    # and PER_CELL_MOST in native/align.c.
+    per_cell_most: int = 4
+    # Control points are spread over cells of this side, px: about a profile. Half: 0.109; twice:
+    # 0.106 %.
+    cell_px: int = 8
+    # Most control points of a cell, so that two edges in it count. Half: 0.133; twice: 0.102 %.
+    per_cell: int = 2
+    # Least gradient of control points, grey levels per pixel, in light from everywhere and in
+    # estimated light. In a dim image, noise hides weaker edges, which would count as outliers.
+    least_gradient: tuple[float, float] = (0.5, 1.5)
+    # Border of a window around the target, px: reach of the search and half a profile.
+    margin_px: int = 14
+    # Least correlation of a profile with the image. Half: 0.107 %.
+    min_correlation: float = 0.6
+    # Standard deviation of a grey level by noise and by texture that the mesh does not have.
+    noise: float = 2.0
+    # The same as ``INLIER_PX`` while errors of the geometry are not estimated yet: they displace
+    # points by pixels. Half: 0.106 %; twice: the same.
+    displaced_inlier_px: float = 5.0
+    # Reach of the search, px, after they are: twice ``INLIER_PX``. A third: 0.101; twice: 0.103 %.
+    refined_reach_px: int = 3
+    # Distance from an edge, px, at which the surfaces beside it are looked up.
+    beside_px: float = 3.0
+    # Number of neighbouring control points that err together, so that their information counts
+    # once: fitted to the errors of poses (NEES, docs/evidence/markerless.md).
+    correlated_points: float = 5.5
+    # Largest number of points that count: shading and facets that the mesh does not have do not
+    # become more accurate with more pixels.
+    independent_most: float = 60.0
+    # The same on a side in the shade, or with the sun behind the target, where it brightens rims,
+    # which move together;
+    independent_dim: float = 25.0
+    # and least z in IRF of the direction of such a sun.
+    behind_z: float = 0.3
+
+
+_MATCH = AlignmentParameters()
+
 INLIER_PX = 1.5
-_DISPLACED_INLIER_PX, _REFINED_REACH_PX = 5.0, 3
+"""Largest distance of a match from the pose, pixels of the level, at which it counts (Tukey's
+cut-off): half the width of an edge with its spread. Of twelve views half loses two, twice errs by
+0.120 instead of 0.106 % of the range.
+"""
 MIN_POINTS = 24
+"""Least number of control points, and of those that count: four for each unknown of a pose. Half
+and twice: the same poses.
+"""
 NEAR_PX = 1300.0
 """Diameter of the target in the image, in pixels of level 0, beyond which it shows texture that the
 mesh does not have.
 """
-_BESIDE_PX = 3.0
-"""Distance from an edge at which the surfaces beside it are looked up."""
-_CORRELATED_POINTS, _INDEPENDENT_MOST = 5.5, 60.0
-"""Number of neighbouring control points that err together, so that their information counts once;
-and largest number of points that count: shading and facets that the mesh does not have do not
-become more accurate with more pixels."""
-_INDEPENDENT_DIM, _BEHIND_Z = 25.0, 0.3
-"""The same on a side in the shade, or with the sun behind the target, where it brightens rims,
-which move together; and least z in IRF of the direction of such a sun."""
 _SPREAD_PX = {0: 0.6, 1: 0.45, -1: 1.2}
 """Standard deviation, in pixels of a level, of the point spread that the synthetic view gets."""
 
@@ -109,7 +145,7 @@ class ControlPoints:
     pose: PoseInCamera
     displaced_m: Array
     border_m: Array
-    independent: float = _INDEPENDENT_MOST
+    independent: float = _MATCH.independent_most
 
 
 @dataclass(frozen=True)
@@ -154,14 +190,14 @@ def window_of(
     height, width = int(pyramid.camera.height_px * scale), int(pyramid.camera.width_px * scale)
     u, v = fx * at[:, 0] / at[:, 2] + cx, fy * at[:, 1] / at[:, 2] + cy
     left, right = (
-        max(0, math.floor(u.min()) - _MARGIN_PX),
-        min(width, math.ceil(u.max()) + _MARGIN_PX),
+        max(0, math.floor(u.min()) - _MATCH.margin_px),
+        min(width, math.ceil(u.max()) + _MATCH.margin_px),
     )
     top, bottom = (
-        max(0, math.floor(v.min()) - _MARGIN_PX),
-        min(height, math.ceil(v.max()) + _MARGIN_PX),
+        max(0, math.floor(v.min()) - _MATCH.margin_px),
+        min(height, math.ceil(v.max()) + _MATCH.margin_px),
     )
-    if right - left < 3 * _PROFILE or bottom - top < 3 * _PROFILE:
+    if right - left < 3 * _MATCH.profile or bottom - top < 3 * _MATCH.profile:
         return None
     return PixelWindow(bottom - top, right - left, (fx, fy, cx - left, cy - top)), left, top
 
@@ -186,19 +222,19 @@ def control_points(
     spread = _SPREAD_PX.get(k, 0.4)
     view = np.asarray(cv2.GaussianBlur(view, (0, 0), spread), dtype=np.float32)
     h, w = view.shape
-    cells = (-(-h // _CELL_PX)) * (-(-w // _CELL_PX))
-    most = cells * _PER_CELL
+    cells = (-(-h // _MATCH.cell_px)) * (-(-w // _MATCH.cell_px))
+    most = cells * _MATCH.per_cell
     points, ahead = np.empty((most, 3)), np.empty((most, 3))
-    profiles, owners = np.empty((most, _PROFILE)), np.empty(most, dtype=np.int64)
-    work = np.empty(h * w + cells * 5 * _PER_CELL_MOST)
+    profiles, owners = np.empty((most, _MATCH.profile)), np.empty(most, dtype=np.int64)
+    work = np.empty(h * w + cells * 5 * _MATCH.per_cell_most)
     vertices, triangles, _, _ = mesh.contiguous
     at = pose_array(pose)
-    least = _LEAST_GRADIENT[light.shadows]
+    least = _MATCH.least_gradient[light.shadows]
     brightness = light.ambient + (0.0 if light.weak else light.direct)
     n = function("control_points", c_int64)(
         address(view), address(synthetic.nearest), address(synthetic.owner), c_int64(h), c_int64(w),
         (c_double * 4)(*window.lens), address(at), address(vertices), address(triangles),
-        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * brightness, least), 4.0)),
+        (c_double * 3)(_MATCH.cell_px, _MATCH.per_cell, min(max(0.02 * gain * brightness, least), 4.0)),
         address(points), address(ahead), address(profiles), address(owners), address(work),
     )  # fmt: skip
     if n < MIN_POINTS:
@@ -210,9 +246,9 @@ def control_points(
         return None
     points, owners = points[used], owners[used]
     displaced, border = mesh.mode_displacements(owners, points), mesh.border_of(owners)
-    behind = light.to_sun_irf is not None and light.to_sun_irf[2] > _BEHIND_Z
+    behind = light.to_sun_irf is not None and light.to_sun_irf[2] > _MATCH.behind_z
     dim = behind or light.weak or (light.shadows and light.direct == 0.0)
-    independent = _INDEPENDENT_DIM if dim else _INDEPENDENT_MOST
+    independent = _MATCH.independent_dim if dim else _MATCH.independent_most
     return ControlPoints(
         points, ahead[:n][used], profiles[:n][used], owners, k, pose, displaced, border, independent
     )
@@ -242,7 +278,7 @@ def _on_textured(
     step = next_to[:, :2] / next_to[:, 2:] * (fx, fy) + (cx, cy) - px
     last = np.array([window.width - 1, window.height - 1])
     beside = []
-    for side in (-_BESIDE_PX, _BESIDE_PX):
+    for side in (-_MATCH.beside_px, _MATCH.beside_px):
         column, row = np.clip(np.rint(px + side * step).astype(np.int64), 0, last).T
         owner = view.owner[row, column]
         beside.append(np.where(owner >= 0, patterns[owner], NO_PATTERN))
@@ -325,11 +361,13 @@ def align(
     if not k:
         found = _match(pyramid, points, known, prior, reach_px, iterations, INLIER_PX)
         return found and _alignment(pyramid, points, known, found)
-    found = _match(pyramid, points, known, prior, reach_px, iterations, _DISPLACED_INLIER_PX)
+    found = _match(pyramid, points, known, prior, reach_px, iterations, _MATCH.displaced_inlier_px)
     solved = found and _alignment(pyramid, points, known, found)
     if not solved:
         return None
-    found = _match(pyramid, points, solved.modes, solved.pose, _REFINED_REACH_PX, 1, INLIER_PX)
+    found = _match(
+        pyramid, points, solved.modes, solved.pose, _MATCH.refined_reach_px, 1, INLIER_PX
+    )
     return found and _alignment(pyramid, points, solved.modes, found)
 
 
@@ -356,7 +394,7 @@ def _match(
     n = len(points.points_m)
     distortion = (*pyramid.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     camera = (c_double * 11)(*pyramid.lens(points.level), *distortion, *image.shape)
-    settings = (c_double * 5)(reach_px, iterations, _MIN_CORRELATION, _NOISE, inlier_px)
+    settings = (c_double * 5)(reach_px, iterations, _MATCH.min_correlation, _MATCH.noise, inlier_px)
     displacement = np.einsum("k,kni->ni", modes, points.displaced_m) if len(modes) else 0.0
     at, ahead = points.points_m + displacement, points.ahead_m + displacement
     pose, residual, weight = pose_array(prior), np.empty(n), np.empty(n)
@@ -421,7 +459,7 @@ def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] 
     """
     rows = np.concatenate([fit.jacobian, fit.shifts], axis=1)
     chi_square = float(fit.residual**2 @ fit.weight) / max(len(fit.residual) - 6, 1)
-    correlated = max(_CORRELATED_POINTS, len(fit.residual) / fit.independent)
+    correlated = max(_MATCH.correlated_points, len(fit.residual) / fit.independent)
     weight = fit.weight / (correlated * max(chi_square, 1.0))
     information = rows.T @ (rows * weight[:, None])
     right = rows.T @ (weight * fit.residual)

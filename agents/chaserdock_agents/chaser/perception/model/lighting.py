@@ -26,29 +26,51 @@ from .mesh import ShadowMaps, TrackerMesh
 from .rendering import Lighting, PixelWindow, SyntheticView, render
 from .steps import LIGHT_MS, LIKELY_MS, SUNS_MS, VIEWS_MS, Steps, compared_ms
 
-_MOST_POINTS, _FEWEST_POINTS = 600, 40
-_EVERY_POINT = 3
-"""Of the points, those that rate directions all around."""
-_LEAST_AMBIENT = 0.02
-"""Least ambient level as a share of the directed one."""
-_GREY_NOISE = 3.0
-_NEIGHBOURS_RAD, _FINE_TEXELS = (0.12, 0.05), 96
-_COMPARED, _DISTINCT_RAD = 8, 0.35
-"""Number of directions that are compared by synthetic views, and their least distance."""
-_LIKELY = 0.08
-"""Increase of the mean squared residual, as a share of its least, at which a direction weighs 1/e
-in the mean of the likely ones.
-"""
 
-_EVEN_RESIDUAL, _CLEARLY = 0.15, 0.95
-"""Mean squared residual, in standard deviations, below which light from everywhere explains the
-points: of 40 sunlit views the least was 0.45, of views without sun on what is visible the most
-0.17. Ratio of residuals below which a sun explains a view better."""
-_LEAST_BEHIND, _LEAST_IN_FRONT = -0.1, -0.9
-"""Directions of which synthetic views are compared have a z in IRF above the one, behind the
-target, or below the other, as of a lamp beside the lens."""
-_COMPARED_FINELY = 3
-"""Number of these that are compared at a finer level."""
+@dataclass(frozen=True)
+class LightParameters:
+    """Numbers of the search for the light, chosen by benchmarks/perception.py (``shape``)."""
+
+    # Points by which the light is estimated: the time grows with them.
+    most_points: int = 600
+    # A target with fewer points away from edges has no estimate of its light. Half and twice: the
+    # same poses.
+    fewest_points: int = 40
+    # One of so many points rates directions all around.
+    every_point: int = 3
+    # Least ambient level as a share of the directed one.
+    least_ambient: float = 0.02
+    # Standard deviation of a grey level by noise and by facets, beside the texture's. Half: poses
+    # err by 0.098, twice: by 0.114 instead of 0.106 % of the range.
+    grey_noise: float = 3.0
+    # A direction is refined among eight at these angles, rad: two thirds and a quarter of the
+    # distance of the directions all around. Half: 0.124; twice: 0.102 %.
+    neighbours_rad: tuple[float, ...] = (0.12, 0.05)
+    # Side of the shadow maps of these, texels. Half: 0.102; twice: 0.091 %.
+    fine_texels: int = 96
+    # Number of directions that are compared by synthetic views,
+    compared: int = 8
+    # and their least distance, rad.
+    distinct_rad: float = 0.35
+    # Increase of the mean squared residual, as a share of its least, at which a direction weighs
+    # 1/e in the mean of the likely ones.
+    likely: float = 0.08
+    # Mean squared residual, in standard deviations, below which light from everywhere explains the
+    # points: of 40 sunlit views the least was 0.45, of views without sun on what is visible the
+    # most 0.17.
+    even_residual: float = 0.15
+    # Ratio of residuals below which a sun explains a view better.
+    clearly: float = 0.95
+    # Directions of which synthetic views are compared have a z in IRF above this one, behind the
+    # target,
+    least_behind: float = -0.1
+    # or below this one, as of a lamp beside the lens.
+    least_in_front: float = -0.9
+    # Number of these that are compared at a finer level.
+    compared_finely: int = 3
+
+
+_LIGHT = LightParameters()
 
 
 @dataclass(frozen=True)
@@ -106,7 +128,9 @@ def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:
     rows[:, 3:6] = 0.0  # without normals, the sun has no effect
     anywhere = ShadowMaps(np.eye(3)[:1], np.zeros((1, 12)), np.zeros((1, 0, 0), np.float32))
     residual, ambient, _ = rate_suns(LitPoints(rows, points.rotation), anywhere)[0].tolist()
-    return Lighting(None, 0.0, ambient) if residual < _EVEN_RESIDUAL and ambient > 1e-3 else None
+    return (
+        Lighting(None, 0.0, ambient) if residual < _LIGHT.even_residual and ambient > 1e-3 else None
+    )
 
 
 def _view_steps(
@@ -140,7 +164,7 @@ def _view_steps(
     yield len(around) * one_ms
     found += [(*view.rate(to_sun), to_sun) for to_sun in around]
     residual, ambient, direct, to_sun = min(found, key=lambda f: f[0])
-    if residual > _CLEARLY * view.residual:
+    if residual > _LIGHT.clearly * view.residual:
         return even
     return Lighting(to_sun, direct, ambient, weak=True)
 
@@ -212,12 +236,14 @@ class _ComparedView:
         points = _points_in(self.mesh, self.pose, fine, view, samples)
         maps = self.mesh.few_suns
         towards = maps.to_sun_trf @ self.pose.rotation.T
-        tried = np.flatnonzero((towards[:, 2] > _LEAST_BEHIND) | (towards[:, 2] < _LEAST_IN_FRONT))
+        tried = np.flatnonzero(
+            (towards[:, 2] > _LIGHT.least_behind) | (towards[:, 2] < _LIGHT.least_in_front)
+        )
         sunlit, rated = np.zeros((2 * h, 2 * w), np.float32), []
         for k in tried:
             sunlit.ravel()[samples] = direct_light(points, maps, int(k))
             rated.append(self._fit(cv2.resize(sunlit, (w, h), interpolation=cv2.INTER_AREA))[0])
-        return towards[tried[np.argsort(rated)[:_COMPARED_FINELY]]]
+        return towards[tried[np.argsort(rated)[: _LIGHT.compared_finely]]]
 
 
 def smooth(grey: NDArray[Any]) -> Array:
@@ -228,14 +254,14 @@ def smooth(grey: NDArray[Any]) -> Array:
 
 
 def likely_lights(mesh: TrackerMesh, points: LitPoints) -> list[Lighting]:
-    """Return the light of the best directions that are at least ``_DISTINCT_RAD`` apart, likely
+    """Return the light of the best directions that are at least ``distinct_rad`` apart, likely
     ones first.
     """
     rated, towards = rate_suns(points, mesh.suns), mesh.suns.to_sun_trf
     chosen: list[int] = []
     for k in np.argsort(rated[:, 0]).tolist():
-        if len(chosen) < _COMPARED and all(
-            towards[k] @ towards[other] < math.cos(_DISTINCT_RAD) for other in chosen
+        if len(chosen) < _LIGHT.compared and all(
+            towards[k] @ towards[other] < math.cos(_LIGHT.distinct_rad) for other in chosen
         ):
             chosen.append(k)
     return [
@@ -245,7 +271,11 @@ def likely_lights(mesh: TrackerMesh, points: LitPoints) -> list[Lighting]:
 
 
 def lit_points(
-    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, most: int = _MOST_POINTS
+    pyramid: Pyramid,
+    mesh: TrackerMesh,
+    pose: PoseInCamera,
+    level: int,
+    most: int = _LIGHT.most_points,
 ) -> LitPoints | None:
     """Return at most ``most`` points of the target with their grey levels, away from edges; None if
     there are too few.
@@ -261,9 +291,9 @@ def lit_points(
     for side in (5, 3, 1):
         # Beside edges of the outline a slightly wrong pose mixes target and background.
         pixels = np.flatnonzero(cv2.erode(covered, np.ones((side, side), np.uint8)))
-        if len(pixels) >= 4 * _FEWEST_POINTS:
+        if len(pixels) >= 4 * _LIGHT.fewest_points:
             break
-    if len(pixels) < _FEWEST_POINTS:
+    if len(pixels) < _LIGHT.fewest_points:
         return None
     pixels = pixels[np.linspace(0, len(pixels) - 1, min(most, len(pixels))).astype(np.int64)]
     return _points_in(mesh, pose, window, view, pixels, patch.ravel()[pixels].astype(float))
@@ -301,7 +331,7 @@ def points_on(
     rows[:, 0:3], rows[:, 3:6], rows[:, 6:9] = at_trf, mesh.mean_normals[owners], to_camera_trf
     rows[:, 9:12] = mesh.contiguous[3][owners]
     rows[:, 12] = grey
-    rows[:, 13] = np.hypot(_GREY_NOISE, mesh.texture_share[owners] * grey)
+    rows[:, 13] = np.hypot(_LIGHT.grey_noise, mesh.texture_share[owners] * grey)
     return LitPoints(rows, rotation)
 
 
@@ -313,7 +343,7 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
     out, work = np.empty((k, 3)), np.empty(2 * n)
     function("rate_suns")(
         address(points.rows), c_int64(n), address(maps.to_sun_trf), address(maps.settings), address(maps.depths),
-        c_int64(k), c_double(_LEAST_AMBIENT), address(out), address(work),
+        c_int64(k), c_double(_LIGHT.least_ambient), address(out), address(work),
     )  # fmt: skip
     return out
 
@@ -337,13 +367,15 @@ def fit_light(
     if previous is not None and previous.to_sun_irf is not None and not previous.weak:
         best = points.rotation.T @ previous.to_sun_irf
     else:
-        few = LitPoints(np.ascontiguousarray(points.rows[::_EVERY_POINT]), points.rotation)
+        few = LitPoints(np.ascontiguousarray(points.rows[:: _LIGHT.every_point]), points.rotation)
         best = _likely_direction(rate_suns(few, mesh.suns), mesh.suns)
-    for angle in _NEIGHBOURS_RAD:
-        maps = mesh.shadow_maps(_around(best, angle), _FINE_TEXELS)
+    for angle in _LIGHT.neighbours_rad:
+        maps = mesh.shadow_maps(_around(best, angle), _LIGHT.fine_texels)
         rated = rate_suns(points, maps)
         best = _likely_direction(rated, maps)
-    _, ambient, direct = rate_suns(points, mesh.shadow_maps(best[None], _FINE_TEXELS))[0].tolist()
+    _, ambient, direct = rate_suns(points, mesh.shadow_maps(best[None], _LIGHT.fine_texels))[
+        0
+    ].tolist()
     if not ambient + direct > 1e-3:
         return None
     return Lighting(points.rotation @ best, direct, ambient)
@@ -354,7 +386,7 @@ def _likely_direction(rated: Array, maps: ShadowMaps) -> Array:
     k = int(np.argmin(rated[:, 0]))
     near = maps.to_sun_trf @ maps.to_sun_trf[k] > 0.9
     excess = (rated[near, 0] - rated[k, 0]) / max(float(rated[k, 0]), 1e-6)
-    mean = np.exp(-excess / _LIKELY) @ maps.to_sun_trf[near]
+    mean = np.exp(-excess / _LIGHT.likely) @ maps.to_sun_trf[near]
     return mean / np.linalg.norm(mean)
 
 

@@ -26,6 +26,9 @@ edges of a box.
 """
 
 MAX_TRIANGLES = 200_000
+"""Ten times as many as a mesh file may have (``surface.MAX_TRIANGLES``): rejects what cannot be a
+mesh of a scenario; each rendering takes time for each triangle.
+"""
 
 SCALE_SIGMA = 0.003
 """Standard deviation of the scale of a target's known shape."""
@@ -42,7 +45,12 @@ common (mode ``rim``): the known mesh does not have the grid."""
 NO_PATTERN, CELLS, WRINKLES = 0, 1, 2
 """Patterns of a surface that the known mesh does not have."""
 _SUNS, _SUN_TEXELS = 400, 64
+"""Directions of the sun that points are rated for, 10 degrees apart, and side of their shadow maps:
+6.6 MB. Of twelve views half the directions err by 0.133, twice by 0.109, and half and twice the
+texels by 0.102 and 0.108 instead of 0.106 % of the range."""
 _FEW_SUNS, _FEW_SUN_TEXELS = 60, 256
+"""The same for whole views with a sun behind the target, 26 degrees apart: 16 MB. Half and twice
+change none of twelve views with a sun in front."""
 
 
 class MeshError(ValueError):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 from typing import TypeGuard
 
 import numpy as np
@@ -38,17 +39,45 @@ MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
 """Gate: a larger standard deviation in any direction, of position as a share of the range, rejects
 a pose.
 """
-_FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 600_000, 12_000, 24_000
-_LARGEST_PX = (NEAR_PX, 740.0)
-"""Largest diameter of the target at the finest level, in pixels of it: if that is the image's own,
-or a coarser one. Nearer targets are aligned at a coarser level: they show texture that the mesh
-does not have at the size of profiles, and a whole image of them takes the most time."""
-_FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
-_START_SHARE, _START_RAD = 0.02, math.radians(3.0)
-_SETTLED_SHARE, _SETTLED_RAD, _MOST_REPEATED = 0.85, math.radians(0.5), 3
-"""A pose from a rough prior is settled within this turn from the view that it comes from; light and
-view are repeated until it is, at most three times, and once for a smaller share of inliers. One
-that still turns is rejected."""
+
+
+@dataclass(frozen=True)
+class TrackingParameters:
+    """Numbers of the way from a prior to a pose, chosen by benchmarks/perception.py (``shape``)."""
+
+    # The finest level shows the target on at most so many pixels: 36 ms of CPU
+    # (``steps.level_ms``). Half: poses err by 0.111 instead of 0.106 % of the range; twice: the
+    # same.
+    finest_area_px: int = 600_000
+    # The coarsest level shows it on at most so many, about 110 squared: the reach of a search is
+    # then a tenth of the target. Half: 0.106; twice: 0.097 %, in twice the time.
+    coarsest_area_px: int = 12_000
+    # A target on fewer pixels of the image is aligned in one of twice the resolution, so that its
+    # profiles do not overlap. Half and twice: the same, at 0.9 to 4 m.
+    upsampled_area_px: int = 24_000
+    # Largest diameter of the target at the finest level, in pixels of it: if that is the image's
+    # own, or a coarser one. Nearer targets are aligned at a coarser level: they show texture that
+    # the mesh does not have at the size of profiles, and a whole image of them takes the most time.
+    largest_px: tuple[float, float] = (NEAR_PX, 740.0)
+    # Reach of the search, px, at the first level,
+    first_reach_px: int = 10
+    # and at the next ones, whose prior is half as wrong.
+    next_reach_px: int = 5
+    # Starts around a prior: moved by this share of the range,
+    start_share: float = 0.02
+    # and turned by this angle.
+    start_rad: float = math.radians(3.0)
+    # A pose from a rough prior is settled within the turn below from the view that it comes from;
+    # light and view are repeated until it is: once for a smaller share of inliers than this,
+    settled_share: float = 0.85
+    # with this turn,
+    settled_rad: float = math.radians(0.5)
+    # and at most so many times. One that still turns is rejected.
+    most_repeated: int = 3
+
+
+_TRACK = TrackingParameters()
+
 _EVEN_LIGHT = Lighting(None, 0.0, 1.0, shadows=False)
 """Light from everywhere."""
 
@@ -76,19 +105,22 @@ def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[
     out of view.
 
     The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded
-    time, and at most ``_LARGEST_PX`` wide, of which it may show a part; small targets are upsampled
+    time, and at most ``largest_px`` wide, of which it may show a part; small targets are upsampled
     twice.
     """
     found = window_of(pyramid, 0, mesh, pose)
     if found is None:
         return ()
     area = found[0].height * found[0].width
-    finest = -1 if area < _UPSAMPLED_AREA_PX else 0
+    finest = -1 if area < _TRACK.upsampled_area_px else 0
     diameter = diameter_px(pyramid.camera, mesh, pose)
-    while area / 4**finest > _FINEST_AREA_PX or diameter / 2**finest > _LARGEST_PX[finest > 0]:
+    while (
+        area / 4**finest > _TRACK.finest_area_px
+        or diameter / 2**finest > _TRACK.largest_px[finest > 0]
+    ):
         finest += 1
     coarsest = finest
-    while area / 4**coarsest > _COARSEST_AREA_PX and coarsest < finest + 4:
+    while area / 4**coarsest > _TRACK.coarsest_area_px and coarsest < finest + 4:
         coarsest += 1
     return tuple(range(coarsest, finest - 1, -1))
 
@@ -99,7 +131,7 @@ def pose_steps(
     prior: PoseInCamera,
     light: Lighting,
     levels: tuple[int, ...],
-    first_reach_px: int = _FIRST_REACH_PX,
+    first_reach_px: int = _TRACK.first_reach_px,
     modes: Array | None = None,
 ) -> Steps[Alignment | None]:
     """Align the mesh with an image from ``prior``, one level in each step; None without an
@@ -113,7 +145,11 @@ def pose_steps(
             None
             if points is None
             else align(
-                pyramid, points, pose, first_reach_px if number == 0 else _NEXT_REACH_PX, modes
+                pyramid,
+                points,
+                pose,
+                first_reach_px if number == 0 else _TRACK.next_reach_px,
+                modes,
             )
         )
         if alignment is not None:
@@ -141,7 +177,7 @@ def prior_steps(
     """
     found = yield from rough_prior_steps(pyramid, mesh, prior, modes)
     levels = levels_of(pyramid, mesh, prior)
-    if (found is not None and found[0].inlier_share >= _SETTLED_SHARE) or not levels:
+    if (found is not None and found[0].inlier_share >= _TRACK.settled_share) or not levels:
         return found
     light = yield from light_steps(pyramid, mesh, prior, levels[0], by_view=True)
     if light is None:
@@ -179,21 +215,23 @@ def _settling_steps(
     """Align the two finest levels, and improve light and pose again until the pose settles; None if
     it does not.
     """
-    fine = yield from pose_steps(pyramid, mesh, pose, light, levels[-2:], _NEXT_REACH_PX, modes)
-    for number in range(_MOST_REPEATED):
-        if fine is None or _is_settled(fine, 0.0 if number else _SETTLED_SHARE):
+    fine = yield from pose_steps(
+        pyramid, mesh, pose, light, levels[-2:], _TRACK.next_reach_px, modes
+    )
+    for number in range(_TRACK.most_repeated):
+        if fine is None or _is_settled(fine, 0.0 if number else _TRACK.settled_share):
             break
         # The light of a coarse pose that is wrong by degrees is wrong as well, and leaves the fine
         # one between the two.
         light = (yield from light_steps(pyramid, mesh, fine.pose, levels[0], by_view=True)) or light
         fine = yield from pose_steps(
-            pyramid, mesh, fine.pose, light, levels[-2:], _NEXT_REACH_PX, fine.modes
+            pyramid, mesh, fine.pose, light, levels[-2:], _TRACK.next_reach_px, fine.modes
         )
         if fine is not None and not _is_settled(fine):
             # Of few points the coarser level turns a pose away by more than that, and the finest
             # one back.
             fine = yield from pose_steps(
-                pyramid, mesh, fine.pose, light, levels[-1:], _NEXT_REACH_PX, fine.modes
+                pyramid, mesh, fine.pose, light, levels[-1:], _TRACK.next_reach_px, fine.modes
             )
     return (fine, light) if fine is not None and _is_settled(fine) else None
 
@@ -203,24 +241,24 @@ def _is_settled(alignment: Alignment, least_share: float = 0.0) -> bool:
     the points agree with it.
     """
     turned_rad = turn_between(alignment.pose, alignment.points.pose)
-    return alignment.inlier_share >= least_share and turned_rad <= _SETTLED_RAD
+    return alignment.inlier_share >= least_share and turned_rad <= _TRACK.settled_rad
 
 
 def track_points(
     pyramid: Pyramid, points: ControlPoints, prior: PoseInCamera, modes: Array | None = None
 ) -> Alignment | None:
     """Align the control points of an earlier rendering from ``prior``."""
-    return align(pyramid, points, prior, _FIRST_REACH_PX, modes)
+    return align(pyramid, points, prior, _TRACK.first_reach_px, modes)
 
 
 def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
     """Return twelve poses around ``prior``: turned by 3 degrees about each axis, moved by 2 % of
     the range along each.
     """
-    starts, step_m = [], _START_SHARE * float(np.linalg.norm(prior.position))
+    starts, step_m = [], _TRACK.start_share * float(np.linalg.norm(prior.position))
     for axis, sign in itertools.product(range(3), (1.0, -1.0)):
         unit = sign * np.eye(3)[axis]
-        turn = rotations.to_matrix(rotations.exp(_START_RAD * unit))
+        turn = rotations.to_matrix(rotations.exp(_TRACK.start_rad * unit))
         starts.append(PoseInCamera(prior.position, turn @ prior.rotation))
         starts.append(PoseInCamera(prior.position + step_m * unit, prior.rotation))
     return starts

@@ -1,14 +1,20 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Refines marker corners as intersections of lines fitted to the sides. Method: chaserdock_agents.chaser.perception.corners. */
+/* Refines marker corners as intersections of lines fitted to the sides. Method:
+ * chaserdock_agents.chaser.perception.corners. */
 #include "base.h"
 
+/* Capacities: lines across a side and samples on each (settings: 8 and 11), lines of pixels across
+ * a side (48), and pixels beside it: 48 lines of 42. */
 #define ROWS_MOST 20
+/* See above. */
 #define TAPS_MOST 15
+/* See above. */
 #define COLUMNS_MOST 64
+/* See above. */
 #define PIXELS_MOST 2048
 /* Tabulated normal distribution: steps of 1 / STEPS up to LAST sigma on either side. */
 #define STEPS 32
-#define LAST 5
+#define LAST 5 /* beyond, the distribution is 0 or 1 to 3e-7 */
 
 typedef struct {
     const uint8_t *image;
@@ -19,16 +25,23 @@ typedef struct {
 
 /* Settings, in the order of the Python caller. */
 typedef struct {
-    /* Both steps: share of a cell and least pixels to look inwards; least contrast and share of usable rows; largest move. */
+    /* Both steps: share of a cell and least pixels to look inwards; least contrast and share of
+     * usable rows; largest move. */
     double reach_cells, reach_least_px, min_contrast, min_rows_share, max_move_px;
-    /* Coarse step. `first` and `last` exclude the ends of a side, where the gradient of the adjacent side interferes. */
+    /* Coarse step. `first` and `last` exclude the ends of a side, where the gradient of the
+     * adjacent side interferes. */
     double first, last, rows, taps, coarse_reach_px, border_share;
-    /* Fit to pixels: samples along a side, ends that are left out, looks across an edge, prior of the logarithm of the edge's
-     * sigma, rounds and iterations per round. */
-    double columns, end_px, end_share, reach_px, clear_px, beyond_px, strip_px, partial_px, least_fall, agreement_px;
+    /* Fit to pixels: samples along a side, ends that are left out, looks across an edge, prior of
+     * the logarithm of the edge's sigma, rounds and iterations per round. */
+    double columns, end_px, end_share, reach_px, clear_px, beyond_px, strip_px, partial_px,
+        least_fall, agreement_px;
     double log_edge_sigma, edge_sigma_spread, rounds, iterations, strip_iterations;
     double uncertain_px, uncertain_level;
 } Settings;
+LAYOUT(Settings, reach_cells, reach_least_px, min_contrast, min_rows_share, max_move_px, first,
+       last, rows, taps, coarse_reach_px, border_share, columns, end_px, end_share, reach_px,
+       clear_px, beyond_px, strip_px, partial_px, least_fall, agreement_px, log_edge_sigma,
+       edge_sigma_spread, rounds, iterations, strip_iterations, uncertain_px, uncertain_level)
 
 typedef struct {
     double start[2], vector[2], normal[2], extent;
@@ -42,11 +55,13 @@ static void sides_of(const double *corners, Side *sides) {
         Side *s = sides + i;
         const double *a = corners + 2 * i, *b = corners + 2 * ((i + 1) % 4);
         for (int k = 0; k < 2; k++) s->start[k] = a[k], s->vector[k] = b[k] - a[k];
-        double length = max_of(sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]), 1e-6);
+        double length =
+            max_of(sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]), 1e-6);
         s->normal[0] = s->vector[1] / length;
         s->normal[1] = -s->vector[0] / length;
         double across = 0.0;
-        for (int k = 0; k < 2; k++) across += (a[k] + 0.5 * s->vector[k] - middle[k]) * s->normal[k];
+        for (int k = 0; k < 2; k++)
+            across += (a[k] + 0.5 * s->vector[k] - middle[k]) * s->normal[k];
         s->extent = 2.0 * abs_of(across);
     }
 }
@@ -76,9 +91,11 @@ static void distort(const Image *p, double *x, double *y) {
     *y = ((b * radial + l[6] * (r2 + 2.0 * b * b)) + 2.0 * l[7] * a * b) * l[1] + l[3];
 }
 
-/* Samples a row across a side: position `along` it (-0.5 to 0.5), offsets `across` (taps), pixels, positive outwards. Returns
- * whether both ends of the row, and thus all of it, lie inside the image. */
-static int row_of(const Image *p, const Side *s, double along, const double *across, int taps, double *levels) {
+/* Samples a row across a side: position `along` it (-0.5 to 0.5), offsets `across` (taps), pixels,
+ * positive outwards. Returns whether both ends of the row, and thus all of it, lie inside the
+ * image. */
+static int row_of(const Image *p, const Side *s, double along, const double *across, int taps,
+                  double *levels) {
     double base[2];
     int inside = 1;
     for (int k = 0; k < 2; k++) base[k] = (s->start[k] + 0.5 * s->vector[k]) + along * s->vector[k];
@@ -86,7 +103,8 @@ static int row_of(const Image *p, const Side *s, double along, const double *acr
         double x = base[0] + s->normal[0] * across[t], y = base[1] + s->normal[1] * across[t];
         if (p->distorted) distort(p, &x, &y);
         if (t == 0 || t == taps - 1)
-            inside &= x >= 0.0 && x <= (double)(p->width - 1) && y >= 0.0 && y <= (double)(p->height - 1);
+            inside &=
+                x >= 0.0 && x <= (double)(p->width - 1) && y >= 0.0 && y <= (double)(p->height - 1);
         levels[t] = level_at(p, x, y);
     }
     return inside;
@@ -97,7 +115,8 @@ static double reach_of(const Settings *set, const Side *s, double cells, double 
 }
 
 /* Weighted least squares of offset = level + slope * along. */
-static void fit_line(const double *along, const double *offset, const double *weight, int rows, double *level, double *slope) {
+static void fit_line(const double *along, const double *offset, const double *weight, int rows,
+                     double *level, double *slope) {
     double s0 = 0.0, s1 = 0.0, s2 = 0.0, t0 = 0.0, t1 = 0.0;
     for (int i = 0; i < rows; i++) {
         double w = weight[i], wa = w * along[i];
@@ -122,14 +141,15 @@ static double median_of(const double *values, const double *weight, int rows) {
     return count ? ordered[count / 2] : 0.0;
 }
 
-/* Fits a side's line to the centroids of the grey-level gradient across it: outward offsets of its two ends, pixels.
- * Returns whether enough rows are usable. */
-static int centroid_line(const Image *p, const Settings *set, const Side *s, double cells, double margin, double *at_start,
-                         double *at_end) {
+/* Fits a side's line to the centroids of the grey-level gradient across it: outward offsets of its
+ * two ends, pixels. Returns whether enough rows are usable. */
+static int centroid_line(const Image *p, const Settings *set, const Side *s, double cells,
+                         double margin, double *at_start, double *at_end) {
     int rows = (int)set->rows, taps = (int)set->taps, count = 0;
     double border = max_of(set->border_share * margin * s->extent, set->reach_least_px);
     double reach = reach_of(set, s, cells, min_of(set->coarse_reach_px, border));
-    double along[ROWS_MOST], offset[ROWS_MOST], usable[ROWS_MOST], weight[ROWS_MOST], across[TAPS_MOST], levels[TAPS_MOST];
+    double along[ROWS_MOST], offset[ROWS_MOST], usable[ROWS_MOST], weight[ROWS_MOST],
+        across[TAPS_MOST], levels[TAPS_MOST];
     double residual[ROWS_MOST], level, slope;
     for (int t = 0; t < taps; t++) across[t] = (2.0 * t / (taps - 1) - 1.0) * reach;
     for (int i = 0; i < rows; i++) {
@@ -158,8 +178,10 @@ static int centroid_line(const Image *p, const Settings *set, const Side *s, dou
     return (double)count >= set->min_rows_share * rows;
 }
 
-/* Intersects adjacent sides after moving their ends outwards. Returns 0, with nothing written, if two are nearly parallel. */
-static int crossings(const Side *sides, const double *at_start, const double *at_end, double *corners) {
+/* Intersects adjacent sides after moving their ends outwards. Returns 0, with nothing written, if
+ * two are nearly parallel. */
+static int crossings(const Side *sides, const double *at_start, const double *at_end,
+                     double *corners) {
     double low[4][2], vector[4][2], found[8];
     for (int i = 0; i < 4; i++)
         for (int k = 0; k < 2; k++) {
@@ -182,7 +204,8 @@ static int crossings(const Side *sides, const double *at_start, const double *at
     return 1;
 }
 
-/* The normal distribution function, to 1e-7 (Abramowitz and Stegun 26.2.17), and density, tabulated. */
+/* The normal distribution function, to 1e-7 (Abramowitz and Stegun 26.2.17), and density,
+ * tabulated. */
 typedef struct {
     double distribution[2 * LAST * STEPS + 2], density[2 * LAST * STEPS + 2];
 } Edge;
@@ -208,23 +231,27 @@ static void edge_at(const Edge *edge, double z, double *distribution, double *de
     double at = (z + LAST) * STEPS;
     int i = (int)at;
     at -= i;
-    *distribution = edge->distribution[i] + at * (edge->distribution[i + 1] - edge->distribution[i]);
+    *distribution =
+        edge->distribution[i] + at * (edge->distribution[i + 1] - edge->distribution[i]);
     *density = edge->density[i] + at * (edge->density[i + 1] - edge->density[i]);
 }
 
-/* Width of the white border beyond a side, pixels: `at` its start, and `rise` per pixel along it. */
+/* Width of the white border beyond a side, pixels: `at` its start, and `rise` per pixel along
+ * it. */
 typedef struct {
     double at, rise;
 } Border;
 
 /* Borders of the four sides from the corners and the border's share of the marker's side. */
 static void borders_of(const double *c, const Side *sides, double share, Border *borders) {
-    /* Homography of the unit square (P. S. Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989). */
+    /* Homography of the unit square (P. S. Heckbert, "Fundamentals of Texture Mapping and Image
+     * Warping", 1989). */
     double dx1 = c[2] - c[4], dx2 = c[6] - c[4], sx = ((c[0] - c[2]) + c[4]) - c[6];
     double dy1 = c[3] - c[5], dy2 = c[7] - c[5], sy = ((c[1] - c[3]) + c[5]) - c[7];
-    double det = dx1 * dy2 - dx2 * dy1, g = (sx * dy2 - dx2 * sy) / det, h = (dx1 * sy - sx * dy1) / det;
-    double ax = (c[2] - c[0]) + g * c[2], bx = (c[6] - c[0]) + h * c[6], ay = (c[3] - c[1]) + g * c[3],
-           by = (c[7] - c[1]) + h * c[7], outer[8];
+    double det = dx1 * dy2 - dx2 * dy1, g = (sx * dy2 - dx2 * sy) / det,
+           h = (dx1 * sy - sx * dy1) / det;
+    double ax = (c[2] - c[0]) + g * c[2], bx = (c[6] - c[0]) + h * c[6],
+           ay = (c[3] - c[1]) + g * c[3], by = (c[7] - c[1]) + h * c[7], outer[8];
     for (int i = 0; i < 4; i++) {
         double u = i == 1 || i == 2 ? 1.0 + share : -share, v = i >= 2 ? 1.0 + share : -share;
         double scale = 1.0 / ((g * u + h * v) + 1.0);
@@ -233,7 +260,8 @@ static void borders_of(const double *c, const Side *sides, double share, Border 
     }
     for (int i = 0; i < 4; i++) {
         const Side *s = sides + i;
-        double along[2], across[2], length = sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]);
+        double along[2], across[2],
+            length = sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]);
         for (int k = 0; k < 2; k++) {
             const double *corner = outer + 2 * ((i + k) % 4);
             double x = corner[0] - s->start[0], y = corner[1] - s->start[1];
@@ -245,39 +273,50 @@ static void borders_of(const double *c, const Side *sides, double share, Border 
     }
 }
 
-/* The pixels near a side: offsets outwards from its line, pixels; place along it, -0.5 to 0.5; width of the border there;
- * grey level; column, of `columns` lines of pixels across the side, of which those not `inside` the image are not used. */
+/* The pixels near a side: offsets outwards from its line, pixels; place along it, -0.5 to 0.5;
+ * width of the border there; grey level; column, of `columns` lines of pixels across the side, of
+ * which those not `inside` the image are not used. */
 typedef struct {
     int count, columns, column[PIXELS_MOST];
-    double inside[COLUMNS_MOST], offset[PIXELS_MOST], along[PIXELS_MOST], border[PIXELS_MOST], level[PIXELS_MOST];
+    double inside[COLUMNS_MOST], offset[PIXELS_MOST], along[PIXELS_MOST], border[PIXELS_MOST],
+        level[PIXELS_MOST];
 } Band;
 
-/* How far outwards, pixels, the pixels at `at` pixels along a side are used: up to beyond the border's outer edge, or not as far. */
+/* How far outwards, pixels, the pixels at `at` pixels along a side are used: up to beyond the
+ * border's outer edge, or not as far. */
 static double outward_limit(const Settings *set, const Border *border, int outer, double at) {
     double edge = border->at + border->rise * at;
     return outer ? edge + set->beyond_px : min_of(set->reach_px, edge - set->clear_px);
 }
 
-/* Collects the pixels from `inner` pixels inside the side's line to those before the border's outer edge, or about both. */
-static void collect(const Image *p, const Settings *set, const Side *s, const Border *border, int outer, double inner,
-                    Band *band) {
+/* Collects the pixels from `inner` pixels inside the side's line to those before the border's outer
+ * edge, or about both. */
+static void collect(const Image *p, const Settings *set, const Side *s, const Border *border,
+                    int outer, double inner, Band *band) {
     double length = sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]);
     double end = min_of(set->end_px, set->end_share * length), reach = set->reach_px;
     int k = abs_of(s->vector[0]) >= abs_of(s->vector[1]) ? 0 : 1, o = 1 - k;
     int64_t sizes[2] = {p->width, p->height};
     band->count = 0;
-    band->columns = (int)min_of(set->columns, max_of(abs_of(s->vector[k]) * (1.0 - 2.0 * end / length), 1.0));
+    band->columns =
+        (int)min_of(set->columns, max_of(abs_of(s->vector[k]) * (1.0 - 2.0 * end / length), 1.0));
     for (int c = 0; c < band->columns; c++) {
-        double at = end + (length - 2.0 * end) * (c + 0.5) / band->columns, ideal[2], shift[2], seen[2];
+        double at = end + (length - 2.0 * end) * (c + 0.5) / band->columns, ideal[2], shift[2],
+               seen[2];
         for (int j = 0; j < 2; j++) seen[j] = ideal[j] = s->start[j] + at / length * s->vector[j];
         if (p->distorted) distort(p, seen, seen + 1);
         for (int j = 0; j < 2; j++) shift[j] = seen[j] - ideal[j];
         double most = outward_limit(set, border, outer, at);
         double low = seen[o] - inner / s->normal[o], high = seen[o] + most / s->normal[o];
-        double from = min_of(low, high), to = max_of(low, high), line = __builtin_floor(seen[k] + 0.5);
-        band->inside[c] = line >= 0.0 && line < (double)sizes[k] && from >= 0.0 && to <= (double)(sizes[o] - 1) ? 1.0 : 0.0;
+        double from = min_of(low, high), to = max_of(low, high),
+               line = __builtin_floor(seen[k] + 0.5);
+        band->inside[c] =
+            line >= 0.0 && line < (double)sizes[k] && from >= 0.0 && to <= (double)(sizes[o] - 1)
+                ? 1.0
+                : 0.0;
         if (band->inside[c] == 0.0) continue;
-        for (double row = __builtin_ceil(from); row <= to && band->count < PIXELS_MOST; row += 1.0) {
+        for (double row = __builtin_ceil(from); row <= to && band->count < PIXELS_MOST;
+             row += 1.0) {
             double pixel[2], q[2];
             pixel[k] = line, pixel[o] = row;
             for (int j = 0; j < 2; j++) q[j] = pixel[j] - shift[j];
@@ -287,7 +326,8 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
                 for (int j = 0; j < 2; j++) q[j] += pixel[j] - d[j];
             }
             double x = q[0] - s->start[0], y = q[1] - s->start[1];
-            double offset = x * s->normal[0] + y * s->normal[1], along = (x * s->vector[0] + y * s->vector[1]) / length;
+            double offset = x * s->normal[0] + y * s->normal[1],
+                   along = (x * s->vector[0] + y * s->vector[1]) / length;
             double width = border->at + border->rise * along;
             if (!(offset >= -inner && offset <= outward_limit(set, border, outer, along))) continue;
             if (offset > reach && offset < width - reach) continue;
@@ -320,13 +360,15 @@ static int solve_normal(double *a, double *b, int n) {
     return solve_rows(a, b, n);
 }
 
-/* Fits a side's line to the grey levels of its pixels, with a border `outer` of known width or none:
- * black + rise Phi((s - e) / sigma) + fall Phi((s - e - border) / sigma), where e = offset + slope * along. The levels are by
- * least squares, sigma has a prior. Columns that do not fit, as where something hides the side, are left out. Writes the
- * outward offsets of the line's two ends, pixels, and the rise and the fall in grey levels; returns whether the side is usable. */
-static int fit_band(const Settings *set, const Edge *edge, const Band *band, int outer, int iterations, double *ends,
-                    double *change) {
-    double offset = 0.0, slope = 0.0, log_sigma = set->log_edge_sigma, weight[COLUMNS_MOST], levels[3] = {0.0};
+/* Fits a side's line to the grey levels of its pixels, with a border `outer` of known width or
+ * none: black + rise Phi((s - e) / sigma) + fall Phi((s - e - border) / sigma), where e = offset +
+ * slope * along. The levels are by least squares, sigma has a prior. Columns that do not fit, as
+ * where something hides the side, are left out. Writes the outward offsets of the line's two ends,
+ * pixels, and the rise and the fall in grey levels; returns whether the side is usable. */
+static int fit_band(const Settings *set, const Edge *edge, const Band *band, int outer,
+                    int iterations, double *ends, double *change) {
+    double offset = 0.0, slope = 0.0, log_sigma = set->log_edge_sigma, weight[COLUMNS_MOST],
+           levels[3] = {0.0};
     /* An assumed error of 2 grey levels sets the weight of the prior of sigma. */
     double prior = (2.0 / set->edge_sigma_spread) * (2.0 / set->edge_sigma_spread);
     int count = outer ? 3 : 2, n = count + 3;
@@ -346,7 +388,8 @@ static int fit_band(const Settings *set, const Edge *edge, const Band *band, int
         zero(b, 6);
         for (int i = 0; i < band->count; i++) {
             double s = band->offset[i] - (offset + slope * band->along[i]), density[2] = {0.0};
-            double z[2] = {s / sigma, (s - band->border[i]) / sigma}, residual = band->level[i] - levels[0];
+            double z[2] = {s / sigma, (s - band->border[i]) / sigma},
+                   residual = band->level[i] - levels[0];
             for (int k = 0; k < count - 1; k++) {
                 edge_at(edge, z[k], row + 1 + k, density + k);
                 residual -= levels[1 + k] * row[1 + k];
@@ -367,7 +410,8 @@ static int fit_band(const Settings *set, const Edge *edge, const Band *band, int
         log_sigma += limited(b[count + 2], 0.2);
         for (int c = 0; c < band->columns; c++) square[c] /= max_of(pixels[c], 1.0);
         double limit = 9.0 * median_of(square, band->inside, band->columns) + 4.0;
-        for (int c = 0; c < band->columns; c++) weight[c] = square[c] < limit ? band->inside[c] : 0.0;
+        for (int c = 0; c < band->columns; c++)
+            weight[c] = square[c] < limit ? band->inside[c] : 0.0;
     }
     double used = 0.0;
     for (int c = 0; c < band->columns; c++) used += weight[c];
@@ -375,15 +419,19 @@ static int fit_band(const Settings *set, const Edge *edge, const Band *band, int
     ends[1] = offset + 0.5 * slope;
     change[0] = levels[1];
     change[1] = -levels[2];
-    return levels[1] >= set->min_contrast && used >= set->min_rows_share * band->columns && finite(ends[0]) && finite(ends[1]);
+    return levels[1] >= set->min_contrast && used >= set->min_rows_share * band->columns &&
+           finite(ends[0]) && finite(ends[1]);
 }
 
-/* Fits a side's line and its contrast, grey levels. The outer edge of a border, used in the last round if `outlined`, must be a fall
- * in brightness and agree with the side itself: otherwise another face adjoins it. A border that ends at neighbours beside parts of
- * the side only is not fitted with its outer edge, as long as enough of it is clear. */
-static int fit_side(const Image *p, const Settings *set, const Edge *edge, const Side *side, const Border *border, int outlined,
-                    int last, double inner, Band *band, double *at_start, double *at_end, double *contrast) {
-    double width = border->at + 0.5 * border->rise * side->extent, ends[2] = {0.0}, both[2], change[2];
+/* Fits a side's line and its contrast, grey levels. The outer edge of a border, used in the last
+ * round if `outlined`, must be a fall in brightness and agree with the side itself: otherwise
+ * another face adjoins it. A border that ends at neighbours beside parts of the side only is not
+ * fitted with its outer edge, as long as enough of it is clear. */
+static int fit_side(const Image *p, const Settings *set, const Edge *edge, const Side *side,
+                    const Border *border, int outlined, int last, double inner, Band *band,
+                    double *at_start, double *at_end, double *contrast) {
+    double width = border->at + 0.5 * border->rise * side->extent, ends[2] = {0.0}, both[2],
+           change[2];
     int fine = 0, narrow = width < (outlined ? set->strip_px : set->partial_px);
     if (!narrow) {
         collect(p, set, side, border, 0, inner, band);
@@ -391,10 +439,13 @@ static int fit_side(const Image *p, const Settings *set, const Edge *edge, const
     }
     if (narrow || (fine && outlined && last)) {
         collect(p, set, side, border, 1, inner, band);
-        int fits = fit_band(set, edge, band, 1, (int)(narrow ? set->strip_iterations : set->iterations), both, change);
+        int fits = fit_band(set, edge, band, 1,
+                            (int)(narrow ? set->strip_iterations : set->iterations), both, change);
         if (narrow) fine = fits;
-        else fits = fits && change[1] >= set->least_fall * change[0] && abs_of(both[0] - ends[0]) < set->agreement_px &&
-                    abs_of(both[1] - ends[1]) < set->agreement_px;
+        else
+            fits = fits && change[1] >= set->least_fall * change[0] &&
+                   abs_of(both[0] - ends[0]) < set->agreement_px &&
+                   abs_of(both[1] - ends[1]) < set->agreement_px;
         if (fits) copy(both, ends, 2);
     }
     *at_start = ends[0];
@@ -403,25 +454,30 @@ static int fit_side(const Image *p, const Settings *set, const Edge *edge, const
     return fine;
 }
 
-/* Refines corners (n, 4, 2), ideal pixels, in place. `good` (n): whether all four sides are usable; otherwise the corners
- * are unchanged, as for corners that are not finite. `sigma` (n): uncertainty relative to that of a large marker. `margin`
- * (n): width of the white border over the marker's side; `outlined` (n): whether it ends there on all sides. `cells`: cells
- * along a side, including the black border. */
-EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width, const double *lens, int64_t distorted,
-                                const Settings *set, double cells, int64_t n, const double *margin, const uint8_t *outlined,
-                                double *corners, uint8_t *good, double *sigma) {
+/* Refines corners (n, 4, 2), ideal pixels, in place. `good` (n): whether all four sides are usable;
+ * otherwise the corners are unchanged, as for corners that are not finite. `sigma` (n): uncertainty
+ * relative to that of a large marker. `margin` (n): width of the white border over the marker's
+ * side; `outlined` (n): whether it ends there on all sides. `cells`: cells along a side, including
+ * the black border. */
+EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width,
+                                 const double *lens, int64_t distorted, const Settings *set,
+                                 double cells, int64_t n, const double *margin,
+                                 const uint8_t *outlined, double *corners, uint8_t *good,
+                                 double *sigma) {
     Image p = {image, height, width, distorted, lens};
     Edge edge;
     Band band;
     tabulate(&edge);
     for (int64_t m = 0; m < n; m++) {
-        double *given = corners + 8 * m, refined[8], at_start[4], at_end[4], contrast[4] = {1.0, 1.0, 1.0, 1.0};
+        double *given = corners + 8 * m, refined[8], at_start[4], at_end[4],
+               contrast[4] = {1.0, 1.0, 1.0, 1.0};
         Side sides[4];
         Border borders[4];
         int fine = 1;
         copy(given, refined, 8);
         sides_of(refined, sides);
-        for (int i = 0; i < 4; i++) fine &= centroid_line(&p, set, sides + i, cells, margin[m], at_start + i, at_end + i);
+        for (int i = 0; i < 4; i++)
+            fine &= centroid_line(&p, set, sides + i, cells, margin[m], at_start + i, at_end + i);
         fine = fine && crossings(sides, at_start, at_end, refined);
         for (int round = 0; round < (int)set->rounds && fine; round++) {
             sides_of(refined, sides);
@@ -429,7 +485,8 @@ EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t w
             int last = round + 1 == (int)set->rounds;
             for (int i = 0; i < 4 && fine; i++) {
                 double inner = reach_of(set, sides + i, cells, set->reach_px);
-                fine = fit_side(&p, set, &edge, sides + i, borders + i, outlined[m], last, inner, &band, at_start + i, at_end + i, contrast + i);
+                fine = fit_side(&p, set, &edge, sides + i, borders + i, outlined[m], last, inner,
+                                &band, at_start + i, at_end + i, contrast + i);
             }
             fine = fine && crossings(sides, at_start, at_end, refined);
         }
@@ -437,7 +494,8 @@ EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t w
         if (!fine) copy(given, refined, 8);
         sides_of(refined, sides);
         double finest = sides[0].extent, least = contrast[0];
-        for (int i = 1; i < 4; i++) finest = min_of(finest, sides[i].extent), least = min_of(least, contrast[i]);
+        for (int i = 1; i < 4; i++)
+            finest = min_of(finest, sides[i].extent), least = min_of(least, contrast[i]);
         double blur = set->uncertain_px / max_of(finest * min_of(margin[m], 1.0 / cells), 0.1);
         double noise = set->uncertain_level / max_of(least, 1.0);
         sigma[m] = sqrt_of((1.0 + blur * blur) + noise * noise);

@@ -2,19 +2,21 @@
 /* Pose of minimum weighted reprojection error: Levenberg-Marquardt. */
 #include "base.h"
 
-/* Iteration ends when a step lowers the squared error by at most the first share of it, or the linear model predicts at most
- * the second. */
-#define MIN_GAIN 1e-5
+/* Iteration ends when a step lowers the squared error by at most the first share of it, or the
+ * linear model predicts at most the second. */
+#define MIN_GAIN 1e-5 /* chosen: of 32 coordinates, a pose off by 0.02 standard deviations */
+/* Chosen, below MIN_GAIN: saves the last step where it would change nothing. */
 #define MIN_PREDICTED_GAIN 2e-6
 
 typedef struct {
     double cost, gradient[6], information[36];
 } Normal;
 
-/* Compute squared weighted error, gradient and Gauss-Newton matrix of a pose (position (3), rotation (3, 3)) by a rotation phi
- * in camera axes, R_true = exp([phi]x) R, and by position; return 0 for points behind the camera. */
-static int normal_of(const double *lens, const double *points, const double *pixels, const double *weight, int64_t n,
-                     const double *pose, Normal *out) {
+/* Compute squared weighted error, gradient and Gauss-Newton matrix of a pose (position (3),
+ * rotation (3, 3)) by a rotation phi in camera axes, R_true = exp([phi]x) R, and by position;
+ * return 0 for points behind the camera. */
+static int normal_of(const double *lens, const double *points, const double *pixels,
+                     const double *weight, int64_t n, const double *pose, Normal *out) {
     out->cost = 0.0;
     zero(out->gradient, 6);
     zero(out->information, 36);
@@ -24,7 +26,8 @@ static int normal_of(const double *lens, const double *points, const double *pix
         double x = turned[0] + pose[0], y = turned[1] + pose[1], z = turned[2] + pose[2];
         if (!(z > 1e-6)) return 0;
         double u = x / z, v = y / z;
-        double by[2][3] = {{lens[0] / z, 0.0, -lens[0] * u / z}, {0.0, lens[1] / z, -lens[1] * v / z}};
+        double by[2][3] = {{lens[0] / z, 0.0, -lens[0] * u / z},
+                           {0.0, lens[1] / z, -lens[1] * v / z}};
         residual[0] = lens[0] * u + lens[2] - pixels[2 * i];
         residual[1] = lens[1] * v + lens[3] - pixels[2 * i + 1];
         for (int k = 0; k < 2; k++) {
@@ -37,7 +40,8 @@ static int normal_of(const double *lens, const double *points, const double *pix
         }
         for (int a = 0; a < 6; a++) {
             out->gradient[a] += row[0][a] * residual[0] + row[1][a] * residual[1];
-            for (int b = 0; b <= a; b++) out->information[6 * a + b] += row[0][a] * row[0][b] + row[1][a] * row[1][b];
+            for (int b = 0; b <= a; b++)
+                out->information[6 * a + b] += row[0][a] * row[0][b] + row[1][a] * row[1][b];
         }
     }
     for (int a = 0; a < 6; a++)
@@ -57,14 +61,16 @@ static void turned_by(const double *phi, const double *rotation, double *out) {
         double column[3] = {rotation[j], rotation[3 + j], rotation[6 + j]}, across[3];
         cross3(axis, column, across);
         double along = (1.0 - c) * dot3(axis, column);
-        for (int i = 0; i < 3; i++) out[3 * i + j] = (c * column[i] + along * axis[i]) + s * across[i];
+        for (int i = 0; i < 3; i++)
+            out[3 * i + j] = (c * column[i] + along * axis[i]) + s * across[i];
     }
 }
 
-/* Move ``pose`` (position (3), rotation (3, 3), TRF to IRF) to the nearest minimum; return 0 if there is none
- * of finite numbers. ``lens``: fx, fy, cx, cy; ``points`` (n, 3) TRF, ``pixels`` (n, 2) ideal, ``weight`` (n, 2). */
-EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const double *pixels, const double *weight,
-                                int64_t n, double *pose) {
+/* Move ``pose`` (position (3), rotation (3, 3), TRF to IRF) to the nearest minimum; return 0 if
+ * there is none of finite numbers. ``lens``: fx, fy, cx, cy; ``points`` (n, 3) TRF, ``pixels`` (n,
+ * 2) ideal, ``weight`` (n, 2). */
+EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const double *pixels,
+                                 const double *weight, int64_t n, double *pose) {
     Normal now, then;
     if (!normal_of(lens, points, pixels, weight, n, pose, &now) || !finite(now.cost)) return 0;
     double damping = 1e-7;
@@ -79,7 +85,8 @@ EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const
         for (int i = 0; i < 6; i++) predicted -= step[i] * now.gradient[i];
         for (int i = 0; i < 3; i++) trial[i] = pose[i] + step[3 + i];
         turned_by(step, pose + 3, trial + 3);
-        /* An undamped step whose predicted gain is negligible is the last one and needs no check. */
+        /* An undamped step whose predicted gain is negligible is the last one and needs no
+         * check. */
         if (damping < 1e-3 && predicted <= MIN_PREDICTED_GAIN * now.cost + 1e-12) {
             copy(trial, pose, 12);
             break;

@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The markers that a camera sees of a target in a known pose, and an error of the pose drawn from theirs. */
+/* The markers that a camera sees of a target in a known pose, and an error of the pose drawn from
+ * theirs. */
 #include "base.h"
 
 typedef struct {
@@ -11,7 +12,8 @@ typedef struct {
     double sigma_px, small_side_px, least_side_px, least_cosine, least_cosine_single, margin_px;
 } MarkerLimits;
 
-/* Factorize the symmetric a (6, 6) in place: lower triangle of G, G G' = a. Return 0 unless each pivot is larger than
+/* Factorize the symmetric a (6, 6) in place: lower triangle of G, G G' = a. Return 0 unless each
+ * pivot is larger than
  * ``least`` (false for NaN). */
 static int factorize6(double *a, double least) {
     for (int i = 0; i < 6; i++)
@@ -28,10 +30,11 @@ static int factorize6(double *a, double least) {
     return 1;
 }
 
-/* Pixels (4, 2) and cosine of the angle of view of marker i in a pose; return whether it is detected. */
-static int see_marker(const PinholeCamera *lens, const MarkerLimits *limits, const double *corners, const double *origin,
-                      const double *normal, const double *position, const double *rotation, double *px, double *side,
-                      double *cosine) {
+/* Pixels (4, 2) and cosine of the angle of view of marker i in a pose; return whether it is
+ * detected. */
+static int see_marker(const PinholeCamera *lens, const MarkerLimits *limits, const double *corners,
+                      const double *origin, const double *normal, const double *position,
+                      const double *rotation, double *px, double *side, double *cosine) {
     double low = 1e300, right = -1e300, bottom = -1e300, centre[3], outwards[3];
     for (int k = 0; k < 4; k++) {
         double at[3];
@@ -55,26 +58,30 @@ static int see_marker(const PinholeCamera *lens, const MarkerLimits *limits, con
     for (int j = 0; j < 3; j++) centre[j] += position[j];
     *cosine = -dot3(outwards, centre) / sqrt_of(dot3(centre, centre));
     return low >= limits->margin_px && right <= lens->width - 1.0 - limits->margin_px &&
-           bottom <= lens->height - 1.0 - limits->margin_px && *cosine > limits->least_cosine && *side >= limits->least_side_px;
+           bottom <= lens->height - 1.0 - limits->margin_px && *cosine > limits->least_cosine &&
+           *side >= limits->least_side_px;
 }
 
-/* Add to the information (6, 6), lower triangle, by position and rotation dtheta (R exp([dtheta]x)), that of a marker's corners
- * with errors of standard deviation ``sigma``. */
-static void add_information(const PinholeCamera *lens, const double *corners, const double *position, const double *rotation,
-                            double sigma, double *information) {
+/* Add to the information (6, 6), lower triangle, by position and rotation dtheta (R
+ * exp([dtheta]x)), that of a marker's corners with errors of standard deviation ``sigma``. */
+static void add_information(const PinholeCamera *lens, const double *corners,
+                            const double *position, const double *rotation, double sigma,
+                            double *information) {
     for (int k = 0; k < 4; k++) {
         const double *p = corners + 3 * k;
         double at[3];
         multiply3(rotation, p, at);
         for (int j = 0; j < 3; j++) at[j] += position[j];
         const double inverse = 1.0 / (at[2] * sigma);
-        const double rows[2][3] = {{lens->fx * inverse, 0.0, -lens->fx * (at[0] / at[2]) * inverse},
-                                   {0.0, lens->fy * inverse, -lens->fy * (at[1] / at[2]) * inverse}};
+        const double rows[2][3] = {
+            {lens->fx * inverse, 0.0, -lens->fx * (at[0] / at[2]) * inverse},
+            {0.0, lens->fy * inverse, -lens->fy * (at[1] / at[2]) * inverse}};
         for (int r = 0; r < 2; r++) {
             /* A rotation moves the corner by R (dtheta x p): the row by dtheta is p x (row R). */
             double j[6], turned[3];
             for (int c = 0; c < 3; c++)
-                turned[c] = rows[r][0] * rotation[c] + rows[r][1] * rotation[3 + c] + rows[r][2] * rotation[6 + c];
+                turned[c] = rows[r][0] * rotation[c] + rows[r][1] * rotation[3 + c] +
+                            rows[r][2] * rotation[6 + c];
             for (int c = 0; c < 3; c++) j[c] = rows[r][c];
             cross3(p, turned, j + 3);
             for (int a = 0; a < 6; a++)
@@ -83,14 +90,17 @@ static void add_information(const PinholeCamera *lens, const double *corners, co
     }
 }
 
-/* ``corners`` (m, 4, 3), ``origins`` and ``normals`` (m, 3) of m markers in the target's axes; ``pose``: position (3) and
- * rotation (3, 3) of the target in the camera; ``white`` (6): standard normal numbers. Writes which markers are seen (m), the
- * ideal pixels of all corners (m, 4, 2), and, by position and rotation vector, the covariance (6, 6) of the pose and an error
- * (6) drawn from it. Returns the number of markers seen; 0 if none is or if they do not determine the pose; -1 if a corner of
- * any is behind the camera. */
-EXPORT int64_t NAME(measure_pose)(const PinholeCamera *lens, const MarkerLimits *limits, const double *corners,
-                                  const double *origins, const double *normals, int64_t m, const double *pose,
-                                  const double *white, int64_t *seen, double *px, double *covariance, double *error) {
+/* ``corners`` (m, 4, 3), ``origins`` and ``normals`` (m, 3) of m markers in the target's axes;
+ * ``pose``: position (3) and rotation (3, 3) of the target in the camera; ``white`` (6): standard
+ * normal numbers. Writes which markers are seen (m), the ideal pixels of all corners (m, 4, 2),
+ * and, by position and rotation vector, the covariance (6, 6) of the pose and an error (6) drawn
+ * from it. Returns the number of markers seen; 0 if none is or if they do not determine the pose;
+ * -1 if a corner of any is behind the camera. */
+EXPORT int64_t NAME(measure_pose)(const PinholeCamera *lens, const MarkerLimits *limits,
+                                  const double *corners, const double *origins,
+                                  const double *normals, int64_t m, const double *pose,
+                                  const double *white, int64_t *seen, double *px,
+                                  double *covariance, double *error) {
     const double *position = pose, *rotation = pose + 3;
     for (int64_t i = 0; i < 4 * m; i++)
         if (!(dot3(rotation + 6, corners + 3 * i) + position[2] > 0.0)) return -1;
@@ -99,8 +109,8 @@ EXPORT int64_t NAME(measure_pose)(const PinholeCamera *lens, const MarkerLimits 
     int64_t count = 0;
     for (int64_t i = 0; i < m; i++) {
         double side, cosine;
-        seen[i] = see_marker(lens, limits, corners + 12 * i, origins + 3 * i, normals + 3 * i, position, rotation, px + 8 * i,
-                             &side, &cosine);
+        seen[i] = see_marker(lens, limits, corners + 12 * i, origins + 3 * i, normals + 3 * i,
+                             position, rotation, px + 8 * i, &side, &cosine);
         if (!seen[i]) continue;
         count++;
         cosine_of_last = cosine;

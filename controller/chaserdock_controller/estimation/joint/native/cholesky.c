@@ -2,8 +2,8 @@
 /* Cholesky factors of small matrices. */
 #include "layout.h"
 
-/* Replace the lower triangle of a symmetric matrix a (k, k) by its Cholesky factor, of which only that triangle is set.
- * Return 0 if a is not positive definite or not finite. */
+/* Replace the lower triangle of a symmetric matrix a (k, k) by its Cholesky factor, of which only
+ * that triangle is set. Return 0 if a is not positive definite or not finite. */
 static int factorize(double *a, int k) {
     for (int j = 0; j < k; j++) {
         double d = a[k * j + j];

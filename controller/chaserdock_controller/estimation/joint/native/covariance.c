@@ -10,9 +10,10 @@ static void mirror(double *a, int64_t d) {
                 for (int64_t c = c0; c < c0 + 8 && c < r; c++) a[d * c + r] = a[d * r + c];
 }
 
-/* Rows 0 .. 11 of `out` (12 rows of length d) become the first `columns` (at least 12) elements of F x, F' = `f` (k, 12) and
- * x the k rows of `p`. */
-static void transform_rows(const double *f, int k, const double *p, int64_t d, int64_t columns, double *out) {
+/* Rows 0 .. 11 of `out` (12 rows of length d) become the first `columns` (at least 12) elements of
+ * F x, F' = `f` (k, 12) and x the k rows of `p`. */
+static void transform_rows(const double *f, int k, const double *p, int64_t d, int64_t columns,
+                           double *out) {
     for (int64_t at = 0; at < columns; at += 4) {
         const int64_t c = at + 4 <= columns ? at : columns - 4; /* the last columns once more */
         v4 sum[12];
@@ -37,11 +38,12 @@ static void transform_row(const double *f, int k, const double *x, double *out) 
     store(out, a), store(out + 4, b), store(out + 8, c);
 }
 
-/* Lower triangle of `out` becomes that of F P F', for P = `p` (d, d): F is block diagonal, with the transposed `target` (12,
- * 12), and for each chaser rows as `motion_transition` gives them, in `motion` (n, MOTION, COUPLED), and factors `fade`
- * (n, CHASER) of the components from MOTION on; what follows the chasers is constant. `g`: working memory (d, d). */
-static void propagate(int64_t n, int64_t d, const double *target, const double *motion, const double *fade, const double *p,
-                      double *g, double *out) {
+/* Lower triangle of `out` becomes that of F P F', for P = `p` (d, d): F is block diagonal, with the
+ * transposed `target` (12, 12), and for each chaser rows as `motion_transition` gives them, in
+ * `motion` (n, MOTION, COUPLED), and factors `fade` (n, CHASER) of the components from MOTION on;
+ * what follows the chasers is constant. `g`: working memory (d, d). */
+static void propagate(int64_t n, int64_t d, const double *target, const double *motion,
+                      const double *fade, const double *p, double *g, double *out) {
     const int64_t end = size_of(n);
     transform_rows(target, TARGET, p, d, TARGET, g);
     for (int64_t i = 0; i < n; i++) {
@@ -51,7 +53,8 @@ static void propagate(int64_t n, int64_t d, const double *target, const double *
         transform_rows(motion + MOTION * COUPLED * i, MOTION, own, d, columns, rows);
         copy(own + d * COUPLED, rows + d * COUPLED, d * (MOTION - COUPLED));
         for (int64_t r = MOTION; r < CHASER; r++)
-            for (int64_t c = 0; c < columns; c++) rows[d * r + c] = fade[CHASER * i + r] * own[d * r + c];
+            for (int64_t c = 0; c < columns; c++)
+                rows[d * r + c] = fade[CHASER * i + r] * own[d * r + c];
     }
     copy(p + d * end, g + d * end, d * (d - end));
     for (int64_t r = 0; r < d; r++) {
@@ -74,17 +77,21 @@ static void add_element(double *p, int64_t d, int64_t first, int r, int c, doubl
     p[d * (first + r) + first + c] += added;
 }
 
-/* Add the process noise of a chaser to the lower triangle. impulse (6), prior (CHASER - 12): variances of additive states. */
-static void add_noise(double *p, int64_t d, int64_t first, const double *impulse, const double *fade, const double *prior,
-                      int is_latched, const Motion *m) {
+/* Add the process noise of a chaser to the lower triangle. impulse (6), prior (CHASER - 12):
+ * variances of additive states. */
+static void add_noise(double *p, int64_t d, int64_t first, const double *impulse,
+                      const double *fade, const double *prior, int is_latched, const Motion *m) {
     const double force = length3(impulse), dt = m->dt;
     for (int k = 0; k < 3; k++) {
-        double linear = m->latched_acceleration * dt, angular = m->latched_angular_acceleration * dt;
+        double linear = m->latched_acceleration * dt,
+               angular = m->latched_angular_acceleration * dt;
         linear *= linear, angular *= angular;
         if (!is_latched) {
-            const double share = m->control_force_share * force / m->mass, unknown = m->force_max * m->unknown_s / m->mass;
+            const double share = m->control_force_share * force / m->mass,
+                         unknown = m->force_max * m->unknown_s / m->mass;
             linear = share * share + unknown * unknown;
-            const double torque = m->control_torque_share * impulse[3 + k], arm = m->control_arm * force;
+            const double torque = m->control_torque_share * impulse[3 + k],
+                         arm = m->control_arm * force;
             const double more = m->torque_max * m->unknown_s;
             angular = (torque * torque + arm * arm + more * more) / (m->inertia[k] * m->inertia[k]);
         }
@@ -96,33 +103,43 @@ static void add_noise(double *p, int64_t d, int64_t first, const double *impulse
         add_element(p, d, first, ATTITUDE + k, ATTITUDE + k, angular * dt * dt / 3.0);
         add_element(p, d, first, RATE + k, ATTITUDE + k, angular * dt / 2.0);
         if (is_latched) continue;
-        add_element(p, d, first, FORCE + k, FORCE + k, m->disturbance_force * m->disturbance_force * dt);
-        add_element(p, d, first, TORQUE + k, TORQUE + k, m->disturbance_torque * m->disturbance_torque * dt);
+        add_element(p, d, first, FORCE + k, FORCE + k,
+                    m->disturbance_force * m->disturbance_force * dt);
+        add_element(p, d, first, TORQUE + k, TORQUE + k,
+                    m->disturbance_torque * m->disturbance_torque * dt);
     }
-    for (int k = CENTRE; k < CHASER; k++) add_element(p, d, first, k, k, (1.0 - fade[k] * fade[k]) * prior[k - 12]);
+    for (int k = CENTRE; k < CHASER; k++)
+        add_element(p, d, first, k, k, (1.0 - fade[k] * fade[k]) * prior[k - 12]);
 }
 
 EXPORT int64_t NAME(predict_workspace)(int64_t n, int64_t d) {
     return d * d + n * (MOTION * COUPLED + CHASER) + 144 + 4 * 8;
 }
 
-/* Predict the chasers' `mean` in place, and `covariance` (D, D) to `out`. target, target_noise (12, 12): of the target.
- * impulses (n, 6): N s, N m s; orbital (n, 6): wrench of the orbit. fade_view (n,): decay of the view's error. alive, latched
- * (n,): 0 or 1. prior (31): variances of the additive states. */
-EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *target, const double *target_noise, const double *impulses,
-                          const double *orbital, const double *fade_view, const double *prior, const int64_t *alive,
-                          const int64_t *latched, double *mean, const double *covariance, double *out, double *work) {
-    double *g = allocate(&work, d * d), *motion = allocate(&work, n * MOTION * COUPLED), *fade = allocate(&work, n * CHASER);
+/* Predict the chasers' `mean` in place, and `covariance` (D, D) to `out`. target, target_noise (12,
+ * 12): of the target. impulses (n, 6): N s, N m s; orbital (n, 6): wrench of the orbit. fade_view
+ * (n,): decay of the view's error. alive, latched (n,): 0 or 1. prior (31): variances of the
+ * additive states. */
+EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *target,
+                          const double *target_noise, const double *impulses, const double *orbital,
+                          const double *fade_view, const double *prior, const int64_t *alive,
+                          const int64_t *latched, double *mean, const double *covariance,
+                          double *out, double *work) {
+    double *g = allocate(&work, d * d), *motion = allocate(&work, n * MOTION * COUPLED),
+           *fade = allocate(&work, n * CHASER);
     double *transposed = allocate(&work, 144);
     for (int i = 0; i < 12; i++)
         for (int j = 0; j < 12; j++) transposed[12 * j + i] = target[12 * i + j];
     for (int64_t i = 0; i < n; i++) {
-        double *x = mean + TARGET_MEAN + CHASER_MEAN * i, *own = fade + CHASER * i, wrench[6] = {0}, centre[3] = {0}, total[6];
+        double *x = mean + TARGET_MEAN + CHASER_MEAN * i, *own = fade + CHASER * i, wrench[6] = {0},
+               centre[3] = {0}, total[6];
         double *additive = x + ADDITIVE;
         for (int k = 0; k < CHASER; k++) own[k] = k >= VIEW ? fade_view[i] : 1.0;
-        for (int k = 0; k < 3; k++) own[POSITION_DRIFT + k] = m->fade_position, own[ATTITUDE_DRIFT + k] = m->fade_attitude;
+        for (int k = 0; k < 3; k++)
+            own[POSITION_DRIFT + k] = m->fade_position, own[ATTITUDE_DRIFT + k] = m->fade_attitude;
         if (!latched[i]) {
-            for (int k = 0; k < 6; k++) wrench[k] = impulses[6 * i + k] / m->dt + additive[FORCE + k];
+            for (int k = 0; k < 6; k++)
+                wrench[k] = impulses[6 * i + k] / m->dt + additive[FORCE + k];
             copy(additive + CENTRE, centre, 3);
         }
         shift_wrench(wrench, centre, x + OMEGA, m->mass, m->inertia, total);
@@ -135,12 +152,14 @@ EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *t
     for (int i = 0; i < TARGET; i++)
         for (int j = 0; j <= i; j++) out[d * i + j] += target_noise[12 * i + j];
     for (int64_t i = 0; i < n; i++)
-        if (alive[i]) add_noise(out, d, first_of(i), impulses + 6 * i, fade + CHASER * i, prior, latched[i] != 0, m);
+        if (alive[i])
+            add_noise(out, d, first_of(i), impulses + 6 * i, fade + CHASER * i, prior,
+                      latched[i] != 0, m);
     mirror(out, d);
 }
 
-/* Subtract W'W from the lower triangle of p (d, d), W the k rows of `w`, of length `stride` with zeros from d on (stride a
- * multiple of 8, at least d + 3). */
+/* Subtract W'W from the lower triangle of p (d, d), W the k rows of `w`, of length `stride` with
+ * zeros from d on (stride a multiple of 8, at least d + 3). */
 static void subtract_square(const double *w, int k, int64_t stride, double *p, int64_t d) {
     for (int64_t r = 0; r < d; r += 4)
         for (int64_t c = 0; c <= r + 3 && c < d; c += 8) {
@@ -167,8 +186,8 @@ static void subtract_square(const double *w, int k, int64_t stride, double *p, i
         }
 }
 
-/* Make the rotation error at `first` relative to an attitude corrected by `correction` (3), in the lower triangle of p
- * (Sola eq. 287). */
+/* Make the rotation error at `first` relative to an attitude corrected by `correction` (3), in the
+ * lower triangle of p (Sola eq. 287). */
 static void turn_error(double *p, int64_t d, int64_t first, const double *correction) {
     double reset[9], transposed[9];
     right_jacobian(correction, reset);
@@ -180,7 +199,8 @@ static void turn_error(double *p, int64_t d, int64_t first, const double *correc
     }
     double own[9];
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) own[3 * i + j] = i >= j ? rows[d * i + first + j] : rows[d * j + first + i];
+        for (int j = 0; j < 3; j++)
+            own[3 * i + j] = i >= j ? rows[d * i + first + j] : rows[d * j + first + i];
     multiply_matrices(reset, own, own);
     multiply_matrices(own, transposed, own);
     put(rows, d, first, 1.0, own);

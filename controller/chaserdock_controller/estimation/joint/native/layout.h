@@ -1,10 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Layout of the error vector and of the mean, as in state.py.
  *
- * Error vector (D = TARGET + CHASER n, or more): the target's components, then those of each chaser. Further ones are constant, no
- * measurement depends on them, and the mean does not contain them: the shape of a torque-free target. Mean (TARGET_MEAN +
- * CHASER_MEAN n): position, velocity, attitude, rate of the target; the same of each chaser, and its additive states, which
- * are its error's components from FORCE on.
+ * Error vector (D = TARGET + CHASER n, or more): the target's components, then those of each
+ * chaser. Further ones are constant, no measurement depends on them, and the mean does not contain
+ * them: the shape of a torque-free target. Mean (TARGET_MEAN + CHASER_MEAN n): position, velocity,
+ * attitude, rate of the target; the same of each chaser, and its additive states, which are its
+ * error's components from FORCE on.
  */
 #ifndef CHASERDOCK_LAYOUT_H
 #define CHASERDOCK_LAYOUT_H
@@ -13,15 +14,33 @@ enum { TARGET = 12, CHASER = 43, MOTION = 21, COUPLED = 12, TARGET_MEAN = 13, CH
 /* Components of the error of target and chaser. */
 enum { POSITION = 0, VELOCITY = 3, ATTITUDE = 6, RATE = 9 };
 /* Further components of a chaser's error. */
-enum { FORCE = 12, TORQUE = 15, CENTRE = 18, POSITION_DRIFT = 21, ATTITUDE_DRIFT = 24, GYRO_BIAS = 27, TURN = 30, SHIFT = 33,
-       FOCAL = 36, VIEW = 37 };
+enum {
+    FORCE = 12,
+    TORQUE = 15,
+    CENTRE = 18,
+    POSITION_DRIFT = 21,
+    ATTITUDE_DRIFT = 24,
+    GYRO_BIAS = 27,
+    TURN = 30,
+    SHIFT = 33,
+    FOCAL = 36,
+    VIEW = 37
+};
 /* Of a mean: attitude and rate; place of an additive state less its component in the error. */
 enum { QUATERNION = 6, OMEGA = 10, ADDITIVE = 1 };
 /* Rows of measurements, channels of a chaser's measurements, components that they depend on. */
-enum { SIGHTING_ROWS = 6, ODOMETRY_ROWS = 12, MOST_ROWS = 18, CHANNELS = 5, SEEN = TARGET + CHASER };
+enum {
+    SIGHTING_ROWS = 6,
+    ODOMETRY_ROWS = 12,
+    MOST_ROWS = 18,
+    CHANNELS = 5,
+    SEEN = TARGET + CHASER
+};
 
 static inline int64_t size_of(int64_t n) { return TARGET + CHASER * n; }
 static inline int64_t first_of(int64_t i) { return TARGET + CHASER * i; }
-static inline const double *chaser_of(const double *mean, int64_t i) { return mean + TARGET_MEAN + CHASER_MEAN * i; }
+static inline const double *chaser_of(const double *mean, int64_t i) {
+    return mean + TARGET_MEAN + CHASER_MEAN * i;
+}
 
 #endif

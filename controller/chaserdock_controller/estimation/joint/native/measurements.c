@@ -2,24 +2,32 @@
 /* Measurements of a chaser, linearized. Models: measurements.py. */
 #include "layout.h"
 
-/* Measurements of chaser i of n. lens (3), axes (3, 3), camera (4): nominal mounting. odometry (13): position, velocity,
- * attitude, rate; noise (12, 12). sighting (7): position, attitude in IRF; stated covariance (6, 6) with the floor.
- * view (6, 6): covariance in whose units the view's error is. odometry and sighting may be null, not both. */
+/* Measurements of chaser i of n. lens (3), axes (3, 3), camera (4): nominal mounting. odometry
+ * (13): position, velocity, attitude, rate; noise (12, 12). sighting (7): position, attitude in
+ * IRF; stated covariance (6, 6) with the floor. view (6, 6): covariance in whose units the view's
+ * error is. odometry and sighting may be null, not both. */
 typedef struct {
     int64_t n, i;
     const double *lens, *axes, *camera, *odometry, *odometry_noise, *sighting, *stated, *view;
     double white_ratio, view_ratio;
 } Measurement;
+LAYOUT(Measurement, n, i, lens, axes, camera, odometry, odometry_noise, sighting, stated, view,
+       white_ratio, view_ratio)
 
-static int rows_of(const Measurement *z) { return (z->sighting ? SIGHTING_ROWS : 0) + (z->odometry ? ODOMETRY_ROWS : 0); }
+static int rows_of(const Measurement *z) {
+    return (z->sighting ? SIGHTING_ROWS : 0) + (z->odometry ? ODOMETRY_ROWS : 0);
+}
 
-/* Predict the sighting of the target (mean `t`) by a chaser (mean `x`): position, attitude (4) in IRF, and Jacobian (6,
- * SEEN) by the errors of target and chaser, without that by the view's error. */
-static void predict_pose(const double *t, const double *x, const double *lens, const double *mounting, const double *camera,
-                         double *position, double *attitude, double *h) {
+/* Predict the sighting of the target (mean `t`) by a chaser (mean `x`): position, attitude (4) in
+ * IRF, and Jacobian (6, SEEN) by the errors of target and chaser, without that by the view's
+ * error. */
+static void predict_pose(const double *t, const double *x, const double *lens,
+                         const double *mounting, const double *camera, double *position,
+                         double *attitude, double *h) {
     const double *additive = x + ADDITIVE, *delta = additive + TURN;
     const double minus[3] = {-delta[0], -delta[1], -delta[2]};
-    double c[9], rt[9], c_t[9], rt_t[9], mounting_t[9], axes_t[9], turned[9], jr[9], line[9], m[9], n[9], q[4], offset[3];
+    double c[9], rt[9], c_t[9], rt_t[9], mounting_t[9], axes_t[9], turned[9], jr[9], line[9], m[9],
+        n[9], q[4], offset[3];
     matrix_of(x + QUATERNION, c);
     matrix_of(t + QUATERNION, rt);
     transpose_matrix(c, c_t);
@@ -76,10 +84,10 @@ static void turn_between(const double *predicted, const double *measured, double
     logarithmic_map(q, turn);
 }
 
-/* Residual (6), Jacobian (6, SEEN) and noise, in rows of length `k`. Without the view's error if a covariance is
- * not positive definite; the noise is then NaN. */
-static void linearize_sighting(const Measurement *z, const double *t, const double *x, double *residual, double *h,
-                               double *noise, int k) {
+/* Residual (6), Jacobian (6, SEEN) and noise, in rows of length `k`. Without the view's error if a
+ * covariance is not positive definite; the noise is then NaN. */
+static void linearize_sighting(const Measurement *z, const double *t, const double *x,
+                               double *residual, double *h, double *noise, int k) {
     double position[3], attitude[4], factor[36], turn[3];
     predict_pose(t, x, z->lens, z->axes, z->camera, position, attitude, h);
     copy(z->stated, factor, 36);
@@ -96,11 +104,13 @@ static void linearize_sighting(const Measurement *z, const double *t, const doub
             residual[i] -= z->view_ratio * factor[6 * i + j] * x[ADDITIVE + VIEW + j];
         }
         for (int j = 0; j < SIGHTING_ROWS; j++)
-            noise[k * i + j] = valid ? z->white_ratio * z->white_ratio * z->stated[6 * i + j] : __builtin_nan("");
+            noise[k * i + j] =
+                valid ? z->white_ratio * z->white_ratio * z->stated[6 * i + j] : __builtin_nan("");
     }
 }
 
-static void linearize_odometry(const Measurement *z, const double *x, double *residual, double *h, double *noise, int k) {
+static void linearize_odometry(const Measurement *z, const double *x, double *residual, double *h,
+                               double *noise, int k) {
     const double *additive = x + ADDITIVE, *drift = additive + ATTITUDE_DRIFT, *o = z->odometry;
     const double minus[3] = {-drift[0], -drift[1], -drift[2]};
     double q[4], m[9];
@@ -127,17 +137,21 @@ static void linearize_odometry(const Measurement *z, const double *x, double *re
     for (int i = 0; i < ODOMETRY_ROWS; i++) copy(z->odometry_noise + 12 * i, noise + k * i, 12);
 }
 
-/* Residual (k), Jacobian (k, SEEN) by the errors of target and chaser, and noise (k, k), the sighting first. */
-EXPORT void NAME(linearize)(const Measurement *z, const double *mean, double *residual, double *h, double *noise) {
+/* Residual (k), Jacobian (k, SEEN) by the errors of target and chaser, and noise (k, k), the
+ * sighting first. */
+EXPORT void NAME(linearize)(const Measurement *z, const double *mean, double *residual, double *h,
+                            double *noise) {
     const double *x = chaser_of(mean, z->i);
     const int k = rows_of(z), first = z->sighting ? SIGHTING_ROWS : 0;
     zero(noise, k * k);
     if (z->sighting) linearize_sighting(z, mean, x, residual, h, noise, k);
-    if (z->odometry) linearize_odometry(z, x, residual + first, h + SEEN * first, noise + (k + 1) * first, k);
+    if (z->odometry)
+        linearize_odometry(z, x, residual + first, h + SEEN * first, noise + (k + 1) * first, k);
 }
 
 /* As the function above, of chaser i: pose (7) and Jacobian (6, SEEN). */
-EXPORT void NAME(predict_sighting)(const double *mean, int64_t i, const double *lens, const double *axes, const double *camera,
-                                   double *pose, double *h) {
+EXPORT void NAME(predict_sighting)(const double *mean, int64_t i, const double *lens,
+                                   const double *axes, const double *camera, double *pose,
+                                   double *h) {
     predict_pose(mean, chaser_of(mean, i), lens, axes, camera, pose, pose + 3, h);
 }

@@ -2,23 +2,28 @@
 /* Motion of a chaser: its mean, and the transition of its errors. Equations: prediction.py. */
 #include "layout.h"
 
-/* Parameters of a prediction over dt. inertia: principal moments. fade_*: factors by which drifts decay. unknown_s: time
- * in which the command is unknown. Others: as in JointParameters. */
+/* Parameters of a prediction over dt. inertia: principal moments. fade_*: factors by which drifts
+ * decay. unknown_s: time in which the command is unknown. Others: as in JointParameters. */
 typedef struct {
     double dt, mass, inertia[3], mean_motion, fade_position, fade_attitude, unknown_s;
-    double control_force_share, control_torque_share, control_arm, force_max, torque_max, disturbance_force,
-        disturbance_torque, latched_acceleration, latched_angular_acceleration;
+    double control_force_share, control_torque_share, control_arm, force_max, torque_max,
+        disturbance_force, disturbance_torque, latched_acceleration, latched_angular_acceleration;
 } Motion;
+LAYOUT(Motion, dt, mass, inertia, mean_motion, fade_position, fade_attitude, unknown_s,
+       control_force_share, control_torque_share, control_arm, force_max, torque_max,
+       disturbance_force, disturbance_torque, latched_acceleration, latched_angular_acceleration)
 
-static void angular_acceleration(const double *torque, const double *omega, const double *inertia, double *alpha) {
-    const double momentum[3] = {inertia[0] * omega[0], inertia[1] * omega[1], inertia[2] * omega[2]};
+static void angular_acceleration(const double *torque, const double *omega, const double *inertia,
+                                 double *alpha) {
+    const double momentum[3] = {inertia[0] * omega[0], inertia[1] * omega[1],
+                                inertia[2] * omega[2]};
     double gyroscopic[3];
     cross3(omega, momentum, gyroscopic);
     for (int i = 0; i < 3; i++) alpha[i] = (torque[i] - gyroscopic[i]) / inertia[i];
 }
 
-static void shift_wrench(const double *wrench, const double *centre, const double *omega, double mass, const double *inertia,
-                         double *out) {
+static void shift_wrench(const double *wrench, const double *centre, const double *omega,
+                         double mass, const double *inertia, double *out) {
     double moment[3], alpha[3], tangential[3], spin[3], centripetal[3];
     cross3(centre, wrench, moment);
     subtract3(wrench + 3, moment, out + 3);
@@ -29,9 +34,10 @@ static void shift_wrench(const double *wrench, const double *centre, const doubl
     for (int i = 0; i < 3; i++) out[i] = wrench[i] - mass * (tangential[i] + centripetal[i]);
 }
 
-/* Wrench (6) that moves a body with its centre of mass at the origin as `wrench` (6) moves one with it at `centre` (3). */
-EXPORT void NAME(wrench_at_origin)(const double *wrench, const double *centre, const double *omega, double mass,
-                                   const double *inertia, double *out) {
+/* Wrench (6) that moves a body with its centre of mass at the origin as `wrench` (6) moves one with
+ * it at `centre` (3). */
+EXPORT void NAME(wrench_at_origin)(const double *wrench, const double *centre, const double *omega,
+                                   double mass, const double *inertia, double *out) {
     shift_wrench(wrench, centre, omega, mass, inertia, out);
 }
 
@@ -61,15 +67,18 @@ static void move(double *y, const double *u, const Motion *p) {
         if (s < 3)
             for (int i = 0; i < 13; i++) at[i] = y[i] + step * k[s][i];
     }
-    for (int i = 0; i < 13; i++) y[i] += p->dt / 6.0 * ((k[0][i] + k[3][i]) + 2.0 * (k[1][i] + k[2][i]));
+    for (int i = 0; i < 13; i++)
+        y[i] += p->dt / 6.0 * ((k[0][i] + k[3][i]) + 2.0 * (k[1][i] + k[2][i]));
     normalize_quaternion(y + QUATERNION);
 }
 
-/* Transposed rows 0 .. COUPLED - 1 of a chaser's transition 1 + A dt + (A dt)^2 / 2, `out` (MOTION, COUPLED); its other
- * rows are those of the unit matrix. wrench, total (6): at the centre of mass, at the origin. */
-static void motion_transition(const double *x, const double *wrench, const double *total, const double *centre,
-                              const Motion *p, double *out) {
-    double a[COUPLED * MOTION], c[9], centre_skew[9], turning[9], m[9], n[9], alpha[3], momentum[3], spin[3];
+/* Transposed rows 0 .. COUPLED - 1 of a chaser's transition 1 + A dt + (A dt)^2 / 2, `out` (MOTION,
+ * COUPLED); its other rows are those of the unit matrix. wrench, total (6): at the centre of mass,
+ * at the origin. */
+static void motion_transition(const double *x, const double *wrench, const double *total,
+                              const double *centre, const Motion *p, double *out) {
+    double a[COUPLED * MOTION], c[9], centre_skew[9], turning[9], m[9], n[9], alpha[3], momentum[3],
+        spin[3];
     const double *omega = x + OMEGA, *inertia = p->inertia;
     zero(a, COUPLED * MOTION);
     matrix_of(x + QUATERNION, c);
@@ -83,8 +92,11 @@ static void motion_transition(const double *x, const double *wrench, const doubl
     for (int i = 0; i < 3; i++) momentum[i] = inertia[i] * omega[i];
     skew(momentum, m);
     for (int i = 0; i < 3; i++) {
-        for (int j = 0; j < 3; j++) rate[MOTION * i + RATE + j] = (m[3 * i + j] - turning[3 * i + j] * inertia[j]) / inertia[i];
-        for (int j = 0; j < 3; j++) rate[MOTION * i + FORCE + j] = -centre_skew[3 * i + j] / inertia[i];
+        for (int j = 0; j < 3; j++)
+            rate[MOTION * i + RATE + j] =
+                (m[3 * i + j] - turning[3 * i + j] * inertia[j]) / inertia[i];
+        for (int j = 0; j < 3; j++)
+            rate[MOTION * i + FORCE + j] = -centre_skew[3 * i + j] / inertia[i];
         rate[MOTION * i + TORQUE + i] = 1.0 / inertia[i];
     }
     skew(wrench, m);
@@ -93,7 +105,8 @@ static void motion_transition(const double *x, const double *wrench, const doubl
     multiply_matrices(c, centre_skew, m);
     for (int i = 0; i < 3; i++)
         for (int j = RATE; j < MOTION; j++)
-            velocity[MOTION * i + j] = m[3 * i] * rate[j] + m[3 * i + 1] * rate[MOTION + j] + m[3 * i + 2] * rate[2 * MOTION + j];
+            velocity[MOTION * i + j] = m[3 * i] * rate[j] + m[3 * i + 1] * rate[MOTION + j] +
+                                       m[3 * i + 2] * rate[2 * MOTION + j];
     skew(total, m);
     multiply_matrices(c, m, n);
     put(velocity, MOTION, ATTITUDE, -1.0 / p->mass, n);

@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Rotations: quaternions scalar first, body to world; matrices (3, 3) by rows. J. Sola, "Quaternion kinematics", 2017. */
+/* Rotations: quaternions scalar first, body to world; matrices (3, 3) by rows. J. Sola, "Quaternion
+ * kinematics", 2017. */
 #include "layout.h"
 
 static void multiply_quaternions(const double *a, const double *b, double *out) {
@@ -33,7 +34,8 @@ static void exponential_map(const double *phi, double *q) {
     for (int i = 0; i < 3; i++) q[1 + i] = s * phi[i];
 }
 
-/* Angle whose tangent is n / w, both not negative: halved three times, then the series of the arc tangent. */
+/* Angle whose tangent is n / w, both not negative: halved three times, then the series of the arc
+ * tangent. */
 static double arc_tangent(double n, double w) {
     double t = n / (w + sqrt_of(w * w + n * n));
     for (int i = 0; i < 2; i++) t = t / (1.0 + sqrt_of(1.0 + t * t));
@@ -66,7 +68,9 @@ static void skew(const double *v, double *m) {
 static void multiply_matrices(const double *a, const double *b, double *out) {
     double product[9];
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) product[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+        for (int j = 0; j < 3; j++)
+            product[3 * i + j] =
+                a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
     copy(product, out, 9);
 }
 

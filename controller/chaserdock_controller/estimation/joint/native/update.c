@@ -1,14 +1,17 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Update of mean and covariance by the measurements of one chaser. Equations: docs/estimation.md. */
+/* Update of mean and covariance by the measurements of one chaser. Equations:
+ * docs/estimation.md. */
 #include "layout.h"
 
-/* Memory of an update: residual (18), jacobian (18, SEEN), noise, innovation covariance s (18, 18), cross (18, stride) = H P,
- * white (18, stride), correction (D). values: squared norm of each channel's residual by its innovation covariance, then
- * the determinant of the sighting's; NaN where that is not positive definite. stride: D, rounded up to a multiple of 8. size: D. */
+/* Memory of an update: residual (18), jacobian (18, SEEN), noise, innovation covariance s (18, 18),
+ * cross (18, stride) = H P, white (18, stride), correction (D). values: squared norm of each
+ * channel's residual by its innovation covariance, then the determinant of the sighting's; NaN
+ * where that is not positive definite. stride: D, rounded up to a multiple of 8. size: D. */
 typedef struct {
     double *residual, *jacobian, *noise, *s, *cross, *white, *correction, *values;
     int64_t stride, size;
 } Innovation;
+LAYOUT(Innovation, residual, jacobian, noise, s, cross, white, correction, values, stride, size)
 
 static void body_difference(const double *a, const double *b, double *error) {
     for (int i = 0; i < 3; i++) {
@@ -29,7 +32,8 @@ static void chaser_difference(const double *a, const double *b, double *error) {
 /* Error (D) that takes the mean `a` to `b`. */
 EXPORT void NAME(difference)(int64_t n, const double *a, const double *b, double *error) {
     body_difference(a, b, error);
-    for (int64_t i = 0; i < n; i++) chaser_difference(chaser_of(a, i), chaser_of(b, i), error + first_of(i));
+    for (int64_t i = 0; i < n; i++)
+        chaser_difference(chaser_of(a, i), chaser_of(b, i), error + first_of(i));
 }
 
 static void inject_body(const double *x, const double *error, double *out) {
@@ -55,7 +59,8 @@ EXPORT void NAME(inject)(int64_t n, const double *mean, const double *error, dou
     }
 }
 
-/* Rows of the covariance that belong to target and chaser i, (SEEN, d), from the lower triangle of p. */
+/* Rows of the covariance that belong to target and chaser i, (SEEN, d), from the lower triangle of
+ * p. */
 static void gather(const double *p, int64_t d, int64_t i, double *seen) {
     const int64_t first = first_of(i);
     for (int64_t r = 0; r < SEEN; r++) {
@@ -65,12 +70,15 @@ static void gather(const double *p, int64_t d, int64_t i, double *seen) {
     for (int64_t c = 1; c < d; c++) {
         const double *row = p + d * c;
         for (int64_t r = 0; r < TARGET && r < c; r++) seen[d * r + c] = row[r];
-        for (int64_t r = 0; r < CHASER && first + r < c; r++) seen[d * (TARGET + r) + c] = row[first + r];
+        for (int64_t r = 0; r < CHASER && first + r < c; r++)
+            seen[d * (TARGET + r) + c] = row[first + r];
     }
 }
 
-/* Squared norm of the residual of rows first .. first + k - 1 by their innovation covariance, and its determinant. */
-static double normalized_square(const double *s, int rows, const double *residual, int first, int k, double *determinant) {
+/* Squared norm of the residual of rows first .. first + k - 1 by their innovation covariance, and
+ * its determinant. */
+static double normalized_square(const double *s, int rows, const double *residual, int first, int k,
+                                double *determinant) {
     double factor[SIGHTING_ROWS * SIGHTING_ROWS], b[SIGHTING_ROWS], square = 0.0;
     for (int i = 0; i < k; i++) {
         b[i] = residual[first + i];
@@ -89,10 +97,11 @@ static double normalized_square(const double *s, int rows, const double *residua
 
 EXPORT int64_t NAME(innovate_workspace)(int64_t d) { return SEEN * d + TARGET + CHASER + 2 * 8; }
 
-/* Linearize the measurements at `mean` and compute the innovation by the lower triangle of `covariance` (D, D). The residual
- * is that of the prior mean `prior`, to first order, for an iterated update; equal to `mean` in the first iteration. */
-EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const double *prior, const double *covariance,
-                           Innovation *out, double *work) {
+/* Linearize the measurements at `mean` and compute the innovation by the lower triangle of
+ * `covariance` (D, D). The residual is that of the prior mean `prior`, to first order, for an
+ * iterated update; equal to `mean` in the first iteration. */
+EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const double *prior,
+                           const double *covariance, Innovation *out, double *work) {
     const int64_t d = out->size, first = first_of(z->i), stride = out->stride;
     const int k = rows_of(z);
     double *seen = allocate(&work, SEEN * d), *error = allocate(&work, SEEN), *s = out->s;
@@ -101,7 +110,8 @@ EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const doubl
         body_difference(prior, mean, error);
         chaser_difference(chaser_of(prior, z->i), chaser_of(mean, z->i), error + TARGET);
         for (int r = 0; r < k; r++)
-            for (int j = 0; j < SEEN; j++) out->residual[r] += out->jacobian[SEEN * r + j] * error[j];
+            for (int j = 0; j < SEEN; j++)
+                out->residual[r] += out->jacobian[SEEN * r + j] * error[j];
     }
     gather(covariance, d, z->i, seen);
     zero(out->cross, k * stride);
@@ -127,17 +137,20 @@ EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const doubl
     for (int c = 0; c <= CHANNELS; c++) out->values[c] = __builtin_nan("");
     int row = 0;
     if (z->sighting) {
-        out->values[0] = normalized_square(s, k, out->residual, 0, SIGHTING_ROWS, out->values + CHANNELS);
+        out->values[0] =
+            normalized_square(s, k, out->residual, 0, SIGHTING_ROWS, out->values + CHANNELS);
         row = SIGHTING_ROWS;
     }
     if (z->odometry)
-        for (int c = 1; c < CHANNELS; c++, row += 3) out->values[c] = normalized_square(s, k, out->residual, row, 3, &unused);
+        for (int c = 1; c < CHANNELS; c++, row += 3)
+            out->values[c] = normalized_square(s, k, out->residual, row, 3, &unused);
 }
 
-/* Correct the mean `prior` by the `used` rows (m) of the k rows of an innovation: white = L^-1 H P and the correction in
- * `z`, and `mean`. Return 0 and leave `mean` if their innovation covariance is not positive definite. */
-EXPORT int64_t NAME(correct)(int64_t n, int64_t k, const int64_t *used, int64_t m, Innovation *z, const double *prior,
-                             double *mean) {
+/* Correct the mean `prior` by the `used` rows (m) of the k rows of an innovation: white = L^-1 H P
+ * and the correction in `z`, and `mean`. Return 0 and leave `mean` if their innovation covariance
+ * is not positive definite. */
+EXPORT int64_t NAME(correct)(int64_t n, int64_t k, const int64_t *used, int64_t m, Innovation *z,
+                             const double *prior, double *mean) {
     double factor[MOST_ROWS * MOST_ROWS], y[MOST_ROWS];
     const int64_t d = z->size, stride = z->stride;
     for (int64_t i = 0; i < m; i++) {
@@ -162,8 +175,8 @@ EXPORT int64_t NAME(correct)(int64_t n, int64_t k, const int64_t *used, int64_t 
     return 1;
 }
 
-/* Subtract the information of the m rows of white from the lower triangle of `covariance`, and make the rotation errors of
- * target and chaser i relative to their corrected attitudes. */
+/* Subtract the information of the m rows of white from the lower triangle of `covariance`, and make
+ * the rotation errors of target and chaser i relative to their corrected attitudes. */
 EXPORT void NAME(reduce)(int64_t i, int64_t m, const Innovation *z, double *covariance) {
     const int64_t d = z->size, own = first_of(i) + ATTITUDE;
     subtract_square(z->white, (int)m, z->stride, covariance, d);

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of an experiment: sections as Markdown, or as one self-contained HTML file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+from chaserdock.html_page import Markup, html_page, table
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table. The first column is text; the others are numbers, or ``text``. Raise ValueError for
+    a row of another length.
+    """
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    text: bool = False
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.header):
+                raise ValueError(
+                    f"a row of {len(row)} cells under {len(self.header)} headings: {row}"
+                )
+
+
+@dataclass(frozen=True)
+class PageSection:
+    """A heading (none: ""), followed by paragraphs (text, with code in backticks), tables, and HTML
+    (``Markup``), which Markdown leaves out.
+    """
+
+    title: str
+    parts: tuple[str | Table, ...]
+
+
+def markdown(title: str, sections: Sequence[PageSection]) -> str:
+    """Return the page as Markdown."""
+    lines = [f"# {title}", ""]
+    for section in sections:
+        lines += [f"## {section.title}", ""] if section.title else []
+        for part in section.parts:
+            if isinstance(part, Table):
+                lines += _markdown_table(part)
+            elif not isinstance(part, Markup):
+                lines += [part, ""]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _markdown_table(table: Table) -> list[str]:
+    def line(cells: tuple[str, ...]) -> str:
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+    rule = "| --- |" + (" --- |" if table.text else " ---: |") * (len(table.header) - 1)
+    return [line(table.header), rule, *map(line, table.rows), ""]
+
+
+def html(title: str, sections: Sequence[PageSection]) -> str:
+    """Return the page as HTML without external resources."""
+    body = [f"<h1>{escape(title)}</h1>"]
+    for section in sections:
+        if section.title:
+            body.append(f"<h2>{escape(section.title)}</h2>")
+        body += [
+            table(p.header, p.rows, p.text) if isinstance(p, Table) else _paragraph(p)
+            for p in section.parts
+        ]
+    return html_page(title, body)
+
+
+def _paragraph(text: str) -> str:
+    if isinstance(text, Markup):
+        return text
+    return "<p>" + re.sub("`([^`]+)`", r"<code>\1</code>", escape(text)) + "</p>"

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``chaserdock reproduce``: fly the paper's experiments, write the page."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import msgspec
+from chaserdock_controller.nmpc.open_backend import missing_part
+from chaserdock_protocol.errors import errors_of_writing
+
+from chaserdock.exit_codes import DONE, FAILED, STOPPED
+from chaserdock.experiments.page import html, markdown
+from chaserdock.experiments.plan import ExperimentError, ExperimentPlan
+from chaserdock.experiments.worker import ExperimentProgress, Workers, fly_plan
+from chaserdock.launch.signals import stop_on_signals
+
+from .content import sections
+from .plan import code_digest, make_plan, needs_open
+from .provenance import Provenance, provenance
+from .tables import results_by_label
+
+TITLE = "Reproduction of the paper's results"
+
+
+def reproduce(quick: bool, out: Path, jobs: int) -> int:
+    """Fly what has no result yet; write ``reproduction.md`` and ``.html`` into ``out``; return the
+    exit status.
+
+    Without the paper's solver its chain is left out, and the status is FAILED. Raise
+    ExperimentError or ScenarioError when a flight is not possible.
+    """
+    return fly_and_report(make_plan(quick), out.absolute(), quick, jobs)
+
+
+def fly_and_report(plan: ExperimentPlan, out: Path, quick: bool = False, jobs: int = 1) -> int:
+    """Fly any plan of the reproduction; return the exit status."""
+    missing = missing_part()
+    flights = tuple(f for f in plan.flights if missing is None or not needs_open(f))
+    with errors_of_writing(out, ExperimentError):
+        out.mkdir(parents=True, exist_ok=True)
+        about = begun(out)
+        with stop_on_signals("stopping after the active flights") as stop:
+            flyable = ExperimentPlan(plan.name, flights)
+            outcomes = fly_plan(flyable, out, Workers(jobs), ExperimentProgress(), stop)
+        parts = sections(plan, results_by_label(plan, outcomes), about, quick)
+        for name, text in (
+            ("reproduction.md", markdown(TITLE, parts)),
+            ("reproduction.html", html(TITLE, parts)),
+        ):
+            (out / name).write_text(text, encoding="utf-8")
+            _report(f"wrote {out / name}")
+    if stop.is_set():
+        _report("stopped; repeat the command to resume")
+        return STOPPED
+    for flight in flights:
+        if outcomes[flight.name].summary is None:
+            _report(f"chaserdock: {flight.label}: {outcomes[flight.name].last_words}")
+    if missing is not None and len(flights) < len(plan.flights):
+        _report(f"chaserdock: the paper's chain was not flown: {missing}")
+    complete = all(f.name in outcomes and outcomes[f.name].summary for f in plan.flights)
+    return DONE if complete else FAILED
+
+
+def begun(out: Path) -> Provenance:
+    """Return where and when the first flight of this code into ``out`` began; later calls only
+    resume it.
+    """
+    path = out / f"provenance-{code_digest()}.json"
+    if not path.exists():
+        path.write_bytes(msgspec.json.encode(provenance()))
+    return msgspec.json.decode(path.read_bytes(), type=Provenance)
+
+
+def _report(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fly a plan: one process per flight, on this machine or on the workers of a Dask cluster.
+
+A flight that has ended leaves ``runs/NAME/result.json``, written atomically. A later call skips the
+flights that have one. A flight that crashed leaves none, and is flown again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+from chaserdock_protocol.errors import require_extra
+from chaserdock_protocol.process import SINGLE_THREADED
+from chaserdock_protocol.recording.scan import LOG_NAME
+from msgspec import Struct
+
+from .plan import ExperimentError, ExperimentPlan, PlannedFlight
+
+Keep = Literal["failures", "all", "none"]
+
+
+class FlightOutcome(Struct, frozen=True):
+    """Outcome of a flight: exit status, summary (None after a crash), last line of output, and the
+    path of a log that was kept.
+    """
+
+    name: str
+    status: int
+    summary: dict[str, Any] | None
+    last_words: str
+    log: str | None = None
+
+
+ReportProgress = Callable[[int, int, PlannedFlight, FlightOutcome], None]
+"""Receives the number of flights that have ended, of all flights, and the one that just ended."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where flights are flown: ``jobs`` at a time on this machine, or on the Dask scheduler at
+    ``cluster``. ``keep``: flights whose logs are kept.
+    """
+
+    jobs: int = 1
+    cluster: str | None = None
+    keep: Keep = "none"
+
+
+def fly_plan(
+    plan: ExperimentPlan,
+    folder: Path,
+    workers: Workers,
+    report: ReportProgress,
+    stop: threading.Event,
+) -> dict[str, FlightOutcome]:
+    """Fly what has no result in ``folder`` yet, until ``stop``; return the outcomes by flight name,
+    in the plan's order.
+
+    Raise ExperimentError, and MissingPackageError for a cluster without Dask.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    outcomes = results_of(plan, folder)
+    remaining = [f for f in plan.flights if f.name not in outcomes]
+    fly_all = _fly_here if workers.cluster is None else _fly_on_cluster
+    for flight, outcome in fly_all(remaining, folder / "runs", workers, stop):
+        write_result(folder, outcome)
+        outcomes[flight.name] = outcome
+        report(len(outcomes), len(plan.flights), flight, outcome)
+    return {f.name: outcomes[f.name] for f in plan.flights if f.name in outcomes}
+
+
+def results_of(plan: ExperimentPlan, folder: Path) -> dict[str, FlightOutcome]:
+    """Return the results of a plan so far, by flight name. Raise ExperimentError for a damaged
+    one.
+    """
+    found = ((f.name, read_result(folder, f.name)) for f in plan.flights)
+    return {name: outcome for name, outcome in found if outcome is not None}
+
+
+def result_path(folder: Path, name: str) -> Path:
+    """Return the path of a flight's result."""
+    return folder / "runs" / name / "result.json"
+
+
+def read_result(folder: Path, name: str) -> FlightOutcome | None:
+    """Return the result of an earlier flight, or None. Raise ExperimentError for a damaged file."""
+    path = result_path(folder, name)
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=FlightOutcome)
+    except FileNotFoundError:
+        return None
+    except (OSError, msgspec.DecodeError) as error:
+        raise ExperimentError(
+            f"{path}: not a result of a flight: {error}; delete it to fly the flight again"
+        ) from None
+
+
+def write_result(folder: Path, outcome: FlightOutcome) -> None:
+    """Write a result atomically; of a flight that crashed, none."""
+    if outcome.summary is None:
+        return
+    path = result_path(folder, outcome.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        file.write(msgspec.json.format(msgspec.json.encode(outcome)) + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
+    """Fly one flight in a temporary folder; move its log to ``logs`` if ``keep`` says so.
+
+    Also runs on Dask workers, so that arguments and result are plain values. Where ``logs`` is not
+    writable (no shared disk), a kept log stays on the worker's machine and the result names host
+    and path.
+    """
+    folder = Path(tempfile.mkdtemp(prefix=f"chaserdock-{flight.name}-"))
+    try:
+        out = folder / "run"
+        # A session of its own: Ctrl-C in the terminal reaches this process only, which lets the
+        # flight finish.
+        done = subprocess.run(
+            [sys.executable, "-m", *_program(flight, out)],
+            input=msgspec.json.encode(flight).decode() if flight.alone is not None else None,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+            env=os.environ | SINGLE_THREADED if flight.alone is not None else None,
+        )
+        summary_file = out / "summary.json"
+        summary = json.loads(summary_file.read_text()) if summary_file.is_file() else None
+        output = (done.stderr.strip() or done.stdout.strip()).splitlines()
+        keep_log = keep == "all" or (keep == "failures" and done.returncode != 0)
+        log = out / LOG_NAME
+        kept = _move_log(log, logs / flight.name) if keep_log and log.is_file() else None
+        last_words = output[-1].removeprefix("chaserdock: ") if output else ""
+        return FlightOutcome(flight.name, done.returncode, summary, last_words, kept)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _program(flight: PlannedFlight, out: Path) -> list[str]:
+    """Return module and arguments that fly a flight and write ``out/summary.json``."""
+    if flight.alone is not None:
+        return ["chaserdock.experiments.controller_flight", str(out)]
+    sets = [item for override in flight.overrides for item in ("--set", override)]
+    return ["chaserdock", "run", flight.scenario, "--out", str(out), "--quiet", *sets]
+
+
+def _move_log(log: Path, folder: Path) -> str:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.move(log, folder / LOG_NAME)
+        return str(folder / LOG_NAME)
+    except OSError:
+        local = Path(tempfile.mkdtemp(prefix=f"chaserdock-log-{folder.name}-")) / LOG_NAME
+        shutil.move(log, local)
+        return f"{socket.gethostname()}:{local}"
+
+
+def _fly_here(
+    flights: Sequence[PlannedFlight], logs: Path, workers: Workers, stop: threading.Event
+) -> Iterator[tuple[PlannedFlight, FlightOutcome]]:
+    """Yield each flight as it ends. Start none after ``stop``."""
+    waiting = iter(flights)
+    with ThreadPoolExecutor(workers.jobs) as pool:
+        active: dict[Any, PlannedFlight] = {}
+        while True:
+            while (
+                len(active) < workers.jobs
+                and not stop.is_set()
+                and (flight := next(waiting, None)) is not None
+            ):
+                active[pool.submit(fly, flight, workers.keep, logs)] = flight
+            if not active:
+                return
+            for future in wait(active, return_when=FIRST_COMPLETED).done:
+                yield active.pop(future), future.result()
+
+
+def _fly_on_cluster(
+    flights: Sequence[PlannedFlight], logs: Path, workers: Workers, stop: threading.Event
+) -> Iterator[tuple[PlannedFlight, FlightOutcome]]:
+    """Yield each flight as it ends. Raise ExperimentError, and MissingPackageError without Dask."""
+    require_extra("distributed", "cluster")
+    from distributed import Client, as_completed
+
+    address = workers.cluster
+    try:
+        client = Client(address, timeout=5)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ExperimentError(f"--cluster {address}: no Dask scheduler answers: {error}") from None
+    with client:
+        by_key = {}
+        for flight in flights:
+            # pure=False: Dask must not reuse a result. retries=1: the flight of a lost worker is
+            # flown again.
+            future = client.submit(
+                fly, flight, workers.keep, logs, key=flight.name, pure=False, retries=1
+            )
+            by_key[future.key] = (flight, future)
+        for future in as_completed([f for _, f in by_key.values()]):
+            flight = by_key[future.key][0]
+            if future.status == "error":
+                raise ExperimentError(f"{flight.label} failed on the cluster: {future.exception()}")
+            yield flight, future.result()
+            if stop.is_set():
+                client.cancel([f for _, f in by_key.values()])
+                return
+
+
+class ExperimentProgress:
+    """Prints one line per flight that has ended: its outcome, and an estimate of the time left."""
+
+    def __init__(self) -> None:
+        self._start_s = time.monotonic()
+        self._ended_before: int | None = None
+
+    def __call__(
+        self, ended: int, total: int, flight: PlannedFlight, outcome: FlightOutcome
+    ) -> None:
+        if self._ended_before is None:
+            self._ended_before = ended - 1
+        each_s = (time.monotonic() - self._start_s) / (ended - self._ended_before)
+        verdict = "passed" if outcome.status == 0 else f"FAILED: {outcome.last_words}"
+        left_min = each_s * (total - ended) / 60
+        left = f", about {left_min:.0f} min left" if ended < total else ""
+        varied = ", ".join(f"{name}={value}" for name, value in flight.varied.items())
+        label = flight.label + (f" ({varied})" if varied else "")
+        print(f"{ended}/{total} {label}: {verdict}{left}", flush=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
 from chaserdock_controller.estimation.joint.parameters import SightingNoise, TargetParameters
-from chaserdock_controller.estimation.types import ChaserMeasurement, EstimatorInputs
+from chaserdock_controller.estimation.types import EstimatorInputs, MeasuredChaser
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
@@ -103,7 +103,7 @@ class SyntheticFlight:
         odometry = [self._odometry(i) for i in range(self.n)]
         sightings = tuple(self._sighting(i) for i in range(self.n))
         chasers = tuple(
-            ChaserMeasurement(i, self.impulses[i].copy(), odometry[i]) for i in range(self.n)
+            MeasuredChaser(i, self.impulses[i].copy(), odometry[i]) for i in range(self.n)
         )
         return EstimatorInputs(self.time_ns, PERIOD_S, chasers, sightings)
 

@@ -23,7 +23,7 @@ from chaserdock_controller.bodies.mass_properties import (
 )
 from chaserdock_controller.estimation.composite_body import stated_properties
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters, parameters_of
-from chaserdock_controller.estimation.types import ChaserMeasurement, EstimatorInputs
+from chaserdock_controller.estimation.types import EstimatorInputs, MeasuredChaser
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
@@ -140,7 +140,7 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
             image_s = period_s * timing.ticks_per_image
             sightings = tuple(views[s.chaser].added_to(s, image_s) for s in sightings)
         measured = tuple(
-            ChaserMeasurement(
+            MeasuredChaser(
                 i,
                 _impulse(scenario, (before or own)[i], own[i]),
                 odometry_of(sensor, i, own[i], tick, now_ns),

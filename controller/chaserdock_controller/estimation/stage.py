@@ -33,7 +33,7 @@ from chaserdock_controller.interfaces import (
 from .composite_body import CompositeBody
 from .identification.stage import StackIdentification
 from .target_shape import ShapeEstimation, shape_parameters
-from .types import ChaserMeasurement, ChaserMotion, Estimator, EstimatorInputs
+from .types import ChaserMotion, Estimator, EstimatorInputs, MeasuredChaser
 
 _NOTHING = np.zeros(6)
 
@@ -156,7 +156,7 @@ class EstimationStage:
         latched = self.composite.latched
         changed = latched ^ latched_before
         chasers = tuple(
-            ChaserMeasurement(
+            MeasuredChaser(
                 chaser=c.chaser,
                 impulse=_NOTHING if c.impulse is None else c.impulse.impulse,
                 odometry=c.measured,

@@ -18,7 +18,7 @@ from chaserdock_controller.interfaces import RelativePose, TargetState
 
 
 @dataclass(frozen=True, eq=False)
-class ChaserMeasurement:
+class MeasuredChaser:
     """What is measured and known of one chaser in a tick.
 
     ``odometry``: measured in this tick. ``outdated``: the newest one where there is none of this
@@ -45,7 +45,7 @@ class EstimatorInputs:
 
     time_ns: int
     covered_s: float
-    chasers: tuple[ChaserMeasurement, ...]
+    chasers: tuple[MeasuredChaser, ...]
     sightings: tuple[Sighting, ...] = ()
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from chaserdock_protocol.messages import Odometry, Sighting
 
-from chaserdock_controller.estimation.types import ChaserMeasurement, EstimatorEvent, Shock
+from chaserdock_controller.estimation.types import EstimatorEvent, MeasuredChaser, Shock
 
 from .hypotheses import FilterState, apply_shocks
 from .parameters import TargetParameters
@@ -34,7 +34,7 @@ class FilterTick:
     time_ns: int
     parameters: TargetParameters
     covered_s: float
-    chasers: tuple[ChaserMeasurement, ...]
+    chasers: tuple[MeasuredChaser, ...]
     sightings: dict[int, Sighting] = field(default_factory=dict)
     shocks: list[Shock] = field(default_factory=list)
     state: FilterState | None = None

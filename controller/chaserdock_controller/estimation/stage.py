@@ -120,20 +120,20 @@ class EstimationStage:
         """Return what is known of a chaser with the estimated ``state``; ``known``: the target's pose
         is.
         """
-        i, own, latched = c.chaser, None, c.chaser in self.composite.latched
+        i, latched = c.chaser, c.chaser in self.composite.latched
+        own = relative = covariance = None
         if state is not None:
             disturbance = self._disturbance(state, motion, latched)
-            own = OwnMotion(
-                state, predict_state(state, c.ahead, disturbance, self._body), disturbance
-            )
-        relevant = motion if own is not None else None
+            at_effect = predict_state(state, c.ahead, disturbance, self._body)
+            own = OwnMotion(state, at_effect, disturbance)
+            relative = None if motion is None else motion.relative
+            if motion is not None and known and self._passive_safety:
+                covariance = motion.motion_covariance
         return ChaserEstimate(
             chaser=i,
             own=own,
-            motion_covariance=relevant.motion_covariance
-            if relevant is not None and known and self._passive_safety
-            else None,
-            relative=None if relevant is None else relevant.relative,
+            motion_covariance=covariance,
+            relative=relative,
             camera=cameras.get(i),
             visible=i in seeing,
             latched=latched,

@@ -28,6 +28,7 @@ from chaserdock_controller.estimation.joint.state import (
     ATTITUDE_DRIFT,
     CENTRE,
     CHASER,
+    POSITION_DRIFT,
     SIGHTING_CHANNEL,
     TARGET,
     VIEW,
@@ -160,6 +161,19 @@ def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None
             - noise
         )
         np.testing.assert_allclose(grown, np.outer(column, column), atol=1e-3)
+
+
+def test_drifts_of_odometry_fade() -> None:
+    p, state = parameters(SCENARIO, navigation("orbit")), random_state(0)
+    later = predict(state, state.time_ns + 10_000_000_000, np.zeros((2, 6)), p)
+    n = p.navigation
+    assert min(n.position_drift_m, n.attitude_drift_rad) > 0.0
+    for part, time_s in (
+        (POSITION_DRIFT, n.position_drift_time_s),
+        (ATTITUDE_DRIFT, n.attitude_drift_time_s),
+    ):
+        expected = math.exp(-10.0 / time_s) * state.of(1, part)
+        np.testing.assert_allclose(later.of(1, part), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("chasers", [1, 2])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
+from chaserdock_controller.bodies.target_body import TargetBody, attach_bodies
 from chaserdock_controller.guidance.detumble.stack import thruster_wrenches
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.chaser_machine import ChaserMachine
 from chaserdock_controller.guidance.chaser_state import ChaserTick, CommandResult, TrackingErrors
 from chaserdock_controller.guidance.docking import DockingObservation
@@ -16,7 +15,13 @@ from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_controller.guidance.trajectories import Motion
-from chaserdock_controller.interfaces import Observation
+from chaserdock_controller.interfaces import (
+    ChaserInputs,
+    ChaserObservation,
+    Observation,
+    TargetState,
+    TickInputs,
+)
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, OperatorCommand, Sighting
@@ -110,15 +115,35 @@ def start(seed: int) -> Array:
     return x
 
 
+def tick_inputs(
+    tick: int,
+    time_ns: int,
+    odometry: Mapping[int, Odometry],
+    sightings: tuple[Sighting, ...] = (),
+    commands: tuple[OperatorCommand, ...] = (),
+    **by_chaser: Mapping[int, Any],
+) -> TickInputs:
+    """Return the inputs of a tick; ``by_chaser``: other fields of ``ChaserInputs``."""
+    numbers = sorted(odometry.keys() | {i for values in by_chaser.values() for i in values})
+    chasers = tuple(
+        ChaserInputs(
+            i, odometry.get(i), **{name: values.get(i) for name, values in by_chaser.items()}
+        )
+        for i in numbers
+    )
+    return TickInputs(tick, time_ns, chasers, sightings, commands)
+
+
 def observation_of(
     time_ns: int,
     odometry: Mapping[int, Odometry],
     sightings: tuple[Sighting, ...] = (),
     outdated: Mapping[int, Odometry] | None = None,
+    chasers: int = 2,
 ) -> Observation:
     """Return an observation of chasers without docking, thrusters or commands."""
-    return Observation(
-        tick=0, time_ns=time_ns, effective_ns=time_ns, odometry=odometry, invalid={}, lost={}, sightings=sightings,
-        commands=(), docking={}, impulses={}, ahead=dict.fromkeys(odometry, ()), input_limits={}, isolated={}, events=(),
-        thruster_impulses={}, last_commands={}, outdated=outdated or {},
-    )  # fmt: skip
+    seen = tuple(
+        ChaserObservation(i, np.zeros(6), odometry.get(i), outdated=(outdated or {}).get(i))
+        for i in range(chasers)
+    )
+    return Observation(0, time_ns, time_ns, seen, sightings)

@@ -6,13 +6,13 @@ navigation grade.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
-from chaserdock_controller.estimation.joint.estimator import JointInputs
-from chaserdock_controller.estimation.joint.parameters import SightingNoise
-from chaserdock_controller.estimation.parameters import MekfParameters
+from chaserdock_controller.estimation.joint.parameters import SightingNoise, TargetParameters
+from chaserdock_controller.estimation.types import ChaserMeasurement, EstimatorInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
@@ -50,7 +50,8 @@ class SyntheticFlight:
 
     The chasers follow the reference exactly by a wrench computed from it, plus a command noise;
     ``disturbance`` acts on them. ``view_error``: ratio of the part of a sighting's error that is
-    constant.
+    constant. ``texts``: events of the estimator that it feeds.
+    ``turns``: rotations (4,) of the attitudes that the chasers hold.
     """
 
     def __init__(
@@ -90,16 +91,21 @@ class SyntheticFlight:
                 )
             )
         self.impulses = np.zeros((chasers, 6))
+        self.texts: list[str] = []
+        self.turns = [rotations.IDENTITY] * chasers
 
     @property
     def time_ns(self) -> int:
         return round(self.tick * PERIOD_S * 1e9)
 
-    def inputs(self) -> JointInputs:
+    def inputs(self) -> EstimatorInputs:
         """Return the measurements now."""
-        odometry = {i: self._odometry(i) for i in range(self.n)}
+        odometry = [self._odometry(i) for i in range(self.n)]
         sightings = tuple(self._sighting(i) for i in range(self.n))
-        return JointInputs(self.time_ns, odometry, sightings, self.impulses.copy(), PERIOD_S)
+        chasers = tuple(
+            ChaserMeasurement(i, self.impulses[i].copy(), odometry[i]) for i in range(self.n)
+        )
+        return EstimatorInputs(self.time_ns, PERIOD_S, chasers, sightings)
 
     def step(self) -> None:
         """Move everything to the next tick under a feedback that holds the chasers at their places."""
@@ -146,7 +152,7 @@ class SyntheticFlight:
 
     def _turn(self, i: int) -> Array:
         t, s = self.target, self.chasers[i].state
-        wanted = rotations.multiply(t[6:10], self._place(i)[1])
+        wanted = rotations.multiply(t[6:10], rotations.multiply(self._place(i)[1], self.turns[i]))
         error = rotations.log(rotations.multiply(rotations.conjugate(s[6:10]), wanted))
         rate = rotations.rotate_inverse(self._place(i)[1], t[10:13])
         inertia = np.array(self.body.inertia)
@@ -205,7 +211,7 @@ class SyntheticFlight:
         """Return the error of a chaser's estimated pose relative to the target: m, rad, and NEES
         (of 6).
         """
-        pose = next(r for r in estimator.relative_poses() if r.chaser == i)
+        pose = estimator.relative_poses()[i]
         t, s = self.target, self.chasers[i].state
         place = rotations.rotate_inverse(t[6:10], s[:3] - t[:3])
         q = rotations.multiply(rotations.conjugate(t[6:10]), s[6:10])
@@ -213,6 +219,20 @@ class SyntheticFlight:
         e = np.concatenate([place - pose.position_m, turn])
         nees = float(e @ np.linalg.solve(pose.covariance, e))
         return float(np.linalg.norm(e[:3])), float(np.linalg.norm(turn)), nees
+
+
+def odometry_in(inputs: EstimatorInputs, i: int) -> Odometry:
+    """Return the odometry of a chaser that is measured."""
+    odometry = inputs.chasers[i].odometry
+    assert odometry is not None
+    return odometry
+
+
+def changed(inputs: EstimatorInputs, i: int, **fields: Any) -> EstimatorInputs:
+    """Return inputs with other fields of one chaser."""
+    chasers = list(inputs.chasers)
+    chasers[i] = replace(chasers[i], **fields)
+    return replace(inputs, chasers=tuple(chasers))
 
 
 WHITE = SightingNoise(white_ratio=0.85, view_ratio=0.0, view_time_s=1.0)
@@ -225,7 +245,7 @@ def parameters(scenario: Scenario, errors: NavigationErrors, **more: object) -> 
     """
     options = {"single_marker": WHITE, "floor_sighting_m": 0.0, "floor_sighting_rad": 0.0, **more}
     return JointParameters(
-        MekfParameters(), scenario.chaser, scenario.camera_model(), errors, **options
+        TargetParameters(), scenario.chaser, scenario.camera_model(), errors, **options
     )  # type: ignore[arg-type]
 
 

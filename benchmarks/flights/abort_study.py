@@ -12,11 +12,11 @@ from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.chaser_state import ChaserTick, TrackingErrors
 from chaserdock_controller.guidance.escape import EscapePlanner, RelativeState
 from chaserdock_controller.guidance.phases import Phase, Trigger
 from chaserdock_controller.guidance.stage import GuidanceStage
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.orbit import HillFrame, hill_frame, propagate, state_of

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from chaserdock_agents.chaser.command_gate import damping_command
 from chaserdock_agents.chaser.local_damping import LocalDamping
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.allocation import MinimumTime, minimum_time
 from chaserdock_controller.guidance.detumble.stack import StackMotion, thruster_wrenches

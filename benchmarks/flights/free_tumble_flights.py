@@ -16,15 +16,14 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from chaserdock_controller.estimation.composite_body import stated_properties
-from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
-from chaserdock_controller.estimation.joint.estimator import JointInputs
-from chaserdock_controller.estimation.mass_properties import (
+from chaserdock_controller.bodies.mass_properties import (
     inertia_ratios,
     properties_of,
     with_shape,
 )
-from chaserdock_controller.parameters import estimator_of
+from chaserdock_controller.estimation.composite_body import stated_properties
+from chaserdock_controller.estimation.joint import JointEstimator, JointParameters, parameters_of
+from chaserdock_controller.estimation.types import ChaserMeasurement, EstimatorInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
@@ -118,11 +117,11 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     velocity = np.array(start.velocity_m_s) + rotations.rotate(
         q0, np.cross(omega0, body.centre_trf_m)
     )
-    camera = RenderedImages(scenario)
-    sensor = OdometrySensor(scenario)
-    estimator = estimator_of(flight)
-    if not isinstance(estimator, JointEstimator):
-        raise ValueError('needs estimator.name = "joint"')
+    camera, sensor, estimator = (
+        RenderedImages(scenario),
+        OdometrySensor(scenario),
+        JointEstimator(parameters_of(flight), len(flight.chasers)),
+    )
     chasers, before, nees = range(len(scenario.chasers)), None, []
     drawn = scenario.perception.name == "statistical"
     views = [ViewErrors(estimator.parameters, scenario.seed, i) for i in chasers]
@@ -142,22 +141,20 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
         if drawn:
             image_s = period_s * timing.ticks_per_image
             sightings = tuple(views[s.chaser].added_to(s, image_s) for s in sightings)
-        estimator.update(
-            JointInputs(
-                time_ns=now_ns,
-                odometry={i: odometry_of(sensor, i, own[i], tick, now_ns) for i in chasers},
-                sightings=sightings,
-                impulses=np.array(
-                    [_impulse(scenario, *pair) for pair in zip(before or own, own, strict=True)]
-                ),
-                covered_s=period_s,
+        measured = tuple(
+            ChaserMeasurement(
+                i,
+                _impulse(scenario, (before or own)[i], own[i]),
+                odometry_of(sensor, i, own[i], tick, now_ns),
             )
+            for i in chasers
         )
+        estimator.update(EstimatorInputs(now_ns, period_s, measured, sightings))
         before = own
         if tick * period_s >= 10.0:
             nees += [
-                _nees(r.position_m, r.q_wxyz, r.covariance, target, own[r.chaser])
-                for r in estimator.relative_poses()
+                _nees(r.position_m, r.q_wxyz, r.covariance, target, own[i])
+                for i, r in estimator.relative_poses().items()
             ]
     shape = estimator.shape
     if shape is None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
+from chaserdock_controller.bodies.target_body import TargetBody, attach_bodies
 from chaserdock_controller.guidance.detumble.stack import StackMotion
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array

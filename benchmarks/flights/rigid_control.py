@@ -16,13 +16,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from chaserdock_controller.bodies.mass_properties import properties_of
 from chaserdock_controller.estimation.identification.stage import StackIdentification
-from chaserdock_controller.estimation.mass_properties import properties_of
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.control import DetumbleControl, StackState, StackTask
 from chaserdock_controller.guidance.detumble.planning import plan_stop
 from chaserdock_controller.guidance.detumble.stack import StackMotion
-from chaserdock_controller.interfaces import Observation, TargetEstimation
+from chaserdock_controller.interfaces import (
+    ChaserEstimate,
+    ChaserObservation,
+    Observation,
+    OwnMotion,
+    TargetEstimation,
+    TargetState,
+)
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry
@@ -67,27 +73,22 @@ class ControlledStack:
         effective_ns = timing.effective_ns(stack.tick)
         odometry = {i: stack.measure(i) for i in stack.mounted if i not in self.lost}
         seconds = (effective_ns - now_ns) / 1e9
+        none = np.zeros(6)
         observation = Observation(
             tick=stack.tick,
             time_ns=now_ns,
             effective_ns=effective_ns,
-            odometry=odometry,
-            outdated={},
-            invalid={},
-            lost={},
-            sightings=(),
-            commands=(),
-            docking={},
-            impulses={},
-            last_commands={},
-            thruster_impulses={i: given for i, given in self._given.items() if i in odometry},
-            ahead={
-                i: ((1.0, self._coming[i]),) if i in self._coming and seconds else ()
-                for i in odometry
-            },
-            input_limits={},
-            isolated=dict(self.reported),
-            events=(),
+            chasers=tuple(
+                ChaserObservation(
+                    i,
+                    input_limits=none,
+                    odometry=odometry.get(i),
+                    thruster_impulses=self._given.get(i) if i in odometry else None,
+                    ahead=((1.0, self._coming[i]),) if i in self._coming and seconds else (),
+                    isolated=self.reported.get(i, ()),
+                )
+                for i in stack.mounted
+            ),
         )
         estimation = self._estimation(now_ns, odometry)
         return observation, self.identification.identified(observation, estimation)
@@ -114,16 +115,18 @@ class ControlledStack:
         return TargetEstimation(
             target=target,
             at_effect=target,
-            own=odometry,
-            own_at_effect={},
-            disturbances={},
-            motion_covariances={},
-            relative=(),
-            visible_to=frozenset(odometry),
-            cameras=(),
-            latched=frozenset(stack.mounted),
+            chasers=tuple(
+                ChaserEstimate(
+                    i,
+                    own=OwnMotion(odometry[i], np.zeros(13), np.zeros(6))
+                    if i in odometry
+                    else None,
+                    visible=i in odometry,
+                    latched=True,
+                )
+                for i in stack.mounted
+            ),
             body=self.identification.target.body,
-            events=(),
         )
 
     def step(
@@ -132,13 +135,12 @@ class ControlledStack:
         """Fly one tick with a task of the thrusters, None for no thrust."""
         self.events += [text for _, text in estimation.events]
         commands: Mapping[int, Array] = {}
+        present = present_chasers(observation)
         state = self.control.state(observation, estimation)
         if task is not None and state is not None:
-            directs = self.control.commands(
-                state, set(observation.odometry), self._shut(), task, observation
-            )
+            directs = self.control.commands(state, set(present), task, observation)
             commands = {i: d.thrusts_N for i, d in directs.items() if d.thrusts_N is not None}
-        return self._fly({i: commands.get(i, self._none()) for i in observation.odometry})
+        return self._fly({i: commands.get(i, self._none()) for i in present})
 
     def damp(self) -> StackStep:
         """Fly one tick without the controller: every chaser damps the stack by its own odometry."""
@@ -152,9 +154,10 @@ class ControlledStack:
 
     def _shut(self) -> dict[int, tuple[int, ...]]:
         """Return the thrusters whose shut-off valve is closed."""
-        found, reported = self.identification.failed, self.reported
+        found = sorted(self.identification.failed)
         return {
-            i: (*found.get(i, ()), *reported.get(i, ())) for i in found.keys() | reported.keys()
+            i: (*(k for chaser, k in found if chaser == i), *self.reported.get(i, ()))
+            for i in {i for i, _ in found} | self.reported.keys()
         }
 
     def _none(self) -> Array:
@@ -168,6 +171,11 @@ class ControlledStack:
             stack.body.inertia_kg_m2 @ stack.omega_rad_s,
         )
         return StackState(stack.body, stack.mounted, motion, stack.q_wxyz)
+
+
+def present_chasers(observation: Observation) -> list[int]:
+    """Return the chasers with odometry."""
+    return [c.chaser for c in observation.chasers if c.odometry is not None]
 
 
 @dataclass(frozen=True)
@@ -209,7 +217,7 @@ def fly_controlled(
             observation, estimation = flight.estimate()
             state = flight.control.state(observation, estimation)
             if k == begin and state is not None:
-                refused = flight.control.why_not(state, set(observation.odometry), flight.reported)
+                refused = flight.control.why_not(state, set(present_chasers(observation)))
                 if refused:
                     break
             flown = flight.step(tasks.at(k, flight.control, state), observation, estimation)
@@ -277,7 +285,7 @@ def optimum_share(scenario: Scenario, seconds: float, guesses: int, programmes: 
     with so many linear programmes."""
     flight = ControlledStack(scenario)
     state = flight.state()
-    problem = flight.control.problem(state, set(state.chasers), {})
+    problem = flight.control.problem(state, set(state.chasers))
     count, rng = round(seconds / _OPTIMUM_STEP_S), np.random.default_rng([scenario.seed, 0x0971])
     shape, plans = (count, len(problem.limits_N)), []
     for _ in range(guesses):

@@ -17,7 +17,7 @@ import numpy as np
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.interfaces import ChaserInputs, TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Image, Sighting, TargetEstimate
@@ -174,7 +174,8 @@ class ParallelEstimator:
             sightings = tuple(
                 look(self._perceptions[i], image, None) for i, image in images.items()
             )
-        inputs = TickInputs(record.tick, record.time_ns, record.odometry, sightings)
+        received = tuple(ChaserInputs(i, odometry) for i, odometry in record.odometry.items())
+        inputs = TickInputs(record.tick, record.time_ns, received, sightings)
         estimate = self._core.estimate(inputs)
         self.errors.add(record.time_s, estimate, record.states["target"])
 

@@ -13,22 +13,21 @@ from __future__ import annotations
 import itertools
 import math
 
+import msgspec
 import numpy as np
-from chaserdock_controller.estimation.camera_calibration import (
-    ERRORS,
-    NO_ERROR,
-    predict_measurement,
-)
-from chaserdock_controller.estimation.motion_models import constant_rates
-from chaserdock_controller.estimation.types import CameraPose
+from chaserdock_controller.estimation.joint.measurements import mounting_of, predict_sighting
+from chaserdock_controller.estimation.joint.motion_models import constant_rates
+from chaserdock_controller.estimation.joint.state import FOCAL, TURN, empty_state
 from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_turns
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ
+from chaserdock_models.camera import Camera
 from common import Figures, Group, Options
 
 RATES = {"still": np.zeros(3), "tumbling": np.array([0.015, 0.045, 0.03])}
 """rad/s; tumbling: the paper's."""
+ERRORS = FOCAL.stop - TURN.start
+MOUNTING = mounting_of(Camera.from_hfov(640, 480, math.radians(60.0)))
 IMAGE_HZ, DURATION_S = 5.0, 60.0
 """Rate of the images, and time over which their poses are stacked."""
 MEASUREMENT_SIGMA = np.array([5e-4] * 3 + [math.radians(0.05)] * 3)
@@ -45,24 +44,25 @@ def jacobian(chasers: int, omega: Array, errors: int, manoeuvre: bool) -> Array:
     """Return the scaled Jacobian (M, 12 + errors * chasers); ``errors`` of each camera: 3 or 7."""
     rows = []
     yaws = [rotations.exp([0.0, 0.0, math.radians(yaw)]) for yaw in YAWS_DEG[:chasers]]
+    state = empty_state(0, chasers)
     for t in np.arange(0.0, DURATION_S, 1.0 / IMAGE_HZ):
         q, _, transition = constant_rates(rotations.IDENTITY.copy(), omega, float(t))
         motion = np.eye(12)
         motion[0:3, 3:6] = t * np.eye(3)
         motion[6:12, 6:12] = transition
+        state = msgspec.structs.replace(state, q_wxyz=q)
         for c, yaw in enumerate(yaws):
             position = rotations.rotate(q, rotations.rotate(yaw, [-1.0, 0.0, 0.0]))
             attitude = rotations.multiply(q, yaw)
             if manoeuvre and c == 0:
                 turns = calibration_turns([t / DURATION_S * CALIBRATION_S])
                 attitude = rotations.multiply(attitude, turns[0])
-            camera = CameraPose(position, rotations.multiply(attitude, Q_CRF_IRF_FORWARD_WXYZ))
-            predicted = predict_measurement(camera, np.zeros(3), q, NO_ERROR)
-            by_target = np.zeros((6, 12))
-            by_target[:3, 0:3], by_target[3:, 6:9] = predicted.by_position, np.eye(3)
+            state.positions_m[c], state.attitudes_wxyz[c] = position, attitude
+            seen = predict_sighting(state, c, MOUNTING)
             row = np.zeros((6, 12 + errors * chasers))
-            row[:, :12] = by_target @ motion
-            row[:, 12 + errors * c : 12 + errors * (c + 1)] = predicted.by_errors[:, :errors]
+            row[:, :12] = seen.by_target @ motion
+            own = seen.by_chaser[:, TURN.start : TURN.start + errors]
+            row[:, 12 + errors * c : 12 + errors * (c + 1)] = own
             rows.append(row / MEASUREMENT_SIGMA[:, None])
     return np.concatenate(rows) * np.concatenate([TARGET_SIGMA, *[CAMERA_SIGMA[:errors]] * chasers])
 

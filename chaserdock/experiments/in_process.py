@@ -22,7 +22,7 @@ from chaserdock_agents.chaser.outbox import ChaserOutputs
 from chaserdock_agents.chaser.vision import Vision
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
-from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.interfaces import ChaserInputs, TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
@@ -133,7 +133,7 @@ class InProcessMission:
         self._gain, self._solve_delay_s = actuator_gain, solve_delay_s
         self._busy_until_ns = 0
         self._odometry_sensor = OdometrySensor(scenario)
-        self._validation = OdometryValidation(flight)
+        self._validations = tuple(OdometryValidation(flight) for _ in flight.chasers)
 
     def retreats(self, chaser: int) -> list[str]:
         """Return why a chaser retreated, in order: phase and reason."""
@@ -194,11 +194,13 @@ class InProcessMission:
             sightings = tuple(self.perception(i, self.tick, time_ns, states) for i in self.chasers)
         outputs = None
         if time_ns >= self._busy_until_ns:
-            validated = {i: self._validated(o) for i, o in odometry.items()}
-            inputs = TickInputs(
-                self.tick, time_ns, validated, sightings, commands, reports, docking
+            received = tuple(
+                ChaserInputs(
+                    i, self._validated(o), thrusters=reports.get(i), docking=docking.get(i)
+                )
+                for i, o in odometry.items()
             )
-            outputs = self._control(inputs)
+            outputs = self._control(TickInputs(self.tick, time_ns, received, sightings, commands))
         errors = {i: self.tracking_error(i, states, outputs) for i in self.chasers}
         actuator_commands, delivered = self._act(outputs, odometry, time_ns)
         record = TickRecord(
@@ -223,8 +225,8 @@ class InProcessMission:
         )
 
     def _validated(self, odometry: Odometry) -> Odometry:
-        doubtful = odometry.chaser in self.controller.doubtful
-        validated, events = self._validation.update(odometry, doubtful)
+        doubtful = self.controller.doubts(odometry.chaser)
+        validated, events = self._validations[odometry.chaser].update(odometry, doubtful)
         self.events += [(odometry.sim_time_ns / 1e9, level, text) for level, text in events]
         return validated
 

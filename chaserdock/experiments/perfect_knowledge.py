@@ -5,30 +5,21 @@ controller's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from chaserdock_controller.estimation.types import (
-    EstimatorEvent,
-    Matrix3,
-    Measurement,
-    Shock,
-    TargetState,
-)
+from chaserdock_controller.estimation.types import Estimate, Estimator, EstimatorInputs
 from chaserdock_controller.guidance.reference import predict_target
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_protocol.scenario.bodies import Target
 
 _VARIANCE = 1e-12
 """Variance of every number (SI units): nothing, but positive, as a covariance must be."""
 
 
-class PerfectEstimator:
-    """The ``Estimator`` of a target with prescribed motion; it ignores measurements.
+class PerfectEstimator(Estimator):
+    """Returns the prescribed motion of the target, whatever is measured.
 
     Raises ValueError for a ``torque_free`` target, whose motion has no closed form.
     """
-
-    accepted = gated = late_dropped = reinitialisations = 0
 
     def __init__(self, target: Target) -> None:
         if target.motion == "torque_free":
@@ -58,16 +49,6 @@ class PerfectEstimator:
             (),
         )
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
-        """Return the state now."""
-        return self.estimate_at(now_ns)
-
-    def disturb(self, shock: Shock) -> None:
-        """Do nothing: a push does not move a prescribed target."""
-
-    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
-        """Do nothing: a prescribed target moves the same with chasers attached."""
-
-    def drain_events(self) -> list[EstimatorEvent]:
-        """Return no events."""
-        return []
+    def update(self, inputs: EstimatorInputs) -> Estimate:
+        """Return the state now. Pushes and latched chasers do not move a prescribed target."""
+        return Estimate(self.estimate_at(inputs.time_ns))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from chaserdock_protocol.messages import TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 
-from .estimation.joint import JointEstimator
+from .estimation.estimators import make_estimator
 from .estimation.stage import EstimationStage
 from .estimation.types import Estimator
 from .guidance.stage import GuidanceStage
@@ -17,7 +17,7 @@ from .interfaces import TickInputs, TickOutputs
 from .nmpc.stage import PlanningStage
 from .output.message_builders import target_message
 from .output.stage import OutputStage
-from .parameters import estimator_of, nmpc_parameters
+from .parameters import nmpc_parameters
 
 
 class ControllerCore:
@@ -33,12 +33,13 @@ class ControllerCore:
         self,
         scenario: FlightScenario,
         now_s: Callable[[], float],
-        estimator: Estimator | JointEstimator | None = None,
+        estimator: Estimator | None = None,
         realtime: bool = False,
     ) -> None:
         self.scenario = scenario
         self.ingest = IngestStage(scenario)
-        self.estimation = EstimationStage(scenario, estimator or estimator_of(scenario))
+        estimator = estimator or make_estimator(scenario.estimator.name, scenario)
+        self.estimation = EstimationStage(scenario, estimator)
         self.guidance = GuidanceStage(scenario)
         self.planning = PlanningStage(scenario, nmpc_parameters(scenario), now_s, realtime)
         self.output = OutputStage(scenario)
@@ -46,24 +47,24 @@ class ControllerCore:
 
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
-        observation = self.ingest.run(inputs, self.output.history)
+        observation = self.ingest.run(inputs, self.output.sent)
         estimation = self.estimation.run(observation, self.inspecting)
         guidance = self.guidance.run(observation, estimation, self.planning.history)
-        self.inspecting = guidance.inspecting
+        self.inspecting = frozenset(d.chaser for d in guidance.directives if d.inspects)
         plan = self.planning.run(observation, estimation, guidance)
         return self.output.run(observation, estimation, guidance, plan)
 
     def estimate(self, inputs: TickInputs) -> TargetEstimate:
         """Run ingest and estimation only, in place of ``step``."""
-        observation = self.ingest.run(inputs, self.output.history)
+        observation = self.ingest.run(inputs, self.output.sent)
         return target_message(observation, self.estimation.run(observation))
 
-    @property
-    def doubtful(self) -> frozenset[int]:
-        """Return the chasers whose odometry may be wrong, after the last tick."""
-        return self.estimation.consistency.doubtful
+    def doubts(self, chaser: int) -> bool:
+        """Return whether the odometry of a chaser may be wrong, after the last tick."""
+        consistency = self.estimation.consistency
+        return chaser < len(consistency) and consistency[chaser].doubtful
 
     @property
-    def estimator(self) -> Estimator | JointEstimator:
+    def estimator(self) -> Estimator:
         """Return the target estimator."""
         return self.estimation.estimator

@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs and outputs of a controller tick, and the results that its stages hand to each other."""
+"""Inputs and outputs of a controller tick, and the results that its stages hand to each other.
+
+``Observation``, ``TargetEstimation``, ``GuidanceResult`` and ``PlanResult`` each describe a chaser by
+one object. The first two have one for every chaser of the mission, so that ``chasers[i]`` is chaser
+i; what is not known of it is None.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
@@ -22,6 +27,7 @@ from chaserdock_protocol.messages import (
     Odometry,
     OperatorCommand,
     PassiveSafety,
+    PhaseName,
     Plan,
     Reference,
     Sighting,
@@ -32,34 +38,42 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 
-from .estimation.mass_properties import MassProperties
-from .estimation.target_body import TargetBody
-from .estimation.types import RelativePose, TargetState
-from .guidance.phases import Phase
-from .nmpc.plan_monitor import ChaserPlan, PlanningFailure
-from .nmpc.types import NmpcPlan
+from .bodies.mass_properties import MassProperties
+from .bodies.target_body import TargetBody
 
 LogEntry = tuple[Level, str]
 """Level and text of an event."""
 ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search", "detumble"]
 
+# -- the tick --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ChaserInputs:
+    """Messages of one chaser for a tick.
+
+    ``odometry``: of the tick; a lost one is extrapolated for a while. ``outdated``: the newest one,
+    where it is of an earlier tick. ``thrusters``: the newest report. ``docking``: of the tick.
+    """
+
+    chaser: int
+    odometry: Odometry | None = None
+    outdated: Odometry | None = None
+    thrusters: ThrusterReport | None = None
+    docking: DockingStatus | None = None
+
 
 @dataclass(frozen=True)
 class TickInputs:
-    """Messages of a tick. Sightings may belong to earlier ticks.
-
-    ``odometry``: of the tick; a lost one is extrapolated for a while. ``outdated``: the newest
-    odometry of chasers that have none of this tick, by chaser.
+    """Messages of a tick. Sightings may belong to earlier ticks. ``chasers``: those of which
+    anything is known, in order.
     """
 
     tick: int
     time_ns: int
-    odometry: Mapping[int, Odometry]
-    sightings: tuple[Sighting, ...]
+    chasers: tuple[ChaserInputs, ...]
+    sightings: tuple[Sighting, ...] = ()
     commands: tuple[OperatorCommand, ...] = ()
-    thrusters: Mapping[int, ThrusterReport] = field(default_factory=dict)
-    docking: Mapping[int, DockingStatus] = field(default_factory=dict)
-    outdated: Mapping[int, Odometry] = field(default_factory=dict)
 
 
 @dataclass
@@ -77,6 +91,9 @@ class TickOutputs:
     events: list[Event] = field(default_factory=list)
 
 
+# -- ingest ----------------------------------------------------------------------------------------
+
+
 class AppliedImpulse(NamedTuple):
     """Impulse (6,), N s and N m s, body axes, since the tick before: ``measured`` by thrusters, or
     commanded.
@@ -86,70 +103,175 @@ class AppliedImpulse(NamedTuple):
     measured: bool
 
 
+@dataclass(frozen=True, eq=False)
+class ChaserObservation:
+    """What is known of one chaser in a tick before anything is estimated.
+
+    ``odometry``: its valid state, None without one; ``invalid``: why it is not used, or empty.
+    ``outdated``: valid odometry of an earlier tick, with the time of that, where there is no newer;
+    an ``odometry`` beside it is extrapolated. ``lost``: its last odometry, while it is an obstacle
+    to the others. ``interrupted``: without odometry for a while before this tick, as it sent none
+    or this controller received none.
+
+    ``impulse``: on a chaser with ``odometry``. ``last_command``: to one without, (6,); what it flies
+    now is not known. ``ahead``: what acts on it until ``Observation.effective_ns``, as durations (s)
+    and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
+    ``thruster_impulses`` (n,): of its thrusters since the tick before, N s, if it reports them.
+    ``isolated``: thrusters that it reports as closed.
+    """
+
+    chaser: int
+    input_limits: Array
+    odometry: Odometry | None = None
+    invalid: str = ""
+    outdated: Odometry | None = None
+    lost: Odometry | None = None
+    interrupted: bool = False
+    docking: DockingStatus | None = None
+    impulse: AppliedImpulse | None = None
+    last_command: Array | None = None
+    ahead: tuple[tuple[float, Array], ...] = ()
+    thruster_impulses: Array | None = None
+    isolated: tuple[int, ...] = ()
+
+    @property
+    def measured(self) -> Odometry | None:
+        """Return the odometry of this tick, None for an extrapolated state, which leaves out the
+        thrust.
+        """
+        return self.odometry if self.outdated is None else None
+
+    @property
+    def touches(self) -> bool:
+        """Return whether its tip touches the target while its latch is open."""
+        return self.docking is not None and self.docking.contact and not self.docking.latched
+
+
 @dataclass(frozen=True)
 class Observation:
-    """Result of ingest: checked inputs and what follows from them about the chasers; mappings by
-    chaser.
+    """Result of ingest: checked inputs and what follows from them about each of the ``chasers``.
 
-    ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states, of
-    ``outdated`` chasers extrapolated; ``invalid``: why a state is not. ``outdated``: valid odometry
-    of earlier ticks, with the times of these, of chasers without newer. ``lost``: last odometry of
-    chasers that are obstacles to the others. ``interrupted``: chasers without odometry for a while
-    before this tick, as they sent none or this controller received none. ``ahead``: what acts on a
-    chaser until ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,).
-    Wrenches are N and N m, body axes. ``isolated``: thrusters that chasers report as closed.
-    ``thruster_impulses``: of the thrusters (n,) since the tick before, N s, as chasers report them.
-    ``last_commands``: to chasers without odometry in this tick, (6,); what they fly now is not
-    known.
+    ``effective_ns``: when this tick's commands take effect.
     """
 
     tick: int
     time_ns: int
     effective_ns: int
-    odometry: Mapping[int, Odometry]
-    outdated: Mapping[int, Odometry]
-    invalid: Mapping[int, str]
-    lost: Mapping[int, Odometry]
-    sightings: tuple[Sighting, ...]
-    commands: tuple[OperatorCommand, ...]
-    docking: Mapping[int, DockingStatus]
-    impulses: Mapping[int, AppliedImpulse]
-    last_commands: Mapping[int, Array]
-    thruster_impulses: Mapping[int, Array]
-    ahead: Mapping[int, tuple[tuple[float, Array], ...]]
-    input_limits: Mapping[int, Array]
-    isolated: Mapping[int, tuple[int, ...]]
-    events: tuple[LogEntry, ...]
-    interrupted: frozenset[int] = frozenset()
+    chasers: tuple[ChaserObservation, ...]
+    sightings: tuple[Sighting, ...] = ()
+    commands: tuple[OperatorCommand, ...] = ()
+    events: tuple[LogEntry, ...] = ()
 
     @property
     def time_s(self) -> float:
         """Return the simulated time in seconds."""
         return self.time_ns / 1e9
 
-    @property
-    def measured(self) -> dict[int, Odometry]:
-        """Return the odometry of this tick without extrapolated states, which leave out the thrust."""
-        return {i: odometry for i, odometry in self.odometry.items() if i not in self.outdated}
+
+# -- estimation ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TargetState:
+    """Estimated state of the target at ``time_ns``.
+
+    position_m, velocity_m_s: (3,) WRF. q_wxyz: (4,) TRF to WRF. omega_rad_s: (3,) TRF axes.
+    covariance: (12, 12), order (position WRF, velocity WRF, dtheta TRF, omega TRF).
+    status: "none" (no measurement yet: pose and rates are zero, the covariance is 1e6 times identity),
+        "tracking" (a measurement was accepted recently), "predicting" (motion model only), "lost" (too
+        uncertain to use).
+    sightings: number of chasers whose measurements were accepted at the newest exposure.
+    rejected: chasers whose measurements were gated out at the newest exposure.
+    """
+
+    time_ns: int
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+    covariance: Array
+    status: str
+    sightings: int
+    rejected: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """Estimated pose of a chaser relative to the target.
+
+    position_m: (3,) origin of CRF in TRF. q_wxyz: (4,) CRF to TRF. covariance: (6, 6), order
+    (position in TRF axes, m; dtheta in CRF axes, rad).
+    """
+
+    position_m: Array
+    q_wxyz: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class OwnMotion:
+    """Estimated motion of a chaser with valid odometry.
+
+    ``state``: now. ``at_effect``: at ``Observation.effective_ns``, (13,): p, v (WRF), q_wxyz, omega
+    (body). ``disturbance``: estimated force and torque (6,) on it, body axes.
+    """
+
+    state: Odometry
+    at_effect: Array
+    disturbance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ChaserEstimate:
+    """What is estimated of one chaser.
+
+    ``own``: None without valid odometry. ``motion_covariance``: (6, 6) of its position and velocity
+    relative to the target, WRF, unless passive safety is off; ``relative``: its pose relative to
+    the target; both if estimated, with ``own``. ``camera``: the errors of its camera, once they are
+    estimated. ``visible``: it has a sighting of the target in this tick. ``latched``: its latch holds
+    the target. ``doubtful``: its odometry may be wrong.
+    """
+
+    chaser: int
+    own: OwnMotion | None = None
+    motion_covariance: Array | None = None
+    relative: RelativePose | None = None
+    camera: CameraCalibration | None = None
+    visible: bool = False
+    latched: bool = False
+    doubtful: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class StackChaser:
+    """A chaser that is part of the stack: where it is fixed, and estimated over stated thrust (n,)
+    of its thrusters.
+    """
+
+    chaser: int
+    mounting: MountedChaser
+    thrust_factors: Array
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedStack:
     """Mass properties of the stack and of the target alone, as identified until now.
 
-    ``chasers``: where they are fixed. ``motion``: of the centre of mass (WRF) and the target's
-    axes. ``thrust_factors`` (n,): estimated over stated thrust, by chaser. ``failed``: thrusters
-    found stuck, by chaser. ``informative`` returns the thrusters (chaser, number) whose pulses
-    would tell most about the mass properties, the best first.
+    ``motion``: of the centre of mass (WRF) and the target's axes. ``failed``: thrusters found stuck,
+    as (chaser, number). ``informative`` returns the thrusters (chaser, number) whose pulses would
+    tell most about the mass properties, the best first.
     """
 
     stack: MassProperties
     target: MassProperties
-    chasers: Mapping[int, MountedChaser]
+    chasers: tuple[StackChaser, ...]
     motion: BodyState
-    thrust_factors: Mapping[int, Array]
-    failed: Mapping[int, tuple[int, ...]]
+    failed: frozenset[tuple[int, int]]
     informative: Callable[[], tuple[tuple[int, int], ...]]
+
+    def failed_of(self, chaser: int) -> tuple[int, ...]:
+        """Return the thrusters of a chaser that were found stuck."""
+        return tuple(sorted(number for i, number in self.failed if i == chaser))
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,37 +293,25 @@ class TargetEstimation:
     """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose
     is known.
 
-    ``own``: estimated states of the chasers with valid odometry; ``own_at_effect``: the same at
-    ``Observation.effective_ns``, (13,): p, v (WRF), q_wxyz, omega (body). ``disturbances``:
-    estimated force and torque (6,) on a chaser, body axes. ``motion_covariances``: (6, 6) of a
-    chaser's position and velocity relative to the target, WRF, unless passive safety is off.
-    ``relative``: poses of the chasers relative to the target, if estimated with covariance.
-    ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds
-    the target; ``body``: the target and these chasers as one rigid body. ``stack``: their mass
-    properties as identified, if they are. ``shape``: errors of the known geometry, once they are
-    estimated. ``doubtful``: chasers whose odometry may be wrong.
+    ``body``: the target and the latched chasers as one rigid body. ``stack``: their mass properties
+    as identified, if they are. ``shape``: errors of the known geometry, once they are estimated.
     """
 
     target: TargetState
     at_effect: TargetState | None
-    own: Mapping[int, Odometry]
-    own_at_effect: Mapping[int, Array]
-    disturbances: Mapping[int, Array]
-    motion_covariances: Mapping[int, Array]
-    relative: tuple[RelativePose, ...]
-    visible_to: frozenset[int]
-    cameras: tuple[CameraCalibration, ...]
-    latched: frozenset[int]
+    chasers: tuple[ChaserEstimate, ...]
     body: TargetBody
-    events: tuple[LogEntry, ...]
+    events: tuple[LogEntry, ...] = ()
     stack: IdentifiedStack | None = None
     shape: EstimatedShape | None = None
-    doubtful: frozenset[int] = frozenset()
 
     @property
     def known(self) -> bool:
         """Return whether the target's pose is known."""
         return self.at_effect is not None
+
+
+# -- guidance --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -228,10 +338,14 @@ class DirectCommand:
 
 @dataclass(frozen=True)
 class Directive:
-    """Guidance of one chaser. ``isolated`` and ``trusted``: thrusters, by operator command.
-    ``reference`` is None while the target or the chaser's own state is unknown."""
+    """Guidance of one chaser. ``phase``: its name. ``isolated`` and ``trusted``: thrusters, by
+    operator command. ``reference`` is None while the target or the chaser's own state is unknown.
+    ``inspects``: it flies around the target to view it. ``abort_margin``: of its best abort, in
+    sigmas, while its passive safety is enforced.
+    """
 
-    phase: Phase
+    chaser: int
+    phase: PhaseName
     phase_time_s: float
     latch: Latch
     free: bool
@@ -239,6 +353,8 @@ class Directive:
     trusted: tuple[int, ...]
     reference: ReferencePose | None
     direct: DirectCommand | None
+    inspects: bool = False
+    abort_margin: float | None = None
 
 
 @dataclass(frozen=True)
@@ -262,19 +378,57 @@ class HorizonReference:
 
 @dataclass(frozen=True)
 class GuidanceResult:
-    """Result of guidance. ``horizon`` is None when no chaser is planned for. ``abort_margins``:
-    margin in sigmas of the best abort of each chaser whose passive safety is enforced now."""
+    """Result of guidance. ``directives``: one for every chaser of the mission, in order.
+    ``horizon`` is None when no chaser is planned for.
+    """
 
-    directives: Mapping[int, Directive]
+    directives: tuple[Directive, ...]
     horizon: HorizonReference | None
     replies: tuple[CommandReply, ...]
     events: tuple[LogEntry, ...]
-    abort_margins: Mapping[int, float] = field(default_factory=dict)
 
-    @property
-    def inspecting(self) -> frozenset[int]:
-        """Return the chasers that fly around the target to view it."""
-        return frozenset(i for i, d in self.directives.items() if d.phase is Phase.INSPECT)
+
+# -- planning --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ChaserPlan:
+    """Plan of one chaser from ``time_ns`` on: states (D+1, 13) and inputs (D, 6), as in
+    ``NmpcPlan``.
+    """
+
+    time_ns: int
+    states: Array
+    inputs: Array
+
+    def input_at(self, time_ns: int, step_s: float) -> Array | None:
+        """Return the input (6,) at a time, None after the plan's end."""
+        stage = int((time_ns - self.time_ns) / 1e9 / step_s + 1e-9)
+        return self.inputs[stage] if 0 <= stage < len(self.inputs) else None
+
+
+@dataclass(frozen=True)
+class PlanningFailure:
+    """Planning has failed for a chaser for so long that it has to retreat: there is no usable plan
+    (``without_plan``), or plans are degraded. ``text``: the reason.
+    """
+
+    without_plan: bool
+    text: str
+
+
+class PlanningHistory(Protocol):
+    """What guidance learns about the plans of earlier ticks."""
+
+    def failure(self, chaser: int, time_ns: int) -> PlanningFailure | None:
+        """Return why a chaser has to retreat at ``time_ns`` because planning has failed."""
+        ...
+
+    def unsafe(self, chaser: int, time_ns: int) -> str:
+        """Return why the plans of a chaser are not passively safe at ``time_ns``, or an empty
+        string.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -288,30 +442,36 @@ class PlanCertificate:
     safe: bool
 
 
-class PlanningHistory(Protocol):
-    """What guidance learns about the plans of earlier ticks."""
+class SolveStatus(NamedTuple):
+    """How the solver ended for one chaser, as in ``NmpcPlan``."""
 
-    def failures(self, time_ns: int) -> Mapping[int, PlanningFailure]:
-        """Return the chasers that have to retreat at ``time_ns`` because planning has failed."""
-        ...
+    status: str
+    iterations: int
+    cost: float
+    max_violation_m: float
 
-    def unsafe(self, time_ns: int) -> Mapping[int, str]:
-        """Return why chasers lack passive safety at ``time_ns``."""
-        ...
+
+@dataclass(frozen=True)
+class ChaserPlanning:
+    """Result of planning for one chaser.
+
+    ``solve``: of this tick, None without one. ``flyable``: the plan that may be flown, an
+    earlier one for a while after a failed solve. ``certificate``: passive safety of its newest plan,
+    where it is monitored.
+    """
+
+    chaser: int
+    solve: SolveStatus | None = None
+    flyable: ChaserPlan | None = None
+    certificate: PlanCertificate | None = None
 
 
 @dataclass(frozen=True)
 class PlanResult:
-    """Result of planning: the plan of ``chasers``, row by row; None without a usable solve.
-    ``wall_s``: time of the solve.
-
-    ``flyable``: the plan of each chaser that may be flown, an earlier one for a while after a
-    failed solve. ``certificates``: passive safety of the newest plans, where it is monitored.
+    """Result of planning. ``chasers``: one for every chaser of the mission, in order. ``wall_s``:
+    time of the solve.
     """
 
-    chasers: tuple[int, ...]
-    plan: NmpcPlan | None
-    wall_s: float
-    events: tuple[LogEntry, ...]
-    flyable: Mapping[int, ChaserPlan]
-    certificates: Mapping[int, PlanCertificate]
+    chasers: tuple[ChaserPlanning, ...]
+    wall_s: float = 0.0
+    events: tuple[LogEntry, ...] = ()

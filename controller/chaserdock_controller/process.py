@@ -109,7 +109,7 @@ class ControllerProcess:
         self.inputs = TickInputCollector(scenario)
         self.requests = OperatorRequests()
         self.standby = HotStandby(self.name, realtime, replaying)
-        self.checkpoint = Checkpoint(core, self.inputs.odometry_validation)
+        self.checkpoint = Checkpoint(core, [c.validation for c in self.inputs.chasers])
         self._left_at = (-1, -1)
         self._last_result: tuple[Tick, TickOutputs, float] | None = None
         self._idle_receives = 0
@@ -226,8 +226,7 @@ class ControllerProcess:
         late = self._open_tick()
         if late is not None and odometry.tick > late.tick:
             self._process(late)  # while its own odometry is still the newest
-        doubtful = odometry.chaser in self.core.doubtful
-        events = self.inputs.add_odometry(odometry, doubtful)
+        events = self.inputs.add_odometry(odometry, self.core.doubts(odometry.chaser))
         self.node.counts.stale += events is None
         for level, text in events or ():
             if self.standby.leads:

@@ -29,18 +29,18 @@ class _EstimationOnly:
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Return outputs with the target's estimate and nothing else."""
         target = self._core.estimate(inputs)
-        self._core.output.history.forget_before(inputs.time_ns)
+        for sent in self._core.output.sent:
+            sent.forget_before(inputs.time_ns)
         return TickOutputs(target=target)
 
-    @property
-    def doubtful(self) -> frozenset[int]:
-        """See ``ControllerCore.doubtful``."""
-        return self._core.doubtful
+    def doubts(self, chaser: int) -> bool:
+        """See ``ControllerCore.doubts``."""
+        return self._core.doubts(chaser)
 
     def add_command(self, command: WrenchCommand) -> None:
         """Add a recorded command, which the estimator needs to know."""
         wrench = np.array([*command.force_N, *command.torque_N_m])
-        self._core.output.history.add(command.chaser, command.effective_time_ns, wrench)
+        self._core.output.sent[command.chaser].add(command.effective_time_ns, wrench)
 
 
 def _core_of(scenario: FlightScenario) -> ControllerCore:

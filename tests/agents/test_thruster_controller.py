@@ -20,12 +20,11 @@ from chaserdock_controller.ingest.latency_compensation import (
     CommandHistory,
     predict_state,
 )
-from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.faults import faults_of
-from flight_cases import fleet_of, odometry, order
+from flight_cases import fleet_of, odometry, order, tick_inputs
 from flights.measured_poses import measurement_model
 from thruster_cases import at_rest, box, mission, wrench
 
@@ -175,9 +174,9 @@ def test_prediction_by_impulse_equals_prediction_by_wrench() -> None:
     s = mission()
     o, history = odometry(velocity_m_s=(0.1, 0.0, 0.0)), CommandHistory()
     commanded = np.array([1.0, -0.5, 0.2, 0.01, 0.02, -0.03])
-    history.add(0, 0, commanded)
+    history.add(0, commanded)
     still = np.zeros(6)
-    expected = predict_state(o, history.ahead(0, 0, 50_000_000), still, s.chaser)
+    expected = predict_state(o, history.ahead(0, 50_000_000), still, s.chaser)
     by_impulse = predict_state(o, ((0.05, commanded * 0.05 / 0.05),), still, s.chaser)
     np.testing.assert_allclose(by_impulse, expected, atol=1e-12)
     np.testing.assert_allclose(
@@ -190,7 +189,7 @@ def test_commanded_force_respects_reported_limits() -> None:
     s = mission()
     flight = ControllerCore(s, lambda: 0.0)
     o = odometry(velocity_m_s=(5.0, -5.0, 5.0))
-    free = flight.step(TickInputs(0, 0, {0: o}, ())).wrenches[0]
+    free = flight.step(tick_inputs(0, 0, {0: o}, ())).wrenches[0]
     report = ThrusterReport(
         chaser=0,
         tick=1,
@@ -200,7 +199,7 @@ def test_commanded_force_respects_reported_limits() -> None:
         coming_angular_impulse_N_m_s=(0.0, 0.0, 0.0),
         thrusters=("healthy",) * 12,
     )
-    bound = flight.step(TickInputs(1, 0, {0: o}, (), thrusters={0: report})).wrenches[0]
+    bound = flight.step(tick_inputs(1, 0, {0: o}, (), thrusters={0: report})).wrenches[0]
     assert max(map(abs, free.force_N)) == s.chaser.force_max_N
     assert max(map(abs, bound.force_N)) == pytest.approx(0.5, rel=1e-3)
 
@@ -229,11 +228,11 @@ def test_operator_gets_reply_with_reason(
 def test_operator_commands_reach_the_chaser_and_persist() -> None:
     s = mission(timeline=[{"at_s": 0.0, "command": "isolate", "chasers": [0], "thruster": 2}])
     flight = ControllerCore(s, lambda: 0.0)
-    out = flight.step(TickInputs(0, 0, {0: odometry()}, ()))
+    out = flight.step(tick_inputs(0, 0, {0: odometry()}, ()))
     assert out.replies[0].accepted
     assert out.wrenches[0].isolated == (2,)
     back = OperatorCommand(command="restore", chaser=0, thruster=2)
-    out = flight.step(TickInputs(1, 66_666_666, {0: odometry(tick=1)}, (), (back, back)))
+    out = flight.step(tick_inputs(1, 66_666_666, {0: odometry(tick=1)}, (), (back, back)))
     assert [r.reason for r in out.replies] == [
         "thruster 2 restored",
         "thruster 2 is already restored",

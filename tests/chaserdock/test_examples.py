@@ -6,6 +6,7 @@ controller.
 from __future__ import annotations
 
 import ast
+import dataclasses
 import os
 import re
 import subprocess
@@ -13,14 +14,14 @@ import sys
 import tomllib
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.types import CameraPose, Measurement, PoseHypothesis
-from chaserdock_controller.parameters import estimator_of
+from chaserdock_controller.estimation.estimators import make_estimator
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, ByHand, finished, run, sets, summary
+from joint_cases import SyntheticFlight, navigation
 
 EXAMPLES = ROOT / "examples"
 FOREIGN = EXAMPLES / "foreign_controller" / "foreign_controller.py"
@@ -100,17 +101,17 @@ def test_estimator_of_the_docs_ignores_few_markers(
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     scenario = load_scenario(ROOT / "scenarios/single.toml", ("estimator.name=three",))
-    estimator = estimator_of(scenario)
-    assert not isinstance(estimator, JointEstimator)
-    pose = PoseHypothesis(
-        np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6)
-    )
-    eye = CameraPose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    assert estimator.update([Measurement(0, 0, (pose,), 2, eye)], 0).status == "none"
-    assert estimator.accepted == 0
-    found = estimator.update([Measurement(0, 100_000_000, (pose,), 3, eye)], 100_000_000)
-    assert found.status == "tracking"
-    np.testing.assert_allclose(found.position_m, pose.position_m)
+    estimator = make_estimator("three", scenario)
+    flight = SyntheticFlight(scenario, navigation("lab"), 1, 0)
+    inputs = flight.inputs()
+    few = tuple(msgspec.structs.replace(s, marker_ids=(0, 1)) for s in inputs.sightings)
+    blind = estimator.update(dataclasses.replace(inputs, sightings=few))
+    assert blind.target.status == "none"
+    flight.step()
+    found = estimator.update(flight.inputs())
+    assert found.target.status == "tracking"
+    assert np.linalg.norm(found.target.position_m - flight.target[:3]) < 0.01
+    assert [m.chaser for m in found.chasers] == [0]
 
 
 def test_foreign_controller_imports_only_zenoh_and_msgpack() -> None:

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.joint.estimator import JointInputs
+from chaserdock_controller.estimation.types import Estimate, EstimatorInputs
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.recording.log import LogWriter, Record, read_log, read_scenario
@@ -108,12 +108,13 @@ def test_replay_finds_a_change_in_the_filter(monkeypatch: pytest.MonkeyPatch) ->
     """
     original = JointEstimator.update
 
-    def changed(self: JointEstimator, inputs: JointInputs) -> Any:
+    def changed(self: JointEstimator, inputs: EstimatorInputs) -> Estimate:
         estimate = original(self, inputs)
         if inputs.time_ns < 500_000_000:
             return estimate
+        moved = estimate.target.position_m + np.array([1e-4, 0.0, 0.0])
         return dataclasses.replace(
-            estimate, position_m=estimate.position_m + np.array([1e-4, 0.0, 0.0])
+            estimate, target=dataclasses.replace(estimate.target, position_m=moved)
         )
 
     monkeypatch.setattr(JointEstimator, "update", changed)

@@ -7,17 +7,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation import motion_models as motion
-from chaserdock_controller.estimation.body_shape import (
+from chaserdock_controller.bodies.body_shape import (
     INERTIA_ROWS,
     BodyShape,
     mass_covariance,
     shape_covariance,
     shape_of,
 )
-from chaserdock_controller.estimation.mass_properties import inertia_ratios, prior_of, with_shape
-from chaserdock_controller.estimation.parameters import MekfParameters
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.bodies.mass_properties import inertia_ratios, prior_of, with_shape
+from chaserdock_controller.bodies.target_body import TargetBody
+from chaserdock_controller.estimation.joint import motion_models as motion
+from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_wrench
@@ -110,23 +110,34 @@ def test_the_transition_is_the_derivative_of_the_motion(
     np.testing.assert_allclose(transition, numeric, atol=tolerance)
 
 
-def test_the_motion_is_that_of_the_other_models() -> None:
-    """In free space that of ``mekf``; in an orbit that of the equations by which the chasers are
-    predicted.
-    """
-    shape, body = client(), target_alone()
-    rows = body.inertia_kg_m2.tolist()
-    p = MekfParameters(
-        motion_model="torque_free",
-        inertia_ratios=(tuple(rows[0]), tuple(rows[1]), tuple(rows[2])),
-        centre_of_mass_trf_m=tuple(body.centre_trf_m.tolist()),
+def test_the_motion_is_that_of_a_fine_integration() -> None:
+    """Explicit midpoint on small steps, and the attitude by the exponential map."""
+    inertia, seconds, n = np.diag([1.0, 2.0, 2.5]), 4.0, 4_000
+    inverse, dt = np.linalg.inv(inertia), seconds / n
+    start = np.array([0.05, 0.6, 0.1])
+    q, w = MOTION[2], start
+    for _ in range(n):
+        middle = w + 0.5 * dt * inverse @ -np.cross(w, inertia @ w)
+        q = so3.multiply(q, so3.exp(middle * dt))
+        w = w + dt * inverse @ -np.cross(middle, inertia @ middle)
+    motion_then, _ = motion.free_shape(
+        (np.zeros(3), np.zeros(3), MOTION[2], start), seconds, shape_of(inertia, np.zeros(3))
     )
-    expected, transition = motion.propagate_target(*MOTION, 0.1, p)
-    found, by_errors = motion.free_shape(MOTION, 0.1, shape)
-    for a, b in zip(found, expected, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12)
-    np.testing.assert_allclose(by_errors[:, :12], transition, atol=1e-6)
+    assert float(rotations.angle_between(q, motion_then[2])) < 2e-6
+    np.testing.assert_allclose(motion_then[3], w, atol=2e-6)
+    assert np.linalg.norm(w - start) > 0.02  # the rates did move
 
+
+def test_a_ball_turns_at_constant_rates() -> None:
+    centre = np.array([0.1, -0.2, 0.05])
+    free = motion.free_shape(MOTION, 0.1, shape_of(np.eye(3), centre))
+    steady = motion.steady_motion(MOTION, 0.1, centre)
+    for x, y in zip(free[0], steady[0], strict=True):
+        np.testing.assert_allclose(x, y, atol=2e-8)
+    np.testing.assert_allclose(free[1][:, :12], steady[1], atol=1e-6)
+
+
+def test_the_motion_in_an_orbit_is_that_by_which_chasers_are_predicted() -> None:
     n, seconds, chaser = 1.1e-3, 10.0, Body(inertia_kg_m2=(1.0, 2.0, 2.5), mass_kg=5.0)
     state = np.concatenate([np.zeros(6), MOTION[2], MOTION[3]])
     for _ in range(1000):

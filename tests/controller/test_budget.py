@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.interfaces import TickOutputs
 from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, make_solver
 from chaserdock_controller.nmpc import stage as planning
 from chaserdock_controller.nmpc.budget import SolveBudget
 from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import Scenario, ScenarioError
-from flight_cases import odometry, scenario
+from flight_cases import odometry, scenario, tick_inputs
 from nmpc_cases import PARAMS, far_start, swap
 
 from chaserdock.experiments.perfect_knowledge import PerfectEstimator
@@ -103,7 +103,7 @@ def far(mission: Scenario, flight: ControllerCore, tick: int) -> TickOutputs:
     now_ns = mission.timing.tick_time_ns(tick)
     still = {"velocity_m_s": (0.0,) * 3, "omega_rad_s": (0.0,) * 3, "q_wxyz": (1.0, 0.0, 0.0, 0.0)}
     here = {i: odometry(i, tick, now_ns, position_m=(-3.0, 2.0 * i, 0.5), **still) for i in (0, 1)}
-    return flight.step(TickInputs(tick, now_ns, here, ()))
+    return flight.step(tick_inputs(tick, now_ns, here, ()))
 
 
 @pytest.mark.parametrize("realtime", [True, False])

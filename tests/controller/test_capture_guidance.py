@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.target_body import TargetBody
-from chaserdock_controller.estimation.types import RelativePose, TargetState
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.guidance.activities.docking import pull_N
 from chaserdock_controller.guidance.horizon import ReferenceBuilder
 from chaserdock_controller.guidance.phases import Trigger
+from chaserdock_controller.interfaces import RelativePose, TargetState
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario, senses
 from flight_cases import at, drain, fleet_of, order, step
@@ -361,7 +361,7 @@ def test_uncertainty_pushes_no_chaser_out_of_its_corridor(phase: str, pushed: bo
     builder, planned = ReferenceBuilder(pilot.scenario), pilot.guidance.chasers
     limit_m = pilot.guidance.chasers[0].min_distance_target_m()
     for sigma_m, margin_m in ((0.001, 0.003), (0.03, 0.09)):
-        place = RelativePose(0, np.array([-limit_m - 0.02, 0.0, 0.0]), q, np.eye(6) * sigma_m**2)
+        place = RelativePose(np.array([-limit_m - 0.02, 0.0, 0.0]), q, np.eye(6) * sigma_m**2)
         body = TargetBody(40.0, np.eye(3), still)
         kept_m = builder.horizon(planned, target, body, frozenset(), [place]).min_distance_target_m[
             0

@@ -12,13 +12,13 @@ import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import stage as estimation
 from chaserdock_controller.guidance.phases import Phase
-from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.interfaces import TickOutputs
 from chaserdock_controller.nmpc import stage as planning
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import DockingStatus
 from chaserdock_protocol.scenario import Scenario, load_scenario, parse_scenario
 from docking_cases import scenario as capture_scenario
-from flight_cases import odometry
+from flight_cases import odometry, tick_inputs
 from harness import ROOT
 
 from chaserdock.experiments.flight_record import record_flight
@@ -59,7 +59,7 @@ def step(
             velocity_m_s=(0.0,) * 3,
             omega_rad_s=(0.0,) * 3,
         )
-    return flight.step(TickInputs(tick, now_ns, here, (), **more))  # type: ignore[arg-type]
+    return flight.step(tick_inputs(tick, now_ns, here, (), **more))  # type: ignore[arg-type]
 
 
 def test_joining_and_leaving_chasers_do_not_interrupt_planning(

@@ -19,12 +19,12 @@ from chaserdock_controller.guidance.approach_cone import (
 )
 from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
-from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.interfaces import TickOutputs
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario as capture_scenario
 from docking_cases import senses
-from flight_cases import fleet_of, odometry, order, quick, scenario
+from flight_cases import fleet_of, odometry, order, quick, scenario, tick_inputs
 from hypothesis import given
 from hypothesis import strategies as st
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
@@ -166,7 +166,7 @@ def step(flight: ControllerCore, tick: int, **changes: Any) -> TickOutputs:
             1, tick, timing.tick_time_ns(tick), position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3
         ),
     }
-    return flight.step(TickInputs(tick, timing.tick_time_ns(tick), here, ()))
+    return flight.step(tick_inputs(tick, timing.tick_time_ns(tick), here, ()))
 
 
 @pytest.mark.parametrize("order", ["approach", "hold"])

@@ -10,10 +10,10 @@ import re
 
 import numpy as np
 import pytest
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.target_body import TargetBody
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.control import observed_motion
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.codec import vector
@@ -185,7 +185,7 @@ def test_exact_states_give_the_exact_momentum_whatever_the_weights(seed: int) ->
         (),
     )
     moving = BodyState(target.position_m, target.velocity_m_s, q, target.omega_rad_s)
-    own = {}
+    own = []
     for i in range(3):
         state = moving_with(moving, rng.normal(size=3), rotations.normalize(rng.normal(size=4)))
         fields = {
@@ -193,7 +193,7 @@ def test_exact_states_give_the_exact_momentum_whatever_the_weights(seed: int) ->
             for name in Odometry.__struct_fields__
             if hasattr(state, name)
         }
-        own[i] = Odometry(chaser=i, **fields)
+        own.append(Odometry(chaser=i, **fields))
     found = observed_motion(body, target, own, (1e-6, 1e-6))
     exact = stack_motion(body, target.velocity_m_s, q, target.omega_rad_s)
     assert found.momentum == pytest.approx(exact.momentum, abs=1e-8)

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.target_body import attach_bodies
+from chaserdock_controller.bodies.target_body import attach_bodies
 from chaserdock_controller.guidance.detumble.allocation import (
     allocate,
     feedback,

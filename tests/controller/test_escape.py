@@ -11,13 +11,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.target_body import TargetPath
-from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.bodies.target_body import TargetPath
 from chaserdock_controller.guidance.escape import EscapePlanner, RelativeState
 from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.reference import seen_from
 from chaserdock_controller.guidance.trajectories import Escape, move_to, stay
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.orbit import OrbitalElements, propagate, state_of
 from chaserdock_models.relative_motion import propagate_relative

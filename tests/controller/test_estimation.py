@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimation interface: estimators by name, refused parameters, and what its modules may import."""
+"""Estimators by name, refused parameters, and what the modules of estimation may import."""
 
 from __future__ import annotations
 
@@ -9,32 +9,26 @@ from pathlib import Path
 
 import pytest
 from chaserdock_controller import estimation
-from chaserdock_controller.estimation import (
-    Mekf,
-    MekfParameters,
-    PaperEstimator,
-    PaperParameters,
-    make_estimator,
-)
+from chaserdock_controller.estimation.estimators import make_estimator
+from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.joint.parameters import TargetParameters
+from chaserdock_controller.estimation.paper import PaperEstimator
+from chaserdock_protocol.plugins import PluginError
+from chaserdock_protocol.scenario import ESTIMATORS
+from flight_cases import scenario
 
 
-def test_make_estimator() -> None:
-    assert isinstance(make_estimator("mekf"), Mekf)
-    assert isinstance(make_estimator("paper", PaperParameters(window=3)), PaperEstimator)
-    with pytest.raises(ValueError, match="known: mekf, paper"):
-        make_estimator("ukf")
-    with pytest.raises(TypeError, match="MekfParameters"):
-        make_estimator("mekf", PaperParameters())
-    with pytest.raises(TypeError, match="PaperParameters"):
-        make_estimator("paper", MekfParameters())
+def test_every_estimator_of_the_schema_can_be_made() -> None:
+    made = [type(make_estimator(name, scenario())) for name in ESTIMATORS]
+    assert made == [JointEstimator, PaperEstimator]
+    with pytest.raises(PluginError, match="built in: joint, paper"):
+        make_estimator("ukf", scenario())
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
         {"motion_model": "spline"},
-        {"gate_chi_square": 0.0},
-        {"bias_focal_share": -1e-3},
         {"buffer_s": -1.0},
         {"initial_omega_rad_s": math.nan},
         {"single_marker_scale": 0.5},
@@ -44,9 +38,7 @@ def test_make_estimator() -> None:
 )
 def test_wrong_parameters_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong)).replace("motion_model", "motion model")):
-        MekfParameters(**wrong)
-    with pytest.raises(ValueError, match="window"):
-        PaperParameters(window=0)
+        TargetParameters(**wrong)
 
 
 def test_no_clock_and_no_global_randomness() -> None:

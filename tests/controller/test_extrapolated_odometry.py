@@ -11,53 +11,65 @@ from typing import Any, cast
 
 import msgspec
 import numpy as np
-import pytest
 from chaserdock_controller.estimation.identification.stage import StackIdentification
 from chaserdock_controller.estimation.stage import EstimationStage
-from chaserdock_controller.estimation.types import Measurement
-from chaserdock_controller.interfaces import TargetEstimation
+from chaserdock_controller.estimation.types import (
+    Estimate,
+    Estimator,
+    EstimatorInputs,
+    no_estimate,
+)
+from chaserdock_controller.interfaces import (
+    ChaserEstimate,
+    OwnMotion,
+    TargetEstimation,
+    TargetState,
+)
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import load_scenario
 from flight_cases import observation_of, scenario
-from joint_cases import SyntheticFlight, navigation
+from joint_cases import SyntheticFlight, navigation, odometry_in
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 ZERO = (0.0, 0.0, 0.0)
 
 
-class Recorded:
-    """An estimator that keeps the measurements of each tick."""
+class Recorded(Estimator):
+    """An estimator that keeps the odometry of each tick."""
 
     def __init__(self) -> None:
-        self.ticks: list[list[Measurement]] = []
+        self.ticks: list[tuple[list[int], list[int]]] = []
 
-    def update(self, measurements: list[Measurement], now_ns: int) -> Any:
-        self.ticks.append(measurements)
-        raise StopIteration
+    def update(self, inputs: EstimatorInputs) -> Estimate:
+        measured = [c.chaser for c in inputs.chasers if c.odometry is not None]
+        self.ticks.append((measured, [c.chaser for c in inputs.chasers if c.outdated is not None]))
+        return Estimate(no_estimate(inputs.time_ns))
+
+    def estimate_at(self, time_ns: int) -> TargetState:
+        return no_estimate(time_ns)
 
 
-def test_estimators_of_the_target_alone_take_measured_odometry_only() -> None:
-    """A sighting whose odometry is lost becomes a measurement when that odometry arrives, not
-    before.
-    """
+def test_estimators_get_measured_odometry_only() -> None:
+    """What is extrapolated is none; odometry that arrives late is handed over with its own time."""
     flight = SyntheticFlight(scenario(), navigation("lab"), 2, 1)
     recorded = Recorded()
-    stage = EstimationStage(scenario(), cast(Any, recorded))
+    stage = EstimationStage(scenario(), recorded)
     first = flight.inputs()
     flight.step()
     second = flight.inputs()
-    moved = msgspec.structs.replace(second.odometry[1], position_m=(9.0, 9.0, 9.0))
-    late = second.sightings[1]
+    moved = msgspec.structs.replace(odometry_in(second, 1), position_m=(9.0, 9.0, 9.0))
     for observation in (
         observation_of(
-            second.time_ns, {**second.odometry, 1: moved}, second.sightings, {1: first.odometry[1]}
+            second.time_ns,
+            {0: odometry_in(second, 0), 1: moved},
+            second.sightings,
+            {1: odometry_in(first, 1)},
         ),
-        observation_of(second.time_ns + 1, {}, (late,), {1: second.odometry[1]}),
+        observation_of(second.time_ns + 1, {}, (), {1: odometry_in(second, 1)}),
     ):
-        with pytest.raises(StopIteration):
-            stage.run(observation)
-    assert [[m.chaser for m in tick] for tick in recorded.ticks] == [[0], [1]]
+        stage.run(observation)
+    assert recorded.ticks == [([0], [1]), ([], [1])]
 
 
 def test_identification_of_the_stack_takes_measured_odometry_only() -> None:
@@ -91,7 +103,8 @@ def test_identification_of_the_stack_takes_measured_odometry_only() -> None:
 def latched_estimation(chasers: frozenset[int], own: Mapping[int, Odometry]) -> TargetEstimation:
     """Return an estimation with the target at the origin, at rest, and latched chasers."""
     target: Any = type("Target", (), {"position_m": np.zeros(3), "q_wxyz": rotations.IDENTITY})()
-    return TargetEstimation(
-        target=target, at_effect=target, own=own, own_at_effect={}, disturbances={}, motion_covariances={}, relative=(),
-        visible_to=frozenset(), cameras=(), latched=chasers, body=cast(Any, None), events=(),
-    )  # fmt: skip
+    estimates = tuple(
+        ChaserEstimate(i, OwnMotion(own[i], np.zeros(13), np.zeros(6)), latched=i in chasers)
+        for i in sorted(own)
+    )
+    return TargetEstimation(target, target, estimates, body=cast(Any, None))

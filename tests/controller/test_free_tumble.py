@@ -9,6 +9,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from chaserdock_controller.estimation.joint import parameters_of
 from chaserdock_controller.estimation.joint.prediction import predict_target
 from chaserdock_controller.estimation.joint.state import (
     JointState,
@@ -16,7 +17,6 @@ from chaserdock_controller.estimation.joint.state import (
     start_shape,
     with_body,
 )
-from chaserdock_controller.parameters import estimator_of
 from chaserdock_controller.redundancy.serialization import decode, encode
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from detumble_cases import target_alone
@@ -73,7 +73,7 @@ def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(tumble: TumbleO
 def test_a_change_of_the_body_restarts_its_shape() -> None:
     """A prediction beyond a latch uses the new body, with the uncertainty that is stated of it."""
     flight = flight_scenario(scenario_of([4.0, -3.0, 5.0]))
-    p = estimator_of(flight).parameters  # type: ignore[union-attr]
+    p = parameters_of(flight)
     state = msgspec.structs.replace(
         start_shape(empty_state(0, 2), p.target),
         target_known=True,
@@ -96,7 +96,7 @@ def test_a_change_of_the_body_restarts_its_shape() -> None:
 
 
 def test_a_checkpoint_keeps_the_shape() -> None:
-    p = estimator_of(flight_scenario(scenario_of([4.0, -3.0, 5.0]))).parameters  # type: ignore[union-attr]
+    p = parameters_of(flight_scenario(scenario_of([4.0, -3.0, 5.0])))
     state = start_shape(empty_state(0, 2), p.target)
     again = decode(encode(state), JointState)
     assert state.shape is not None

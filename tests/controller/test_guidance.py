@@ -21,13 +21,24 @@ from chaserdock_controller.guidance.phases import (
 )
 from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_controller.guidance.thruster_commands import THRUSTER_COMMANDS
-from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand, OperatorCommandName, PhaseName
 from chaserdock_protocol.scenario import Scenario
 from docking_cases import scenario as capture_scenario
-from flight_cases import at, drain, fleet_of, known, odometry, order, points, quick, scenario, step
+from flight_cases import (
+    at,
+    drain,
+    fleet_of,
+    known,
+    odometry,
+    order,
+    points,
+    quick,
+    scenario,
+    step,
+    tick_inputs,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -319,7 +330,7 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
     timing = mission.timing
     for tick in range(4):
         here = {i: odometry(i, tick, timing.tick_time_ns(tick)) for i in (0, 1)}
-        out = flight.step(TickInputs(tick, timing.tick_time_ns(tick), here, ()))
+        out = flight.step(tick_inputs(tick, timing.tick_time_ns(tick), here, ()))
         assert out.target.status == "none"
         assert out.target.accepted == ()
         assert sorted(out.wrenches) == [0, 1]
@@ -338,7 +349,7 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
         events = [(r.accepted, r.reason) for r in out.replies]
         assert events == ([(False, "the target has not been found yet")] if tick == 0 else [])
     assert flight.step(
-        TickInputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())
+        tick_inputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())
     ).wrenches.keys() == {1}
 
 

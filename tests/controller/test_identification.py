@@ -9,14 +9,7 @@ import math
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.identification.composite import (
-    CompositeIdentification,
-    IdentificationParameters,
-)
-from chaserdock_controller.estimation.identification.fault_recovery import (
-    FaultTolerantIdentification,
-)
-from chaserdock_controller.estimation.mass_properties import (
+from chaserdock_controller.bodies.mass_properties import (
     MassProperties,
     attach,
     body_of,
@@ -25,7 +18,14 @@ from chaserdock_controller.estimation.mass_properties import (
     prior_of,
     properties_of,
 )
-from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
+from chaserdock_controller.bodies.target_body import TargetBody, attach_bodies
+from chaserdock_controller.estimation.identification.composite import (
+    CompositeIdentification,
+    IdentificationParameters,
+)
+from chaserdock_controller.estimation.identification.fault_recovery import (
+    FaultTolerantIdentification,
+)
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
@@ -88,7 +88,9 @@ class Stack:
         self.q, self.omega = qs[1], omegas[1] + turn / 2.0
 
     def filter(self, target: TargetBody | None = None) -> CompositeIdentification:
-        prior = attach(prior_of(target or target_alone(), 0.3, 0.3, 0.1), self.chasers, BODY)
+        prior = attach(
+            prior_of(target or target_alone(), 0.3, 0.3, 0.1), tuple(self.chasers.values()), BODY
+        )
         usable = dict.fromkeys(self.chasers, FREE)
         return CompositeIdentification(
             prior, self.chasers, self.states(0.0), BODY.thrusters, usable, ERRORS, PARAMETERS
@@ -109,7 +111,7 @@ def test_covariance_by_chasers_is_that_of_drawn_masses_and_centres() -> None:
             place = c.position_m + rng.normal(0.0, 0.01, 3)
             parts.append((share * BODY.mass_kg, share * np.asarray(BODY.inertia), place, c.q_wxyz))
         drawn.append(properties_of(attach_bodies(target, parts)))
-    found = covariance_by_chasers(target, chasers, BODY, 0.1, 0.01)
+    found = covariance_by_chasers(target, tuple(chasers.values()), BODY, 0.1, 0.01)
     expected = np.cov(np.array(drawn).T)
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert np.abs((found - expected) / size).max() < 0.1
@@ -124,7 +126,8 @@ def test_detaching_undoes_attaching(seed: int) -> None:
     root[0, 0] *= 1e-3  # what the curvature in the mass adds to the uncertainty is not undone
     target = MassProperties(target_alone(), root @ root.T * 1e-4)
     chasers = mounted((0, 1, 3))
-    again = detach(attach(target, chasers, BODY), chasers, BODY)
+    parts = tuple(chasers.values())
+    again = detach(attach(target, parts, BODY), parts, BODY)
     assert again.values == pytest.approx(target.values, abs=1e-9)
     assert again.covariance == pytest.approx(target.covariance, rel=1e-4, abs=1e-6)
     assert properties_of(body_of(target.values)) == pytest.approx(target.values)
@@ -138,7 +141,7 @@ def test_a_stack_is_as_uncertain_as_its_nonlinear_dependence_on_the_mass() -> No
     scale = np.diag([45.0**2, *[1e-6] * 3, *[1e-4] * 6])
     for share in (0.7, 1.3):
         stated = TargetBody(share * true.mass_kg, true.inertia_kg_m2, true.centre_trf_m)
-        stack = attach(MassProperties(stated, share**2 * scale), chasers, BODY)
+        stack = attach(MassProperties(stated, share**2 * scale), tuple(chasers.values()), BODY)
         off = properties_of(stack_of(chasers)) - stack.values
         # The mass of the stack is learned as a logarithm.
         off[0] = stack.body.mass_kg * math.log1p(off[0] / stack.body.mass_kg)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.ingest.sighting_validation import valid_sightings
-from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.interfaces import TickOutputs
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_protocol import codec
 from chaserdock_protocol.codec import Rejected
@@ -23,7 +23,7 @@ from chaserdock_protocol.messages import (
     encoding_of,
 )
 from chaserdock_protocol.scenario import Scenario, ScenarioError, parse_scenario
-from flight_cases import odometry, scenario
+from flight_cases import odometry, scenario, tick_inputs
 
 from chaserdock.experiments.perfect_knowledge import PerfectEstimator
 
@@ -96,7 +96,7 @@ def step(
         ),
         1: odometry(1, tick, now_ns, position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3),
     }
-    return flight.step(TickInputs(tick, now_ns, here, (), commands))
+    return flight.step(tick_inputs(tick, now_ns, here, (), commands))
 
 
 INVALID = [
@@ -145,7 +145,7 @@ def test_invalid_odometry_makes_only_that_chaser_coast(
 def test_all_chasers_coast_without_valid_odometry() -> None:
     flight = core_of(scenario())
     invalid = {i: odometry(i, 0, 0, q_wxyz=(0.0,) * 4) for i in (0, 1)}
-    out = flight.step(TickInputs(0, 0, invalid, ()))
+    out = flight.step(tick_inputs(0, 0, invalid, ()))
     assert [out.wrenches[i].mode for i in (0, 1)] == ["coast", "coast"]
 
 

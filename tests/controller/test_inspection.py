@@ -21,12 +21,11 @@ from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import circuit
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
-from chaserdock_controller.interfaces import TickInputs
 from chaserdock_controller.redundancy.checkpoint import Checkpoint
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import load_scenario
-from flight_cases import at, fleet_of, scenario, step
+from flight_cases import at, fleet_of, scenario, step, tick_inputs
 from harness import ROOT
 
 SECTION = {"distance_m": 1.1, "speed_m_s": 0.1, "axis": [1.0, 2.0, 2.0]}
@@ -203,13 +202,17 @@ def markerless() -> ControllerCore:
     )
 
 
+def validations(core: ControllerCore) -> list[OdometryValidation]:
+    return [OdometryValidation(core.scenario) for _ in core.scenario.chasers]
+
+
 def test_standby_takes_over_the_estimate(markerless: ControllerCore) -> None:
     shape = markerless.estimation.shape
     assert shape is not None
     assert [p.name for p in shape.parameters][-2:] == ["scale", "rim"]
     k = len(shape.parameters)
     shape.filter = ShapeFilter.prior(k).with_view(np.array([1.0, 0.0, 0.0]), np.eye(k), np.ones(k))
-    checkpoint = Checkpoint(markerless, OdometryValidation(markerless.scenario))
+    checkpoint = Checkpoint(markerless, validations(markerless))
     saved = checkpoint.save()
     shape.filter = ShapeFilter.prior(k)
     checkpoint.restore(saved)
@@ -233,11 +236,11 @@ def test_images_count_once_guidance_has_let_their_chaser_inspect(
         if tick == 3:
             chaser.state = replace(chaser.state, phase=Phase.HOLD)
         now_ns = flight.scenario.timing.tick_time_ns(tick)
-        flight.step(TickInputs(tick, now_ns, {}, ()))
+        flight.step(tick_inputs(tick, now_ns, {}, ()))
     assert used == [frozenset(), frozenset(), {1}, {1}]
     flight.inspecting = frozenset({0})
-    saved = Checkpoint(flight, OdometryValidation(flight.scenario)).save()
-    Checkpoint(markerless, OdometryValidation(markerless.scenario)).restore(saved)
+    saved = Checkpoint(flight, validations(flight)).save()
+    Checkpoint(markerless, validations(markerless)).restore(saved)
     assert markerless.inspecting == {0}
 
 

@@ -16,10 +16,9 @@ from chaserdock_controller.ingest.lost_chasers import (
     FORGOTTEN_S,
     GROWTH_M_S,
     MOST_M,
-    LostChasers,
+    LossWatch,
     margin_m,
 )
-from chaserdock_controller.interfaces import TickInputs
 from chaserdock_controller.nmpc import NmpcInput
 from chaserdock_controller.nmpc.lost_chasers import coasting, with_lost_chasers
 from chaserdock_models.arrays import Array
@@ -27,6 +26,7 @@ from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from flight_cases import tick_inputs
 from nmpc_cases import PARAMS
 
 from chaserdock.experiments.perfect_knowledge import PerfectEstimator
@@ -71,13 +71,12 @@ def test_position_is_extrapolated_at_constant_velocity() -> None:
 
 
 def test_loss_expiry_and_return_are_each_reported_once() -> None:
-    lost = LostChasers()
-    assert lost.update({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
-    events = []
+    watch, events = LossWatch(1), []
+    assert watch.update(odometry(1, 0.0, Q[1:]), 0) is None
     for k in range(1, 200):
         now_s = 0.4 * k
-        now = {0: odometry(0, now_s, Q[1:])}
-        events += [(round(now_s, 1), *event) for event in lost.update(now, round(now_s * 1e9))]
+        event = watch.update(None, round(now_s * 1e9))
+        events += [] if event is None else [(round(now_s, 1), *event)]
     assert [(level, text.split(":")[0]) for _, level, text in events] == [
         ("warning", "chaser 1")
     ] * 2
@@ -85,32 +84,38 @@ def test_loss_expiry_and_return_are_each_reported_once() -> None:
     assert "no obstacle any more" in events[1][2]
     assert events[0][0] == pytest.approx(0.4)
     assert events[1][0] > FORGOTTEN_S
-    lost.update({}, round(81e9))
-    (back,) = lost.update({0: odometry(0, 81.1, Q[1:])}, round(81.1e9))
+
+
+def test_return_of_a_lost_chaser_is_reported() -> None:
+    watch = LossWatch(0)
+    watch.update(odometry(0, 79.0, Q[1:]), round(79e9))
+    watch.update(None, round(81e9))
+    back = watch.update(odometry(0, 81.1, Q[1:]), round(81.1e9))
     assert back == ("info", "chaser 0: odometry received again")
 
 
-def test_chasers_are_absent_until_their_next_odometry() -> None:
+def test_chaser_is_absent_until_its_next_odometry() -> None:
     """Also without ticks in between, as for a controller that received nothing."""
-    lost = LostChasers()
-    lost.update({0: odometry(0, 1.0, Q[1:]), 1: odometry(1, 0.5, Q[1:])}, 10**9)
+    watch = LossWatch(1)
+    assert not watch.is_absent(10**9)
+    watch.update(odometry(1, 0.5, Q[1:]), 10**9)
     back_ns = round((0.75 + ABSENT_S) * 1e9)
-    assert lost.absent(back_ns) == {1}
-    lost.update({1: odometry(1, 0.75 + ABSENT_S, Q[1:])}, back_ns)
-    assert lost.absent(back_ns) == set()
-    assert lost.absent(round(100e9)) == {0, 1}
+    assert watch.is_absent(back_ns)
+    watch.update(odometry(1, 0.75 + ABSENT_S, Q[1:]), back_ns)
+    assert not watch.is_absent(back_ns)
+    assert watch.is_absent(round(100e9))
 
 
 def test_short_interruption_is_not_a_loss() -> None:
-    lost = LostChasers()
-    lost.update({0: odometry(0, 1.0, Q[1:])}, 10**9)
-    assert lost.update({}, round((1.0 + 0.9 * ABSENT_S) * 1e9)) == []
-    assert lost.obstacles(round((1.0 + 0.9 * ABSENT_S) * 1e9)) == {}
+    watch, now_ns = LossWatch(0), round((1.0 + 0.9 * ABSENT_S) * 1e9)
+    watch.update(odometry(0, 1.0, Q[1:]), 10**9)
+    assert watch.update(None, now_ns) is None
+    assert watch.obstacle(now_ns) is None
 
 
 def test_problem_is_unchanged_without_lost_chasers() -> None:
     problem: Any = object()
-    assert with_lost_chasers(problem, PARAMS, {}, 0) is problem
+    assert with_lost_chasers(problem, PARAMS, (), 0) is problem
 
 
 @pytest.mark.parametrize("between", [0.35, np.array([[0.0, 0.4], [0.4, 0.0]])])
@@ -128,7 +133,7 @@ def test_lost_chaser_becomes_a_row_without_constraints_of_its_own(between: Any) 
         corridors=np.ones((n, stages + 1, 5)),
     )
     last = odometry(7, 1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0))
-    extended = with_lost_chasers(problem, params, {7: last}, 2_000_000_000)
+    extended = with_lost_chasers(problem, params, (last,), 2_000_000_000)
     assert extended.states.shape == (3, 13)
     np.testing.assert_allclose(extended.states[2, :6], [1.1, 0.0, 0.0, 0.1, 0.0, 0.0])
     np.testing.assert_allclose(extended.references[2, -1, :3], [1.15, 0.0, 0.0])
@@ -150,7 +155,8 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
     """
     flight = ControllerCore(scenario, lambda: 0.0, PerfectEstimator(scenario.target))
     if blind:
-        flight.ingest.lost_chasers.obstacles = lambda now_ns: {}  # type: ignore[method-assign]
+        for chaser in flight.ingest.chasers:
+            chaser.loss.obstacle = lambda now_ns: None  # type: ignore[method-assign]
     timing, rate_hz = scenario.timing, scenario.time.rate_hz
     # On chaser 0's path. Wrenches act without latency.
     lost = np.array([0.0, -0.8, -0.1])
@@ -173,7 +179,7 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
         commands: tuple[OperatorCommand, ...] = ()
         if tick == 2 * rate_hz:
             commands = (OperatorCommand(command="goto", chaser=0, offset_m=(1.0, -1.6, 0.0)),)
-        out = flight.step(TickInputs(tick, now_ns, here, (), commands))
+        out = flight.step(tick_inputs(tick, now_ns, here, (), commands))
         assert set(out.wrenches) == set(here)
         assert out.solver is not None
         assert len(out.solver.status) == len(out.solver.chasers) == len(here)

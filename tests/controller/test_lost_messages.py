@@ -12,7 +12,6 @@ from chaser_cases import ZERO, docking, lost, odometry, tick_of
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.ingest.tick_inputs import TickInputCollector
-from chaserdock_controller.interfaces import TickInputs
 from chaserdock_controller.process import ControllerProcess
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage
@@ -27,6 +26,7 @@ from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import ReceivedMessage
+from flight_cases import tick_inputs
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -67,8 +67,11 @@ def test_controller_keeps_the_newest_docking_status_and_thruster_report(capture:
     assert not inputs.add_thruster_report(msgspec.structs.replace(report, tick=1))
     assert inputs.is_complete(tick)
     taken = inputs.take(tick, ())
-    assert taken.docking[0].latched
-    assert taken.thrusters[0].tick == 2
+    own = taken.chasers[0]
+    assert own.docking is not None
+    assert own.docking.latched
+    assert own.thrusters is not None
+    assert own.thrusters.tick == 2
 
 
 @pytest.fixture
@@ -164,11 +167,10 @@ def test_extrapolated_odometry_is_no_measurement(scenario: Scenario) -> None:
             behind = msgspec.structs.replace(odometry(scenario, 1, late[tick]), sim_time_ns=0)
             inputs.add_odometry(behind)
         taken = inputs.take(tick_of(scenario, tick, (0, 1)), ())
-        assert set(taken.odometry) == {0, 1}
+        assert [c.odometry is not None for c in taken.chasers[:2]] == [True, True]
         assert [(s.chaser, s.tick) for s in taken.sightings] == [(0, tick), (1, tick)]
-        assert {i: o.tick for i, o in taken.outdated.items()} == (
-            {1: late.get(tick, 1)} if tick > 1 else {}
-        )
+        outdated = {c.chaser: c.outdated.tick for c in taken.chasers if c.outdated is not None}
+        assert outdated == ({1: late.get(tick, 1)} if tick > 1 else {})
         core.step(taken)
         assert isinstance(core.estimator, JointEstimator)
         assert core.estimator.state is not None
@@ -190,9 +192,10 @@ def test_sightings_are_taken_in_the_order_of_chasers(scenario: Scenario) -> None
 def test_state_extrapolated_from_an_invalid_one_is_invalid(scenario: Scenario) -> None:
     core, now = ControllerCore(scenario, lambda: 0.0), odometry(scenario, 0, 1)
     invalid = msgspec.structs.replace(odometry(scenario, 0, 0), q_wxyz=(0.5, 0.0, 0.0, 0.0))
-    taken = TickInputs(1, now.sim_time_ns, {0: now}, (), outdated={0: invalid})
-    observation = core.ingest.run(taken, core.output.history)
-    assert (observation.odometry, observation.outdated, set(observation.invalid)) == ({}, {}, {0})
+    taken = tick_inputs(1, now.sim_time_ns, {0: now}, (), outdated={0: invalid})
+    seen = core.ingest.run(taken, core.output.sent).chasers[0]
+    assert seen.invalid
+    assert (seen.odometry, seen.outdated) == (None, None)
 
 
 def test_chaser_without_recent_odometry_gets_no_command(

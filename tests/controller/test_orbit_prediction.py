@@ -8,7 +8,8 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.estimators import make_estimator
+from chaserdock_controller.estimation.joint import parameters_of
 from chaserdock_controller.estimation.joint.prediction import predict
 from chaserdock_controller.estimation.joint.state import (
     POSITION,
@@ -18,7 +19,6 @@ from chaserdock_controller.estimation.joint.state import (
     empty_state,
 )
 from chaserdock_controller.estimation.stage import EstimationStage
-from chaserdock_controller.parameters import estimator_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_acceleration, cw_transition, cw_wrench
@@ -56,10 +56,9 @@ def state_at(row: Array) -> JointState:
 def predicted(
     scenario: FlightScenario, state: JointState, ticks: int, period_s: float
 ) -> JointState:
-    estimator = estimator_of(scenario)
-    assert isinstance(estimator, JointEstimator)
+    parameters = parameters_of(scenario)
     for k in range(1, ticks + 1):
-        state = predict(state, round(k * period_s * 1e9), np.zeros((1, 6)), estimator.parameters)
+        state = predict(state, round(k * period_s * 1e9), np.zeros((1, 6)), parameters)
     return state
 
 
@@ -119,8 +118,11 @@ def odometry(row: Array) -> Odometry:
 def test_planning_cancels_the_wrench_of_the_orbit() -> None:
     scenario = mission()
     assert scenario.orbit is not None
-    observation = observation_of(0, {0: odometry(STATE)})
-    found = EstimationStage(scenario, estimator_of(scenario)).run(observation).disturbances[0]
+    observation = observation_of(0, {0: odometry(STATE)}, chasers=1)
+    stage = EstimationStage(scenario, make_estimator("joint", scenario))
+    own = stage.run(observation).chasers[0].own
+    assert own is not None
+    found = own.disturbance
     body = scenario.chaser
     mean_motion = scenario.orbit.elements.mean_motion_rad_s
     assert found == pytest.approx(

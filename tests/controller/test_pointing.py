@@ -1,26 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pointing: target search pattern, calibration manoeuvre, and the camera mounting that the filter
-estimates from it.
-"""
+"""Pointing: target search pattern and calibration manoeuvre."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.estimation import (
-    CameraPose,
-    Measurement,
-    Mekf,
-    MekfParameters,
-    PoseHypothesis,
-)
-from chaserdock_controller.estimation.camera_calibration import predict_measurement
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.chaser_state import ChaserTick
 from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import Trigger
@@ -33,14 +21,14 @@ from chaserdock_controller.guidance.pointing import (
     search_angles,
     search_wrench,
 )
-from chaserdock_controller.interfaces import TickInputs
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
-from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
+from chaserdock_models.camera import Camera
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
-from estimation_cases import R, V, W
-from flight_cases import fleet_of, known, odometry, order, scenario, step
+from estimation_cases import V, W
+from flight_cases import fleet_of, known, odometry, order, scenario, step, tick_inputs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -180,7 +168,7 @@ def test_unknown_target_starts_search_then_goto_facing_the_target() -> None:
 
 def test_controller_without_sightings_searches_and_reports_it() -> None:
     # The chasers do not move as commanded, which the joint filter would report.
-    s = scenario(estimator={"name": "mekf"})
+    s = scenario(estimator={"name": "paper"})
     flight = ControllerCore(s, lambda: 0.0)
     events, modes, torque = [], [], ()
     for k in range(40):
@@ -189,7 +177,7 @@ def test_controller_without_sightings_searches_and_reports_it() -> None:
             i: _odometry(i, k, np.concatenate([p, np.zeros(3), q, np.zeros(3)]))
             for i, (p, q) in enumerate(places)
         }
-        out = flight.step(TickInputs(k, now[0].sim_time_ns, now, ()))
+        out = flight.step(tick_inputs(k, now[0].sim_time_ns, now, ()))
         events += [e.what for e in out.events]
         modes.append(out.wrenches[0].mode)
         torque = out.wrenches[0].torque_N_m
@@ -230,39 +218,3 @@ def test_calibrate_is_rejected_without_target_without_bias_states_and_outside_ho
     )
     order(guidance, OperatorCommand(command="approach", chaser=0), 2.0)
     assert "hold first" in reply(guidance, 3.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_mounting_rotation_is_observable_with_calibration_manoeuvre_only(seed: int) -> None:
-    """One camera, white noise of 1 mm and 0.2 degrees per image, mounting error of 0.3 degrees (one
-    sigma).
-    """
-    residual_rad = {}
-    for manoeuvre in (True, False):
-        rng = np.random.default_rng(seed)
-        true = np.concatenate([rng.normal(size=3) * math.radians(0.3), np.zeros(4)])
-        p = replace(MekfParameters(), bias_position_m=0.0, bias_focal_share=0.0)
-        f = Mekf(p)
-        for k in range(round((CALIBRATION_S + 2.0) * 15)):
-            t = k / 15
-            q = rotations.integrate(rotations.IDENTITY, W, t)
-            place = V * t + rotations.rotate(q, [-1.0, 0.0, 0.0])
-            turned = rotations.multiply(q, calibration_turns([t])[0]) if manoeuvre else q
-            camera = CameraPose(place, rotations.multiply(turned, Q_CRF_IRF_FORWARD_WXYZ))
-            expected = predict_measurement(camera, V * t, q, true)
-            noise = rng.normal(size=6) * np.sqrt(np.diag(R))
-            h = PoseHypothesis(
-                expected.position_m + noise[:3],
-                rotations.multiply(expected.q_wxyz, rotations.exp(noise[3:])),
-                R,
-            )
-            f.update([Measurement(0, round(t * 1e9), (h,), 4, camera)], round(t * 1e9))
-        (found,) = f.cameras()
-        residual_rad[manoeuvre] = float(np.linalg.norm(found.turn_rad - true[:3]))
-        assert residual_rad[manoeuvre] < 4.0 * math.sqrt(float(np.trace(found.covariance[:3, :3])))
-        if manoeuvre:
-            assert math.sqrt(float(np.trace(found.covariance[:3, :3]))) < math.radians(0.08)
-        else:  # rotation about the line of sight is unobservable
-            assert math.sqrt(float(found.covariance[2, 2])) > math.radians(0.25)
-    assert residual_rad[True] < math.radians(0.08)

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import replace
 
 import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.joint.estimator import JointInputs
 from chaserdock_controller.estimation.joint.parameters import SHAPE, JointParameters, SightingNoise
-from chaserdock_controller.estimation.joint.state import SIGHTING_CHANNEL
-from chaserdock_controller.estimation.target_hypotheses import POSE
+from chaserdock_controller.estimation.joint.state import POSE, SIGHTING_CHANNEL
+from chaserdock_controller.estimation.types import EstimatorInputs
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Sighting
@@ -42,7 +42,7 @@ class ShapeFlight(SyntheticFlight):
         )
         self.logarithms = SPREAD * self.view_rng.normal(size=(CHASERS, 2))
 
-    def inputs(self) -> JointInputs:
+    def inputs(self) -> EstimatorInputs:
         """Return the measurements, with the persistent errors of now."""
         fade = math.exp(-PERIOD_S / SHAPE.view_time_s)
         sigmas = SHAPE.view_ratio * math.sqrt(1.0 - fade**2) * SIGHTING_SIGMAS
@@ -52,9 +52,7 @@ class ShapeFlight(SyntheticFlight):
         self.logarithms = fade * self.logarithms + more
         inputs = super().inputs()
         sightings = tuple(self._by_shape(s) for s in inputs.sightings)
-        return JointInputs(
-            inputs.time_ns, inputs.odometry, sightings, self.impulses.copy(), inputs.covered_s
-        )
+        return replace(inputs, sightings=sightings)
 
     def _by_shape(self, sighting: Sighting) -> Sighting:
         error, scale = (
@@ -78,7 +76,7 @@ def target_nees(flight: ShapeFlight, noise: SightingNoise) -> tuple[float, float
     estimator = JointEstimator(parameters(SCENARIO, flight.errors, shape=noise), CHASERS)
     values = []
     for k in range(round(FLIGHT_S / PERIOD_S)):
-        estimate = estimator.update(flight.inputs())
+        estimate = estimator.update(flight.inputs()).target
         if k * PERIOD_S >= FLIGHT_S / 2.0 and k % 15 == 0:
             turn = rotations.multiply(rotations.conjugate(flight.target[6:10]), estimate.q_wxyz)
             e = np.concatenate([estimate.position_m - flight.target[:3], rotations.log(turn)])
@@ -118,15 +116,7 @@ def test_an_invalid_covariance_does_not_change_the_units() -> None:
     solution = inputs.sightings[0].solutions[0]
     invalid = msgspec.structs.replace(solution, covariance=vector(-np.eye(6)))
     spoilt = msgspec.structs.replace(inputs.sightings[0], solutions=(invalid,))
-    estimator.update(
-        JointInputs(
-            inputs.time_ns,
-            inputs.odometry,
-            (spoilt, *inputs.sightings[1:]),
-            inputs.impulses,
-            inputs.covered_s,
-        )
-    )
+    estimator.update(replace(inputs, sightings=(spoilt, *inputs.sightings[1:])))
     after = estimator.state
     assert before is not None
     assert after is not None
@@ -143,17 +133,18 @@ def test_error_that_jumps_as_with_a_new_view_is_followed(sigmas: float, follows:
     flight = ShapeFlight(3)
     estimator = JointEstimator(parameters(SCENARIO, flight.errors), CHASERS)
     ticks, jump_tick, rejections = round(15.0 / PERIOD_S), round(10.0 / PERIOD_S), []
+    warnings: list[str] = []
     for k in range(ticks):
         if k == jump_tick:
             flight.persistent[1] = sigmas * SIGHTING_SIGMAS * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
-        estimator.update(flight.inputs())
+        events = estimator.update(flight.inputs()).events
+        warnings += [e.text for e in events if e.level == "warning"]
         state = estimator.state
         assert state is not None
         rejections.append(int(state.rejections[1, SIGHTING_CHANNEL]))
         flight.step()
     assert max(rejections[:jump_tick]) <= 1
     assert (max(rejections[jump_tick:]) == REJECTIONS - 1) is follows
-    warnings = [e.text for e in estimator.drain_events() if e.level == "warning"]
     assert warnings == ([] if follows else ["chaser 1 gated out: 5 in a row"])
 
 
@@ -173,7 +164,7 @@ def test_pushed_target_is_no_new_view() -> None:
         for k in range(round(14.0 / PERIOD_S)):
             if k == round(10.0 / PERIOD_S):
                 flight.target[3:6] += [0.02, -0.01, 0.0]
-            velocities[-1].append(estimator.update(flight.inputs()).velocity_m_s.tolist())
+            velocities[-1].append(estimator.update(flight.inputs()).target.velocity_m_s.tolist())
             flight.step()
     assert velocities[0] == velocities[1]
     assert np.linalg.norm(velocities[0][-1] - flight.target[3:6]) < 1e-3

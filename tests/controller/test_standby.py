@@ -341,11 +341,11 @@ def test_an_invalid_checkpoint_is_refused_completely(
         case "unknown":
             values["planning"]["Popen"] = {"args": "true"}
         case "missing":
-            del values["history"]
+            del values["chasers"][0]["sent"]
         case "chasers":
             values["chasers"].pop()
         case "type":
-            values["chasers"][0][0]["interrupted"] = "abc"
+            values["chasers"][0]["machine"]["interrupted"] = "abc"
         case "nan":
             values["fleet"]["_seen_s"] = np.nan
         case "nan array":

@@ -3,18 +3,16 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
-from chaserdock_controller.estimation import motion_models as motion
+from chaserdock_controller.bodies.body_shape import shape_of
+from chaserdock_controller.bodies.target_body import TargetBody, attach_bodies, predict_path
 from chaserdock_controller.estimation.composite_body import target_body
-from chaserdock_controller.estimation.hypothesis import StateHypothesis, predict
-from chaserdock_controller.estimation.parameters import MekfParameters
-from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies, predict_path
+from chaserdock_controller.estimation.joint import motion_models as motion
 from chaserdock_controller.guidance.reference import feed_forward
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
-from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
+from chaserdock_world.physics.simulation import TARGET, Physics
 from docking_cases import CHASER_INERTIA, CHASER_KG, scenario, world
 
 HZ = 960
@@ -38,28 +36,6 @@ def captured() -> Physics:
     return physics
 
 
-def parameters(body: TargetBody) -> MekfParameters:
-    rows = body.inertia_kg_m2.tolist()
-    return MekfParameters(
-        motion_model="torque_free",
-        inertia_ratios=(tuple(rows[0]), tuple(rows[1]), tuple(rows[2])),
-        centre_of_mass_trf_m=tuple(body.centre_trf_m.tolist()),
-        bias_position_m=0.0,
-        bias_attitude_rad=0.0,
-    )
-
-
-def branch(s: BodyState) -> StateHypothesis:
-    return StateHypothesis(
-        time_ns=0,
-        position_m=s.position_m,
-        velocity_m_s=s.velocity_m_s,
-        q_wxyz=s.q_wxyz,
-        omega_rad_s=s.omega_rad_s,
-        covariance=np.eye(12) * 1e-6,
-    )
-
-
 def test_a_captured_target_moves_as_predicted(captured: Physics) -> None:
     """3 s ahead, at three times the paper's rates: 0.2 mm and 0.02 degrees; uniform motion is off
     by more than 1 cm.
@@ -68,16 +44,18 @@ def test_a_captured_target_moves_as_predicted(captured: Physics) -> None:
     path = predict_path(
         body, begin.position_m, begin.velocity_m_s, begin.q_wxyz, begin.omega_rad_s, 0.05, 60
     )
-    estimated = predict(branch(begin), 3_000_000_000, parameters(body))
+    start = (begin.position_m, begin.velocity_m_s, begin.q_wxyz, begin.omega_rad_s)
+    shape = shape_of(body.inertia_kg_m2, body.centre_trf_m)
+    (position, velocity, _, omega), _ = motion.free_shape(start, 3.0, shape)
     captured.advance(3 * HZ, {})
     end = captured.state(TARGET)
     captured.close()
     assert np.linalg.norm(path.positions_m[-1] - end.position_m) < 2e-4
     assert rotations.angle_between(path.q_wxyz[-1], end.q_wxyz) < np.radians(0.02)
     np.testing.assert_allclose(path.omega_rad_s[-1], end.omega_rad_s, atol=2e-5)
-    np.testing.assert_allclose(estimated.position_m, path.positions_m[-1], atol=1e-6)
-    np.testing.assert_allclose(estimated.omega_rad_s, path.omega_rad_s[-1], atol=1e-6)
-    np.testing.assert_allclose(estimated.velocity_m_s, end.velocity_m_s, atol=2e-4)
+    np.testing.assert_allclose(position, path.positions_m[-1], atol=1e-6)
+    np.testing.assert_allclose(omega, path.omega_rad_s[-1], atol=1e-6)
+    np.testing.assert_allclose(velocity, end.velocity_m_s, atol=2e-4)
     assert np.linalg.norm(begin.position_m + 3.0 * begin.velocity_m_s - end.position_m) > 0.01
 
 
@@ -117,54 +95,23 @@ def test_feed_forward_holds_a_place_on_a_body_with_its_centre_elsewhere() -> Non
 
 def test_the_transition_about_another_centre_is_the_derivative() -> None:
     """Central differences of the predicted state, all twelve directions."""
-    p = parameters(TargetBody(50.0, np.diag([1.0, 2.0, 2.5]), np.array([-0.2, 0.05, 0.1])))
-    start = branch(
-        BodyState(
-            np.zeros(3),
-            np.array([0.01, 0.02, 0.0]),
-            so3.exp(np.array([0.3, -0.2, 0.5])),
-            np.array([0.1, 0.2, -0.1]),
-        )
+    start = (
+        np.zeros(3),
+        np.array([0.01, 0.02, 0.0]),
+        so3.exp(np.array([0.3, -0.2, 0.5])),
+        np.array([0.1, 0.2, -0.1]),
     )
-    dt_ns, e = 500_000_000, 1e-5
+    centre, e = np.array([-0.2, 0.05, 0.1]), 1e-5
 
-    def moved(d: np.ndarray) -> StateHypothesis:
-        return predict(
-            msgspec.structs.replace(
-                start,
-                position_m=start.position_m + d[:3],
-                velocity_m_s=start.velocity_m_s + d[3:6],
-                q_wxyz=so3.multiply(start.q_wxyz, so3.exp(d[6:9])),
-                omega_rad_s=start.omega_rad_s + d[9:12],
-            ),
-            dt_ns,
-            p,
-        )
+    def moved(d: np.ndarray) -> tuple[np.ndarray, ...]:
+        p, v, q, w = start
+        begin = (p + d[:3], v + d[3:6], so3.multiply(q, so3.exp(d[6:9])), w + d[9:12])
+        return motion.steady_motion(begin, 0.5, centre)[0]
 
-    def apart(a: StateHypothesis, b: StateHypothesis) -> np.ndarray:
-        turned = so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))
-        return np.concatenate(
-            [
-                a.position_m - b.position_m,
-                a.velocity_m_s - b.velocity_m_s,
-                turned,
-                a.omega_rad_s - b.omega_rad_s,
-            ]
-        )
+    def apart(a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> np.ndarray:
+        turned = so3.log(so3.inverse_multiply(b[2], a[2]))
+        return np.concatenate([a[0] - b[0], a[1] - b[1], turned, a[3] - b[3]])
 
     numeric = np.column_stack([apart(moved(e * d), moved(-e * d)) / (2 * e) for d in np.eye(12)])
-    q, w, turn = motion.torque_free(
-        start.q_wxyz,
-        start.omega_rad_s,
-        0.5,
-        np.array(p.inertia_ratios),
-        np.linalg.inv(np.array(p.inertia_ratios, dtype=np.float64)).astype(np.float64),
-    )
-    f = np.eye(12)
-    f[0, 3] = f[1, 4] = f[2, 5] = 0.5
-    f[6:, 6:] = turn
-    centre = np.array(p.centre_of_mass_trf_m)
-    state = (start.position_m, start.velocity_m_s, start.q_wxyz, start.omega_rad_s)
-    np.testing.assert_allclose(
-        motion.about_centre(state, (q, w), f, centre, 0.5)[2], numeric, atol=2e-6
-    )
+    transition = motion.steady_motion(start, 0.5, centre)[1]
+    np.testing.assert_allclose(transition, numeric, atol=2e-6)

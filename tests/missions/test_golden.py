@@ -16,7 +16,6 @@ from chaserdock_agents.chaser.command_gate import passed_on, refusal
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.interfaces import TickInputs
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Image,
@@ -29,6 +28,7 @@ from chaserdock_protocol.recording.log import Record, read_log, read_scenario
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.rendering.cameras import Cameras
+from flight_cases import tick_inputs
 
 LOG = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 
@@ -98,7 +98,7 @@ def test_controller_answers_the_same(scenario: Scenario, records: dict[type, lis
         time_ns = scenario.timing.tick_time_ns(tick)
         # Another order of arrival must not matter.
         seen = tuple(reversed(sightings[tick]))
-        out = flight.step(TickInputs(tick, time_ns, odometry[tick], seen))
+        out = flight.step(tick_inputs(tick, time_ns, odometry[tick], seen))
         assert out.target.status == targets[tick].status
         np.testing.assert_allclose(out.target.position_m, targets[tick].position_m, atol=1e-7)
         np.testing.assert_allclose(out.target.q_wxyz, targets[tick].q_wxyz, atol=1e-7)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation.composite_body import target_body
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.guidance.reference import predict_target
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_controller.nmpc import kernels
 from chaserdock_controller.nmpc.problem import model_of
 from chaserdock_controller.parameters import nmpc_parameters
@@ -58,10 +58,10 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         )
         ids = tuple(range(n))
         horizon = flight.guidance.references.horizon(
-            flight.guidance.chasers, exact, target_body(scenario), frozenset()
+            flight.guidance.chasers, exact, target_body(scenario), frozenset(), [None] * n
         )
-        limits = dict.fromkeys(ids, nmpc_parameters(scenario).input_limits())
-        problem = flight.planning.problem(horizon, dict(enumerate(states)), limits)
+        limits = np.tile(nmpc_parameters(scenario).input_limits(), (n, 1))
+        problem = flight.planning.problem(horizon, states, limits)
         plan = flight.planning.solver.solve(problem, TICK_S if tick else 0.0, ids)
         assert "failed" not in plan.status
         x = np.empty((n, 5, 13))

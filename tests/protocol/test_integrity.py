@@ -89,33 +89,30 @@ def test_after_long_silence_anything_is_believed() -> None:
 
 
 def test_agreement() -> None:
-    agreement, events_at = SensorConsistency(), []
+    watches, events_at = [SensorConsistency(i) for i in range(3)], []
     for tick in range(100):
         now_s = tick / 16  # exact
         rejected = {2} if 30 <= tick < 60 or tick in (10, 12, 80) else set()
         seen = {0, 1, 2} if tick % 3 else {0, 2}
-        events_at += [
-            (tick, level) for level, _ in agreement.update(now_s, seen - rejected, rejected)
-        ]
+        found = [watches[i].update(now_s, True) for i in sorted(seen - rejected)]
+        found += [watches[i].update(now_s, False) for i in sorted(rejected)]
+        events_at += [(tick, event[0]) for event in found if event is not None]
     assert events_at == [(40, "warning"), (70, "info")]
-
-
-def test_chaser_without_sightings_does_not_disagree() -> None:
-    agreement = SensorConsistency()
-    assert [agreement.update(t / 10, (), ()) for t in range(50)] == [[]] * 50
 
 
 def test_odometry_is_doubtful_until_sightings_agree_since_it_was_interrupted() -> None:
     """Sightings of chaser 1 disagree from 2 to 3 s and from 5 to 6 s; its odometry is interrupted
     until 1 s, and from 4 to 5 s.
     """
-    agreement, doubtful_at = SensorConsistency(), []
+    watch, doubtful_at = SensorConsistency(1), []
     for tick in range(160):
         now_s = tick / 16  # exact
-        rejected = {1} if 2.0 <= now_s < 3.0 or 5.0 <= now_s < 6.0 else set()
-        interrupted = {1} if now_s < 1.0 or 4.0 <= now_s < 5.0 else set()
-        agreement.update(now_s, {0, 1} - rejected - interrupted, rejected, interrupted)
-        doubtful_at += [now_s] if agreement.doubtful else []
+        rejected = 2.0 <= now_s < 3.0 or 5.0 <= now_s < 6.0
+        if now_s < 1.0 or 4.0 <= now_s < 5.0:
+            watch.interrupt(now_s)
+        else:
+            watch.update(now_s, not rejected)
+        doubtful_at += [now_s] if watch.doubtful else []
     # From 2 to 3 s, after a second of agreement, a camera fault is likelier: a jump of the odometry
     # would have been noticed.
     assert doubtful_at[0] == pytest.approx(5.0 + DISAGREES_S, abs=1 / 16)

@@ -16,6 +16,7 @@ from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.recording import schema_migrations
 from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
 from chaserdock_protocol.recording.schema_migrations import UPGRADES, current_key, decode_logged
+from chaserdock_protocol.scenario import ScenarioError, load_scenario, scenario_from_json
 from chaserdock_protocol.scenario.migrations import (
     FORMAT,
     drop_removed_keys,
@@ -23,6 +24,7 @@ from chaserdock_protocol.scenario.migrations import (
     old_keys,
 )
 from message_samples import BY_TYPE
+from source_tree import ROOT
 
 PRESENT: dict[str, msgspec.Struct] = {
     **{kind.__name__: sample for kind, sample in BY_TYPE.items()},
@@ -209,7 +211,7 @@ def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
                 "width_px": 640,
             },
             "estimator": {
-                "name": "mekf",
+                "name": "paper",
                 "camera_bias_attitude_deg": 0.3,
                 "camera_bias_position_m": 0.0,
             },
@@ -218,7 +220,7 @@ def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
     assert json.loads(migrated(text)) == {
         "format": FORMAT,
         "camera": {"width_px": 640},
-        "estimator": {"name": "mekf"},
+        "estimator": {"name": "paper"},
         "navigation": {
             "grade": "exact",
             "position_noise_m": 0.003,
@@ -281,3 +283,18 @@ def test_log_of_version_1_reads_as_present_messages(tmp_path: Path) -> None:
     assert [(r.key, r.message) for r in read_log(path, rejected=rejected)] == written
     assert not rejected
     assert json.loads(read_scenario(path)[0]) == FORMAT_3
+
+
+def test_removed_estimator_is_one_line_in_a_file_and_can_be_read_from_a_log(
+    tmp_path: Path,
+) -> None:
+    line = r"estimator.name: 'mekf' was removed; 'joint' estimates the chasers, too"
+    single = ROOT / "scenarios" / "single.toml"
+    with pytest.raises(ScenarioError, match=f"^--set estimator.name=mekf: {line}$"):
+        load_scenario(single, ("estimator.name=mekf",))
+    file = tmp_path / "old.toml"
+    file.write_text('extends = "single"\n[estimator]\nname = "mekf"\n')
+    with pytest.raises(ScenarioError, match=f"old.toml: {line}$"):
+        load_scenario(file)
+    logged = load_scenario(single).model_dump(mode="json") | {"estimator": {"name": "mekf"}}
+    assert scenario_from_json(migrated(json.dumps(logged)), "a log").estimator.name == "mekf"

@@ -4,23 +4,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.mounting import MountedChaser
-from chaserdock_protocol.messages import DockingStatus, Odometry
+from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock_controller.interfaces import AppliedImpulse
+from chaserdock_controller.bodies.mass_properties import (
+    MassProperties,
+    attach,
+    covariance_by_chasers,
+    prior_of,
+    with_shape,
+)
+from chaserdock_controller.bodies.target_body import TargetBody
+from chaserdock_controller.interfaces import (
+    AppliedImpulse,
+    ChaserObservation,
+    Observation,
+    TargetState,
+)
 
-from .body_shape import BodyShape
-from .joint import JointEstimator
-from .mass_properties import MassProperties, attach, covariance_by_chasers, prior_of, with_shape
-from .parameters import Matrix9
-from .target_body import TargetBody
-from .types import Estimator, Shock, TargetState
+from .types import Estimator, Shock
 
 _TOUCH = Shock(0.005, 0.01)
 """One sigma of the rate changes by a touch or a capture at the limits' speed (m/s, rad/s)."""
@@ -49,11 +57,6 @@ def stated_properties(scenario: FlightScenario) -> MassProperties:
     )
 
 
-def rows_of(covariance: Array) -> Matrix9:
-    """Return a covariance as ``MekfParameters.body_covariance``."""
-    return tuple(tuple(row) for row in covariance.tolist())
-
-
 def centre_in_target(target: TargetState, odometry: Odometry) -> Array:
     """Return a chaser's estimated centre (3,) in TRF."""
     return rotations.rotate_inverse(
@@ -71,7 +74,7 @@ class CompositeBody:
     """Chasers whose latch holds the target (``latched``), and the body that they form with it
     (``body``), by what is known of the target alone at the last change of a latch."""
 
-    def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self._scenario = scenario
         self._estimator = estimator
         self._target_alone = stated_properties(scenario)
@@ -79,29 +82,28 @@ class CompositeBody:
         self.latched: frozenset[int] = frozenset()
         self._changed = False
 
-    def disturb(
-        self,
-        docking: Mapping[int, DockingStatus],
-        odometry: Mapping[int, Odometry],
-        impulses: Mapping[int, AppliedImpulse],
-        now_ns: int,
-    ) -> None:
+    def disturb(self, observation: Observation) -> None:
         """Inform the estimator of contacts, latch changes and impulses of latched chasers, before a
         tick's sightings.
         """
-        latched = self.latched - docking.keys() | {
-            i for i, status in docking.items() if status.latched
-        }
+        chasers = observation.chasers
+        latched = frozenset(c.chaser for c in chasers if self._is_latched(c))
         changed = latched != self.latched
         if changed:
             self._target_alone = self.target
-        if changed or any(s.contact and not s.latched for s in docking.values()):
+        if changed or any(c.touches for c in chasers):
             self._estimator.disturb(_TOUCH)
         else:
-            for i in sorted(latched & odometry.keys()):
-                self._push(odometry[i], impulses[i], now_ns)
+            for c in chasers:
+                if c.chaser in latched and c.odometry is not None and c.impulse is not None:
+                    odometry = self._estimator.without_drift(c.odometry)
+                    self._push(odometry, c.impulse, observation.time_ns)
         self._changed |= changed
         self.latched = latched
+
+    def _is_latched(self, c: ChaserObservation) -> bool:
+        """Return whether a latch holds the target: as before, without a docking status."""
+        return c.chaser in self.latched if c.docking is None else c.docking.latched
 
     def _push(self, odometry: Odometry, applied: AppliedImpulse, now_ns: int) -> None:
         impulse = applied.impulse
@@ -129,7 +131,7 @@ class CompositeBody:
         """Return the mass properties of the target alone: while nothing is latched, with the shape
         that its motion shows.
         """
-        estimated = self._estimated_shape() if not self.latched else None
+        estimated = self._estimator.shape if not self.latched else None
         return (
             self._target_alone if estimated is None else with_shape(self._target_alone, *estimated)
         )
@@ -137,7 +139,7 @@ class CompositeBody:
     @property
     def moving(self) -> TargetBody:
         """Return the body that moves with the target, with the shape that its motion shows."""
-        estimated = self._estimated_shape()
+        estimated = self._estimator.shape
         if estimated is None:
             return self.body
         shape, _ = estimated
@@ -147,37 +149,27 @@ class CompositeBody:
             shape.centre_m,
         )
 
-    def _estimated_shape(self) -> tuple[BodyShape, Array] | None:
-        return self._estimator.shape if isinstance(self._estimator, JointEstimator) else None
-
     def refine_target(self, target: MassProperties) -> None:
         """Replace the target's mass properties by identified ones, from the next update on."""
         self._target_alone = target
         self._changed = True
 
-    def update_body(self, target: TargetState, odometry: Mapping[int, Odometry]) -> None:
+    def update_body(self, target: TargetState, own: Sequence[Odometry | None]) -> None:
         """Recompute the body after a latch change or a better knowledge of the target, after a
-        tick's sightings.
+        tick's sightings. ``own``: estimated states of the chasers.
 
         The chasers' masses are the scenario's; the poses of the latched chasers are estimated.
         """
-        if not self._changed or not self.latched <= odometry.keys():
+        states = [own[i] for i in sorted(self.latched)]
+        known = [state for state in states if state is not None]
+        if not self._changed or len(known) < len(states):
             return
         chaser = self._scenario.chaser
-        mounted = {
-            i: MountedChaser(*pose_in_target(target, odometry[i])) for i in sorted(self.latched)
-        }
+        mounted = [MountedChaser(*pose_in_target(target, state)) for state in known]
         stack = attach(self._target_alone, mounted, chaser)
         self.body = stack.body
-        rows = self.body.inertia_kg_m2.tolist()
-        centre = self.body.centre_trf_m.tolist()
-        inertia = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
-        if isinstance(self._estimator, JointEstimator):
-            alone = self._target_alone.body
-            covariance = stack.covariance + covariance_by_chasers(
-                alone, mounted, chaser, _CHASER_MASS_SHARE, _CHASER_CENTRE_M
-            )
-            self._estimator.change_body(inertia, tuple(centre), rows_of(covariance[1:, 1:]))
-        else:
-            self._estimator.change_body(inertia, tuple(centre))
+        covariance = stack.covariance + covariance_by_chasers(
+            self._target_alone.body, mounted, chaser, _CHASER_MASS_SHARE, _CHASER_CENTRE_M
+        )
+        self._estimator.change_body(self.body, covariance[1:, 1:])
         self._changed = False

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 import msgspec
@@ -20,45 +20,42 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_controller.ingest.latency_compensation import predict_state
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_controller.interfaces import (
+    ChaserEstimate,
+    ChaserObservation,
     IdentifiedStack,
     LogEntry,
     Observation,
+    OwnMotion,
     TargetEstimation,
+    TargetState,
 )
 
 from .composite_body import CompositeBody
 from .identification.stage import StackIdentification
-from .joint import JointEstimator
-from .joint.estimator import JointInputs
-from .joint.prediction import disturbance
-from .joint.state import POSITION_DRIFT, JointState
-from .measurements import SightingConverter
-from .mekf import Mekf
 from .target_shape import ShapeEstimation, shape_parameters
-from .types import Estimator, TargetState
+from .types import ChaserMeasurement, ChaserMotion, Estimator, EstimatorInputs
 
-_NO_DISTURBANCE = np.zeros(6)
+_NOTHING = np.zeros(6)
 
 
 class EstimationStage:
     """The estimator, with the body that the target forms with latched chasers."""
 
-    def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self.estimator = estimator
         self.composite = CompositeBody(scenario, estimator)
-        self.consistency = SensorConsistency()
+        self.consistency = tuple(SensorConsistency(i) for i in range(len(scenario.chasers)))
         self._body, self._period_s = scenario.chaser, 1.0 / scenario.time.rate_hz
         orbit = scenario.orbit
         self._passive_safety = scenario.limits.passive_safety != "off"
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self._camera = scenario.camera_model()
-        self._converter = SightingConverter(self._camera)
         parameters = shape_parameters(scenario)
         self.shape = ShapeEstimation(scenario, parameters) if parameters else None
         enabled = scenario.detumble.identification.enabled
         self.identification = StackIdentification(scenario) if enabled else None
 
-    def run(self, observation: Observation, inspecting: Collection[int] = ()) -> TargetEstimation:
+    def run(self, observation: Observation, inspecting: Set[int] = frozenset()) -> TargetEstimation:
         """Update the estimator with a tick's inputs, and with contacts and impulses from before
         them; then the geometry by pairs of images and those of the chasers that were ``inspecting``
         after the tick before, and the identification of the stack, whose result the estimator takes
@@ -75,163 +72,149 @@ class EstimationStage:
         return estimation
 
     def _estimate(self, observation: Observation) -> TargetEstimation:
-        o, now_ns, estimator = observation, observation.time_ns, self.estimator
-        before = self.composite.latched
-        own = _without_drift(estimator, o.odometry)
-        self.composite.disturb(o.docking, own, o.impulses, now_ns)
-        if isinstance(estimator, JointEstimator):
-            target = estimator.update(self._joint_inputs(o, estimator.chasers, before))
-            own = _estimated(estimator.state, o.odometry)
-        else:
-            target = self._target_only(o, estimator)
+        o, latched_before = observation, self.composite.latched
+        self.composite.disturb(o)
+        found = self.estimator.update(self._inputs(o, latched_before))
+        target, motions = found.target, {m.chaser: m for m in found.chasers}
         known = target.status in ("tracking", "predicting")
+        own = tuple(_estimated(c.odometry, motions.get(c.chaser)) for c in o.chasers)
         if known:
             self.composite.update_body(target, own)
-        disturbances = self._disturbances(o, own)
-        visible_to = frozenset(s.chaser for s in o.sightings if s.solutions)
-        events: list[LogEntry] = [(e.level, e.text) for e in estimator.drain_events()]
-        accepted, rejected = sorted(visible_to - set(target.rejected)), sorted(target.rejected)
-        events += self.consistency.update(o.time_s, accepted, rejected, o.interrupted)
+        seeing = {s.chaser for s in o.sightings if s.solutions}
+        events: list[LogEntry] = [(e.level, e.text) for e in found.events]
+        events += self._follow_consistency(o, seeing, target)
+        cameras = camera_calibrations(found.chasers, self._camera)
         return TargetEstimation(
             target=target,
-            at_effect=estimator.estimate_at(o.effective_ns) if known else None,
-            own=own,
-            own_at_effect={
-                i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own
-            },
-            disturbances=disturbances,
-            motion_covariances=self._motion_covariances(own) if known else {},
-            relative=estimator.relative_poses() if isinstance(estimator, JointEstimator) else (),
-            visible_to=visible_to,
-            doubtful=self.consistency.doubtful,
-            cameras=camera_calibrations(estimator, self._camera),
-            latched=self.composite.latched,
+            at_effect=self.estimator.estimate_at(o.effective_ns) if known else None,
+            chasers=tuple(
+                self._chaser(c, state, motions.get(c.chaser), known, seeing, cameras)
+                for c, state in zip(o.chasers, own, strict=True)
+            ),
             body=self.composite.moving,
             events=tuple(events),
             stack=self._free_target(target) if known else None,
+        )
+
+    def _follow_consistency(
+        self, o: Observation, seeing: Set[int], target: TargetState
+    ) -> list[LogEntry]:
+        """Follow whether the sightings of each chaser agree with the estimate; return the events."""
+        for c in o.chasers:
+            if c.interrupted:
+                self.consistency[c.chaser].interrupt(o.time_s)
+        rejected = set(target.rejected)
+        events = [self.consistency[i].update(o.time_s, True) for i in sorted(seeing - rejected)]
+        events += [self.consistency[i].update(o.time_s, False) for i in sorted(rejected)]
+        return [event for event in events if event is not None]
+
+    def _chaser(
+        self,
+        c: ChaserObservation,
+        state: Odometry | None,
+        motion: ChaserMotion | None,
+        known: bool,
+        seeing: Set[int],
+        cameras: Mapping[int, CameraCalibration],
+    ) -> ChaserEstimate:
+        """Return what is known of a chaser with the estimated ``state``; ``known``: the target's pose
+        is.
+        """
+        i, own, latched = c.chaser, None, c.chaser in self.composite.latched
+        if state is not None:
+            disturbance = self._disturbance(state, motion, latched)
+            own = OwnMotion(
+                state, predict_state(state, c.ahead, disturbance, self._body), disturbance
+            )
+        relevant = motion if own is not None else None
+        return ChaserEstimate(
+            chaser=i,
+            own=own,
+            motion_covariance=relevant.motion_covariance
+            if relevant is not None and known and self._passive_safety
+            else None,
+            relative=None if relevant is None else relevant.relative,
+            camera=cameras.get(i),
+            visible=i in seeing,
+            latched=latched,
+            doubtful=self.consistency[i].doubtful,
         )
 
     def _free_target(self, target: TargetState) -> IdentifiedStack | None:
         """Return what the motion of the target shows of its mass properties while no chaser is
         latched to it.
         """
-        if (
-            self.composite.latched
-            or not isinstance(self.estimator, JointEstimator)
-            or self.estimator.shape is None
-        ):
+        if self.composite.latched or self.estimator.shape is None:
             return None
         motion = BodyState(
             target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s
         )
         found = self.composite.target
-        return IdentifiedStack(found, found, {}, motion, {}, {}, tuple)
+        return IdentifiedStack(found, found, (), motion, frozenset(), tuple)
 
-    def _target_only(self, o: Observation, estimator: Estimator) -> TargetState:
-        """Update an estimator that takes odometry as exact."""
-        self._converter.add_odometry((*o.measured.values(), *o.outdated.values()), o.time_ns)
-        return estimator.update(self._converter.measurements(o.sightings), o.time_ns)
-
-    def _joint_inputs(
-        self, o: Observation, chasers: int, latched_before: frozenset[int]
-    ) -> JointInputs:
-        impulses = np.zeros((chasers, 6))
-        for i, applied in o.impulses.items():
-            impulses[i] = applied.impulse
-        touched = {i for i, s in o.docking.items() if s.contact and not s.latched}
+    def _inputs(self, o: Observation, latched_before: frozenset[int]) -> EstimatorInputs:
         latched = self.composite.latched
-        return JointInputs(
-            time_ns=o.time_ns,
-            odometry=o.measured,
-            sightings=o.sightings,
-            impulses=impulses,
-            covered_s=self._period_s,
-            last_commands=o.last_commands,
-            outdated=o.outdated,
-            latched=latched,
-            contacts=frozenset(touched | (latched ^ latched_before)),
-        )
-
-    def _disturbances(self, o: Observation, own: Mapping[int, Odometry]) -> dict[int, Array]:
-        """Return the wrench of the orbit on each chaser, with the estimated disturbance; none on a
-        latched one, whose motion is the target's."""
-        estimator, found = self.estimator, dict.fromkeys(own, _NO_DISTURBANCE)
-        if self._mean_motion_rad_s:
-            found |= {i: self._orbital_wrench(own[i]) for i in own.keys() - self.composite.latched}
-        if not isinstance(estimator, JointEstimator) or estimator.state is None:
-            return found
-        for i in own.keys() - self.composite.latched:
-            impulse = o.impulses[i].impulse if i in o.impulses else np.zeros(6)
-            estimated = disturbance(
-                estimator.state, i, impulse / self._period_s, estimator.parameters
+        changed = latched ^ latched_before
+        chasers = tuple(
+            ChaserMeasurement(
+                chaser=c.chaser,
+                impulse=_NOTHING if c.impulse is None else c.impulse.impulse,
+                odometry=c.measured,
+                outdated=c.outdated,
+                last_command=c.last_command,
+                latched=c.chaser in latched,
+                contact=c.touches or c.chaser in changed,
             )
-            found[i] = found[i] + estimated if self._mean_motion_rad_s else estimated
-        return found
+            for c in o.chasers
+        )
+        return EstimatorInputs(o.time_ns, self._period_s, chasers, o.sightings)
 
-    def _motion_covariances(self, own: Mapping[int, Odometry]) -> dict[int, Array]:
-        if not self._passive_safety or not isinstance(self.estimator, JointEstimator):
-            return {}
-        found = {i: self.estimator.motion_covariance(i) for i in own}
-        return {i: covariance for i, covariance in found.items() if covariance is not None}
+    def _disturbance(self, own: Odometry, motion: ChaserMotion | None, latched: bool) -> Array:
+        """Return the wrench of the orbit on a chaser, with the estimated disturbance; none on a
+        latched one, whose motion is the target's."""
+        if latched:
+            return _NOTHING
+        estimated = _NOTHING if motion is None else motion.disturbance
+        if not self._mean_motion_rad_s:
+            return estimated
+        orbital = self._orbital_wrench(own)
+        return orbital if motion is None else orbital + estimated
 
     def _orbital_wrench(self, o: Odometry) -> Array:
         state = np.array([*o.position_m, *o.velocity_m_s, *o.q_wxyz, *o.omega_rad_s])
         return cw_wrench(self._mean_motion_rad_s, state, self._body.mass_kg, self._body.inertia)
 
 
-def _without_drift(
-    estimator: Estimator | JointEstimator, odometry: Mapping[int, Odometry]
-) -> Mapping[int, Odometry]:
-    """Return odometry without the estimated drift of its position."""
-    state = estimator.state if isinstance(estimator, JointEstimator) else None
-    if state is None:
+def _estimated(odometry: Odometry | None, motion: ChaserMotion | None) -> Odometry | None:
+    """Return a chaser's estimated state in place of its odometry, where it is known."""
+    if odometry is None or motion is None:
         return odometry
-    return {
-        i: msgspec.structs.replace(
-            o, position_m=vector(np.array(o.position_m) - state.of(i, POSITION_DRIFT))
-        )
-        for i, o in odometry.items()
-    }
-
-
-def _estimated(state: JointState | None, odometry: Mapping[int, Odometry]) -> dict[int, Odometry]:
-    """Return the estimated states of the chasers that have odometry, in place of it, where they are
-    known.
-    """
-    assert state is not None
-    return {
-        i: msgspec.structs.replace(
-            o,
-            position_m=vector(state.positions_m[i]),
-            velocity_m_s=vector(state.velocities_m_s[i]),
-            q_wxyz=vector(state.attitudes_wxyz[i]),
-            omega_rad_s=vector(state.omegas_rad_s[i]),
-        )
-        if state.alive[i]
-        else o
-        for i, o in odometry.items()
-    }
+    return msgspec.structs.replace(
+        odometry,
+        position_m=vector(motion.position_m),
+        velocity_m_s=vector(motion.velocity_m_s),
+        q_wxyz=vector(motion.q_wxyz),
+        omega_rad_s=vector(motion.omega_rad_s),
+    )
 
 
 def camera_calibrations(
-    estimator: Estimator | JointEstimator, camera: Camera
-) -> tuple[CameraCalibration, ...]:
-    """Return the estimated errors of the cameras used so far, in CRF axes; ``camera``: the nominal
-    calibration.
+    motions: Sequence[ChaserMotion], camera: Camera
+) -> dict[int, CameraCalibration]:
+    """Return the estimated errors of the chasers' cameras in CRF axes, by chaser; ``camera``: the
+    nominal calibration.
     """
-    if not isinstance(estimator, Mekf | JointEstimator):
-        return ()
-    errors = estimator.cameras()
-    if not errors:
-        return ()
+    found = [(m.chaser, m.camera) for m in motions if m.camera is not None]
+    if not found:
+        return {}
     axes = rotations.to_matrix(camera.q_crf_irf_wxyz)
-    covariances = np.array([e.covariance for e in errors])
+    covariances = np.array([e.covariance for _, e in found])
     turns, shifts = (axes @ covariances[:, i : i + 3, i : i + 3] @ axes.T for i in (0, 3))
     diagonals = [np.einsum("nii->ni", part) for part in (turns, shifts, covariances[:, 6:, 6:])]
     sigmas = np.sqrt(np.concatenate(diagonals, axis=1)).tolist()
-    return tuple(
-        CameraCalibration(
-            chaser=e.chaser,
+    return {
+        i: CameraCalibration(
+            chaser=i,
             turn_rad=vector(axes @ e.turn_rad),
             turn_sigma_rad=(t1, t2, t3),
             shift_m=vector(axes @ e.shift_m),
@@ -239,5 +222,5 @@ def camera_calibrations(
             focal_share=e.focal_share,
             focal_sigma_share=focal,
         )
-        for e, (t1, t2, t3, s1, s2, s3, focal) in zip(errors, sigmas, strict=True)
-    )
+        for (i, e), (t1, t2, t3, s1, s2, s3, focal) in zip(found, sigmas, strict=True)
+    }

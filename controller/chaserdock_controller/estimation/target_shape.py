@@ -239,7 +239,8 @@ class ShapeEstimation:
         """Fuse the distances between the cameras that see the target in this tick."""
         seen = []
         for sighting in observation.sightings:
-            odometry, measured = observation.measured.get(sighting.chaser), sighting.geometry
+            odometry = observation.chasers[sighting.chaser].measured
+            measured = sighting.geometry
             if measured is None or odometry is None or odometry.sim_time_ns != sighting.sim_time_ns:
                 continue
             ambiguous = len(sighting.solutions) != 1

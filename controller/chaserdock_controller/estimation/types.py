@@ -1,110 +1,67 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs and outputs of target state estimation. Arrays are float64; SI units and radians."""
+"""The interface of estimators: what they get in a tick, and what they return. Arrays are float64;
+SI units and radians.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from chaserdock_models.arrays import Array, Matrix3
-from chaserdock_protocol.messages import Level
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Level, Odometry, Sighting
+
+from chaserdock_controller.bodies.body_shape import BodyShape
+from chaserdock_controller.bodies.target_body import TargetBody
+from chaserdock_controller.interfaces import RelativePose, TargetState
 
 
 @dataclass(frozen=True, eq=False)
-class PoseHypothesis:
-    """One possible pose of the target.
+class ChaserMeasurement:
+    """What is measured and known of one chaser in a tick.
 
-    position_m: (3,) origin of TRF in WRF, m.
-    q_wxyz: (4,) unit quaternion, TRF to WRF.
-    covariance: (6, 6), order (position in WRF axes, m; dtheta in TRF axes, rad) with
-        q_true = q (x) exp(dtheta).
-    """
-
-    position_m: Array
-    q_wxyz: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class CameraPose:
-    """Nominal pose of a camera at an exposure: optical centre (3,) in WRF and rotation (4,) IRF to
-    WRF.
-    """
-
-    position_m: Array
-    q_wxyz: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """Measurement of one chaser in one exposure.
-
-    time_ns: simulated time of the exposure. markers: number of markers used.
-    hypotheses: one pose, two for the planar ambiguity of a single marker (the likelier first), none
-        if the target is not visible. camera: its nominal pose.
+    ``odometry``: measured in this tick. ``outdated``: the newest one where there is none of this
+    tick, with the time of the tick at which it was measured. ``impulse`` (6,): N s and N m s, body
+    axes, that its actuators gave in the last ``EstimatorInputs.covered_s``. ``last_command`` (6,):
+    N and N m, of a chaser without odometry in this tick, which flies by a plan that the controller
+    does not know. ``latched``: its latch holds the target. ``contact``: since the tick before.
     """
 
     chaser: int
+    impulse: Array
+    odometry: Odometry | None = None
+    outdated: Odometry | None = None
+    last_command: Array | None = None
+    latched: bool = False
+    contact: bool = False
+
+
+@dataclass(frozen=True)
+class EstimatorInputs:
+    """Inputs of a tick. ``chasers``: one for every chaser of the mission, in order. ``sightings``:
+    may belong to earlier ticks.
+    """
+
     time_ns: int
-    hypotheses: tuple[PoseHypothesis, ...]
-    markers: int
-    camera: CameraPose
+    covered_s: float
+    chasers: tuple[ChaserMeasurement, ...]
+    sightings: tuple[Sighting, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class CameraError:
-    """Estimated calibration error of a chaser's camera.
+    """Estimated calibration error of a camera.
 
     turn_rad: (3,) rotation vector from nominal to true camera axes, in nominal IRF. shift_m: (3,)
     of the optical centre, in IRF. focal_share: relative error of the focal length. covariance: (7,
     7) in that order.
     """
 
-    chaser: int
     turn_rad: Array
     shift_m: Array
     focal_share: float
     covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class RelativePose:
-    """Estimated pose of a chaser relative to the target.
-
-    position_m: (3,) origin of CRF in TRF. q_wxyz: (4,) CRF to TRF. covariance: (6, 6), order
-    (position in TRF axes, m; dtheta in CRF axes, rad).
-    """
-
-    chaser: int
-    position_m: Array
-    q_wxyz: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class TargetState:
-    """Estimated state of the target at ``time_ns``.
-
-    position_m, velocity_m_s: (3,) WRF. q_wxyz: (4,) TRF to WRF. omega_rad_s: (3,) TRF axes.
-    covariance: (12, 12), order (position WRF, velocity WRF, dtheta TRF, omega TRF).
-    status: "none" (no measurement yet: pose and rates are zero, the covariance is 1e6 times identity),
-        "tracking" (a measurement was accepted recently), "predicting" (motion model only), "lost" (too
-        uncertain to use).
-    sightings: number of chasers whose measurements were accepted at the newest exposure.
-    rejected: chasers whose measurements were gated out at the newest exposure.
-    """
-
-    time_ns: int
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
-    covariance: Array
-    status: str
-    sightings: int
-    rejected: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,30 +86,77 @@ class EstimatorEvent(NamedTuple):
     text: str
 
 
+@dataclass(frozen=True, eq=False)
+class ChaserMotion:
+    """Estimated motion of a chaser, and of its camera.
+
+    position_m, velocity_m_s (3,): WRF. q_wxyz (4,): CRF to WRF. omega_rad_s (3,): CRF. disturbance
+    (6,): force and torque on it besides the commanded ones, body axes; zero on a latched chaser,
+    whose motion is the target's. relative, motion_covariance: while the target is known; the latter
+    (6, 6) of position and velocity relative to it, WRF. camera: once its errors are estimated.
+    """
+
+    chaser: int
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+    disturbance: Array
+    relative: RelativePose | None
+    motion_covariance: Array | None
+    camera: CameraError | None
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Result of a tick. ``chasers``: those whose motion the estimator estimates, in order."""
+
+    target: TargetState
+    chasers: tuple[ChaserMotion, ...] = ()
+    events: tuple[EstimatorEvent, ...] = ()
+
+
 class Estimator(Protocol):
-    """Interface of estimators; ``mekf.Mekf`` documents the members."""
+    """Estimates the target's motion, called once a tick with all inputs.
+
+    Only ``update`` and ``estimate_at`` are required; a class that inherits from this one gets the
+    others for a method without a model of the target's body or of the chasers.
+    """
+
+    def update(self, inputs: EstimatorInputs) -> Estimate:
+        """Process a tick and return the estimates at its time. Ticks come in order."""
+        ...
+
+    def estimate_at(self, time_ns: int) -> TargetState:
+        """Return the target's estimate for a time from the newest tick on; changes no state."""
+        ...
 
     @property
-    def accepted(self) -> int: ...
+    def shape(self) -> tuple[BodyShape, Array] | None:
+        """Return the shape of the body that the target is from now on, as its motion shows it, and
+        its covariance (8, 8); None if it is not estimated.
+        """
+        return None
 
     @property
-    def gated(self) -> int: ...
+    def reinitialisations(self) -> int:
+        """Return how often the target was started again, for statistics."""
+        return 0
 
-    @property
-    def late_dropped(self) -> int: ...
+    def without_drift(self, odometry: Odometry) -> Odometry:
+        """Return odometry without the drift of its position that is estimated up to now."""
+        return odometry
 
-    @property
-    def reinitialisations(self) -> int: ...
+    def disturb(self, shock: Shock) -> None:
+        """Take note that the target's rates change suddenly, after the newest tick."""
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState: ...
+    def change_body(self, body: TargetBody, covariance: Array) -> None:
+        """Take another body for the target from the newest tick on: it was latched or released, or
+        is known better.
 
-    def estimate_at(self, time_ns: int) -> TargetState: ...
-
-    def disturb(self, shock: Shock) -> None: ...
-
-    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None: ...
-
-    def drain_events(self) -> list[EstimatorEvent]: ...
+        covariance (9, 9): of its centre of mass (m) and of the elements xx, yy, zz, xy, xz, yz of
+        its inertia (kg m²). Raises ValueError for an inertia that no rigid body has.
+        """
 
 
 NO_ESTIMATE_VARIANCE = 1e6
@@ -171,44 +175,3 @@ def no_estimate(time_ns: int) -> TargetState:
         0,
         (),
     )
-
-
-def is_usable(measurement: Measurement) -> bool:
-    """Check camera pose and hypotheses: shapes, finite numbers, unit quaternions (to 1e-3), and
-    symmetric positive definite covariances."""
-    camera = measurement.camera
-    if (
-        camera.position_m.shape != (3,)
-        or camera.q_wxyz.shape != (4,)
-        or not np.isfinite(camera.position_m).all()
-    ):
-        return False
-    if not abs(float(camera.q_wxyz @ camera.q_wxyz) - 1.0) < 1e-3:
-        return False
-    for h in measurement.hypotheses:
-        if h.position_m.shape != (3,) or h.q_wxyz.shape != (4,) or h.covariance.shape != (6, 6):
-            return False
-        if not (np.isfinite(h.position_m).all() and np.isfinite(h.covariance).all()):
-            return False
-        # This form rejects NaN as well.
-        if not abs(float(h.q_wxyz @ h.q_wxyz) - 1.0) < 1e-3:
-            return False
-        scale = float(np.abs(h.covariance).max())
-        if float(np.abs(h.covariance - h.covariance.T).max()) > 1e-6 * scale:
-            return False
-        try:
-            np.linalg.cholesky(h.covariance)
-        except np.linalg.LinAlgError:
-            return False
-    return True
-
-
-def content_key(m: Measurement) -> tuple[int, int, int, int, bytes]:
-    """Return a sort key (time, chaser, content) that makes results independent of the order of
-    arrival.
-    """
-    content = m.camera.position_m.tobytes() + m.camera.q_wxyz.tobytes()
-    content += b"".join(
-        h.position_m.tobytes() + h.q_wxyz.tobytes() + h.covariance.tobytes() for h in m.hypotheses
-    )
-    return m.time_ns, m.chaser, len(m.hypotheses), m.markers, content

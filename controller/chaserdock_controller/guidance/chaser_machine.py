@@ -19,10 +19,10 @@ from chaserdock_controller.interfaces import (
     DirectCommand,
     Directive,
     Observation,
+    PlanningFailure,
     ReferencePose,
     TargetEstimation,
 )
-from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from . import command_validation as validation
 from .approach_cone import Cone, cone_of
@@ -215,7 +215,7 @@ class ChaserMachine:
         if failure is not None and (
             before is None or (failure.without_plan and not before.without_plan)
         ):
-            self.fire(Trigger.PLANNING_FAILED, known.now_s, failure.text())
+            self.fire(Trigger.PLANNING_FAILED, known.now_s, failure.text)
         self.failure = failure
 
     def follow_safety(self, known: ChaserTick) -> None:
@@ -245,8 +245,8 @@ class ChaserMachine:
         what, phase = command.command, self.phase
         if what != "goto" and (what == phase or (what == "approach" and phase in APPROACHING)):
             return CommandResult(True, f"already in phase {phase}")
-        if self.failure is not None and what in self.failure.refused:
-            return CommandResult(False, self.failure.text())
+        if self.failure is not None and what in validation.refused_by(self.failure):
+            return CommandResult(False, self.failure.text)
         activity = self._answering[what]
         if reason := activity.refuse(self, command, now_s):
             return CommandResult(False, reason)
@@ -266,7 +266,8 @@ class ChaserMachine:
         if known.own is not None:
             direct = self._activities[self.phase].command(self, known)
         return Directive(
-            phase=self.phase,
+            chaser=self.number,
+            phase=self.phase.value,
             phase_time_s=known.now_s - self.state.since_s,
             latch=self.latch(),
             free=self.is_free(),
@@ -274,6 +275,8 @@ class ChaserMachine:
             trusted=tuple(sorted(self.thrusters.trusted)),
             reference=reference,
             direct=direct,
+            inspects=self.phase is Phase.INSPECT,
+            abort_margin=self.abort_margin,
         )
 
     def motion(self, now_s: float) -> Motion:

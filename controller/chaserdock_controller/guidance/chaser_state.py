@@ -10,8 +10,7 @@ from typing import NamedTuple
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import CameraCalibration, Level, Odometry
 
-from chaserdock_controller.estimation.types import TargetState
-from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
+from chaserdock_controller.interfaces import PlanningFailure, TargetState
 
 from .docking import DockingObservation
 from .escape import RelativeState

@@ -13,6 +13,8 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.checks import angle_deg, shape_distance_m, shapes_apart_m
 from numpy.typing import ArrayLike
 
+from chaserdock_controller.interfaces import PlanningFailure
+
 from .approach_cone import BESIDE_LINE_M
 from .chaser_state import CommandResult
 from .phases import Phase
@@ -52,11 +54,9 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
     """Check that a chaser can fly the calibration manoeuvre."""
     if phase is not Phase.HOLD or not at_rest:
         return f"in phase {phase}; hold first"
-    if (
-        scenario.estimator.name not in ("joint", "mekf")
-        or not scenario.navigation.errors().uncertain_mounting
-    ):
-        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = joint or mekf)"
+    uncertain = scenario.navigation.errors().uncertain_mounting
+    if scenario.estimator.name != "joint" or not uncertain:
+        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = joint)"
     return ""
 
 
@@ -140,3 +140,11 @@ def why_not_identify(scenario: FlightScenario) -> str:
     if not scenario.chaser.thrusters or scenario.chaser.actuation != "thrusters":
         return WITHOUT_THRUSTERS
     return ""
+
+
+def refused_by(failure: PlanningFailure) -> tuple[str, ...]:
+    """Return the operator commands that are refused while planning fails. With degraded plans an
+    operator may still lead a chaser out.
+    """
+    always = ("approach", "inspect")
+    return (*always, "goto", "calibrate") if failure.without_plan else always

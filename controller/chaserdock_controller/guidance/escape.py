@@ -20,7 +20,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.passive_safety import CoastModel
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.interfaces import TargetState
 from chaserdock_controller.nmpc.passive_safety import coast_duration_s
 
 from .trajectories import Escape, Motion

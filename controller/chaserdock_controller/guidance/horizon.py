@@ -12,9 +12,8 @@ from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_models.shape_distance import box_table, moved
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock_controller.estimation.target_body import TargetBody, TargetPath, predict_path
-from chaserdock_controller.estimation.types import RelativePose, TargetState
-from chaserdock_controller.interfaces import HorizonReference
+from chaserdock_controller.bodies.target_body import TargetBody, TargetPath, predict_path
+from chaserdock_controller.interfaces import HorizonReference, RelativePose, TargetState
 
 from . import reference
 from .approach_cone import corridor_rows
@@ -72,12 +71,12 @@ class ReferenceBuilder:
         start: TargetState,
         body: TargetBody,
         attached: frozenset[int],
-        relative: Sequence[RelativePose] = (),
+        relative: Sequence[RelativePose | None],
     ) -> HorizonReference:
         """Return the references of ``chasers`` from the time of ``start`` on.
 
-        ``relative``: poses relative to the target, whose covariance widens the distance to keep
-        from it.
+        ``relative``: their poses relative to the target, whose covariance widens the distance to
+        keep from it; None where they are not estimated.
         """
         s, step_s = self._scenario, self._step_s
         torque_free = s.target.motion == "torque_free"
@@ -99,19 +98,15 @@ class ReferenceBuilder:
                 middles.alpha_rad_s2,
                 middles.acceleration_m_s2,
             )
-        known = {r.chaser: r for r in relative}
-        numbers = tuple(c.number for c in chasers)
         margins = self._margins_m(
-            [known[i].covariance if i in known else start.covariance for i in numbers]
+            [start.covariance if r is None else r.covariance for r in relative]
         )
         distances = np.array([c.min_distance_target_m() for c in chasers])
         # An uncertain pose pushes no chaser out of the corridor of its port, where no other place
         # is safe.
         room = [
-            length(known[c.number].position_m) - d
-            if c.number in known and c.in_corridor()
-            else np.inf
-            for c, d in zip(chasers, distances.tolist(), strict=True)
+            length(r.position_m) - d if r is not None and c.in_corridor() else np.inf
+            for c, r, d in zip(chasers, relative, distances.tolist(), strict=True)
         ]
         distances = distances + np.minimum(margins, np.maximum(room, 0.0))
         boxes = clearance = None
@@ -120,7 +115,7 @@ class ReferenceBuilder:
             kept = np.array([c.min_distance_shape_m() for c in chasers])
             clearance = np.where(kept > 0.0, kept + margins, 0.0)
         return HorizonReference(
-            chasers=numbers,
+            chasers=tuple(c.number for c in chasers),
             references=reference.references_on(
                 nodes.positions_m, nodes.q_wxyz, positions[:, :k], q_off[:, :k]
             ),

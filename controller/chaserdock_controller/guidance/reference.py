@@ -20,7 +20,7 @@ from chaserdock_models.rotations import (
 )
 from numpy.typing import ArrayLike
 
-from chaserdock_controller.estimation.target_body import TargetPath
+from chaserdock_controller.bodies.target_body import TargetPath
 
 
 def predict_target(

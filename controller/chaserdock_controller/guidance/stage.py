@@ -10,18 +10,20 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, length
 from chaserdock_models.docking_geometry import view_of
 from chaserdock_models.rigid_body import BodyState
-from chaserdock_protocol.messages import CommandReply, Odometry, OperatorCommand
+from chaserdock_protocol.messages import CommandReply, DockingStatus, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.estimation.composite_body import centre_in_target, pose_in_target
 from chaserdock_controller.estimation.identification.stage import body_state
 from chaserdock_controller.interfaces import (
+    ChaserEstimate,
     GuidanceResult,
     HorizonReference,
     Observation,
     PlanningHistory,
     ReferencePose,
     TargetEstimation,
+    TargetState,
 )
 
 from .activities.register import activities_of
@@ -85,64 +87,67 @@ class GuidanceStage:
             activity.conclude(observation)
 
         horizon = self._horizon(known, estimation)
-        directives = {c.number: c.directive(tick, references.get(c.number)) for c, tick in ticks}
-        margins = {c.number: c.abort_margin for c in fleet.chasers if c.abort_margin is not None}
-        return GuidanceResult(directives, horizon, replies, fleet.drain_events(), margins)
+        directives = tuple(c.directive(tick, references.get(c.number)) for c, tick in ticks)
+        return GuidanceResult(directives, horizon, replies, fleet.drain_events())
 
     def _known(
         self, observation: Observation, estimation: TargetEstimation, history: PlanningHistory
     ) -> tuple[ChaserTick, ...]:
         """Return what is known of each chaser in this tick, by number."""
-        failures = history.failures(observation.time_ns)
-        unsafe = history.unsafe(observation.time_ns)
-        stuck = {} if estimation.stack is None else estimation.stack.failed
+        stack, time_ns = estimation.stack, observation.time_ns
         return tuple(
             ChaserTick(
                 now_s=observation.time_s,
-                own=estimation.own.get(i),
+                own=None if estimate.own is None else estimate.own.state,
                 target=estimation.target,
-                offset_m=_offset_m(i, estimation),
-                port=self._port(chaser, observation, estimation),
-                relative=self._relative(i, estimation),
-                failure=failures.get(i),
-                camera=next((c for c in estimation.cameras if c.chaser == i), None),
-                acquiring=next((s.acquiring for s in observation.sightings if s.chaser == i), None),
-                stuck_thrusters=stuck.get(i, ()),
-                invalid=i in observation.invalid,
-                latched=i in estimation.latched and i in estimation.own,
-                doubtful=i in estimation.doubtful,
-                unsafe=unsafe.get(i, ""),
+                offset_m=_offset_m(estimate, estimation),
+                port=self._port(chaser, seen.docking, estimate, estimation),
+                relative=self._relative(estimate, estimation.target),
+                failure=history.failure(chaser.number, time_ns),
+                camera=estimate.camera,
+                acquiring=next(
+                    (s.acquiring for s in observation.sightings if s.chaser == chaser.number), None
+                ),
+                stuck_thrusters=() if stack is None else stack.failed_of(chaser.number),
+                invalid=bool(seen.invalid),
+                latched=estimate.latched and estimate.own is not None,
+                doubtful=estimate.doubtful,
+                unsafe=history.unsafe(chaser.number, time_ns),
             )
-            for i, chaser in enumerate(self.chasers)
+            for chaser, seen, estimate in zip(
+                self.chasers, observation.chasers, estimation.chasers, strict=True
+            )
         )
 
     def _port(
-        self, chaser: ChaserMachine, observation: Observation, estimation: TargetEstimation
+        self,
+        chaser: ChaserMachine,
+        status: DockingStatus | None,
+        estimate: ChaserEstimate,
+        estimation: TargetEstimation,
     ) -> DockingObservation | None:
         """Return what is known of a chaser at its port; None where it has none, or its pose
         relative to the target is not known.
         """
-        i, dock, target = chaser.number, chaser.dock, estimation.target
-        if dock is None or i not in estimation.own or not estimation.known:
+        dock, target = chaser.dock, estimation.target
+        if dock is None or estimate.own is None or not estimation.known:
             return None
-        own, status = estimation.own[i], observation.docking.get(i)
+        own = estimate.own.state
         moving = BodyState(
             target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s
         )
-        q_off = np.asarray(self._scenario.chasers[i].q_wxyz)
+        q_off = np.asarray(self._scenario.chasers[chaser.number].q_wxyz)
         view = view_of(dock.port, dock.reach_m, q_off, body_state(own), moving)
         contact = status is not None and status.contact
         pose = pose_in_target(target, own)
-        return DockingObservation(
-            view, contact, i in estimation.latched, *pose, sensed=status is not None
-        )
+        return DockingObservation(view, contact, estimate.latched, *pose, sensed=status is not None)
 
-    def _relative(self, i: int, estimation: TargetEstimation) -> RelativeState | None:
+    def _relative(self, estimate: ChaserEstimate, target: TargetState) -> RelativeState | None:
         """Return a chaser's state relative to the target where passive safety is enforced."""
-        covariance = estimation.motion_covariances.get(i)
-        if covariance is None or self._scenario.limits.passive_safety != "enforce":
+        covariance, enforced = estimate.motion_covariance, self._scenario.limits.passive_safety
+        if covariance is None or estimate.own is None or enforced != "enforce":
             return None
-        own, target = estimation.own[i], estimation.target
+        own = estimate.own.state
         state = np.concatenate(
             [own.position_m - target.position_m, own.velocity_m_s - target.velocity_m_s]
         )
@@ -186,12 +191,14 @@ class GuidanceStage:
         # Latched chasers are planned for only where others have to fly around them.
         if estimation.at_effect is None or not planned or len(attached) == len(present):
             return None
+        relative = [estimation.chasers[c.number].relative for c in planned]
         return self.references.horizon(
-            planned, estimation.at_effect, estimation.body, attached, estimation.relative
+            planned, estimation.at_effect, estimation.body, attached, relative
         )
 
 
-def _offset_m(i: int, estimation: TargetEstimation) -> Array | None:
+def _offset_m(estimate: ChaserEstimate, estimation: TargetEstimation) -> Array | None:
     """Return a chaser's estimated centre (3,), TRF; None where it is not known."""
-    own = estimation.own.get(i)
-    return centre_in_target(estimation.target, own) if own and estimation.known else None
+    if estimate.own is None or not estimation.known:
+        return None
+    return centre_in_target(estimation.target, estimate.own.state)

@@ -13,37 +13,34 @@ from chaserdock_protocol.messages import Odometry
 
 
 class CommandHistory:
-    """Wrenches (6,), body axes, sent to each chaser, with the times at which they take effect."""
+    """Wrenches (6,), body axes, sent to a chaser, with the times at which they take effect."""
 
     def __init__(self) -> None:
-        self._sent: dict[int, list[tuple[int, Array]]] = {}
+        self._sent: list[tuple[int, Array]] = []
 
-    def add(self, chaser: int, effective_ns: int, wrench: Array) -> None:
+    def add(self, effective_ns: int, wrench: Array) -> None:
         """Add a command. Times must not decrease."""
-        self._sent.setdefault(chaser, []).append((effective_ns, np.array(wrench)))
+        self._sent.append((effective_ns, np.array(wrench)))
 
-    def segments(self, chaser: int, from_ns: int, to_ns: int) -> list[tuple[int, int, Array]]:
+    def segments(self, from_ns: int, to_ns: int) -> list[tuple[int, int, Array]]:
         """Return what acts between two times as (from, to, wrench); zero before the first command."""
-        sent = self._sent.get(chaser, [])
-        edges = [from_ns, *sorted({t for t, _ in sent if from_ns < t < to_ns}), to_ns]
+        edges = [from_ns, *sorted({t for t, _ in self._sent if from_ns < t < to_ns}), to_ns]
         out = []
         for begin, end in itertools.pairwise(edges):
-            acting = [w for t, w in sent if t <= begin]
+            acting = [w for t, w in self._sent if t <= begin]
             out.append((begin, end, acting[-1] if acting else np.zeros(6)))
         return out
 
-    def ahead(self, chaser: int, from_ns: int, to_ns: int) -> tuple[tuple[float, Array], ...]:
+    def ahead(self, from_ns: int, to_ns: int) -> tuple[tuple[float, Array], ...]:
         """Return what acts between two times as durations (s) and wrenches (6,)."""
         return tuple(
-            ((end - begin) / 1e9, wrench)
-            for begin, end, wrench in self.segments(chaser, from_ns, to_ns)
+            ((end - begin) / 1e9, wrench) for begin, end, wrench in self.segments(from_ns, to_ns)
         )
 
     def forget_before(self, time_ns: int) -> None:
         """Remove commands that do not act after ``time_ns``."""
-        for chaser, sent in self._sent.items():
-            last = max((k for k, (t, _) in enumerate(sent) if t <= time_ns), default=0)
-            self._sent[chaser] = sent[last:]
+        last = max((k for k, (t, _) in enumerate(self._sent) if t <= time_ns), default=0)
+        self._sent = self._sent[last:]
 
 
 def predict_state(

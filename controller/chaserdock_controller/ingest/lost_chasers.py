@@ -8,8 +8,7 @@ a while. After ``FORGOTTEN_S`` the position is unknown, and the chaser is no obs
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from chaserdock_protocol.messages import Level, Odometry
 
@@ -25,37 +24,36 @@ def margin_m(lost_s: float) -> float:
 
 
 @dataclass
-class LostChasers:
-    """The last odometry of every chaser; ``reported``: chasers that were reported as lost."""
+class LossWatch:
+    """Follows whether one chaser is lost: its ``last`` odometry, and whether it was ``reported`` as
+    lost.
+    """
 
-    last: dict[int, Odometry] = field(default_factory=dict)
-    reported: set[int] = field(default_factory=set)
+    chaser: int
+    last: Odometry | None = None
+    reported: bool = False
 
-    def update(self, odometry: Mapping[int, Odometry], now_ns: int) -> list[tuple[Level, str]]:
-        """Add a tick's odometry; return the events of chasers that were lost or came back."""
-        self.last.update(odometry)
-        lost = self.obstacles(now_ns)
-        events: list[tuple[Level, str]] = []
-        for i in sorted(self.reported - lost.keys()):
-            if i in odometry:
-                events.append(("info", f"chaser {i}: odometry received again"))
-            else:
-                text = f"chaser {i}: no odometry for {FORGOTTEN_S:g} s; it is no obstacle any more"
-                events.append(("warning", text))
-        for i in sorted(lost.keys() - self.reported):
-            events.append(
-                ("warning", f"chaser {i}: lost; the others avoid its extrapolated position")
-            )
-        self.reported = set(lost)
-        return events
+    def is_absent(self, now_ns: int) -> bool:
+        """Return whether the last odometry is ``ABSENT_S`` old or older."""
+        return self.last is not None and (now_ns - self.last.sim_time_ns) / 1e9 >= ABSENT_S
 
-    def absent(self, now_ns: int) -> frozenset[int]:
-        """Return the chasers whose last odometry is ``ABSENT_S`` old or older."""
-        return frozenset(
-            i for i, o in self.last.items() if (now_ns - o.sim_time_ns) / 1e9 >= ABSENT_S
-        )
+    def obstacle(self, now_ns: int) -> Odometry | None:
+        """Return the last odometry of a lost chaser that is an obstacle."""
+        if self.last is None or not self.is_absent(now_ns):
+            return None
+        return self.last if (now_ns - self.last.sim_time_ns) / 1e9 <= FORGOTTEN_S else None
 
-    def obstacles(self, now_ns: int) -> dict[int, Odometry]:
-        """Return the last odometry of the lost chasers that are obstacles."""
-        absent = {i: self.last[i] for i in sorted(self.absent(now_ns))}
-        return {i: o for i, o in absent.items() if (now_ns - o.sim_time_ns) / 1e9 <= FORGOTTEN_S}
+    def update(self, odometry: Odometry | None, now_ns: int) -> tuple[Level, str] | None:
+        """Take the odometry of a tick, if there is any; return an event if the chaser was lost, came
+        back or is forgotten.
+        """
+        self.last = odometry or self.last
+        before, self.reported = self.reported, self.obstacle(now_ns) is not None
+        if self.reported == before:
+            return None
+        who = f"chaser {self.chaser}"
+        if self.reported:
+            return "warning", f"{who}: lost; the others avoid its extrapolated position"
+        if odometry is not None:
+            return "info", f"{who}: odometry received again"
+        return "warning", f"{who}: no odometry for {FORGOTTEN_S:g} s; it is no obstacle any more"

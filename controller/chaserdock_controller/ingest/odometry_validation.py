@@ -88,7 +88,7 @@ class Known:
 
 
 class OdometryValidation:
-    """Removes jumps from the odometry of all chasers."""
+    """Removes jumps from the odometry of one chaser."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         body, errors = scenario.chaser, scenario.navigation.errors()
@@ -100,17 +100,17 @@ class OdometryValidation:
         self._velocity_noise_m_s = 6 * errors.velocity_noise_m_s
         self._acceleration_m_s2 = math.sqrt(3.0) * body.force_max_N / body.mass_kg
         self._alpha_rad_s2 = math.sqrt(3.0) * body.torque_max_N_m / min(body.inertia)
-        self._known: dict[int, Known] = {}
+        self.known: Known | None = None
 
     def update(
         self, odometry: Odometry, doubtful: bool = False
     ) -> tuple[Odometry, list[tuple[Level, str]]]:
-        """Return a chaser's next odometry without jumps, and the events to log. ``doubtful``: what
+        """Return the chaser's next odometry without jumps, and the events to log. ``doubtful``: what
         was received before it may be wrong."""
-        i, known = odometry.chaser, self._known.get(odometry.chaser)
+        i, known = odometry.chaser, self.known
         gap_s = 0.0 if known is None else (odometry.sim_time_ns - known.last.sim_time_ns) / 1e9
         if known is None or not 0.0 < gap_s <= LONGEST_S:
-            self._known[i] = Known(odometry)
+            self.known = Known(odometry)
             return odometry, []
         expected = extrapolate(known.last, odometry.tick, odometry.sim_time_ns)
         corrected = odometry if known.correction is None else _remove(odometry, *known.correction)
@@ -118,19 +118,19 @@ class OdometryValidation:
             known.last = corrected
             return corrected, []
         if known.correction is not None and self._is_plausible(odometry, expected, gap_s):
-            self._known[i] = Known(odometry)
+            self.known = Known(odometry)
             return odometry, [("info", f"chaser {i}: odometry jumped back; correction removed")]
         jump_m, jump_rad = _distance(corrected, expected)
         jump = f"jumped by {jump_m * 1e3:.0f} mm, {math.degrees(jump_rad):.1f} deg"
         if doubtful:
-            self._known[i] = Known(odometry)
+            self.known = Known(odometry)
             text = f"chaser {i}: odometry {jump}; accepted, as its sightings contradicted it before"
             return odometry, [("warning", text)]
         offset = np.subtract(odometry.position_m, expected.position_m)
         rotation = rotations.multiply(rotations.conjugate(expected.q_wxyz), odometry.q_wxyz)
-        self._known[i] = Known(_remove(odometry, offset, rotation), (offset, rotation))
+        self.known = Known(_remove(odometry, offset, rotation), (offset, rotation))
         text = f"chaser {i}: odometry {jump}, more than the chaser can have moved; jump removed"
-        return self._known[i].last, [("warning", text)]
+        return self.known.last, [("warning", text)]
 
     def _is_plausible(self, odometry: Odometry, expected: Odometry, gap_s: float) -> bool:
         limit_m = (

@@ -5,8 +5,6 @@ stale. No I/O.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from chaserdock_protocol import topics
 from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import (
@@ -21,23 +19,30 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.topics import Topic
 
-from chaserdock_controller.interfaces import LogEntry, TickInputs
+from chaserdock_controller.interfaces import ChaserInputs, LogEntry, TickInputs
 
 from .odometry_validation import OdometryValidation
 
 _REMEMBERED_TICKS = 256
 
 
+class Mailbox:
+    """The newest messages of one chaser; ``validation`` removes jumps from its odometry."""
+
+    def __init__(self, scenario: FlightScenario) -> None:
+        self.validation = OdometryValidation(scenario)
+        self.odometry: Odometry | None = None
+        self.thrusters: ThrusterReport | None = None
+        self.docking: DockingStatus | None = None
+
+
 class TickInputCollector:
-    """The newest message of every chaser on every topic, the sightings since the tick before, and
-    the lost messages.
+    """The newest messages of the ``chasers``, the sightings since the tick before, and the lost
+    messages. Messages of chasers that the mission does not have are refused.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
-        self.odometry_validation = OdometryValidation(scenario)
-        self._odometry: dict[int, Odometry] = {}
-        self._thrusters: dict[int, ThrusterReport] = {}
-        self._docking: dict[int, DockingStatus] = {}
+        self.chasers = tuple(Mailbox(scenario) for _ in scenario.chasers)
         self._sightings: list[Sighting] = []
         self._received_sightings: set[tuple[int, int]] = set()
         self._usable_sightings: dict[tuple[int, int], bool] = {}
@@ -52,30 +57,36 @@ class TickInputCollector:
     def add_odometry(self, odometry: Odometry, doubtful: bool = False) -> list[LogEntry] | None:
         """Add an odometry and return the events to log; None if one of that chaser as new is known.
         ``doubtful``: what was received before it may be wrong."""
-        if _is_overtaken(odometry, self._odometry.get(odometry.chaser)):
+        own = self._mailbox(odometry.chaser)
+        if own is None or _is_overtaken(odometry, own.odometry):
             return None
-        self._odometry[odometry.chaser], events = self.odometry_validation.update(
-            odometry, doubtful
-        )
+        own.odometry, events = own.validation.update(odometry, doubtful)
         return events
 
     def add_docking(self, docking: DockingStatus) -> bool:
         """Add a docking status; return False if one of that chaser as new is known."""
-        if _is_overtaken(docking, self._docking.get(docking.chaser)):
+        own = self._mailbox(docking.chaser)
+        if own is None or _is_overtaken(docking, own.docking):
             return False
-        self._docking[docking.chaser] = docking
+        own.docking = docking
         return True
 
     def add_thruster_report(self, report: ThrusterReport) -> bool:
         """Add a thruster report; return False if one of that chaser as new is known."""
-        if _is_overtaken(report, self._thrusters.get(report.chaser)):
+        own = self._mailbox(report.chaser)
+        if own is None or _is_overtaken(report, own.thrusters):
             return False
-        self._thrusters[report.chaser] = report
+        own.thrusters = report
         return True
+
+    def _mailbox(self, chaser: int) -> Mailbox | None:
+        return self.chasers[chaser] if chaser < len(self.chasers) else None
 
     def add_sighting(self, sighting: Sighting) -> bool:
         """Add a sighting; return False for a duplicate, which must not count as evidence twice."""
         key = (sighting.tick, sighting.chaser)
+        if self._mailbox(sighting.chaser) is None:
+            return False
         if sighting.solutions and self._usable_sightings.get(key):
             return False
         self._received_sightings.add(key)
@@ -96,14 +107,12 @@ class TickInputCollector:
         return tuple(topic.key_of(i) for i in tick.chasers for topic in self._missing(tick, i))
 
     def _missing(self, tick: Tick, i: int) -> list[Topic]:
-        missing = []
-        if not self._has_arrived(topics.ODOMETRY, self._odometry, i, tick):
+        own, missing = self.chasers[i], []
+        if not self._has_arrived(topics.ODOMETRY, own.odometry, i, tick):
             missing.append(topics.ODOMETRY)
-        if self._has_thrusters and not self._has_arrived(
-            topics.THRUSTERS, self._thrusters, i, tick
-        ):
+        if self._has_thrusters and not self._has_arrived(topics.THRUSTERS, own.thrusters, i, tick):
             missing.append(topics.THRUSTERS)
-        if self._has_port[i] and not self._has_arrived(topics.DOCKING, self._docking, i, tick):
+        if self._has_port[i] and not self._has_arrived(topics.DOCKING, own.docking, i, tick):
             missing.append(topics.DOCKING)
         sighting = (tick.tick, i) in self._received_sightings or self._is_lost(
             topics.SIGHTING, i, tick
@@ -112,35 +121,21 @@ class TickInputCollector:
             missing.append(topics.SIGHTING)
         return missing
 
-    def _has_arrived(
-        self,
-        topic: Topic,
-        newest: Mapping[int, Odometry | ThrusterReport | DockingStatus],
-        i: int,
-        tick: Tick,
-    ) -> bool:
-        return (i in newest and newest[i].tick == tick.tick) or self._is_lost(topic, i, tick)
+    def _has_arrived(self, topic: Topic, newest: Message | None, i: int, tick: Tick) -> bool:
+        return (newest is not None and newest.tick == tick.tick) or self._is_lost(topic, i, tick)
 
     def _is_lost(self, topic: Topic, i: int, tick: Tick) -> bool:
         return (topic.key, i, tick.tick) in self._lost
 
     def take(self, tick: Tick, commands: tuple[OperatorCommand, ...]) -> TickInputs:
         """Return the inputs of a tick and remove what only that tick uses."""
-        odometry = self._odometry_at(tick)
         inputs = TickInputs(
             tick.tick,
             tick.sim_time_ns,
-            odometry,
+            tuple(self._inputs_of(i, own, tick) for i, own in enumerate(self.chasers)),
             # Equal inputs in any order of arrival give equal results.
             tuple(sorted(self._sightings, key=lambda s: (s.tick, s.chaser))),
             commands,
-            dict(self._thrusters),
-            {i: d for i, d in self._docking.items() if d.tick == tick.tick and i in tick.chasers},
-            {
-                i: o
-                for i, o in sorted(self._odometry.items())
-                if o.tick < tick.tick and i in tick.chasers
-            },
         )
         self._sightings.clear()
         self._received_sightings = {key for key in self._received_sightings if key[0] > tick.tick}
@@ -152,18 +147,26 @@ class TickInputCollector:
         self._lost = {lost for lost in self._lost if lost[2] > tick.tick}
         return inputs
 
-    def _odometry_at(self, tick: Tick) -> dict[int, Odometry]:
+    def _inputs_of(self, i: int, own: Mailbox, tick: Tick) -> ChaserInputs:
+        if i not in tick.chasers:
+            return ChaserInputs(i, thrusters=own.thrusters)
+        docking, newest = own.docking, own.odometry
+        return ChaserInputs(
+            i,
+            odometry=self._odometry_at(i, newest, tick),
+            outdated=newest if newest is not None and newest.tick < tick.tick else None,
+            thrusters=own.thrusters,
+            docking=docking if docking is not None and docking.tick == tick.tick else None,
+        )
+
+    def _odometry_at(self, i: int, newest: Odometry | None, tick: Tick) -> Odometry | None:
         """Return the odometry of a tick; a lost one is extrapolated for the lifetime of a command."""
-        odometry = {
-            i: o for i, o in self._odometry.items() if o.tick == tick.tick and i in tick.chasers
-        }
-        for i in tick.chasers:
-            last = self._odometry.get(i)
-            if i in odometry or last is None or not self._is_lost(topics.ODOMETRY, i, tick):
-                continue
-            if tick.sim_time_ns - last.sim_time_ns <= self._extrapolation_ns:
-                odometry[i] = extrapolate(last, tick.tick, tick.sim_time_ns)
-        return dict(sorted(odometry.items()))
+        if newest is None or newest.tick == tick.tick:
+            return newest
+        if not self._is_lost(topics.ODOMETRY, i, tick):
+            return None
+        recent = tick.sim_time_ns - newest.sim_time_ns <= self._extrapolation_ns
+        return extrapolate(newest, tick.tick, tick.sim_time_ns) if recent else None
 
 
 def _is_overtaken(message: Message, known: Message | None) -> bool:

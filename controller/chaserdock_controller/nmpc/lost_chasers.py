@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -25,7 +25,7 @@ def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
 
 
 def with_lost_chasers(
-    problem: NmpcInput, params: NmpcParameters, lost: Mapping[int, Odometry], from_ns: int
+    problem: NmpcInput, params: NmpcParameters, lost: Sequence[Odometry], from_ns: int
 ) -> NmpcInput:
     """Return the problem with a row for each lost chaser after the others: it coasts, and only the
     others avoid it.
@@ -37,10 +37,10 @@ def with_lost_chasers(
     nodes = params.stages + 1
     times_s = params.dt_s * np.arange(nodes, dtype=np.float64)
     states, references = [], []
-    for last in lost.values():
+    for last in lost:
         places, q = coasting(last, from_ns, times_s), np.asarray(last.q_wxyz)
         states.append(np.concatenate([places[0], last.velocity_m_s, q, np.zeros(3)]))
         references.append(np.concatenate([places, np.tile(q, (nodes, 1))], axis=1))
-    lost_s = [(from_ns - last.sim_time_ns) / 1e9 + float(times_s[-1]) for last in lost.values()]
+    lost_s = [(from_ns - last.sim_time_ns) / 1e9 + float(times_s[-1]) for last in lost]
     margins_m = [margin_m(s) for s in lost_s]
     return with_obstacles(problem, params, np.array(states), np.array(references), margins_m)

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -38,9 +39,41 @@ def coast_duration_s(scenario: FlightScenario) -> float:
     return scenario.limits.passive_safety_s or default_s
 
 
+@dataclass
+class ChaserSafety:
+    """Passive safety of the plans of one chaser.
+
+    ``certificate``: of its newest plan. ``reported``: whether the log says that its plans are safe.
+    ``since``: whether they are, and since when; ``first_ns``: of its first plan. ``armed``: it
+    counts, see ``PassiveSafetyMonitor.unsafe``.
+    """
+
+    certificate: PlanCertificate | None = None
+    reported: bool | None = None
+    first_ns: int | None = None
+    since: tuple[bool, int] | None = None
+    armed: bool = False
+
+    def forget(self) -> None:
+        """Start again, but for whether the chaser counts."""
+        self.certificate = self.reported = self.first_ns = self.since = None
+
+    def lasts(self, time_ns: int, duration_s: float = PERSISTENT_S) -> bool:
+        """Return whether the plans have been safe, or not, for a time."""
+        return self.since is not None and time_ns - self.since[1] >= duration_s * 1e9
+
+    def follow(self, safe: bool, time_ns: int) -> None:
+        """Take whether the plan of a tick is safe."""
+        self.first_ns = time_ns if self.first_ns is None else self.first_ns
+        if self.since is None or self.since[0] != safe:
+            self.since = safe, time_ns
+        converged = safe and self.lasts(time_ns, CONVERGED_S)
+        self.armed |= converged or time_ns - self.first_ns >= ARMED_AFTER_S * 1e9
+
+
 class PassiveSafetyMonitor:
-    """Certifies the plans of a tick. ``certificates``: of each chaser's newest plan. See
-    ``guidance.escape`` for what follows.
+    """Certifies the plans of a tick. ``chasers``: what it knows of each. See ``guidance.escape`` for
+    what follows.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -50,11 +83,7 @@ class PassiveSafetyMonitor:
         self._coast = CoastModel(mean_motion, self.duration_s)
         self._keep_out_m, self._step_s = limits.min_distance_target_m, scenario.controller.dt_s
         self._sigmas = limits.estimate_margin_sigmas
-        self._safe: dict[int, bool] = {}
-        self._armed: set[int] = set()
-        self._first_ns: dict[int, int] = {}
-        self._since: dict[int, tuple[bool, int]] = {}
-        self.certificates: dict[int, PlanCertificate] = {}
+        self.chasers = tuple(ChaserSafety() for _ in scenario.chasers)
 
     def update(
         self,
@@ -76,10 +105,10 @@ class PassiveSafetyMonitor:
         times = np.arange(states.shape[1])[:, None] * self._step_s
         moving = target.position_m + times * target.velocity_m_s
         for row, i in enumerate(chasers):
-            covariance = estimation.motion_covariances.get(i)
-            if covariance is None or i in estimation.latched:
-                for by_chaser in (self._safe, self.certificates, self._first_ns, self._since):
-                    by_chaser.pop(i, None)
+            estimate, safety = estimation.chasers[i], self.chasers[i]
+            covariance = estimate.motion_covariance
+            if covariance is None or estimate.latched:
+                safety.forget()
                 continue
             own = states[row]
             relative = np.concatenate(
@@ -87,55 +116,42 @@ class PassiveSafetyMonitor:
             )
             found = known.get(row) or self._coast.certify(relative, covariance, self._keep_out_m)
             safe = found.margin_sigmas >= self._sigmas
-            self.certificates[i] = PlanCertificate(found, found.loss * self._step_s, safe)
-            self._follow(i, safe, time_ns)
-            if self._safe.get(i) != safe and (i not in self._safe or self._persists(i, time_ns)):
-                self._safe[i] = safe
+            safety.certificate = PlanCertificate(found, found.loss * self._step_s, safe)
+            safety.follow(safe, time_ns)
+            if safety.reported != safe and (safety.reported is None or safety.lasts(time_ns)):
+                safety.reported = safe
                 events.append(("info" if safe else "warning", self._text(i, found, safe)))
         return tuple(events)
 
     def restriction(
-        self, chasers: Sequence[int], enforced: Collection[int], estimation: TargetEstimation
+        self, chasers: Sequence[int], enforced: Set[int], estimation: TargetEstimation
     ) -> CoastSafety | None:
         """Return the passive safety that the plans of ``chasers``, the rows of a problem, have to
         keep; None for none.
 
         It applies to those of ``enforced`` that count (see ``unsafe``).
         """
-        target, known = estimation.at_effect, estimation.motion_covariances
-        kept = {
-            row: known[i]
-            for row, i in enumerate(chasers)
-            if i in enforced and i in self._armed and i in known
-        }
+        target, kept = estimation.at_effect, {}
+        for row, i in enumerate(chasers):
+            covariance = estimation.chasers[i].motion_covariance
+            if i in enforced and self.chasers[i].armed and covariance is not None:
+                kept[row] = covariance
         if target is None or not kept:
             return None
         return CoastSafety(self._coast, self._keep_out_m, self._sigmas, target.velocity_m_s, kept)
 
-    def unsafe(self, time_ns: int) -> dict[int, str]:
-        """Return why chasers have to abort at ``time_ns``: their plans are not safe for
-        `PERSISTENT_S`.
+    def unsafe(self, chaser: int, time_ns: int) -> str:
+        """Return why a chaser has to abort at ``time_ns``, or an empty string: its plans are not safe
+        for `PERSISTENT_S`.
 
         A chaser counts once its plans were safe for `CONVERGED_S`, or `ARMED_AFTER_S` after its
         first plan: until the filter has converged, plans are safe at times only.
         """
-        return {
-            i: self._text(i, self.certificates[i].coast, False)
-            for i, (safe, _) in self._since.items()
-            if i in self._armed and not safe and self._persists(i, time_ns)
-        }
-
-    def _persists(self, i: int, time_ns: int, duration_s: float = PERSISTENT_S) -> bool:
-        return time_ns - self._since[i][1] >= duration_s * 1e9
-
-    def _follow(self, i: int, safe: bool, time_ns: int) -> None:
-        first_ns = self._first_ns.setdefault(i, time_ns)
-        if self._since.get(i, (not safe, 0))[0] != safe:
-            self._since[i] = safe, time_ns
-        if (
-            safe and self._persists(i, time_ns, CONVERGED_S)
-        ) or time_ns - first_ns >= ARMED_AFTER_S * 1e9:
-            self._armed.add(i)
+        safety = self.chasers[chaser]
+        if safety.certificate is None or safety.since is None or safety.since[0]:
+            return ""
+        counts = safety.armed and safety.lasts(time_ns)
+        return self._text(chaser, safety.certificate.coast, False) if counts else ""
 
     def _text(self, chaser: int, found: CoastCertificate, safe: bool) -> str:
         state = "passively safe" if safe else "not passively safe"

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last usable plan of every chaser, and for how long planning has failed."""
+"""The last usable plan of a chaser, and for how long planning has failed for it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from chaserdock_controller.interfaces import ChaserPlan, PlanningFailure
 
-from chaserdock_models.arrays import Array
-
-from .types import BUDGET, FAILED, INFEASIBLE_RELAXED, NmpcPlan
+from .types import BUDGET, FAILED, INFEASIBLE_RELAXED
 
 FAILED_S = 1.0
 """Time (s) without a usable plan after which a chaser retreats. Until then it flies its last plan,
@@ -20,109 +17,65 @@ chaser retreats. Such plans lead out of a keep-out zone at a few cm/s, which tak
 clock runs back while plans are sound."""
 
 
-@dataclass(frozen=True)
-class ChaserPlan:
-    """Plan of one chaser from ``time_ns`` on: states (D+1, 13) and inputs (D, 6), as in
-    ``NmpcPlan``.
-    """
-
-    time_ns: int
-    states: Array
-    inputs: Array
-
-    def input_at(self, time_ns: int, step_s: float) -> Array | None:
-        """Return the input (6,) at a time, None after the plan's end."""
-        stage = int((time_ns - self.time_ns) / 1e9 / step_s + 1e-9)
-        return self.inputs[stage] if 0 <= stage < len(self.inputs) else None
-
-
-@dataclass(frozen=True)
-class PlanningFailure:
-    """``without_plan``: no usable plan for `FAILED_S`; otherwise degraded plans for `DEGRADED_S`,
-    until sound ones for as long.
-    """
-
-    without_plan: bool
-
-    @property
-    def refused(self) -> tuple[str, ...]:
-        """Return the operator commands that are refused meanwhile; an operator may lead a chaser
-        out by degraded plans.
-        """
-        always = ("approach", "inspect")
-        return (*always, "goto", "calibrate") if self.without_plan else always
-
-    def text(self) -> str:
-        """Return the reason for a retreat."""
-        if self.without_plan:
-            return f"no usable plan for {FAILED_S:g} s"
-        return f"plans infeasible or over budget for {DEGRADED_S:g} s"
-
-
 class PlanMonitor:
-    """Follows the results of the solver; chasers that are not planned for are forgotten."""
+    """Follows the results of the solver for one chaser."""
 
     def __init__(self) -> None:
-        self._last: dict[int, ChaserPlan] = {}
-        self._failed_since_ns: dict[int, int] = {}
-        self._degraded_since_ns: dict[int, int] = {}
-        self._degraded: set[int] = set()
+        self._last: ChaserPlan | None = None
+        self._failed_since_ns: int | None = None
+        self._degraded_since_ns: int | None = None
+        self._degraded = False
         self._time_ns = 0
 
-    def update(
-        self, chasers: tuple[int, ...], plan: NmpcPlan | None, time_ns: int, effective_ns: int
-    ) -> None:
-        """Record the result of the tick at ``time_ns`` for ``chasers``; ``effective_ns``: when its
-        plan begins.
-        """
-        for by_chaser in (self._last, self._failed_since_ns, self._degraded_since_ns):
-            for i in by_chaser.keys() - set(chasers):
-                del by_chaser[i]
-        self._degraded &= set(chasers)
-        for row, i in enumerate(chasers):
-            status = FAILED if plan is None else plan.status[row]
-            if plan is not None and status != FAILED:
-                self._last[i] = ChaserPlan(effective_ns, plan.states[row], plan.inputs[row])
-            if status == FAILED:
-                self._failed_since_ns.setdefault(i, time_ns)
-            else:
-                self._failed_since_ns.pop(i, None)
-            self._follow_degraded(i, time_ns, status in (FAILED, BUDGET, INFEASIBLE_RELAXED))
+    def forget(self) -> None:
+        """Start again: the chaser is not planned for."""
+        self._last = self._failed_since_ns = self._degraded_since_ns = None
+        self._degraded = False
+
+    def update(self, status: str, plan: ChaserPlan | None, time_ns: int) -> None:
+        """Record the result of the tick at ``time_ns``; ``plan``: None where the solver failed."""
+        if plan is None:
+            first_ns = self._failed_since_ns
+            self._failed_since_ns = time_ns if first_ns is None else first_ns
+        else:
+            self._last, self._failed_since_ns = plan, None
+        self._follow_degraded(time_ns, status in (FAILED, BUDGET, INFEASIBLE_RELAXED))
         self._time_ns = time_ns
 
-    def plans(self, time_ns: int) -> Mapping[int, ChaserPlan]:
-        """Return what chasers may fly at ``time_ns``: the newest plans, or older ones within
+    def flyable(self, time_ns: int) -> ChaserPlan | None:
+        """Return what the chaser may fly at ``time_ns``: the newest plan, or an older one within
         `FAILED_S`.
         """
-        out = {}
-        for i, plan in self._last.items():
-            failed_ns = time_ns - self._failed_since_ns.get(i, time_ns)
-            if failed_ns < FAILED_S * 1e9:
-                out[i] = plan
-        return out
+        return None if self._has_failed(time_ns) else self._last
 
-    def failures(self, time_ns: int) -> Mapping[int, PlanningFailure]:
-        """Return the chasers that have to retreat at ``time_ns``."""
-        out = {}
-        for i, since_ns in self._degraded_since_ns.items():
-            failed_ns = time_ns - self._failed_since_ns.get(i, time_ns)
-            if failed_ns >= FAILED_S * 1e9:
-                out[i] = PlanningFailure(without_plan=True)
-            elif i in self._degraded or time_ns - since_ns >= DEGRADED_S * 1e9:
-                out[i] = PlanningFailure(without_plan=False)
-        return out
+    def failure(self, time_ns: int) -> PlanningFailure | None:
+        """Return why the chaser has to retreat at ``time_ns``: no usable plan for `FAILED_S`, or
+        degraded ones for `DEGRADED_S`, until sound ones for as long.
+        """
+        since_ns = self._degraded_since_ns
+        if since_ns is None:
+            return None
+        if self._has_failed(time_ns):
+            return PlanningFailure(True, f"no usable plan for {FAILED_S:g} s")
+        if self._degraded or time_ns - since_ns >= DEGRADED_S * 1e9:
+            return PlanningFailure(False, f"plans infeasible or over budget for {DEGRADED_S:g} s")
+        return None
 
-    def _follow_degraded(self, i: int, time_ns: int, degraded: bool) -> None:
+    def _has_failed(self, time_ns: int) -> bool:
+        since_ns = self._failed_since_ns
+        return since_ns is not None and time_ns - since_ns >= FAILED_S * 1e9
+
+    def _follow_degraded(self, time_ns: int, degraded: bool) -> None:
         """Let the clock of degraded plans run, or back to zero, where a failure ends; it shows
         `DEGRADED_S` at most.
         """
-        since_ns, limit_ns = self._degraded_since_ns.get(i, time_ns), round(DEGRADED_S * 1e9)
+        begun_ns, limit_ns = self._degraded_since_ns, round(DEGRADED_S * 1e9)
+        since_ns = time_ns if begun_ns is None else begun_ns
         if time_ns - since_ns >= limit_ns:
-            self._degraded.add(i)
+            self._degraded = True
         if not degraded:
             since_ns += 2 * (time_ns - self._time_ns)
         if degraded or since_ns < time_ns:
-            self._degraded_since_ns[i] = max(since_ns, time_ns - limit_ns)
+            self._degraded_since_ns = max(since_ns, time_ns - limit_ns)
         else:
-            self._degraded_since_ns.pop(i, None)
-            self._degraded.discard(i)
+            self._degraded_since_ns, self._degraded = None, False

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -14,13 +14,18 @@ from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import (
+    ChaserEstimate,
+    ChaserPlan,
+    ChaserPlanning,
     GuidanceResult,
     HorizonReference,
     LogEntry,
     Observation,
-    PlanCertificate,
+    OwnMotion,
+    PlanningFailure,
     PlanningHistory,
     PlanResult,
+    SolveStatus,
     TargetEstimation,
 )
 
@@ -28,9 +33,9 @@ from . import make_solver
 from .budget import Bounded, SolveBudget
 from .lost_chasers import with_lost_chasers
 from .passive_safety import PassiveSafetyMonitor
-from .plan_monitor import PlanMonitor, PlanningFailure
+from .plan_monitor import PlanMonitor
 from .problem import NmpcParameters
-from .types import NmpcInput, NmpcPlan
+from .types import FAILED, NmpcInput, NmpcPlan
 from .warm_start import check_plan
 
 _ATTACHED_FACTOR = 1.2
@@ -46,18 +51,20 @@ _CANCELLED_SHARE = 0.5
 class PlanHistory(PlanningHistory):
     """Failures and passive safety of the plans so far, for the guidance of the next tick."""
 
-    def __init__(self, monitor: PlanMonitor, passive_safety: PassiveSafetyMonitor | None) -> None:
-        self._monitor, self._passive_safety = monitor, passive_safety
+    def __init__(
+        self, monitors: Sequence[PlanMonitor], passive_safety: PassiveSafetyMonitor | None
+    ) -> None:
+        self._monitors, self._passive_safety = monitors, passive_safety
 
-    def failures(self, time_ns: int) -> Mapping[int, PlanningFailure]:
-        """Return the chasers that have to retreat at ``time_ns`` because planning has failed."""
-        return self._monitor.failures(time_ns)
+    def failure(self, chaser: int, time_ns: int) -> PlanningFailure | None:
+        """Return why a chaser has to retreat at ``time_ns`` because planning has failed."""
+        return self._monitors[chaser].failure(time_ns)
 
-    def unsafe(self, time_ns: int) -> Mapping[int, str]:
-        """Return why chasers lack passive safety at ``time_ns``; whether they abort is guidance's
-        matter.
+    def unsafe(self, chaser: int, time_ns: int) -> str:
+        """Return why the plans of a chaser are not passively safe at ``time_ns``, or an empty string;
+        whether it aborts is guidance's matter.
         """
-        return {} if self._passive_safety is None else self._passive_safety.unsafe(time_ns)
+        return "" if self._passive_safety is None else self._passive_safety.unsafe(chaser, time_ns)
 
 
 class PlanningStage:
@@ -80,11 +87,11 @@ class PlanningStage:
         if scenario.limits.min_distance_shape_m > 0.0:
             self._shape = box_table(scenario.chaser.boxes())
         self.solver = make_solver(c.solver, parameters, len(scenario.chasers), c.max_iterations)
-        self.monitor = PlanMonitor()
+        self.monitors = tuple(PlanMonitor() for _ in scenario.chasers)
         self._passive_safety = None
         if scenario.limits.passive_safety != "off":
             self._passive_safety = PassiveSafetyMonitor(scenario)
-        self.history = PlanHistory(self.monitor, self._passive_safety)
+        self.history = PlanHistory(self.monitors, self._passive_safety)
         self._last_solve_ns: int | None = None
         self._budget: SolveBudget | None = None
         if realtime and c.solve_budget_s is not None:
@@ -105,19 +112,23 @@ class PlanningStage:
         """
         horizon = guidance.horizon
         if horizon is None:
-            self.monitor.update((), None, observation.time_ns, observation.effective_ns)
-            return PlanResult((), None, 0.0, (), {}, self._certificates())
-        limits = {i: observation.input_limits[i] for i in horizon.chasers}
-        disturbances = {i: _bounded(estimation.disturbances[i], limits[i]) for i in horizon.chasers}
-        left = {i: limits[i] - np.abs(disturbances[i]) for i in horizon.chasers}
-        problem = self.problem(horizon, estimation.own_at_effect, left)
-        problem = with_lost_chasers(
-            problem, self._parameters, observation.lost, observation.effective_ns
+            for monitor in self.monitors:
+                monitor.forget()
+            return self._result(observation.time_ns, None, (), 0.0, ())
+        own = [_own(estimation.chasers[i]) for i in horizon.chasers]
+        limits = np.array([observation.chasers[i].input_limits for i in horizon.chasers])
+        disturbances = np.array(
+            [_bounded(m.disturbance, row) for m, row in zip(own, limits, strict=True)]
         )
-        if self._passive_safety is not None and guidance.abort_margins:
-            safety = self._passive_safety.restriction(
-                horizon.chasers, guidance.abort_margins, estimation
-            )
+        states = np.array([m.at_effect for m in own])
+        problem = self.problem(horizon, states, limits - np.abs(disturbances))
+        lost = {c.chaser: c.lost for c in observation.chasers if c.lost is not None}
+        problem = with_lost_chasers(
+            problem, self._parameters, tuple(lost.values()), observation.effective_ns
+        )
+        enforced = {d.chaser for d in guidance.directives if d.abort_margin is not None}
+        if self._passive_safety is not None and enforced:
+            safety = self._passive_safety.restriction(horizon.chasers, enforced, estimation)
             problem = replace(problem, coast_safety=safety)
         since_ns = 0 if self._last_solve_ns is None else observation.time_ns - self._last_solve_ns
         if self._budget is not None:
@@ -126,7 +137,7 @@ class PlanningStage:
         events: tuple[LogEntry, ...] = ()
         start_s = self._now_s()
         try:
-            plan = self.solver.solve(problem, since_ns / 1e9, (*horizon.chasers, *observation.lost))
+            plan = self.solver.solve(problem, since_ns / 1e9, (*horizon.chasers, *lost))
             check_plan(plan, len(problem.states), self._parameters.stages)
             self._last_solve_ns = observation.time_ns
         except Exception as error:  # an installed solver may raise anything
@@ -136,26 +147,58 @@ class PlanningStage:
         if self._budget is not None and plan is not None:
             self._budget.note(wall_s, int(plan.iterations.sum()))
         if plan is not None:
-            plan = _without(plan, [disturbances[i] for i in horizon.chasers])
-        self.monitor.update(horizon.chasers, plan, observation.time_ns, observation.effective_ns)
+            plan = _without(plan, disturbances)
+        self._follow(horizon.chasers, plan, observation)
         if self._passive_safety is not None and plan is not None:
             events += self._passive_safety.update(
                 horizon.chasers, plan.states, estimation, observation.time_ns, plan.coasts
             )
-        flyable = self.monitor.plans(observation.time_ns)
-        return PlanResult(horizon.chasers, plan, wall_s, events, flyable, self._certificates())
+        return self._result(observation.time_ns, plan, horizon.chasers, wall_s, events)
 
-    def _certificates(self) -> dict[int, PlanCertificate]:
-        return {} if self._passive_safety is None else dict(self._passive_safety.certificates)
+    def _follow(
+        self, chasers: Sequence[int], plan: NmpcPlan | None, observation: Observation
+    ) -> None:
+        """Let the monitors of the ``chasers`` take their rows of a plan; those of the others forget
+        what was.
+        """
+        rows = {i: row for row, i in enumerate(chasers)}
+        for i, monitor in enumerate(self.monitors):
+            if i not in rows:
+                monitor.forget()
+                continue
+            row, status, own = rows[i], FAILED, None
+            if plan is not None and plan.status[row] != FAILED:
+                status = plan.status[row]
+                own = ChaserPlan(observation.effective_ns, plan.states[row], plan.inputs[row])
+            monitor.update(status, own, observation.time_ns)
 
-    def problem(
+    def _result(
         self,
-        horizon: HorizonReference,
-        states: Mapping[int, Array],
-        input_limits: Mapping[int, Array],
-    ) -> NmpcInput:
-        """Return the problem at the time when the commands take effect, without lost chasers."""
-        limits = np.array([input_limits[i] for i in horizon.chasers])
+        time_ns: int,
+        plan: NmpcPlan | None,
+        chasers: Sequence[int],
+        wall_s: float,
+        events: tuple[LogEntry, ...],
+    ) -> PlanResult:
+        """Return what is planned for each chaser; ``chasers``: the first rows of the ``plan``."""
+        solves = {} if plan is None else {i: _solve(plan, row) for row, i in enumerate(chasers)}
+        safety = self._passive_safety
+        planned = tuple(
+            ChaserPlanning(
+                i,
+                solves.get(i),
+                monitor.flyable(time_ns),
+                None if safety is None else safety.chasers[i].certificate,
+            )
+            for i, monitor in enumerate(self.monitors)
+        )
+        return PlanResult(planned, wall_s, events)
+
+    def problem(self, horizon: HorizonReference, states: Array, input_limits: Array) -> NmpcInput:
+        """Return the problem at the time when the commands take effect, without lost chasers:
+        ``states`` (N, 13) and ``input_limits`` (N, 6) of the chasers in the horizon.
+        """
+        limits = input_limits.copy()
         for row, i in enumerate(horizon.chasers):
             if i in horizon.attached:  # it cannot yield: its inputs only follow the target's motion
                 following = np.abs(horizon.u_ref[row]).max(axis=0)
@@ -163,7 +206,7 @@ class PlanningStage:
                     limits[row], _ATTACHED_FACTOR * following + _ATTACHED_MARGIN
                 )
         return NmpcInput(
-            states=np.array([states[i] for i in horizon.chasers]),
+            states=states,
             references=horizon.references,
             u_ref=horizon.u_ref,
             target_positions=horizon.target_positions,
@@ -194,10 +237,24 @@ def _bounded(disturbance: Array, limits: Array) -> Array:
     return limited(disturbance, _CANCELLED_SHARE * limits)
 
 
-def _without(plan: NmpcPlan, disturbances: list[Array]) -> NmpcPlan:
-    """Return the plan with the inputs that the actuators are to give, in its first rows."""
-    if not np.any(disturbances):
+def _own(estimate: ChaserEstimate) -> OwnMotion:
+    """Return the motion of a chaser that is planned for."""
+    assert estimate.own is not None
+    return estimate.own
+
+
+def _solve(plan: NmpcPlan, row: int) -> SolveStatus:
+    """Return how the solver ended in a row of its plan."""
+    cost, violation_m = float(plan.cost[row]), float(plan.max_violation_m[row])
+    return SolveStatus(plan.status[row], int(plan.iterations[row]), cost, violation_m)
+
+
+def _without(plan: NmpcPlan, disturbances: Array) -> NmpcPlan:
+    """Return the plan with the inputs that the actuators are to give, in its first rows, less the
+    ``disturbances`` (N, 6) that are cancelled.
+    """
+    if not disturbances.any():
         return plan
     inputs = plan.inputs.copy()
-    inputs[: len(disturbances)] -= np.array(disturbances)[:, None, :]
+    inputs[: len(disturbances)] -= disturbances[:, None, :]
     return replace(plan, inputs=inputs)

@@ -14,6 +14,7 @@ from chaserdock_protocol.messages import (
     GeometryEstimate,
     Level,
     MassEstimate,
+    Odometry,
     PassiveSafety,
     Plan,
     Reference,
@@ -24,18 +25,19 @@ from chaserdock_protocol.messages import (
 )
 from numpy.typing import ArrayLike
 
-from chaserdock_controller.estimation.mass_properties import MassProperties
+from chaserdock_controller.bodies.mass_properties import MassProperties
 from chaserdock_controller.interfaces import (
+    ChaserPlan,
     Directive,
     EstimatedShape,
-    GuidanceResult,
     IdentifiedStack,
     Observation,
     PlanCertificate,
     PlanResult,
+    ReferencePose,
     TargetEstimation,
+    TargetState,
 )
-from chaserdock_controller.nmpc.plan_monitor import ChaserPlan
 
 
 def plan_message(chaser: int, tick: int, step_s: float, plan: ChaserPlan) -> Plan:
@@ -63,20 +65,22 @@ def target_message(observation: Observation, estimation: TargetEstimation) -> Ta
         q_wxyz=vector(target.q_wxyz),
         omega_rad_s=vector(target.omega_rad_s),
         covariance=vector(target.covariance),
-        accepted=tuple(sorted(estimation.visible_to - set(target.rejected))),
+        accepted=tuple(
+            c.chaser for c in estimation.chasers if c.visible and c.chaser not in target.rejected
+        ),
         rejected=tuple(sorted(target.rejected)),
-        cameras=estimation.cameras,
+        cameras=tuple(c.camera for c in estimation.chasers if c.camera is not None),
         relative=tuple(
             RelativeEstimate(
-                chaser=r.chaser,
-                position_m=vector(r.position_m),
-                q_wxyz=vector(r.q_wxyz),
-                covariance=vector(r.covariance),
-                force_N=vector(estimation.disturbances[r.chaser][:3]),
-                torque_N_m=vector(estimation.disturbances[r.chaser][3:]),
+                chaser=c.chaser,
+                position_m=vector(c.relative.position_m),
+                q_wxyz=vector(c.relative.q_wxyz),
+                covariance=vector(c.relative.covariance),
+                force_N=vector(c.own.disturbance[:3]),
+                torque_N_m=vector(c.own.disturbance[3:]),
             )
-            for r in estimation.relative
-            if r.chaser in estimation.disturbances
+            for c in estimation.chasers
+            if c.own is not None and c.relative is not None
         ),
     )
 
@@ -95,12 +99,11 @@ def geometry_estimate(shape: EstimatedShape) -> GeometryEstimate:
 
 
 def expected_pose(
-    chaser: int, estimation: TargetEstimation, camera: Camera, time_ns: int, ahead_s: float
+    target: TargetState, own: Odometry, camera: Camera, time_ns: int, ahead_s: float
 ) -> ExpectedPose:
     """Return where the target will be in the camera of a chaser, ``ahead_s`` after the estimates of
     ``time_ns``.
     """
-    target, own = estimation.target, estimation.own[chaser]
     p_own, q_own = _moved(own.position_m, own.velocity_m_s, own.q_wxyz, own.omega_rad_s, ahead_s)
     p, q = _moved(
         target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s, ahead_s
@@ -132,11 +135,11 @@ def stack_message(observation: Observation, stack: IdentifiedStack) -> StackEsti
     return StackEstimate(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,
-        chasers=tuple(stack.chasers),
+        chasers=tuple(c.chaser for c in stack.chasers),
         stack=_mass_estimate(stack.stack),
         target=_mass_estimate(stack.target),
-        thrust_factors=tuple(f for i in stack.chasers for f in vector(stack.thrust_factors[i])),
-        failed=tuple(stack.failed.get(i, ()) for i in stack.chasers),
+        thrust_factors=tuple(f for c in stack.chasers for f in vector(c.thrust_factors)),
+        failed=tuple(stack.failed_of(c.chaser) for c in stack.chasers),
     )
 
 
@@ -150,15 +153,15 @@ def _mass_estimate(properties: MassProperties) -> MassEstimate:
     )
 
 
-def reference_message(chaser: int, observation: Observation, directive: Directive) -> Reference:
-    """Return the reference of one chaser, which must have one."""
-    reference = directive.reference
-    assert reference is not None
+def reference_message(
+    observation: Observation, directive: Directive, reference: ReferencePose
+) -> Reference:
+    """Return the reference of one chaser."""
     return Reference(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,
-        chaser=chaser,
-        phase=directive.phase.value,
+        chaser=directive.chaser,
+        phase=directive.phase,
         phase_time_s=directive.phase_time_s,
         position_m=vector(reference.position_m),
         q_wxyz=vector(reference.q_wxyz),
@@ -169,44 +172,35 @@ def reference_message(chaser: int, observation: Observation, directive: Directiv
 
 def solver_message(observation: Observation, solver: str, result: PlanResult) -> SolverStatus:
     """Return the solver's status; without a plan it lists no chasers."""
-    head = {"tick": observation.tick, "sim_time_ns": observation.time_ns, "solver": solver}
-    plan, n = result.plan, len(result.chasers)
-    if plan is None:
-        return SolverStatus(
-            **head,
-            chasers=(),
-            status=(),
-            iterations=(),
-            cost=(),
-            max_violation_m=(),
-            wall_solve_s=result.wall_s,
-        )
+    solved = [(c.chaser, c.solve) for c in result.chasers if c.solve is not None]
     return SolverStatus(
-        **head,
-        chasers=result.chasers,
-        status=plan.status[:n],
-        iterations=tuple(int(k) for k in plan.iterations[:n]),
-        cost=vector(plan.cost[:n]),
-        max_violation_m=vector(plan.max_violation_m[:n]),
+        tick=observation.tick,
+        sim_time_ns=observation.time_ns,
+        solver=solver,
+        chasers=tuple(i for i, _ in solved),
+        status=tuple(s.status for _, s in solved),
+        iterations=tuple(s.iterations for _, s in solved),
+        cost=tuple(s.cost for _, s in solved),
+        max_violation_m=tuple(s.max_violation_m for _, s in solved),
         wall_solve_s=result.wall_s,
     )
 
 
 def safety_message(
-    chaser: int, observation: Observation, guidance: GuidanceResult, certificate: PlanCertificate
+    observation: Observation, directive: Directive, certificate: PlanCertificate
 ) -> PassiveSafety:
     """Return the certificate of a chaser's newest plan."""
     return PassiveSafety(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,
-        chaser=chaser,
+        chaser=directive.chaser,
         margin_sigmas=certificate.coast.margin_sigmas,
         distance_m=certificate.coast.distance_m,
         closest_s=certificate.coast.time_s,
         loss_s=certificate.loss_s,
         safe=certificate.safe,
-        enforced=chaser in guidance.abort_margins,
-        abort_margin_sigmas=guidance.abort_margins.get(chaser),
+        enforced=directive.abort_margin is not None,
+        abort_margin_sigmas=directive.abort_margin,
     )
 
 

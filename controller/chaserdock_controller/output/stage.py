@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -15,11 +17,16 @@ from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.latency_compensation import CommandHistory
 from chaserdock_controller.interfaces import (
+    ChaserEstimate,
+    ChaserObservation,
+    ChaserPlanning,
     DirectCommand,
+    Directive,
     GuidanceResult,
     HorizonReference,
     LogEntry,
     Observation,
+    OwnMotion,
     PlanResult,
     TargetEstimation,
     TickOutputs,
@@ -39,138 +46,159 @@ from .message_builders import (
 from .quantization import COMMAND_STEP, in_steps
 
 
+class ChaserResult(NamedTuple):
+    """Results of all stages for one chaser."""
+
+    seen: ChaserObservation
+    estimate: ChaserEstimate
+    directive: Directive
+    planning: ChaserPlanning
+
+
 class OutputStage:
-    """Keeps the commands sent so far, and which chasers have no plan."""
+    """Keeps the commands sent to each chaser so far (``sent``), and which chasers have no plan."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
-        self.history = CommandHistory()
+        self.sent = tuple(CommandHistory() for _ in scenario.chasers)
         self._without_plan: set[int] = set()
         self._camera, self._period_s = scenario.camera_model(), 1.0 / scenario.time.rate_hz
+        self._step_s = scenario.controller.dt_s
 
     def run(
         self,
         observation: Observation,
         estimation: TargetEstimation,
         guidance: GuidanceResult,
-        result: PlanResult,
+        planning: PlanResult,
     ) -> TickOutputs:
         """Return all messages of a tick."""
-        out = TickOutputs(
-            target=target_message(observation, estimation), replies=list(guidance.replies)
-        )
-        if estimation.stack is not None and observation.tick % self._scenario.time.rate_hz == 0:
-            out.stack = stack_message(observation, estimation.stack)
-        shape = estimation.shape
-        renewed = shape is not None and (
-            shape.changed or observation.tick % self._scenario.time.rate_hz == 0
-        )
-        geometry = geometry_estimate(shape) if shape is not None and renewed else None
-        expected = self._expected(observation, estimation)
-        events = [*observation.events, *estimation.events, *guidance.events, *result.events]
-        for i in sorted(observation.odometry):
-            directive = guidance.directives[i]
-            if directive.reference is not None:
-                out.references[i] = reference_message(i, observation, directive)
-            command = directive.direct
-            if command is None:
-                command = self._planned_or_safe(
-                    i, observation, estimation, guidance, result, events, out
-                )
-            out.wrenches[i] = self._send(
-                i, observation, guidance, command, geometry, expected.get(i)
+        o, out = observation, TickOutputs(target=target_message(observation, estimation))
+        out.replies = list(guidance.replies)
+        periodic = o.tick % self._scenario.time.rate_hz == 0
+        if estimation.stack is not None and periodic:
+            out.stack = stack_message(o, estimation.stack)
+        shape, geometry = estimation.shape, None
+        if shape is not None and (shape.changed or periodic):
+            geometry = geometry_estimate(shape)
+        events = [*o.events, *estimation.events, *guidance.events, *planning.events]
+        chasers = [
+            ChaserResult(*parts)
+            for parts in zip(
+                o.chasers, estimation.chasers, guidance.directives, planning.chasers, strict=True
             )
-        for i, reason in observation.invalid.items():
-            if i not in self._without_plan:
-                events.append(("error", f"chaser {i}: invalid odometry, coasting: {reason}"))
-            self._without_plan.add(i)
-            command = guidance.directives[i].direct
-            assert command is not None
-            out.wrenches[i] = self._send(i, observation, guidance, command, geometry, None)
-        self.history.forget_before(observation.time_ns)
+        ]
+        for c in chasers:
+            if c.estimate.own is not None:
+                command = self._command(o, estimation, guidance, c, c.estimate.own, out, events)
+                expected = self._expected(o, estimation, c.estimate)
+                out.wrenches[c.seen.chaser] = self._send(o, c, command, geometry, expected)
+        for c in chasers:
+            if c.seen.invalid:
+                command = self._coast(c, events)
+                out.wrenches[c.seen.chaser] = self._send(o, c, command, geometry, None)
+        for sent in self.sent:
+            sent.forget_before(o.time_ns)
         out.safety = {
-            i: safety_message(i, observation, guidance, c) for i, c in result.certificates.items()
+            c.seen.chaser: safety_message(o, c.directive, c.planning.certificate)
+            for c in chasers
+            if c.planning.certificate is not None
         }
-        out.solver = solver_message(observation, self._scenario.controller.solver, result)
-        out.events = [event_message(observation, level, text) for level, text in events]
+        out.solver = solver_message(o, self._scenario.controller.solver, planning)
+        out.events = [event_message(o, level, text) for level, text in events]
         return out
 
-    def _expected(
-        self, observation: Observation, estimation: TargetEstimation
-    ) -> dict[int, ExpectedPose]:
-        """Return where chasers that do not see a target without markers will have it in their next
-        image.
-        """
-        if self._scenario.perception.name != "model" or not estimation.known:
-            return {}
-        unseen = [i for i in observation.odometry if i not in estimation.visible_to]
-        return {
-            i: expected_pose(i, estimation, self._camera, observation.time_ns, self._period_s)
-            for i in unseen
-        }
-
-    def _planned_or_safe(
+    def _command(
         self,
-        i: int,
-        observation: Observation,
+        o: Observation,
         estimation: TargetEstimation,
         guidance: GuidanceResult,
-        result: PlanResult,
-        events: list[LogEntry],
+        c: ChaserResult,
+        own: OwnMotion,
         out: TickOutputs,
+        events: list[LogEntry],
     ) -> DirectCommand:
-        """Return the input of a chaser's plan; without one that may be flown, a safe wrench.
-
-        That follows the reference, and so moves with the target. Without a target it brakes to rest
-        in WRF.
+        """Return the command of a chaser with the state ``own``, and add its reference and plan to
+        ``out``.
         """
-        step_s = self._scenario.controller.dt_s
-        plan = result.flyable.get(i)
-        wrench = None if plan is None else plan.input_at(observation.effective_ns, step_s)
-        new = plan is not None and plan.time_ns == observation.effective_ns
-        if new != (i not in self._without_plan) and estimation.known:
-            if new:
-                events.append(("info", f"chaser {i}: planned again"))
-                self._without_plan.discard(i)
-            else:
-                action = "tracking its reference" if wrench is None else "flying its last plan"
-                events.append(("error", f"chaser {i}: no plan, {action}"))
-                self._without_plan.add(i)
-        if plan is not None and wrench is not None:
-            out.plans[i] = plan_message(i, observation.tick, step_s, plan)
-            return DirectCommand("nmpc", wrench)
-        body, horizon = self._scenario.chaser, guidance.horizon
+        i, directive = c.seen.chaser, c.directive
+        if directive.reference is not None:
+            out.references[i] = reference_message(o, directive, directive.reference)
+        if directive.direct is not None:
+            return directive.direct
+        plan = c.planning.flyable
+        wrench = None if plan is None else plan.input_at(o.effective_ns, self._step_s)
+        new = plan is not None and plan.time_ns == o.effective_ns
+        if estimation.known:
+            self._report_plan(i, new, wrench is not None, events)
+        if plan is None or wrench is None:
+            return self._safe(i, own, guidance.horizon)
+        out.plans[i] = plan_message(i, o.tick, self._step_s, plan)
+        return DirectCommand("nmpc", wrench)
+
+    def _report_plan(self, i: int, new: bool, flies: bool, events: list[LogEntry]) -> None:
+        """Log when a chaser has no ``new`` plan any more, and whether it ``flies`` an older one; or
+        has one again.
+        """
+        if new == (i not in self._without_plan):
+            return
+        if new:
+            events.append(("info", f"chaser {i}: planned again"))
+            self._without_plan.discard(i)
+        else:
+            action = "flying its last plan" if flies else "tracking its reference"
+            events.append(("error", f"chaser {i}: no plan, {action}"))
+            self._without_plan.add(i)
+
+    def _safe(self, i: int, own: OwnMotion, horizon: HorizonReference | None) -> DirectCommand:
+        """Return a command without a plan: follow the reference, and so move with the target;
+        without a target, brake to rest in WRF.
+        """
+        body = self._scenario.chaser
         if horizon is None or i not in horizon.chasers:
-            return DirectCommand("brake", brake_wrench(estimation.own[i], body))
-        setpoint = _setpoint(horizon, horizon.chasers.index(i), step_s)
-        return DirectCommand(
-            "track", track_setpoint(_body_state(estimation.own_at_effect[i]), body, setpoint)
-        )
+            return DirectCommand("brake", brake_wrench(own.state, body))
+        setpoint = _setpoint(horizon, horizon.chasers.index(i), self._step_s)
+        return DirectCommand("track", track_setpoint(_body_state(own.at_effect), body, setpoint))
+
+    def _coast(self, c: ChaserResult, events: list[LogEntry]) -> DirectCommand:
+        """Return the command of a chaser with invalid odometry, and log it once."""
+        i = c.seen.chaser
+        if i not in self._without_plan:
+            events.append(("error", f"chaser {i}: invalid odometry, coasting: {c.seen.invalid}"))
+        self._without_plan.add(i)
+        assert c.directive.direct is not None
+        return c.directive.direct
+
+    def _expected(
+        self, o: Observation, estimation: TargetEstimation, estimate: ChaserEstimate
+    ) -> ExpectedPose | None:
+        """Return where a chaser that does not see a target without markers will have it in its next
+        image.
+        """
+        unseen = self._scenario.perception.name == "model" and not estimate.visible
+        if not unseen or not estimation.known or estimate.own is None:
+            return None
+        own = estimate.own.state
+        return expected_pose(estimation.target, own, self._camera, o.time_ns, self._period_s)
 
     def _send(
         self,
-        i: int,
         observation: Observation,
-        guidance: GuidanceResult,
+        c: ChaserResult,
         command: DirectCommand,
         geometry: GeometryEstimate | None,
         expected: ExpectedPose | None,
     ) -> WrenchCommand:
-        thrusts = command.thrusts_N
+        seen, directive, thrusts = c.seen, c.directive, command.thrusts_N
         # The limits hold on all axes at once; commanded thrusters need none but their own.
-        limits = (
-            observation.input_limits[i]
-            if thrusts is None
-            else np.abs(command.wrench) + COMMAND_STEP
-        )
+        limits = seen.input_limits if thrusts is None else np.abs(command.wrench) + COMMAND_STEP
         wrench = in_steps(command.wrench, limits)
-        self.history.add(i, observation.effective_ns, wrench)
-        directive = guidance.directives[i]
+        self.sent[seen.chaser].add(observation.effective_ns, wrench)
         lifetime_ns = round(self._scenario.controller.command_lifetime_s * 1e9)
         return WrenchCommand(
             tick=observation.tick,
             sim_time_ns=observation.time_ns,
-            chaser=i,
+            chaser=seen.chaser,
             effective_time_ns=observation.effective_ns,
             expires_ns=observation.time_ns + lifetime_ns,
             mode=command.mode,

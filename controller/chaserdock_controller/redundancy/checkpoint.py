@@ -9,33 +9,28 @@ they start from their initial state.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
-import msgspec
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from msgspec import Struct
 
+from chaserdock_controller.bodies.mass_properties import MassProperties
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.estimation import Mekf
-from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
-from chaserdock_controller.estimation.filter_update import FilterState
 from chaserdock_controller.estimation.identification.stage import IdentificationState
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.joint.estimator import JointFilterState, JointTickRecord
-from chaserdock_controller.estimation.mass_properties import MassProperties
-from chaserdock_controller.estimation.mekf import Exposure
-from chaserdock_controller.estimation.parameters import MekfParameters
-from chaserdock_controller.estimation.replay import ReplayBuffer
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.estimation.joint.parameters import TargetParameters
+from chaserdock_controller.estimation.joint.replay import ReplayBuffer
+from chaserdock_controller.estimation.paper import PaperEstimator, PaperParameters, View
 from chaserdock_controller.estimation.target_shape import ShapeFilter
-from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.activities.detumble import detumbling_of
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
-from chaserdock_controller.nmpc.plan_monitor import ChaserPlan, PlanningFailure
+from chaserdock_controller.interfaces import ChaserPlan, PlanningFailure
 
 from .serialization import decode, encode
 
@@ -53,48 +48,16 @@ class CoreState(Struct, forbid_unknown_fields=True):
     inspecting: frozenset[int]
 
 
-class SightingState(Struct, forbid_unknown_fields=True):
-    _odometry: dict[tuple[int, int], Odometry]
-
-
 class PlanningState(Struct, forbid_unknown_fields=True):
     _last_solve_ns: int | None
-
-
-class PlanMonitorState(Struct, forbid_unknown_fields=True):
-    _last: dict[int, ChaserPlan]
-    _failed_since_ns: dict[int, int]
-    _degraded_since_ns: dict[int, int]
-    _degraded: set[int]
-    _time_ns: int
 
 
 class OutputState(Struct, forbid_unknown_fields=True):
     _without_plan: set[int]
 
 
-class ThrusterCommandState(Struct, forbid_unknown_fields=True):
-    isolated: set[int]
-    trusted: set[int]
-    _last_commands: dict[int, tuple[float, OperatorCommand]]
-
-
-class ChaserMachineState(Struct, forbid_unknown_fields=True):
-    state: ChaserGuidance
-    position_m: Array | None
-    seen: DockingObservation | None
-    failure: PlanningFailure | None
-    interrupted: bool
-    abort_margin: float | None
-    _last_command: tuple[float, OperatorCommand] | None
-
-
 class FleetState(Struct, forbid_unknown_fields=True):
     _seen_s: float | None
-
-
-class ThrusterReportState(Struct, forbid_unknown_fields=True):
-    _reports: dict[int, ThrusterReport]
 
 
 class WaitingState(Struct, forbid_unknown_fields=True):
@@ -123,67 +86,104 @@ class CompositeState(Struct, forbid_unknown_fields=True):
     _changed: bool
 
 
-class CommandHistoryState(Struct, forbid_unknown_fields=True):
-    _sent: dict[int, list[tuple[int, Array]]]
-
-
-class LostChaserState(Struct, forbid_unknown_fields=True):
-    last: dict[int, Odometry]
-    reported: set[int]
-
-
-class OdometryState(Struct, forbid_unknown_fields=True):
-    _known: dict[int, Known]
-
-
 class ShapeState(Struct, forbid_unknown_fields=True):
     filter: ShapeFilter
 
 
+# -- of one chaser ---------------------------------------------------------------------------------
+
+
+class IngestState(Struct, forbid_unknown_fields=True):
+    report: ThrusterReport | None
+
+
+class LossState(Struct, forbid_unknown_fields=True):
+    last: Odometry | None
+    reported: bool
+
+
+class OdometryState(Struct, forbid_unknown_fields=True):
+    known: Known | None
+
+
 class ConsistencyState(Struct, forbid_unknown_fields=True):
-    inconsistent: set[int]
-    confirmed: set[int]
-    _interrupted_s: dict[int, float]
-    _since_s: dict[int, tuple[bool, float]]
+    inconsistent: bool
+    confirmed: bool
+    interrupted_s: float
+    agrees: bool
+    since_s: float
 
 
-class MekfState(Struct, forbid_unknown_fields=True, tag=True):
-    target: MekfParameters
-    late_dropped: int
-    early_dropped: int
-    invalid: int
-    duplicates: int
-    _before: list[tuple[int, MekfParameters]]
-    _buffer: ReplayBuffer[Exposure, FilterState]
-    _was_lost: bool
+class MachineState(Struct, forbid_unknown_fields=True):
+    state: ChaserGuidance
+    position_m: Array | None
+    seen: DockingObservation | None
+    failure: PlanningFailure | None
+    interrupted: bool
+    abort_margin: float | None
+    _last_command: tuple[float, OperatorCommand] | None
+
+
+class ThrusterCommandState(Struct, forbid_unknown_fields=True):
+    isolated: set[int]
+    trusted: set[int]
+    _last_commands: dict[int, tuple[float, OperatorCommand]]
+
+
+class PlanMonitorState(Struct, forbid_unknown_fields=True):
+    _last: ChaserPlan | None
+    _failed_since_ns: int | None
+    _degraded_since_ns: int | None
+    _degraded: bool
+    _time_ns: int
+
+
+class SentState(Struct, forbid_unknown_fields=True):
+    _sent: list[tuple[int, Array]]
+
+
+class ChaserCheckpoint(Struct, forbid_unknown_fields=True):
+    """State of all that is kept of one chaser."""
+
+    ingest: IngestState
+    loss: LossState
+    odometry: OdometryState
+    consistency: ConsistencyState
+    machine: MachineState
+    thrusters: ThrusterCommandState
+    plan_monitor: PlanMonitorState
+    sent: SentState
+
+
+# -- of the estimator ------------------------------------------------------------------------------
 
 
 class JointEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
-    target: MekfParameters
-    late_dropped: int
-    duplicates: int
-    _buffer: ReplayBuffer[JointTickRecord, JointFilterState]
+    target: TargetParameters
+    _buffer: ReplayBuffer
     _was_lost: bool
 
 
-class PaperState(Struct, forbid_unknown_fields=True, tag=True):
+class PaperEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
     parameters: PaperParameters
-    accepted: int
-    gated: int
-    late_dropped: int
-    early_dropped: int
-    invalid: int
-    reinitialisations: int
-    _latest: dict[int, Measurement]
+    _odometry: dict[tuple[int, int], Odometry]
+    _latest: dict[int, View]
     _poses: list[tuple[Array, Array]]
     _rates: list[tuple[Array, Array]]
     _mean: tuple[int, Array, Array] | None
     _newest_ns: int | None
+    _removed_in_a_row: int
+    _reinitialisations: int
     _seen: int
     _rejected: tuple[int, ...]
-    _removed_in_a_row: int
-    _events: list[EstimatorEvent]
     _was_lost: bool
+
+
+_ESTIMATORS: dict[type, type[JointEstimatorState | PaperEstimatorState]] = {
+    JointEstimator: JointEstimatorState,
+    PaperEstimator: PaperEstimatorState,
+}
+"""What is copied of an estimator. Of those of installed packages, nothing is."""
 
 
 class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
@@ -192,34 +192,41 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     solver, inputs by chaser."""
 
     core: CoreState
-    sightings: SightingState
     planning: PlanningState
-    plan_monitor: PlanMonitorState
     output: OutputState
-    chasers: list[tuple[ChaserMachineState, ThrusterCommandState]]
+    chasers: list[ChaserCheckpoint]
     fleet: FleetState
     timeline_left: int
-    thruster_reports: ThrusterReportState
     stack: WaitingState
     stack_control: StackControlState
     stack_plan: StackPlanState
     sequencer: SequencerState
     composite: CompositeState
-    history: CommandHistoryState
-    lost_chasers: LostChaserState
-    odometry: OdometryState
-    consistency: ConsistencyState
     identification: IdentificationState | None
     shape: ShapeState | None
-    estimator: JointEstimatorState | MekfState | PaperState | None
+    estimator: JointEstimatorState | PaperEstimatorState | None
     plans: dict[int, Array]
 
 
 class Checkpoint:
-    """Saves and restores the state of one controller."""
+    """Saves and restores the state of one controller. ``odometry``: the validation of each chaser's."""
 
-    def __init__(self, core: ControllerCore, odometry: OdometryValidation) -> None:
+    def __init__(self, core: ControllerCore, odometry: Sequence[OdometryValidation]) -> None:
         self._core, self._odometry = core, odometry
+
+    def _chaser_parts(self, i: int) -> dict[str, tuple[Any, type[Struct]]]:
+        """Return what is copied of one chaser, by field of its checkpoint."""
+        core, machine = self._core, self._core.guidance.chasers[i]
+        return {
+            "ingest": (core.ingest.chasers[i], IngestState),
+            "loss": (core.ingest.chasers[i].loss, LossState),
+            "odometry": (self._odometry[i], OdometryState),
+            "consistency": (core.estimation.consistency[i], ConsistencyState),
+            "machine": (machine, MachineState),
+            "thrusters": (machine.thrusters, ThrusterCommandState),
+            "plan_monitor": (core.planning.monitors[i], PlanMonitorState),
+            "sent": (core.output.sent[i], SentState),
+        }
 
     def _parts(self) -> dict[str, tuple[Any, type[Struct]]]:
         """Return the objects whose attributes are copied, and what is copied of them, by field of
@@ -229,21 +236,14 @@ class Checkpoint:
         detumble = detumbling_of(core.guidance.activities)
         parts: dict[str, tuple[Any, type[Struct]]] = {
             "core": (core, CoreState),
-            "sightings": (vars(core.estimation)["_converter"], SightingState),
             "planning": (core.planning, PlanningState),
-            "plan_monitor": (core.planning.monitor, PlanMonitorState),
             "output": (core.output, OutputState),
             "fleet": (core.guidance.fleet, FleetState),
-            "thruster_reports": (core.ingest.thrusters, ThrusterReportState),
             "stack": (detumble, WaitingState),
             "stack_control": (detumble.control, StackControlState),
             "stack_plan": (detumble.control.planner, StackPlanState),
             "sequencer": (detumble.control.sequencer, SequencerState),
             "composite": (core.estimation.composite, CompositeState),
-            "history": (core.output.history, CommandHistoryState),
-            "lost_chasers": (core.ingest.lost_chasers, LostChaserState),
-            "odometry": (self._odometry, OdometryState),
-            "consistency": (core.estimation.consistency, ConsistencyState),
         }
         if core.estimation.shape is not None:
             parts["shape"] = (core.estimation.shape, ShapeState)
@@ -251,20 +251,20 @@ class Checkpoint:
 
     def save(self) -> bytes:
         """Return the state now. Raises CheckpointError when it contains something other than data."""
-        parts: dict[str, Any] = {"shape": None}
-        parts |= {name: _read(*part) for name, part in self._parts().items()}
+        parts: dict[str, Any] = {"shape": None, **_read_all(self._parts())}
         frame, identification = self._warm_starts(), self._core.estimation.identification
+        estimator, kind = self._core.estimator, _ESTIMATORS.get(type(self._core.estimator))
         try:
             return encode(
                 ControllerCheckpoint(
                     **parts,
                     chasers=[
-                        (_read(c, ChaserMachineState), _read(c.thrusters, ThrusterCommandState))
+                        ChaserCheckpoint(**_read_all(self._chaser_parts(c.number)))
                         for c in self._core.guidance.chasers
                     ],
                     timeline_left=len(vars(self._core.guidance.fleet)["_timeline"]),
                     identification=None if identification is None else identification.save(),
-                    estimator=_estimator_state(self._core.estimator),
+                    estimator=None if kind is None else _read(estimator, kind),
                     plans=dict(frame.plans) if frame is not None else {},
                 )
             )
@@ -289,19 +289,14 @@ class Checkpoint:
         if count != (None if state.shape is None else len(state.shape.filter.vector)):
             raise CheckpointError("the state is of another mission")
         self._restore_identification(state.identification)
-        for name, (owner, _) in self._parts().items():
-            _write(owner, getattr(state, name))
-        for chaser, (guided, thrusters) in zip(
-            self._core.guidance.chasers, state.chasers, strict=True
-        ):
-            _write(chaser, guided)
-            _write(chaser.thrusters, thrusters)
+        _write_all(self._parts(), state)
+        for i, chaser in enumerate(state.chasers):
+            _write_all(self._chaser_parts(i), chaser)
         vars(self._core.guidance.fleet)["_timeline"] = timeline[
             len(timeline) - state.timeline_left :
         ]
-        if state.estimator is not None and type(state.estimator) is _estimator_kind(
-            self._core.estimator
-        ):
+        kind = _ESTIMATORS.get(type(self._core.estimator))
+        if state.estimator is not None and type(state.estimator) is kind:
             _write(self._core.estimator, state.estimator)
         frame = self._warm_starts()
         if frame is not None:
@@ -322,9 +317,27 @@ class Checkpoint:
         return vars(self._core.planning.solver).get("_frame")
 
 
+def _read_all(parts: dict[str, tuple[Any, type[Struct]]]) -> dict[str, Any]:
+    return {name: _read(*part) for name, part in parts.items()}
+
+
+def _write_all(parts: dict[str, tuple[Any, type[Struct]]], state: Struct) -> None:
+    for name, (owner, _) in parts.items():
+        _write(owner, getattr(state, name))
+
+
 def _read(owner: Any, kind: type[PartT]) -> PartT:
     values = vars(owner)
-    return kind(**{name: values[name] for name in kind.__struct_fields__})
+    return kind(**{name: _data(values[name]) for name in kind.__struct_fields__})
+
+
+def _data(value: Any) -> Any:
+    match value:
+        case deque():
+            return list(value)
+        case ReplayBuffer():
+            return value.with_newest_only()
+    return value
 
 
 def _write(owner: Any, state: Struct) -> None:
@@ -337,22 +350,3 @@ def _write(owner: Any, state: Struct) -> None:
             setattr(owner, name, deque(value, current.maxlen))
         else:
             setattr(owner, name, value)
-
-
-EstimatorState = JointEstimatorState | MekfState | PaperState
-
-
-def _estimator_kind(estimator: Any) -> type[EstimatorState] | None:
-    kinds = {JointEstimator: JointEstimatorState, Mekf: MekfState, PaperEstimator: PaperState}
-    return kinds.get(type(estimator))
-
-
-def _estimator_state(estimator: Any) -> EstimatorState | None:
-    kind = _estimator_kind(estimator)
-    if kind is None:
-        return None
-    state = _read(estimator, kind)
-    if isinstance(state, PaperState):
-        state._poses, state._rates = list(state._poses), list(state._rates)
-        return state
-    return msgspec.structs.replace(state, _buffer=state._buffer.with_newest_only())

@@ -102,7 +102,7 @@ def drop_removed_keys(values: dict[str, Any]) -> None:
 
 
 def old_keys(values: dict[str, Any]) -> list[str]:
-    """Return one line per key, or value, of an older format, naming its present name."""
+    """Return one line per key, or value, of an older version, naming what it is now."""
     lines = []
     for old, new in _RENAMED_KEYS.items():
         for _, path in _holders(values, old):
@@ -116,6 +116,9 @@ def old_keys(values: dict[str, Any]) -> list[str]:
     for table, path in _holders(values, ("fault", "*", "topic")):
         if table["topic"] == "jets":
             lines.append(f"{path}: 'jets' is now called 'thrusters'")
+    for table, path in _holders(values, ("estimator", "name")):
+        if table["name"] == "mekf":
+            lines.append(f"{path}: 'mekf' was removed; 'joint' estimates the chasers, too")
     return lines
 
 

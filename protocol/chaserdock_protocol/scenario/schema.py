@@ -28,7 +28,7 @@ from .fields import (
 
 MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
 PERCEPTIONS = (*MARKER_PERCEPTIONS, "model")
-ESTIMATORS = ("joint", "mekf", "paper")
+ESTIMATORS = ("joint", "paper")
 SOLVERS = ("rti", "ipopt", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see
 ``plugins``).
@@ -82,13 +82,13 @@ class EstimatorSection(Section):
 
     name: Name = Field(
         default="joint",
-        description="`joint`: filter of target, chasers, sensors and disturbances. `mekf`: filter of the target, with odometry "
-        "taken as exact. `paper`: the paper's average. Or an installed plugin.",
+        description="`joint`: filter of target, chasers, sensors and disturbances. `paper`: the paper's average, with odometry "
+        "taken as exact. Or an installed plugin.",
     )
     target_acceleration_noise: Positive | None = Field(
         default=None,
         description="Of `joint`: square root of the spectral density of the target's unmodelled "
-        "acceleration, m/s²/√Hz. Not set: 1e-4 for `torque_free`, otherwise 5e-6. Far away "
+        "acceleration, m/s²/√Hz. Not set: 1e-5 for `torque_free`, otherwise 5e-6. Far away "
         "it decides how well the relative velocity is known.",
     )
     target_angular_noise: Positive | None = Field(

@@ -28,8 +28,9 @@ from chaserdock_models.rigid_body import BodyState, RigidBody, free_rotation
 from chaserdock_models.wrench_set import ThrusterMount, wrench_matrix
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 
-from chaserdock_controller.estimation.mass_properties import INERTIA_ROWS, MassProperties, detach
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.bodies.mass_properties import INERTIA_ROWS, MassProperties, detach
+from chaserdock_controller.bodies.target_body import TargetBody
+from chaserdock_controller.interfaces import StackChaser
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 MASS, CENTRE, INERTIA = slice(12, 13), slice(13, 16), slice(16, 22)
@@ -465,16 +466,18 @@ class CompositeIdentification:
         )
 
     @property
-    def mounted(self) -> dict[int, MountedChaser]:
-        """Return the estimated poses of the chasers in TRF."""
+    def members(self) -> tuple[StackChaser, ...]:
+        """Return the estimated poses of the chasers in TRF, and how their thrusters thrust."""
         x = self._estimate
-        return {
-            i: MountedChaser(x.mounts_m[k], x.mounts_wxyz[k]) for k, i in enumerate(self.chasers)
-        }
+        factors = (1.0 + x.thrusts).reshape(len(self.chasers), -1)
+        return tuple(
+            StackChaser(i, MountedChaser(x.mounts_m[k], x.mounts_wxyz[k]), factors[k])
+            for k, i in enumerate(self.chasers)
+        )
 
     def target(self, body: RigidBody) -> MassProperties:
         """Return the mass properties of the target alone; ``body``: those of every chaser."""
-        return detach(self.stack, self.mounted, body)
+        return detach(self.stack, [c.mounting for c in self.members], body)
 
     @property
     def motion(self) -> BodyState:
@@ -483,12 +486,6 @@ class CompositeIdentification:
         """
         x = self._estimate
         return BodyState(x.position_m, x.velocity_m_s, x.q_wxyz, x.omega_rad_s)
-
-    @property
-    def thrust_factors(self) -> dict[int, Array]:
-        """Return the estimated thrust over the stated one (n,) of the thrusters of every chaser."""
-        rows = (1.0 + self._estimate.thrusts).reshape(len(self.chasers), -1)
-        return dict(zip(self.chasers, rows, strict=True))
 
 
 def _inverse(matrix: Array) -> Array:

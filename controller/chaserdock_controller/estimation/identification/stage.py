@@ -19,8 +19,8 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.mounting import nominal_mounting, plume_free_thrusters
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 
+from chaserdock_controller.bodies.mass_properties import MassProperties, attach, inertia_ratios
 from chaserdock_controller.estimation.composite_body import pose_in_target, stated_properties
-from chaserdock_controller.estimation.mass_properties import MassProperties, attach, inertia_ratios
 from chaserdock_controller.interfaces import (
     IdentifiedStack,
     LogEntry,
@@ -64,15 +64,15 @@ class IdentificationState:
     """
 
     target: MassProperties
-    failed: dict[int, tuple[int, ...]]
-    reporting: list[int]
-    silent_ticks: dict[int, int]
+    failed: set[tuple[int, int]]
+    reporting: set[int]
+    silent_ticks: list[int]
     composite: tuple[list[int], RecoveryState] | None
 
 
 class StackIdentification:
     """The filter of the stack that is latched now. ``target``: what is known of the target alone,
-    kept when chasers come and go.
+    kept when chasers come and go. ``failed``: thrusters found stuck, as (chaser, number).
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -80,26 +80,31 @@ class StackIdentification:
         self._period_s = 1.0 / scenario.time.rate_hz
         self._full_N = thrusts_max(scenario.chaser.thrusters)
         self.target = stated_properties(scenario)
-        self.failed: dict[int, tuple[int, ...]] = {}
+        self.failed: set[tuple[int, int]] = set()
         self._composite: FaultTolerantIdentification | None = None
         self._reporting: set[int] = set()
-        self._silent_ticks: dict[int, int] = {}
+        self._silent_ticks = [0] * len(scenario.chasers)
         self._events: list[LogEntry] = []
 
     def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
         """Take a tick's odometry and pulses; return None while the target is unknown. While nothing
         is latched, what the estimator finds of the freely tumbling target becomes the prior of the
         stack."""
-        latched = estimation.latched
+        latched = {c.chaser for c in estimation.chasers if c.latched}
+        present = {c.chaser for c in estimation.chasers if c.own is not None}
         if not latched:
             self._composite = None
             if estimation.stack is not None:
                 self.target = estimation.stack.target
             return estimation.stack
-        if not estimation.known or not latched & observation.odometry.keys():
+        if not estimation.known or not latched & present:
             self._composite = None
             return None
-        states = {i: body_state(o) for i, o in sorted(observation.measured.items()) if i in latched}
+        states = {
+            c.chaser: body_state(c.measured)
+            for c in observation.chasers
+            if c.measured is not None and c.chaser in latched
+        }
         composite = self._composite
         if composite is None or set(composite.filter.chasers) != latched:
             if not states:
@@ -115,10 +120,9 @@ class StackIdentification:
         return IdentifiedStack(
             stack=found.stack,
             target=self.target,
-            chasers=found.mounted,
+            chasers=found.members,
             motion=found.motion,
-            thrust_factors=found.thrust_factors,
-            failed=dict(self.failed),
+            failed=frozenset(self.failed),
             informative=partial(self._by_information, found),
         )
 
@@ -128,7 +132,7 @@ class StackIdentification:
         """
         return np.array(
             [
-                thruster not in self.failed.get(i, ()) and self._silent_ticks.get(i, 0) == 0
+                (i, thruster) not in self.failed and self._silent_ticks[i] == 0
                 for i, thruster in found.usable
             ],
             dtype=bool,
@@ -160,9 +164,9 @@ class StackIdentification:
             composite = list(self._composite.filter.chasers), self._composite.save()
         return IdentificationState(
             self.target,
-            dict(self.failed),
-            sorted(self._reporting),
-            dict(self._silent_ticks),
+            set(self.failed),
+            set(self._reporting),
+            list(self._silent_ticks),
             composite,
         )
 
@@ -182,21 +186,21 @@ class StackIdentification:
                 1,
             )
             composite.load(saved)
-        self.target, self.failed = state.target, dict(state.failed)
-        self._reporting, self._silent_ticks = set(state.reporting), dict(state.silent_ticks)
+        self.target, self.failed = state.target, set(state.failed)
+        self._reporting, self._silent_ticks = set(state.reporting), list(state.silent_ticks)
         self._composite = composite
 
     def _begin(
         self, estimation: TargetEstimation, states: Mapping[int, BodyState]
     ) -> FaultTolerantIdentification:
         s, chasers = self._scenario, {}
-        for i in sorted(estimation.latched):
-            own = estimation.own.get(i)
-            chasers[i] = (
-                nominal_mounting(s, i)
-                if own is None
-                else MountedChaser(*pose_in_target(estimation.target, own))
-            )
+        for c in estimation.chasers:
+            if c.latched:
+                chasers[c.chaser] = (
+                    nominal_mounting(s, c.chaser)
+                    if c.own is None
+                    else MountedChaser(*pose_in_target(estimation.target, c.own.state))
+                )
         # The measured ones first: the filter starts from them.
         chasers = {i: chasers[i] for i in sorted(chasers, key=lambda i: (i not in states, i))}
         return self._filter_of(chasers, states, len(states))
@@ -206,7 +210,7 @@ class StackIdentification:
     ) -> FaultTolerantIdentification:
         s = self._scenario
         found = CompositeIdentification(
-            attach(self.target, chasers, s.chaser),
+            attach(self.target, tuple(chasers.values()), s.chaser),
             chasers,
             states,
             s.chaser.thrusters,
@@ -219,26 +223,28 @@ class StackIdentification:
 
     def _predict(self, composite: FaultTolerantIdentification, observation: Observation) -> None:
         chasers = composite.filter.chasers
-        given = {i: j for i, j in observation.thruster_impulses.items() if i in chasers}
+        given = {
+            c.chaser: c.thruster_impulses
+            for c in observation.chasers
+            if c.thruster_impulses is not None and c.chaser in chasers
+        }
         if given.keys() != self._reporting:
             composite.restart_detection()
         self._reporting = set(given)
         unknown = {}
         for i in chasers:
-            self._silent_ticks[i] = 0 if i in given else self._silent_ticks.get(i, 0) + 1
+            self._silent_ticks[i] = 0 if i in given else self._silent_ticks[i] + 1
             # What was commanded before, or is fired without the controller, is not reported.
             if i not in given:
                 early = self._silent_ticks[i] * self._period_s <= _SILENT_S
                 unknown[i] = self._full_N * (
                     self._period_s if early else _SILENT_SHARE * self._period_s
                 )
-        touched = any(d.contact and not d.latched for d in observation.docking.values())
+        touched = any(c.touches for c in observation.chasers)
         composite.predict(given, self._period_s, unknown, _SHOCK if touched else None)
 
     def _add_fault(self, fault: StackFault) -> None:
-        self.failed[fault.chaser] = tuple(
-            sorted({*self.failed.get(fault.chaser, ()), fault.thruster})
-        )
+        self.failed.add((fault.chaser, fault.thruster))
         kind = fault.kind.replace("_", " ")
         text = f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the stack, isolated"
         self._events.append(("warning", text))
@@ -261,9 +267,7 @@ class StackIdentification:
         gains = found.pulse_gains(float(self._full_N.max()) * _PULSE_S, noise, scale)
         usable = found.usable
         order = np.argsort(-gains, kind="stable")
-        return tuple(
-            usable[k] for k in order if usable[k][1] not in self.failed.get(usable[k][0], ())
-        )
+        return tuple(usable[k] for k in order if usable[k] not in self.failed)
 
 
 def body_state(o: Odometry) -> BodyState:

@@ -4,6 +4,6 @@ on them.
 """
 
 from .estimator import JointEstimator
-from .parameters import JointParameters
+from .parameters import JointParameters, parameters_of
 
-__all__ = ["JointEstimator", "JointParameters"]
+__all__ = ["JointEstimator", "JointParameters", "parameters_of"]

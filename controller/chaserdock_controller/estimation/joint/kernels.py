@@ -18,7 +18,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.native import address, location, scratch
 from numpy.typing import NDArray
 
-from chaserdock_controller.estimation.body_shape import SHAPE
+from chaserdock_controller.bodies.body_shape import SHAPE
 
 from .native import LIBRARY, function
 

@@ -3,9 +3,12 @@
 (native/measurements.c).
 
 Residuals are to first order r = H e + n, with e the error vector of ``state`` and n white noise.
-With the chaser at p_i, C_i, the lens at l (CRF), the nominal camera axes R (IRF to CRF), E = C_i R
-and the camera errors delta, b, s of ``camera_calibration``, a target at p, R_t is seen at S^-1
-exp(-delta) (E' (p - p_i - C_i l) - b) with the attitude exp(-delta) E' R_t.
+With the chaser at p_i, C_i, the lens at l (CRF), the nominal camera axes R (IRF to CRF) and E = C_i
+R, a target at p, R_t is seen at S^-1 exp(-delta) (E' (p - p_i - C_i l) - b) with the attitude
+exp(-delta) E' R_t. The camera's errors, constant in IRF, are the rotation vector delta of its true
+axes, the shift b of its lens and the relative error s of its focal length; S = diag(1, 1, 1 + s): a
+longer focal length reduces the measured distance. An error of the principal point acts as a turn,
+to first order.
 """
 
 from __future__ import annotations

@@ -1,141 +1,228 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the joint filter."""
+"""Parameters of the joint filter; docs/estimation.md derives the values."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
-from chaserdock_models.arrays import Vector3
+import numpy as np
+from chaserdock_models.arrays import Array, Matrix3, Vector3
 from chaserdock_models.camera import Camera
 from chaserdock_models.rigid_body import RigidBody
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.navigation import NavigationErrors
+from chaserdock_protocol.scenario.schema import EstimatorSection
 
-from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE, MekfParameters
+from chaserdock_controller.estimation.composite_body import stated_properties
 
+Matrix9 = tuple[tuple[float, ...], ...]
+BodyPrior = tuple[Matrix3, Vector3, Matrix9]
+"""Inertia, centre of mass and their covariance, as in ``TargetParameters``."""
+
+MODELS = ("constant_rates", "torque_free")
+"""Models of the target's motion."""
+GATE_CHI_SQUARE = 27.85634123601289
+"""0.9999 quantile of the chi-square distribution with 6 degrees of freedom (tests compare with
+SciPy).
+"""
 GATE_CHI_SQUARE_3 = 21.107513466160444
 """0.9999 quantile of the chi-square distribution with 3 degrees of freedom (tests compare with
 SciPy).
 """
-
 TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-5, 1e-5)}
+"""Square roots of the spectral densities of the target's white acceleration (m/s²/√Hz) and angular
+acceleration (rad/s²/√Hz), by motion model. A free target has none; they bound the filter's memory.
+"""
 
 
 class SightingNoise(NamedTuple):
-    """Errors of sightings as ratios to the stated sigma.
-
-    white_ratio: of white noise with the same effect on an average over seconds as the true errors, half of which are correlated
-        over about 0.5 s. view_ratio: of an error that persists while the view stays the same, with the time constant
-        ``view_time_s``. units_time_s: the persistent error is a ratio to the mean of the stated covariances over so long; 0: to the
-        newest one.
-    """
+    """Errors of sightings as ratios to the stated sigma."""
 
     white_ratio: float
+    """White noise with the same effect on an average over seconds as the true errors, half of which
+    are correlated over about 0.5 s."""
     view_ratio: float
+    """Error that persists while the view stays the same."""
     view_time_s: float
+    """Time constant of the view."""
     units_time_s: float = 0.0
+    """The persistent error is a ratio to the mean of the stated covariances over so long; 0: to the
+    newest one."""
 
 
 SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
-# Errors of geometry and shading change only with the view, and are alike in the images of several
-# cameras (docs/markerless.md).
+"""Of several smaller markers, whose corners depend more on the pixel grid."""
 SHAPE = SightingNoise(white_ratio=1.0, view_ratio=1.6, view_time_s=30.0, units_time_s=15.0)
-# Without images, range, bearing and attitude of `[ranging]` have white errors of the stated size.
+"""Errors of geometry and shading change only with the view, and are alike in the images of several
+cameras (docs/markerless.md)."""
 RANGING = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
-# A bearing from an image: light, markers and the pixel grid shift the centroid as long as the view
-# stays the same.
+"""Without images, range, bearing and attitude of `[ranging]` have white errors of the stated size.
+"""
 BEARING = SightingNoise(white_ratio=1.0, view_ratio=1.0, view_time_s=25.0)
+"""A bearing from an image: light, markers and the pixel grid shift the centroid as long as the view
+stays the same."""
+
+
+@dataclass(frozen=True)
+class TargetParameters:
+    """What the filter assumes of the target, and when it starts, restarts and loses it.
+
+    Raises ValueError for values out of range and for an unknown motion model.
+    """
+
+    motion_model: str = "constant_rates"
+    """"constant_rates", or "torque_free": its inertia and centre of mass are estimated."""
+    inertia_ratios: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Inertia tensor in TRF (rows), up to a common factor."""
+    centre_of_mass_trf_m: Vector3 = (0.0, 0.0, 0.0)
+    body_covariance: Matrix9 = ()
+    """Covariance (9, 9), rows, of the centre of mass (m) and of the elements xx, yy, zz, xy, xz,
+    yz of ``inertia_ratios``. Empty: both are exact."""
+    initial_velocity_m_s: float = 0.1
+    """Sigma of the unknown velocity at the first sighting: three times that of the paper's target."""
+    initial_omega_rad_s: float = 0.2
+    """Sigma of the unknown rate at the first sighting, per axis: covers tumbles of 20 degrees/s."""
+    single_marker_scale: float = 3.0
+    """Factor on the sigma of a first pose from one marker, whose attitude is nearly ambiguous."""
+    reinitialised_velocity_m_s: float = 0.03
+    """Sigma added to the velocity at a restart. It keeps its value: the pose jumped, not the rate."""
+    reinitialised_omega_rad_s: float = 0.06
+    """The same of the rate."""
+    sustained_rejections: int = 10
+    """Ticks in a row in which most cameras are rejected, after which the pose is started again."""
+    ambiguity_log_odds: float = 10.0
+    """Log odds at which the less likely of two hypotheses is dropped: wrong in 1 of 20,000 cases."""
+    ambiguity_timeout_s: float = 5.0
+    """Time after which it is dropped anyway."""
+    tracking_s: float = 0.25
+    """Age of the last accepted sighting beyond which the status is "predicting": three images."""
+    lost_position_m: float = 0.2
+    """Largest standard deviation of the position beyond which the target is lost."""
+    lost_attitude_rad: float = math.radians(15.0)
+    """The same of the attitude."""
+    buffer_s: float = 1.0
+    """Sightings up to this much older than the newest tick count at their exposure."""
+
+    def __post_init__(self) -> None:
+        if self.motion_model not in MODELS:
+            raise ValueError(
+                f"unknown motion model {self.motion_model!r}; known: {', '.join(MODELS)}"
+            )
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, float | int) and not 0.0 < value < math.inf:
+                raise ValueError(f"{f.name} is out of range: {value}")
+        if not all(math.isfinite(x) for x in self.centre_of_mass_trf_m):
+            raise ValueError(f"centre_of_mass_trf_m is out of range: {self.centre_of_mass_trf_m}")
+        if self.single_marker_scale < 1.0:
+            raise ValueError(f"single_marker_scale must be at least 1: {self.single_marker_scale}")
+        inertia = np.array(self.inertia_ratios, dtype=float)
+        if inertia.shape != (3, 3) or not np.allclose(inertia, inertia.T):
+            raise ValueError("inertia_ratios must be a symmetric 3 x 3 tensor")
+        principal = np.linalg.eigvalsh(inertia)
+        if principal[0] <= 0.0 or principal[2] > (principal[0] + principal[1]) * (1.0 + 1e-9):
+            raise ValueError(
+                "inertia_ratios: principal moments of inertia violate the triangle inequality"
+            )
+
+    @property
+    def body_prior(self) -> BodyPrior:
+        """Return what is known of the target's body without measurements."""
+        return self.inertia_ratios, self.centre_of_mass_trf_m, self.body_covariance
 
 
 @dataclass(frozen=True)
 class JointParameters:
-    """Parameters of ``JointEstimator``; docs/estimation.md gives the reasons for the values.
+    """What the filter assumes of target, chasers and sensors, and when it uses a measurement."""
 
-    target: motion model, initial sigmas and thresholds of the target; the filter uses none of its camera errors and noises.
-    body: assumed mass properties of the chasers. camera: as calibrated. navigation: errors of the chasers' sensors.
-    control_force_share, control_torque_share: sigma of a commanded impulse's effect, as a share of it; control_arm_m:
-        offset of the force from the centre of mass. They cover errors of thrust, mass, inertia and alignment, which are the
-        same at every tick: as white noise they are larger.
-    disturbance_*: force and torque on a chaser in its body axes: sigma at the start, and density of the random walk.
-    centre_of_mass_m: sigma of a chaser's centre of mass from the origin of CRF, per axis.
-    latched_*: white acceleration of a chaser whose latch holds the target.
-    contact_*: sigma of the change of a chaser's rates by a contact.
-    floor_*: sigmas added to stated odometry, so that exact odometry gives no singular covariance.
-    target_noise: square roots of the spectral densities of the target's white acceleration (m/s²/√Hz) and angular acceleration
-        (rad/s²/√Hz), by motion model. Of a torque-free target the inertia is estimated.
-    stack_noise: the same of the disturbances that latched chasers exert on the target. A constant one of 10 mN on 170 kg, which is
-        to be followed within 3 s, is like white acceleration of 1e-4 m/s²/√Hz.
-    ratio_memory: exponent by which measurements of the inertia of a torque-free target lose weight with time.
-    single_marker, several_markers: errors of a sighting with one marker, and with several smaller ones, whose corners depend
-        more on the pixel grid. shape: errors of a sighting of the target's shape, without markers.
-    unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
-        as by a stuck thruster: for the velocity about a third of the greatest change under commands; for the rate all of it, as
-        the torque of a stuck thruster exceeds that of commands. It is assumed only where velocity or rate does not fit otherwise.
-    rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
-    rejections_to_new_view: a chaser's sightings by shape that are rejected this many times in a row are taken for those of a new
-        view, whose error is unknown, if they then fit: where the tracker renders its view again, its error can jump by several sigmas.
-    collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
-    restart_after_s: a chaser whose odometry was missing, or whose estimate no measurement supported, for so long is started again
-        from its odometry.
-    iterated_updates, iterations: the first updates after a start of the target are iterated, as they are far from linear.
-    mean_motion_rad_s: of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire; the target stays at the
-        origin of the Hill frame, where these forces vanish.
-    overconfident_ticks, overconfident_ratio: odometry is reported as overconfident when its squared normalized
-        innovation, averaged over so many ticks, exceeds its expectation by this factor.
-    """
-
-    target: MekfParameters
+    target: TargetParameters
     body: RigidBody
+    """Assumed mass properties of the chasers."""
     camera: Camera
+    """As calibrated."""
     navigation: NavigationErrors
+    """Errors of the chasers' sensors."""
     force_max_N: float = 1.0
     torque_max_N_m: float = 0.1
+
     control_force_share: float = 0.3
+    """Sigma of a commanded impulse's effect, as a share of it. Errors of thrust, mass, inertia and
+    alignment are the same at every tick: as white noise they are larger."""
     control_torque_share: float = 0.5
     control_arm_m: float = 0.005
+    """Offset of the commanded force from the centre of mass."""
     disturbance_force_N: float = 0.01
+    """Force on a chaser in its body axes: sigma at the start."""
     disturbance_torque_N_m: float = 0.001
     disturbance_force_N_sqrt_s: float = 1e-3
+    """The same: density of the random walk."""
     disturbance_torque_N_m_sqrt_s: float = 1e-4
     centre_of_mass_m: float = 0.005
+    """Sigma of a chaser's centre of mass from the origin of CRF, per axis."""
     latched_acceleration_m_s2: float = 0.05
+    """White acceleration of a chaser whose latch holds the target."""
     latched_acceleration_rad_s2: float = 0.1
     contact_velocity_m_s: float = 0.01
+    """Sigma of the change of a chaser's velocity by a contact."""
     contact_omega_rad_s: float = 0.02
     floor_position_m: float = 2e-5
+    """Sigma added to stated odometry, so that exact odometry gives no singular covariance."""
     floor_velocity_m_s: float = 2e-5
     floor_attitude_rad: float = 1e-5
     floor_omega_rad_s: float = 1e-5
     floor_sighting_m: float = 2e-5
     floor_sighting_rad: float = math.radians(0.002)
     target_noise: Mapping[str, tuple[float, float]] = field(default_factory=lambda: TARGET_NOISE)
+    """See ``TARGET_NOISE``."""
     stack_noise: tuple[float, float] = (1e-4, 2e-4)
+    """The same of the disturbances that latched chasers exert on the target. A constant one of
+    10 mN on 170 kg, which is to be followed within 3 s, is like white acceleration of 1e-4."""
     ratio_memory: float = 1.0
+    """Exponent by which measurements of the inertia of a torque-free target lose weight with time.
+    """
     single_marker: SightingNoise = SINGLE_MARKER
     several_markers: SightingNoise = SEVERAL_MARKERS
     shape: SightingNoise = SHAPE
+    """Errors of a sighting without markers."""
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
     unexpected_velocity_m_s: float = 0.003
+    """Sigma of a change of a chaser's velocity within a tick that no command explains, as by a
+    stuck thruster: a third of the greatest change under commands. It is assumed only where the
+    velocity does not fit otherwise."""
     unexpected_omega_rad_s: float = 0.05
+    """The same of its rate: all of the greatest change, as the torque of a stuck thruster exceeds
+    that of commands."""
     rejections_to_drop: int = 5
+    """A channel that is rejected this many times in a row is not used until it fits as often."""
     rejections_to_new_view: int = 3
+    """A chaser's sightings by shape that are rejected this many times in a row are taken for those
+    of a new view, whose error is unknown, if they then fit: where the tracker renders its view
+    again, its error can jump by several sigmas."""
     collective_rejections: int = 3
+    """Rejections in a row by most cameras after which the target's rates are widened."""
     iterated_updates: int = 5
+    """The first updates after a start of the target are iterated, as they are far from linear."""
     iterations: int = 4
     overconfident_ticks: float = 30.0
+    """Odometry is reported as overconfident when its squared normalized innovation, averaged over
+    so many ticks, exceeds its expectation by ``overconfident_ratio``."""
     overconfident_ratio: float = 2.5
     restart_after_s: float = 1.0
+    """A chaser whose odometry was missing, or whose estimate no measurement supported, for so long
+    is started again from its odometry."""
     mean_motion_rad_s: float = 0.0
+    """Of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire; the target stays
+    at the origin of the Hill frame, where these forces vanish."""
     camera_turn_rad: float = field(init=False)
+    """Prior of the camera's turn. An error of the principal point acts as a turn, to first order.
+    """
 
     def __post_init__(self) -> None:
-        """Derive the prior of the camera's turn: an error of the principal point acts as a turn, to
-        first order.
-        """
         n = self.navigation
         turn = math.hypot(n.camera_turn_rad, n.camera_centre_px / self.camera.fx_px)
         object.__setattr__(self, "camera_turn_rad", turn)
@@ -150,3 +237,57 @@ class JointParameters:
     def inertia(self) -> Vector3:
         """Return the chasers' principal moments of inertia, kg m²."""
         return self.body.inertia
+
+
+def parameters_of(scenario: FlightScenario) -> JointParameters:
+    """Return the parameters for a scenario."""
+    target, body = scenario.target, scenario.chaser
+    rate_hz, orbit = scenario.time.rate_hz, scenario.orbit
+    xx, xy, xz, _, yy, yz, _, _, zz = target.inertia_tensor.reshape(-1).tolist()
+    return JointParameters(
+        target=TargetParameters(
+            motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
+            inertia_ratios=((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)),
+            centre_of_mass_trf_m=target.centre_of_mass_m,
+            body_covariance=rows_of(stated_properties(scenario).covariance[1:, 1:]),
+        ),
+        body=body,
+        camera=scenario.camera_model(),
+        navigation=scenario.navigation.errors(),
+        force_max_N=body.force_max_N,
+        torque_max_N_m=body.torque_max_N_m,
+        unexpected_velocity_m_s=body.force_max_N / body.mass_kg / rate_hz / math.sqrt(3.0),
+        unexpected_omega_rad_s=math.sqrt(3.0) * body.torque_max_N_m / min(body.inertia) / rate_hz,
+        mean_motion_rad_s=0.0 if orbit is None else orbit.elements.mean_motion_rad_s,
+        target_noise=_target_noise(scenario.estimator),
+        shape=_far_noise(scenario),
+    )
+
+
+def _target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]:
+    """Return the process noise of the target for each motion model: the default, or what the
+    scenario states.
+    """
+    stated = (estimator.target_acceleration_noise, estimator.target_angular_noise)
+    return {
+        model: (stated[0] or default[0], stated[1] or default[1])
+        for model, default in TARGET_NOISE.items()
+    }
+
+
+def _far_noise(scenario: FlightScenario) -> SightingNoise:
+    """Return the errors of sightings without markers."""
+    if scenario.ranging is None:
+        return SHAPE
+    return RANGING if scenario.perception.name == "statistical" else BEARING
+
+
+def rows_of(matrix: Array) -> Matrix9:
+    """Return a matrix as rows, which can be compared and kept in parameters."""
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def rows_3(matrix: Array) -> Matrix3:
+    """Return a matrix (3, 3) as rows."""
+    a, b, c = matrix.tolist()
+    return tuple(a), tuple(b), tuple(c)

@@ -22,15 +22,11 @@ from chaserdock_models.relative_motion import cw_wrench
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from msgspec.structs import replace
 
-from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE
-from chaserdock_controller.estimation.motion_models import (
-    free_shape,
-    process_noise,
-    propagate_target,
-)
+from chaserdock_controller.bodies.body_shape import RATIOS, SHAPE
 
 from . import kernels
 from .kernels import CHASER_MEAN, TARGET_MEAN
+from .motion_models import free_shape, process_noise, steady_motion
 from .parameters import JointParameters
 from .state import (
     ATTITUDE_DRIFT,
@@ -152,7 +148,8 @@ def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[J
         return state, np.eye(TARGET, TARGET if state.shape is None else TARGET + SHAPE)
     motion = (state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s)
     if state.shape is None:
-        (position, velocity, q, omega), f = propagate_target(*motion, dt, p.target)
+        centre = np.array(p.target.centre_of_mass_trf_m)
+        (position, velocity, q, omega), f = steady_motion(motion, dt, centre)
     else:
         (position, velocity, q, omega), f = free_shape(motion, dt, state.shape, p.mean_motion_rad_s)
     return replace(

@@ -11,23 +11,25 @@ from __future__ import annotations
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from chaserdock_controller.estimation.body_shape import (
+from chaserdock_controller.bodies.body_shape import (
     RATIOS,
     SHAPE,
     BodyShape,
     shape_covariance,
     shape_of,
 )
-from chaserdock_controller.estimation.parameters import BodyPrior, MekfParameters
-from chaserdock_controller.estimation.target_hypotheses import TargetHypothesis
 
 from . import kernels
 from .kernels import CHASER_MEAN, TARGET_MEAN
+from .parameters import BodyPrior, TargetParameters
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
+POSE, RATES = np.array([0, 1, 2, 6, 7, 8]), np.array([3, 4, 5, 9, 10, 11])
+"""Components of a body's error that belong to its pose and to its rates."""
 TARGET = 12
 """Components of the target's error."""
 FORCE, TORQUE = slice(12, 15), slice(15, 18)
@@ -40,7 +42,7 @@ POSITION_DRIFT, ATTITUDE_DRIFT, GYRO_BIAS = slice(21, 24), slice(24, 27), slice(
 """Errors of its odometry that do not average out: m (WRF), rad (CRF), rad/s (CRF)."""
 TURN, SHIFT, FOCAL = slice(30, 33), slice(33, 36), slice(36, 37)
 """Errors of its camera: rotation vector and shift (IRF), relative focal length (see
-``camera_calibration``).
+``measurements``).
 """
 VIEW = slice(37, 43)
 """Error of its sightings that persists with the view, in units of the stated sigmas."""
@@ -53,10 +55,11 @@ CHANNELS = ("sighting", "position", "velocity", "attitude", "rate")
 """Measurements that are gated separately."""
 
 
-class JointState(TargetHypothesis, frozen=True, eq=False, kw_only=True):
+class JointState(Struct, frozen=True, eq=False, kw_only=True):
     """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``)
     and of N chasers.
 
+    position_m, velocity_m_s, q_wxyz, omega_rad_s: of the target, as in ``TargetState``.
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4).
     extra (N, EXTRA): their additive states. covariance (12 + CHASER N, 12 + CHASER N), or with
     ``shape`` ``SHAPE`` more. alive (N,): chasers whose state is known. shape: of a torque-free
@@ -68,9 +71,16 @@ class JointState(TargetHypothesis, frozen=True, eq=False, kw_only=True):
     (N,): mean of the stated covariances of sightings, and the time of the newest one, where the
     view error is in units of such a mean; 0 before, and where it is in units of the newest one. nis
     (N, 4): moving average of the normalized innovation squared of the odometry's channels. updates:
-    ticks with sightings since the start of the target.
+    ticks with sightings since the start of the target. log_likelihood: of all measurements since
+    then.
     """
 
+    time_ns: int
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+    covariance: Array
     positions_m: Array
     velocities_m_s: Array
     attitudes_wxyz: Array
@@ -90,6 +100,7 @@ class JointState(TargetHypothesis, frozen=True, eq=False, kw_only=True):
     prior: BodyPrior | None = None
     ratio_information: Array | None = None
     shape_ns: int = 0
+    log_likelihood: float = 0.0
 
     @property
     def chasers(self) -> int:
@@ -127,7 +138,7 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
     )
 
 
-def with_body(state: JointState, p: MekfParameters) -> JointState:
+def with_body(state: JointState, p: TargetParameters) -> JointState:
     """Return the state of a target that is the body of ``p`` from now on: the same, unless it was
     another body until now.
     """
@@ -136,7 +147,7 @@ def with_body(state: JointState, p: MekfParameters) -> JointState:
     return start_shape(state, p)
 
 
-def start_shape(state: JointState, p: MekfParameters) -> JointState:
+def start_shape(state: JointState, p: TargetParameters) -> JointState:
     """Return the state in which no more is known of the target's body than ``p`` states."""
     inertia = np.array(p.inertia_ratios, dtype=float)
     own = TARGET + CHASER * state.chasers

@@ -30,11 +30,10 @@ from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from chaserdock_controller.estimation.body_shape import SHAPE
-from chaserdock_controller.estimation.target_hypotheses import POSE, RATES, TargetRates
-from chaserdock_controller.estimation.types import PoseHypothesis
+from chaserdock_controller.bodies.body_shape import SHAPE
 
 from . import kernels
+from .hypotheses import TargetRates
 from .measurements import (
     CameraMounting,
     measurement,
@@ -52,9 +51,11 @@ from .state import (
     FOCAL,
     FORCE,
     GYRO_BIAS,
+    POSE,
     POSITION,
     POSITION_DRIFT,
     RATE,
+    RATES,
     SHIFT,
     SIGHTING_CHANNEL,
     TARGET,
@@ -140,12 +141,24 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
 
 
 @dataclass(frozen=True, eq=False)
-class SightedPose(PoseHypothesis):
-    """Pose of the target by one sighting and the chaser's estimated state; ``cross`` (6, D):
-    covariance with the error vector.
+class SightedPose:
+    """Pose of the target by one sighting and the chaser's estimated state.
+
+    position_m (3,): origin of TRF in WRF. q_wxyz (4,): TRF to WRF. covariance (6, 6): of (position
+    in WRF axes, dtheta in TRF axes), q_true = q (x) exp(dtheta). cross (6, D): covariance with the
+    error vector.
     """
 
+    position_m: Array
+    q_wxyz: Array
+    covariance: Array
     cross: Array
+
+    def agrees(self, other: SightedPose, gate: float) -> bool:
+        """Test whether the difference from another pose at the same time is within the gate."""
+        turn = so3.log(so3.inverse_multiply(other.q_wxyz, self.q_wxyz))
+        d = np.concatenate([self.position_m - other.position_m, turn])
+        return float(d @ np.linalg.solve(self.covariance + other.covariance, d)) <= gate
 
 
 def sighted_pose(

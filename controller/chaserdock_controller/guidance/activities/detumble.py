@@ -69,7 +69,7 @@ class DetumbleActivity(Activity):
             self._state = self.with_trusted(self.control.state(observation, estimation))
         named = {c.chaser for c in commands if c.command == "detumble"}
         able = {c.number for c in self._fleet.chasers if c.number in named and _may_stop_stack(c)}
-        self._refusal = self._why_not(able | self._in(*DETUMBLING), observation) if able else ""
+        self._refusal = self._why_not(able | self._in(*DETUMBLING)) if able else ""
 
     def conclude(self, observation: Observation) -> None:
         """Advance the phases of chasers that move the stack by its motion, and set their thrusts."""
@@ -87,16 +87,15 @@ class DetumbleActivity(Activity):
         if state is None or not state.failed:
             return state
         chasers = self._fleet.chasers
-        return replace(
-            state, failed={i: chasers[i].thrusters.untrusted(k) for i, k in state.failed.items()}
-        )
+        failed = {(i, k) for i, k in state.failed if chasers[i].thrusters.untrusted((k,))}
+        return replace(state, failed=frozenset(failed))
 
     def _in(self, *phases: Phase) -> frozenset[int]:
         """Return the numbers of the chasers in some phases."""
         return frozenset(c.number for c in self._fleet.chasers if c.phase in phases)
 
-    def _why_not(self, chasers: Set[int], observation: Observation) -> str:
-        return self.control.why_not(self._state, chasers, observation.isolated)
+    def _why_not(self, chasers: Set[int]) -> str:
+        return self.control.why_not(self._state, chasers)
 
     def _follow_motion(self, observation: Observation) -> None:
         """Close the thrusters if those that are left cannot stop the stack; otherwise let the
@@ -107,7 +106,7 @@ class DetumbleActivity(Activity):
             return
         self.control.follow(state)
         present = active & state.chasers.keys()
-        failure = self._why_not(present, observation) if present else ""
+        failure = self._why_not(present) if present else ""
         stopped, moving = self.control.is_stopped(state), self.control.moves_again(state)
         for chaser in (self._fleet.chasers[i] for i in sorted(active)):
             if failure:
@@ -132,7 +131,7 @@ class DetumbleActivity(Activity):
         """Return the commands of chasers that move the stack, by chaser. Pulses that identify it
         wait while it is stopped.
         """
-        present = observation.odometry.keys()
+        present = {c.chaser for c in observation.chasers if c.odometry is not None}
         detumbling = self._in(*DETUMBLING) & present
         active = detumbling or self._in(Phase.IDENTIFY) & present
         if self._state is None or not active:
@@ -145,8 +144,7 @@ class DetumbleActivity(Activity):
             task = StackTask.IDENTIFY
         elif active <= self._in(Phase.STACK_HOLD):
             task = StackTask.HOLD
-        isolated = observation.isolated
-        return self.control.commands(self._state, active, isolated, task, observation)
+        return self.control.commands(self._state, active, task, observation)
 
     def _leaving(self) -> list[ChaserMachine]:
         """Return the chasers that back out: the stack must not turn under them by thrust."""

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock_controller.estimation.types import TargetState
-from chaserdock_controller.interfaces import DirectCommand
+from chaserdock_controller.interfaces import DirectCommand, TargetState
 
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import ChaserTick

@@ -21,14 +21,14 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.mounting import plume_free_thrusters
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 
+from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.composite_body import pose_in_target
-from chaserdock_controller.estimation.target_body import TargetBody
-from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.interfaces import (
     DirectCommand,
     IdentifiedStack,
     Observation,
     TargetEstimation,
+    TargetState,
 )
 
 from .allocation import feedback, minimum_time, spans_all_directions
@@ -78,7 +78,8 @@ class StackState:
     latched, by number.
 
     ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if
-    estimated. ``failed``: thrusters found stuck. ``informative``: see ``IdentifiedStack``.
+    estimated. ``isolated``, ``failed``: thrusters that chasers report as closed, and that were found
+    stuck, as (chaser, number). ``informative``: see ``IdentifiedStack``.
     ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the odometry of the chasers alone:
     with noise, but not late where disturbances act.
     """
@@ -88,7 +89,8 @@ class StackState:
     motion: StackMotion
     q_wxyz: Array
     thrust_factors: Mapping[int, Array] = field(default_factory=dict)
-    failed: Mapping[int, tuple[int, ...]] = field(default_factory=dict)
+    isolated: frozenset[tuple[int, int]] = frozenset()
+    failed: frozenset[tuple[int, int]] = frozenset()
     informative: Callable[[], tuple[tuple[int, int], ...]] = tuple
     measured_omega_rad_s: Array | None = None
 
@@ -134,18 +136,19 @@ class DetumbleControl:
         """Return the stack's state; None while the target is unknown or no latched chaser has
         odometry.
         """
-        known = sorted(estimation.latched & estimation.own.keys())
-        if estimation.at_effect is None or not known:
+        latched = [c for c in estimation.chasers if c.latched]
+        own = {c.chaser: c.own.state for c in latched if c.own is not None}
+        if estimation.at_effect is None or not own:
             return None
         if estimation.stack is not None:
-            return self._identified_state(observation, estimation.stack, known)
+            return self._identified_state(observation, estimation.stack, own.keys())
         chasers = {
-            i: MountedChaser(*pose_in_target(estimation.target, estimation.own[i])) for i in known
+            i: MountedChaser(*pose_in_target(estimation.target, state)) for i, state in own.items()
         }
         ahead = _impulse_ahead(observation, chasers, estimation.body)
-        own = {i: estimation.own[i] for i in known}
+        states = tuple(own.values())
         motion = observed_motion(
-            estimation.body, estimation.target, own, self._variances(len(known))
+            estimation.body, estimation.target, states, self._variances(len(states))
         )
         turn = rotations.multiply(
             rotations.conjugate(estimation.at_effect.q_wxyz), estimation.target.q_wxyz
@@ -159,17 +162,19 @@ class DetumbleControl:
             chasers,
             StackMotion(*parts),
             estimation.at_effect.q_wxyz,
-            measured_omega_rad_s=_mean_omega(own, estimation.target.q_wxyz),
+            isolated=_isolated(observation),
+            measured_omega_rad_s=_mean_omega(states, estimation.target.q_wxyz),
         )
 
     def _identified_state(
-        self, observation: Observation, identified: IdentifiedStack, known: Sequence[int]
+        self, observation: Observation, identified: IdentifiedStack, known: Set[int]
     ) -> StackState:
         """Return the state by the identified mass properties and the motion that was estimated with
         them.
         """
         body, motion = identified.stack.body, identified.motion
-        chasers = {i: identified.chasers[i] for i in known}
+        members = [c for c in identified.chasers if c.chaser in known]
+        chasers = {c.chaser: c.mounting for c in sorted(members, key=lambda c: c.chaser)}
         ahead = _impulse_ahead(observation, chasers, body)
         linear = (
             body.mass_kg * rotations.rotate_inverse(motion.q_wxyz, motion.velocity_m_s) + ahead[:3]
@@ -182,10 +187,17 @@ class DetumbleControl:
             rotations.rotate_inverse(turn, linear), rotations.rotate_inverse(turn, angular)
         )
         q = rotations.multiply(motion.q_wxyz, turn)
-        factors = {i: identified.thrust_factors[i] for i in known}
-        measured = _mean_omega({i: observation.odometry[i] for i in known}, motion.q_wxyz)
+        odometry = [observation.chasers[i].odometry for i in chasers]
         return StackState(
-            body, chasers, parts, q, factors, identified.failed, identified.informative, measured
+            body,
+            chasers,
+            parts,
+            q,
+            thrust_factors={c.chaser: c.thrust_factors for c in members},
+            isolated=_isolated(observation),
+            failed=identified.failed,
+            informative=identified.informative,
+            measured_omega_rad_s=_mean_omega([o for o in odometry if o is not None], motion.q_wxyz),
         )
 
     def _variances(self, chasers: int) -> tuple[float, float]:
@@ -218,15 +230,14 @@ class DetumbleControl:
         self,
         state: StackState,
         chasers: Set[int],
-        isolated: Mapping[int, tuple[int, ...]],
         task: StackTask,
         observation: Observation,
     ) -> dict[int, DirectCommand]:
-        """Return the commands of ``chasers`` for the task. ``isolated``: closed thrusters."""
+        """Return the commands of ``chasers`` for the task."""
         active = {i: state.chasers[i] for i in sorted(chasers & state.chasers.keys())}
         if not active:
             return {}
-        thrusters = self._thrusters_of(state, active, isolated)
+        thrusters = self._thrusters_of(state, active)
         match task:
             case StackTask.STOP:
                 thrusts = self._stop(state, thrusters, observation.effective_ns)
@@ -343,9 +354,7 @@ class DetumbleControl:
         speed, rate = float(np.linalg.norm(rates[:3])), float(np.linalg.norm(omega))
         return max(speed / self._settings.speed_m_s, rate / math.radians(self._settings.rate_deg_s))
 
-    def why_not(
-        self, state: StackState | None, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]
-    ) -> str:
+    def why_not(self, state: StackState | None, chasers: Set[int]) -> str:
         """Return why these chasers cannot stop the stack, or an empty string."""
         if not self._thrusters or self._scenario.chaser.actuation != "thrusters":
             return 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
@@ -354,7 +363,7 @@ class DetumbleControl:
         if missing := sorted(chasers - state.chasers.keys()):
             return f"chaser {missing[0]} is not latched, or its state is not known"
         active = {i: state.chasers[i] for i in sorted(chasers)}
-        thrusters = self._thrusters_of(state, active, isolated)
+        thrusters = self._thrusters_of(state, active)
         limits = thrusters.limits_N
         if not spans_all_directions(thrusters.wrenches, limits):
             usable = ", ".join(
@@ -370,12 +379,10 @@ class DetumbleControl:
 
     # -- models ------------------------------------------------------------------------------------
 
-    def problem(
-        self, state: StackState, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]
-    ) -> StackProblem:
+    def problem(self, state: StackState, chasers: Set[int]) -> StackProblem:
         """Return what a plan for these chasers has to solve."""
         active = {i: state.chasers[i] for i in sorted(chasers)}
-        return self._problem(state, self._thrusters_of(state, active, isolated))
+        return self._problem(state, self._thrusters_of(state, active))
 
     def _problem(self, state: StackState, thrusters: _Thrusters) -> StackProblem:
         momentum = [
@@ -392,19 +399,14 @@ class DetumbleControl:
             1 if self.sequencer.limited else None,
         )
 
-    def _thrusters_of(
-        self,
-        state: StackState,
-        active: Mapping[int, MountedChaser],
-        isolated: Mapping[int, tuple[int, ...]],
-    ) -> _Thrusters:
+    def _thrusters_of(self, state: StackState, active: Mapping[int, MountedChaser]) -> _Thrusters:
         """Return the thrusters of the active chasers: the limit is zero where a plume is not free
         or the thruster is closed.
         """
         latched, rows = frozenset(state.chasers), []
         for i in active:
             row = np.where(self._plume_free(latched)[i], self._full_N, 0.0)
-            row[[*isolated.get(i, ()), *state.failed.get(i, ())]] = 0.0
+            row[[number for k, number in state.isolated | state.failed if k == i]] = 0.0
             rows.append(row)
         wrenches = thruster_wrenches(state.body, active, self._thrusters)
         if state.thrust_factors:
@@ -437,22 +439,28 @@ def _impulse_ahead(
     ahead = np.zeros(6)
     for i, chaser in chasers.items():
         impulse = sum(
-            (duration_s * wrench for duration_s, wrench in observation.ahead[i]), np.zeros(6)
+            (duration_s * wrench for duration_s, wrench in observation.chasers[i].ahead),
+            np.zeros(6),
         )
         ahead = ahead + chaser.wrench_to_stack(impulse, body.centre_trf_m)
     return ahead
 
 
-def _mean_omega(own: Mapping[int, Odometry], q_wxyz: Array) -> Array:
+def _isolated(observation: Observation) -> frozenset[tuple[int, int]]:
+    """Return the thrusters (chaser, number) that chasers report as closed."""
+    return frozenset((c.chaser, number) for c in observation.chasers for number in c.isolated)
+
+
+def _mean_omega(own: Sequence[Odometry], q_wxyz: Array) -> Array:
     """Return the mean angular rate (3,) of chasers in the axes of a body with attitude ``q_wxyz``."""
-    omega_world = np.mean([rotations.rotate(o.q_wxyz, o.omega_rad_s) for o in own.values()], axis=0)
+    omega_world = np.mean([rotations.rotate(o.q_wxyz, o.omega_rad_s) for o in own], axis=0)
     return rotations.rotate_inverse(q_wxyz, omega_world)
 
 
 def observed_motion(
     body: TargetBody,
     target: TargetState,
-    own: Mapping[int, Odometry],
+    own: Sequence[Odometry],
     variances: tuple[float, float],
 ) -> StackMotion:
     """Return the momentum of the stack, TRF axes, from the target's estimate and the states of
@@ -468,7 +476,7 @@ def observed_motion(
     velocity_world = np.mean(
         [
             np.array(o.velocity_m_s) + rotations.cross(omega_world, centre - o.position_m)
-            for o in own.values()
+            for o in own
         ],
         axis=0,
     )

@@ -18,7 +18,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.rigid_body import RigidBody
 
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.bodies.target_body import TargetBody
 
 _MARGIN = 0.9
 """Share of the limits that is used: model errors and the joint's vibrations have the rest."""

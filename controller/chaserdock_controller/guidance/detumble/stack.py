@@ -15,7 +15,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.wrench_set import ThrusterMount, wrench_matrix
 
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.bodies.target_body import TargetBody
 
 
 @dataclass(frozen=True, eq=False)

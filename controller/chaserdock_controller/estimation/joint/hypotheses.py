@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hypotheses of the target's state, as both Kalman filters treat them: rates, loss, shocks, choice,
-mixture. Pure functions.
+"""Hypotheses of the target's state: rates, loss, shocks, choice, mixture. Pure functions.
 
-The error vector of every hypothesis begins with the target's 12 components: position, velocity
-(WRF), rotation, rate (TRF).
+Two hypotheses run in parallel after a start at an ambiguous view, until one is ruled out.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
@@ -18,43 +16,24 @@ from chaserdock_models.arrays import Array
 from msgspec import Struct
 from msgspec.structs import replace
 
-from .parameters import MekfParameters
-from .types import EstimatorEvent, PoseHypothesis, Shock, TargetState
+from chaserdock_controller.estimation.types import EstimatorEvent, Shock
+from chaserdock_controller.interfaces import TargetState
 
-POSE, RATES = np.array([0, 1, 2, 6, 7, 8]), np.array([3, 4, 5, 9, 10, 11])
-"""Components of a body's error that belong to its pose and to its rates."""
-
-
-class TargetHypothesis(Struct, frozen=True, eq=False, kw_only=True):
-    """State of the target at ``time_ns``: position, velocity, attitude and rate, as in
-    ``TargetState``.
-
-    covariance: of the filter's complete error vector. log_likelihood: of all measurements since the
-    start of the target.
-    """
-
-    time_ns: int
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
-    covariance: Array
-    log_likelihood: float = 0.0
+from .parameters import TargetParameters
+from .state import RATES, JointState
 
 
-HypothesisT = TypeVar("HypothesisT", bound=TargetHypothesis)
-
-
-class HypothesisSet(Struct, Generic[HypothesisT], frozen=True, eq=False):
-    """State of a filter at ``time_ns``.
+class FilterState(Struct, frozen=True, eq=False):
+    """State of the filter after the tick at ``time_ns``.
 
     hypotheses: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is
     unresolved. seen, rejected: chasers accepted and gated out at this time. accepted, gated,
-    reinitialisations: counts since the start.
+    reinitialisations: counts since the start. collective: ticks in a row in which most cameras were
+    rejected. overconfident, dropped: reported channels of odometry, by chaser and name.
     """
 
     time_ns: int
-    hypotheses: tuple[HypothesisT, ...] = ()
+    hypotheses: tuple[JointState, ...]
     ambiguous_since_ns: int = 0
     last_accepted_ns: int = 0
     seen: tuple[int, ...] = ()
@@ -62,9 +41,9 @@ class HypothesisSet(Struct, Generic[HypothesisT], frozen=True, eq=False):
     accepted: int = 0
     gated: int = 0
     reinitialisations: int = 0
-
-
-StateT = TypeVar("StateT", bound=HypothesisSet[Any])
+    collective: int = 0
+    overconfident: frozenset[tuple[int, str]] = frozenset()
+    dropped: frozenset[tuple[int, str]] = frozenset()
 
 
 class TargetRates(NamedTuple):
@@ -80,13 +59,13 @@ def rate_variances(velocity_m_s: float, omega_rad_s: float) -> Array:
     return np.repeat([velocity_m_s**2, omega_rad_s**2], 3)
 
 
-def unknown_rates(p: MekfParameters) -> TargetRates:
+def unknown_rates(p: TargetParameters) -> TargetRates:
     """Return the rates that are assumed before the first measurement."""
     variances = rate_variances(p.initial_velocity_m_s, p.initial_omega_rad_s)
     return TargetRates(np.zeros(3), np.zeros(3), np.diag(variances))
 
 
-def rates_of(h: TargetHypothesis) -> TargetRates:
+def rates_of(h: JointState) -> TargetRates:
     """Return the rates of a hypothesis."""
     return TargetRates(h.velocity_m_s, h.omega_rad_s, h.covariance[np.ix_(RATES, RATES)])
 
@@ -100,13 +79,13 @@ def widened(covariance: Array, variances: Array, first: int = 0) -> Array:
     return wider
 
 
-def with_uncertain_rates(h: HypothesisT, p: MekfParameters) -> HypothesisT:
+def with_uncertain_rates(h: JointState, p: TargetParameters) -> JointState:
     """Return the hypothesis with the additional variances of a re-initialization."""
     added = rate_variances(p.reinitialised_velocity_m_s, p.reinitialised_omega_rad_s)
     return replace(h, covariance=widened(h.covariance, added))
 
 
-def apply_shocks(state: StateT, shocks: Sequence[Shock]) -> StateT:
+def apply_shocks(state: FilterState, shocks: Sequence[Shock]) -> FilterState:
     """Add the known part of ``shocks`` to the rates of every hypothesis, and the unknown part to
     the covariance.
     """
@@ -125,7 +104,7 @@ def apply_shocks(state: StateT, shocks: Sequence[Shock]) -> StateT:
     return state
 
 
-def is_lost(covariance: Array, p: MekfParameters) -> bool:
+def is_lost(covariance: Array, p: TargetParameters) -> bool:
     """Test whether a pose with this covariance (12+, 12+) is too uncertain to use."""
     v = covariance.diagonal().tolist()
     if v[0] + v[1] + v[2] <= p.lost_position_m**2 and v[6] + v[7] + v[8] <= p.lost_attitude_rad**2:
@@ -134,31 +113,19 @@ def is_lost(covariance: Array, p: MekfParameters) -> bool:
     return position_m > p.lost_position_m or attitude_rad > p.lost_attitude_rad
 
 
-def all_lost(state: HypothesisSet[Any], p: MekfParameters) -> bool:
+def all_lost(state: FilterState, p: TargetParameters) -> bool:
     """Test whether every hypothesis is too uncertain to use."""
     return all(is_lost(h.covariance, p) for h in state.hypotheses)
 
 
-def poses_agree(a: PoseHypothesis, b: PoseHypothesis, covariance: Array, gate: float) -> bool:
-    """Test whether the difference of two simultaneous poses is within the gate of its
-    ``covariance`` (6, 6).
-    """
-    d = np.concatenate(
-        [a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))]
-    )
-    return float(d @ np.linalg.solve(covariance, d)) <= gate
-
-
-def weights(hypotheses: Sequence[TargetHypothesis]) -> list[float]:
+def _weights(hypotheses: Sequence[JointState]) -> list[float]:
     """Return the probabilities of the hypotheses from their likelihoods and equal priors."""
     top = max(h.log_likelihood for h in hypotheses)
     w = [math.exp(h.log_likelihood - top) for h in hypotheses]
     return [x / sum(w) for x in w]
 
 
-def mixture_covariance(
-    hypotheses: Sequence[TargetHypothesis], covariances: Sequence[Array]
-) -> Array:
+def mixture_covariance(hypotheses: Sequence[JointState], covariances: Sequence[Array]) -> Array:
     """Return the target's covariance (12, 12) about the first hypothesis, including the spread
     between hypotheses.
 
@@ -167,13 +134,13 @@ def mixture_covariance(
     if len(hypotheses) == 1:
         return covariances[0].copy()
     total = np.zeros((12, 12))
-    for weight, h, covariance in zip(weights(hypotheses), hypotheses, covariances, strict=True):
-        d = difference(hypotheses[0], h)
+    for weight, h, covariance in zip(_weights(hypotheses), hypotheses, covariances, strict=True):
+        d = _target_difference(hypotheses[0], h)
         total += weight * (covariance + np.outer(d, d))
     return total
 
 
-def difference(a: TargetHypothesis, b: TargetHypothesis) -> Array:
+def _target_difference(a: JointState, b: JointState) -> Array:
     """Return the target's error (12,) that takes ``a`` to ``b``."""
     turn = so3.log(so3.inverse_multiply(a.q_wxyz, b.q_wxyz))
     moved = (
@@ -185,7 +152,9 @@ def difference(a: TargetHypothesis, b: TargetHypothesis) -> Array:
     return np.concatenate(moved)
 
 
-def count_measurements(state: StateT, accepted: Sequence[int], rejected: Sequence[int]) -> StateT:
+def count_measurements(
+    state: FilterState, accepted: Sequence[int], rejected: Sequence[int]
+) -> FilterState:
     """Return the state with the chasers whose measurements were accepted and rejected at its time."""
     return replace(
         state,
@@ -197,7 +166,7 @@ def count_measurements(state: StateT, accepted: Sequence[int], rejected: Sequenc
     )
 
 
-def before_restart(state: StateT) -> StateT:
+def before_restart(state: FilterState) -> FilterState:
     """Return the state in which the measurements of its time are not counted yet, and a
     re-initialization is.
     """
@@ -211,7 +180,7 @@ def before_restart(state: StateT) -> StateT:
     )
 
 
-def choose(state: StateT, p: MekfParameters, events: list[EstimatorEvent]) -> StateT:
+def choose(state: FilterState, p: TargetParameters, events: list[EstimatorEvent]) -> FilterState:
     """Sort the hypotheses by likelihood and drop those ruled out by log odds or timeout; append an
     event for that.
     """
@@ -231,12 +200,12 @@ def choose(state: StateT, p: MekfParameters, events: list[EstimatorEvent]) -> St
 
 
 def target_state(
-    state: HypothesisSet[Any],
+    state: FilterState,
     time_ns: int,
-    best: TargetHypothesis,
+    best: JointState,
     covariance: Array,
     lost: bool,
-    p: MekfParameters,
+    p: TargetParameters,
 ) -> TargetState:
     """Return the estimate for ``time_ns``: ``best`` and ``covariance`` (12, 12) predicted from the
     filter's ``state``.

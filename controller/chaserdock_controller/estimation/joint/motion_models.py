@@ -13,11 +13,10 @@ import math
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import rk4_step
 
-from .body_shape import RATIO_BASIS, SHAPE, BodyShape
-from .parameters import MekfParameters
-from .types import Array
+from chaserdock_controller.bodies.body_shape import RATIO_BASIS, SHAPE, BodyShape
 
 _EYE3, _EYE12, _ZERO3 = np.eye(3), np.eye(12), np.zeros(3)
 
@@ -33,36 +32,6 @@ def constant_rates(q_wxyz: Array, omega_rad_s: Array, dt_s: float) -> tuple[Arra
     transition[:3, 3:] = so3.right_jacobian(phi) * dt_s
     transition[3:, 3:] = _EYE3
     return so3.normalize(so3.multiply(q_wxyz, step)), omega_rad_s, transition
-
-
-def torque_free(
-    q_wxyz: Array, omega_rad_s: Array, dt_s: float, inertia: Array, inertia_inverse: Array
-) -> tuple[Array, Array, Array]:
-    """Predict as ``constant_rates`` for a free rigid body: I omega' = (I omega) x omega.
-
-    inertia (3, 3) in TRF axes, up to a common factor; inertia_inverse (3, 3). State and variational
-    equations are integrated together by RK4 in steps of at most 0.5 s and 0.1 rad.
-    """
-    n = max(1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s)))))
-
-    def derivative(y: Array) -> Array:
-        q, w, transition = y[:4], y[4:7], y[7:].reshape(6, 6)
-        momentum = inertia @ w
-        omega_skew = so3.skew(w)
-        jacobian = np.zeros((6, 6))
-        jacobian[:3, :3] = -omega_skew
-        jacobian[:3, 3:] = _EYE3
-        jacobian[3:, 3:] = inertia_inverse @ (so3.skew(momentum) - omega_skew @ inertia)
-        q_rate = 0.5 * so3.multiply(q, np.array([0.0, *w.tolist()]))
-        return np.concatenate(
-            [q_rate, -(inertia_inverse @ (omega_skew @ momentum)), (jacobian @ transition).ravel()]
-        )
-
-    y = np.concatenate([q_wxyz, omega_rad_s, np.eye(6).ravel()])
-    for _ in range(n):
-        y = rk4_step(derivative, y, dt_s / n)
-        y[:4] = so3.normalize(y[:4])
-    return y[:4], y[4:7], y[7:].reshape(6, 6)
 
 
 def free_shape(
@@ -115,8 +84,8 @@ def _rotation(
     With W the rate of WRF in TRF axes, which changes by W' = -omega x W, the body turns in space at
     Omega = omega + W: I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, and T = 3 n^2 u
     x I u with u away from the Earth. The change of T with an error (4e-6 1/s^2 at most) is left out
-    of the transition. Attitude and rate by RK4, in the steps of ``torque_free``; the transition of
-    a step to third order, with the derivatives in its middle.
+    of the transition. Attitude and rate by RK4 in steps of at most 0.5 s and 0.1 rad; the
+    transition of a step to third order, with the derivatives in its middle.
     """
     steps = max(
         1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s))))
@@ -180,61 +149,29 @@ def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:
     return m
 
 
-def about_centre(
-    before: tuple[Array, Array, Array, Array],
-    after: tuple[Array, Array],
-    transition: Array,
-    centre_trf_m: Array,
-    dt_s: float,
-) -> tuple[Array, Array, Array]:
-    """Return position, velocity (3,) of TRF's origin and transition (12, 12) for an offset centre
-    of mass.
-
-    ``before``: position, velocity, attitude, rate; ``after``: attitude and rate ``dt_s`` later;
-    ``transition`` (12, 12) of a body whose centre of mass is TRF's origin. The centre of mass moves
-    at constant velocity.
-    """
-    position, velocity, q, omega = before
-    q_after, omega_after = after
-    arm, arm_after = so3.to_matrix(q) @ centre_trf_m, so3.to_matrix(q_after) @ centre_trf_m
-    spin = so3.to_matrix(q) @ rotations.cross(omega, centre_trf_m)
-    centre_velocity = velocity + spin
-    centre_after = position + arm + centre_velocity * dt_s
-    from_centre = np.linalg.inv(to_centre(q_after, omega_after, centre_trf_m))
-    return (
-        centre_after - arm_after,
-        centre_velocity - so3.to_matrix(q_after) @ rotations.cross(omega_after, centre_trf_m),
-        from_centre @ transition @ to_centre(q, omega, centre_trf_m),
-    )
-
-
-def propagate_target(
-    position_m: Array,
-    velocity_m_s: Array,
-    q_wxyz: Array,
-    omega_rad_s: Array,
-    dt_s: float,
-    p: MekfParameters,
+def steady_motion(
+    motion: tuple[Array, Array, Array, Array], dt_s: float, centre_trf_m: Array
 ) -> tuple[tuple[Array, Array, Array, Array], Array]:
-    """Return position, velocity, attitude and rate after ``dt_s`` by the motion model of ``p``, and
-    the transition (12, 12).
+    """Return position, velocity, attitude and rate of TRF after ``dt_s``, and the transition (12,
+    12) by their errors.
+
+    The body rate is constant, and the centre of mass moves at constant velocity.
     """
-    if p.motion_model == "torque_free":
-        inertia = np.array(p.inertia_ratios, dtype=float)
-        q, w, t = torque_free(q_wxyz, omega_rad_s, dt_s, inertia, np.linalg.inv(inertia))
-    else:
-        q, w, t = constant_rates(q_wxyz, omega_rad_s, dt_s)
+    position, velocity, q, omega = motion
+    q_after, omega_after, turned = constant_rates(q, omega, dt_s)
     f = np.eye(12)
     f[0, 3] = f[1, 4] = f[2, 5] = dt_s
-    f[6:12, 6:12] = t
-    if not any(p.centre_of_mass_trf_m):
-        return (position_m + velocity_m_s * dt_s, velocity_m_s, q, w), f
-    before, centre = (
-        (position_m, velocity_m_s, q_wxyz, omega_rad_s),
-        np.array(p.centre_of_mass_trf_m),
-    )
-    position, velocity, f = about_centre(before, (q, w), f, centre, dt_s)
-    return (position, velocity, q, w), f
+    f[6:12, 6:12] = turned
+    if not centre_trf_m.any():
+        return (position + velocity * dt_s, velocity, q_after, omega_after), f
+    r, r_after = so3.to_matrix(q), so3.to_matrix(q_after)
+    centre_velocity = velocity + r @ rotations.cross(omega, centre_trf_m)
+    centre = position + r @ centre_trf_m + centre_velocity * dt_s
+    position_after = centre - r_after @ centre_trf_m
+    velocity_after = centre_velocity - r_after @ rotations.cross(omega_after, centre_trf_m)
+    back = np.linalg.inv(to_centre(q_after, omega_after, centre_trf_m))
+    f = back @ f @ to_centre(q, omega, centre_trf_m)
+    return (position_after, velocity_after, q_after, omega_after), f
 
 
 def process_noise(dt_s: float, acceleration_density: float, angular_density: float) -> Array:

@@ -16,49 +16,50 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
+from chaserdock_protocol.messages import Odometry, Sighting
 
-from .types import (
-    Array,
-    EstimatorEvent,
-    Matrix3,
-    Measurement,
-    Shock,
-    TargetState,
-    content_key,
-    is_usable,
-    no_estimate,
-)
+from chaserdock_controller.interfaces import TargetState
+
+from .types import Estimate, Estimator, EstimatorEvent, EstimatorInputs, no_estimate
+
+_ODOMETRY_KEPT_NS = 2_000_000_000
+"""A sighting that arrives later than this is not used: twice the buffer of the joint filter."""
 
 
 @dataclass(frozen=True)
 class PaperParameters:
-    """Parameters of ``PaperEstimator``.
-
-    window: poses in the moving average. rate_window: differences in the mean of the rates.
-    stale_s: a chaser's latest estimate is used for this long.
-    outlier_position_m, outlier_attitude_rad: a pose farther than this from the median of three and more
-        chasers, or a combination farther than this from the moving average, is removed.
-    outlier_patience: after this many removed combinations in a row the history is dropped instead.
-    tracking_s, lost_s: age of the newest combination beyond which the status is "predicting" (the pose
-        is held constant) and "lost".
-    sigma_*: constant reported standard deviations, as the method computes no covariance; they match the errors of the
-        averaging with good poses in closed loop.
+    """Window, limits and stated accuracy of ``PaperEstimator``. The paper states none of them.
 
     Raises ValueError for values that are not positive.
     """
 
     window: int = 5
+    """Poses in the moving average."""
     rate_window: int = 11
+    """Differences in the mean of the rates, as in the authors' code."""
     stale_s: float = 0.5
+    """A chaser's latest pose is used for this long."""
     outlier_position_m: float = 0.2
+    """A pose farther than this from the median of three and more chasers, or a combination farther
+    than this from the moving average, is removed."""
     outlier_attitude_rad: float = math.radians(30.0)
+    """The same of the attitude."""
     outlier_patience: int = 10
+    """After this many removed combinations in a row the history is dropped instead."""
     tracking_s: float = 0.25
+    """Age of the newest combination beyond which the status is "predicting" (the pose is held)."""
     lost_s: float = 5.0
+    """The same for "lost"."""
     sigma_position_m: float = 0.02
+    """Stated standard deviation, as the method computes no covariance: the error of the averages of
+    good poses in closed loop, as are the next three."""
     sigma_velocity_m_s: float = 0.02
     sigma_attitude_rad: float = math.radians(2.0)
     sigma_omega_rad_s: float = math.radians(5.0)
@@ -84,66 +85,61 @@ def average_quaternion(quaternions: Sequence[Array]) -> Array:
     return -q if q[0] < 0.0 else q
 
 
-class PaperEstimator:
-    """The paper's combiner with the interface of ``Mekf``.
+class View(NamedTuple):
+    """Pose of the target, WRF, by one chaser's sighting at ``time_ns`` and its odometry."""
 
-    ``late_dropped`` counts measurements not newer than the chaser's latest or than the newest
-    combination, ``gated`` the poses removed as outliers, ``reinitialisations`` the dropped
-    histories. For an ambiguous view the first hypothesis is used.
+    time_ns: int
+    position_m: Array
+    q_wxyz: Array
+
+
+class PaperEstimator(Estimator):
+    """The paper's combiner. It takes odometry as exact, and of an ambiguous view the first pose.
+
+    A sighting counts once the odometry of its exposure is known, and if it is newer than the newest
+    combination. Pushes and latched chasers change nothing: the rates are differences of poses.
     """
 
-    def __init__(self, parameters: PaperParameters | None = None) -> None:
-        self.parameters = parameters if parameters is not None else PaperParameters()
-        self.accepted = 0
-        self.gated = 0
-        self.late_dropped = 0
-        self.early_dropped = 0
-        self.invalid = 0
-        self.reinitialisations = 0
-        p = self.parameters
-        self._latest: dict[int, Measurement] = {}
+    def __init__(self, camera: Camera, parameters: PaperParameters | None = None) -> None:
+        self.parameters = p = parameters if parameters is not None else PaperParameters()
+        self._camera = camera
+        self._odometry: dict[tuple[int, int], Odometry] = {}
+        self._latest: dict[int, View] = {}
         self._poses: deque[tuple[Array, Array]] = deque(maxlen=p.window)
         self._rates: deque[tuple[Array, Array]] = deque(maxlen=p.rate_window)
         self._mean: tuple[int, Array, Array] | None = None
         self._newest_ns: int | None = None
         self._removed_in_a_row = 0
+        self._reinitialisations = 0
         self._seen = 0
         self._rejected: tuple[int, ...] = ()
-        self._events: list[EstimatorEvent] = []
         self._was_lost = False
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
-        """Add measurements, in any order, and return the estimate for ``now_ns``."""
-        usable: list[Measurement] = []
-        for m in sorted(measurements, key=content_key):
-            if m.time_ns > now_ns:
-                self.early_dropped += 1
-            elif self._newest_ns is not None and m.time_ns <= self._newest_ns:
-                self.late_dropped += 1
-            elif not is_usable(m):
-                self.invalid += 1
-                self._events.append(
-                    EstimatorEvent(
-                        now_ns, "info", f"chaser {m.chaser}: dropped an unusable measurement"
-                    )
-                )
-            else:
-                usable.append(m)
-        for time_ns, group in groupby(usable, key=lambda m: m.time_ns):
+    @property
+    def reinitialisations(self) -> int:
+        """Return how often the history was dropped."""
+        return self._reinitialisations
+
+    def update(self, inputs: EstimatorInputs) -> Estimate:
+        """Combine the sightings of a tick."""
+        events: list[EstimatorEvent] = []
+        now_ns = inputs.time_ns
+        self._keep_odometry(inputs)
+        usable = [s for s in inputs.sightings if self._is_usable(s, now_ns)]
+        usable.sort(key=lambda s: (s.sim_time_ns, s.chaser, len(s.solutions)))
+        for time_ns, group in groupby(usable, key=lambda s: s.sim_time_ns):
             self._newest_ns = time_ns
             fresh: set[int] = set()
-            for m in group:
-                if m.chaser in fresh:
-                    self.late_dropped += 1
-                    continue
-                fresh.add(m.chaser)
-                self._latest[m.chaser] = m
-            self._combine(time_ns, fresh)
+            for sighting in group:
+                if sighting.chaser not in fresh:
+                    fresh.add(sighting.chaser)
+                    self._take(sighting)
+            self._combine(time_ns, fresh, events)
         estimate = self.estimate_at(now_ns)
         if estimate.status == "lost" and not self._was_lost:
-            self._events.append(EstimatorEvent(now_ns, "info", "lost"))
+            events.append(EstimatorEvent(now_ns, "info", "lost"))
         self._was_lost = estimate.status == "lost"
-        return estimate
+        return Estimate(estimate, events=tuple(events))
 
     def estimate_at(self, time_ns: int) -> TargetState:
         """Return the newest combination for any time; the method does not predict."""
@@ -178,24 +174,45 @@ class PaperEstimator:
             self._rejected,
         )
 
-    def disturb(self, shock: Shock) -> None:
-        """Do nothing: the rates are differences of poses."""
+    def _keep_odometry(self, inputs: EstimatorInputs) -> None:
+        for c in inputs.chasers:
+            for o in (c.odometry, c.outdated):
+                if o is not None:
+                    self._odometry[o.chaser, o.sim_time_ns] = o
+        oldest_ns = inputs.time_ns - _ODOMETRY_KEPT_NS
+        for key in [k for k in self._odometry if k[1] < oldest_ns]:
+            del self._odometry[key]
 
-    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
-        """Do nothing: the method has no model of the body."""
+    def _is_usable(self, sighting: Sighting, now_ns: int) -> bool:
+        """Test whether a sighting is new, and the odometry of its exposure known."""
+        newest = -1 if self._newest_ns is None else self._newest_ns
+        time_ns = sighting.sim_time_ns
+        return newest < time_ns <= now_ns and (sighting.chaser, time_ns) in self._odometry
 
-    def drain_events(self) -> list[EstimatorEvent]:
-        """Return the events since the last call."""
-        events, self._events = self._events, []
-        return events
+    def _take(self, sighting: Sighting) -> None:
+        """Make a sighting the latest of its chaser."""
+        if not sighting.solutions:
+            self._latest.pop(sighting.chaser, None)
+            return
+        seen, camera = sighting.solutions[0], self._camera
+        own = self._odometry[sighting.chaser, sighting.sim_time_ns]
+        mounting = rotations.normalize(camera.q_crf_irf_wxyz)
+        q_own, q_seen = rotations.normalize(own.q_wxyz), rotations.normalize(seen.q_wxyz)
+        line = so3.to_matrix(mounting) @ np.array(seen.position_m)
+        lever = np.array(camera.position_crf_m) + line
+        self._latest[sighting.chaser] = View(
+            sighting.sim_time_ns,
+            np.array(own.position_m) + so3.to_matrix(q_own) @ lever,
+            rotations.normalize(rotations.multiply(q_own, rotations.multiply(mounting, q_seen))),
+        )
 
-    def _combine(self, time_ns: int, fresh: set[int]) -> None:
+    def _combine(self, time_ns: int, fresh: set[int], events: list[EstimatorEvent]) -> None:
         p = self.parameters
         horizon = time_ns - round(p.stale_s * 1e9)
         views = {
-            c: (m.hypotheses[0].position_m, m.hypotheses[0].q_wxyz)
-            for c, m in sorted(self._latest.items())
-            if m.hypotheses and m.time_ns >= horizon
+            c: (view.position_m, view.q_wxyz)
+            for c, view in sorted(self._latest.items())
+            if view.time_ns >= horizon
         }
         removed: set[int] = set()
         if len(views) > 2:
@@ -214,17 +231,18 @@ class PaperEstimator:
             }
         self._rejected = tuple(sorted(removed & fresh))
         self._seen = len((views.keys() - removed) & fresh)
-        self.gated += len(removed & fresh)
-        self.accepted += self._seen
         kept = [views[c] for c in views if c not in removed]
         if kept:
             self._append(
                 time_ns,
                 np.mean([x for x, _ in kept], axis=0),
                 average_quaternion([q for _, q in kept]),
+                events,
             )
 
-    def _append(self, time_ns: int, position: Array, q: Array) -> None:
+    def _append(
+        self, time_ns: int, position: Array, q: Array, events: list[EstimatorEvent]
+    ) -> None:
         p = self.parameters
         if self._mean is not None:
             _, mean_position, mean_q = self._mean
@@ -232,17 +250,15 @@ class PaperEstimator:
             if far or _angle(mean_q, q) > p.outlier_attitude_rad:
                 self._removed_in_a_row += 1
                 if self._removed_in_a_row < p.outlier_patience:
-                    self.gated += self._seen
-                    self.accepted -= self._seen
                     self._seen = 0
                     return
                 self._poses.clear()
                 self._rates.clear()
                 self._mean = None
-                self.reinitialisations += 1
-                self._events.append(EstimatorEvent(time_ns, "info", "re-initialised"))
+                self._reinitialisations += 1
+                events.append(EstimatorEvent(time_ns, "info", "re-initialised"))
         else:
-            self._events.append(EstimatorEvent(time_ns, "info", "initialised"))
+            events.append(EstimatorEvent(time_ns, "info", "initialised"))
         self._removed_in_a_row = 0
         self._poses.append((position, q))
         mean = (

@@ -6,7 +6,7 @@ or detached. Pure functions.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +49,7 @@ def body_of(values: Array) -> TargetBody:
 
 
 def attach(
-    target: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody
+    target: MassProperties, chasers: Sequence[MountedChaser], body: RigidBody
 ) -> MassProperties:
     """Return the mass properties of a target with chasers fixed to it; the chasers' are taken as
     exact.
@@ -79,7 +79,7 @@ def attach(
 
 def covariance_by_chasers(
     target: TargetBody,
-    chasers: Mapping[int, MountedChaser],
+    chasers: Sequence[MountedChaser],
     body: RigidBody,
     mass_share: float,
     centre_m: float,
@@ -106,17 +106,17 @@ def covariance_by_chasers(
 
 
 def detach(
-    stack: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody
+    stack: MassProperties, chasers: Sequence[MountedChaser], body: RigidBody
 ) -> MassProperties:
     """Return the mass properties of the target of a stack: those of the stack without the chasers."""
     return _transformed(stack, _parts(chasers, body, -1.0))
 
 
 def _parts(
-    chasers: Mapping[int, MountedChaser], body: RigidBody, sign: float
+    chasers: Sequence[MountedChaser], body: RigidBody, sign: float
 ) -> list[tuple[float, Array, Array, Array]]:
     inertia = sign * np.asarray(body.inertia)
-    return [(sign * body.mass_kg, inertia, c.position_m, c.q_wxyz) for c in chasers.values()]
+    return [(sign * body.mass_kg, inertia, c.position_m, c.q_wxyz) for c in chasers]
 
 
 def _transformed(

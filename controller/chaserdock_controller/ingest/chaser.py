@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ingest keeps of one chaser, and what follows from its messages in a tick. No I/O."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Odometry, ThrusterReport
+from chaserdock_protocol.scenario import FlightScenario
+
+from chaserdock_controller.interfaces import (
+    AppliedImpulse,
+    ChaserInputs,
+    ChaserObservation,
+    LogEntry,
+)
+
+from .latency_compensation import CommandHistory
+from .lost_chasers import LossWatch
+from .odometry_validation import why_invalid
+
+
+class ChaserIngest:
+    """Keeps the newest thruster ``report`` of one chaser, and for how long it has sent nothing."""
+
+    def __init__(self, scenario: FlightScenario, chaser: int) -> None:
+        self.chaser = chaser
+        self.loss = LossWatch(chaser)
+        self.report: ThrusterReport | None = None
+        self._timing, self._nominal = scenario.timing, scenario.chaser.wrench_max
+        self._period_ns = round(1e9 / scenario.time.rate_hz)
+
+    def observe(
+        self, inputs: ChaserInputs, tick: int, time_ns: int, sent: CommandHistory
+    ) -> tuple[ChaserObservation, LogEntry | None]:
+        """Check the messages of a tick; return what is known of the chaser, and an event if it was
+        lost or is lost no more. ``sent``: the commands to this chaser so far.
+        """
+        self.report = inputs.thrusters or self.report
+        # What is extrapolated from an invalid state is invalid.
+        source = None if inputs.odometry is None else inputs.outdated or inputs.odometry
+        invalid = "" if source is None else why_invalid(source)
+        odometry = None if invalid else inputs.odometry
+        effective_ns = self._timing.effective_ns(tick)
+        interrupted = self.loss.is_absent(time_ns)
+        event = self.loss.update(odometry, time_ns)
+        observation = ChaserObservation(
+            chaser=self.chaser,
+            input_limits=self._limits(),
+            odometry=odometry,
+            invalid=invalid,
+            outdated=self._outdated(inputs.outdated),
+            lost=self.loss.obstacle(time_ns),
+            interrupted=interrupted,
+            docking=inputs.docking,
+            impulse=None if odometry is None else self._impulse(tick, time_ns, sent),
+            last_command=sent.segments(time_ns, time_ns + 1)[-1][2] if odometry is None else None,
+            ahead=() if odometry is None else self._ahead(tick, time_ns, effective_ns, sent),
+            thruster_impulses=self._thruster_impulses(tick),
+            isolated=() if self.report is None else self.report.isolated,
+        )
+        return observation, event
+
+    def _outdated(self, odometry: Odometry | None) -> Odometry | None:
+        """Return valid odometry with the time of its tick: the clock of a chaser may be wrong."""
+        if odometry is None or why_invalid(odometry):
+            return None
+        time_ns = self._timing.tick_time_ns(odometry.tick)
+        return msgspec.structs.replace(odometry, sim_time_ns=time_ns)
+
+    def _limits(self) -> Array:
+        """Return the greatest force and torque (6,) per body axis that the chaser can produce now."""
+        report = self.report
+        if report is None:
+            return self._nominal.copy()
+        return np.minimum(self._nominal, np.abs([*report.force_max_N, *report.torque_max_N_m]))
+
+    def _impulse(self, tick: int, time_ns: int, sent: CommandHistory) -> AppliedImpulse:
+        """Return the impulse since the tick before: as thrusters report it, or as commanded."""
+        r = self.report
+        if r is not None and r.tick == tick:
+            given = np.array([*r.given_impulse_N_s, *r.given_angular_impulse_N_m_s])
+            return AppliedImpulse(given, measured=True)
+        segments = sent.segments(time_ns - self._period_ns, time_ns)
+        commanded = sum((w * ((end - begin) / 1e9) for begin, end, w in segments), np.zeros(6))
+        return AppliedImpulse(commanded, measured=False)
+
+    def _ahead(
+        self, tick: int, time_ns: int, effective_ns: int, sent: CommandHistory
+    ) -> tuple[tuple[float, Array], ...]:
+        """Return what acts until the tick's command does; an impulse of pulses that are still to
+        fire is spread evenly.
+        """
+        r = self.report
+        if r is None or r.tick != tick:
+            return sent.ahead(time_ns, effective_ns)
+        coming = np.array([*r.coming_impulse_N_s, *r.coming_angular_impulse_N_m_s])
+        duration_s = (effective_ns - time_ns) / 1e9
+        return ((duration_s, coming / duration_s),) if duration_s > 0.0 else ()
+
+    def _thruster_impulses(self, tick: int) -> Array | None:
+        """Return the impulses (n,) of the thrusters since the tick before, as reported."""
+        r = self.report
+        if r is None or r.tick != tick or not r.given_thrusters_N_s:
+            return None
+        return np.array(r.given_thrusters_N_s)

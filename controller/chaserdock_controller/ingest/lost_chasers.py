@@ -15,7 +15,11 @@ from chaserdock_protocol.messages import Level, Odometry
 ABSENT_S = 0.3
 """A chaser without odometry for this long is lost."""
 FORGOTTEN_S = 60.0
+"""Time, s, after which the coast of a lost chaser says nothing about its place any more. Chosen."""
 FIRST_M, GROWTH_M_S, MOST_M = 0.02, 0.01, 0.3
+"""Margin around a lost chaser: at first (m), its growth (m/s) by the error of its last velocity and by
+disturbances, and at most (m).
+"""
 
 
 def margin_m(lost_s: float) -> float:

@@ -23,12 +23,19 @@ from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Level, Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
+# Change of position (m) and attitude between two ticks, beyond what motion and stated noise explain,
+# up to which odometry has not jumped: larger than steps of motion capture, smaller than the errors
+# that endanger a docking. Chosen.
 PLAUSIBLE_M = 0.02
 PLAUSIBLE_RAD = math.radians(2.0)
 LONGEST_S = 1.0
 """After a longer gap every state is accepted."""
 _UNIT_WITHIN = 0.1
+"""Deviation of a quaternion's length from 1 that is taken for rounding of its sender."""
 _ROUNDING = 1e-9
+"""Asymmetry and negative eigenvalues of a covariance, as a share of its largest element, that are
+rounding.
+"""
 
 COVARIANCES = (
     "position_covariance_m2",

@@ -10,6 +10,7 @@ from chaserdock_protocol.messages import Level
 DISAGREES_S = 0.6
 """A chaser whose sightings were all rejected for this long is inconsistent."""
 AGREES_S = 0.6
+"""Time, s, for which its sightings must be accepted to be trusted (again): as long as the above."""
 
 
 @dataclass

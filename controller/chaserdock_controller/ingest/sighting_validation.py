@@ -11,7 +11,11 @@ import numpy as np
 from chaserdock_protocol.messages import Level, PoseSolution, Sighting
 
 _UNIT_WITHIN = 0.1
+"""Deviation of a quaternion's length from 1 that is taken for rounding of its sender."""
 _ROUNDING = 1e-6
+"""Asymmetry of a covariance, as a share of its largest element, that is rounding: perception may
+compute in single precision.
+"""
 
 
 def why_invalid(solution: PoseSolution) -> str:

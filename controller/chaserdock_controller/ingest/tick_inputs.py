@@ -24,6 +24,9 @@ from chaserdock_controller.interfaces import ChaserInputs, LogEntry, TickInputs
 from .odometry_validation import OdometryValidation
 
 _REMEMBERED_TICKS = 256
+"""Ticks for which it is known whether their sightings were usable; memory is bounded by twice as
+many.
+"""
 
 
 class Mailbox:

@@ -35,6 +35,7 @@ from chaserdock_controller.interfaces import StackChaser
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 MASS, CENTRE, INERTIA = slice(12, 13), slice(13, 16), slice(16, 22)
 PROPERTIES = slice(12, 22)
+# First component of the mounts of the chasers, which follow the mass properties.
 _MOUNTS = 22
 _BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate(INERTIA_ROWS):

@@ -22,10 +22,13 @@ from chaserdock_controller.bodies.body_shape import SHAPE
 
 from .native import LIBRARY, function
 
+# Numbers of doubles in the kernels' arrays: see native/layout.h.
 TARGET_MEAN, CHASER_MEAN = 13, 44
 MOST_ROWS = 18
 """Largest number of rows that a chaser measures in a tick: 6 of a sighting, 12 of odometry."""
+# Doubles of a sighting, and number of gated channels (`state.CHANNELS`).
 _SEEN = 55
+# See above.
 _CHANNELS = 5
 
 

@@ -60,7 +60,11 @@ moving.
 """
 _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
 _ATTITUDE_TIME_S = 5.0
+"""Time constant, s, with which the stack turns to a commanded attitude. Chosen."""
 _PULSE_PERIOD_NS, _PULSE_NS = 600_000_000, 300_000_000
+"""Identifying pulses begin at this interval and last for half of it, ns, so that the rates before and
+after each are measured for as long.
+"""
 
 
 class StackTask(Enum):

@@ -170,9 +170,8 @@ def test_flight_scenario_keeps_its_values_and_types(name: str) -> None:
     full = load_scenario(shipped_scenario(name))
     flight = flight_scenario(full)
     assert type(flight) is FlightScenario
-    assert {type(c) for c in flight.chasers} == {
-        type(flight).model_fields["chasers"].annotation.__args__[0]
-    }  # type: ignore[union-attr]
+    (kind, *_) = get_args(type(flight).model_fields["chasers"].annotation)
+    assert {type(c) for c in flight.chasers} == {kind}
     assert type(flight.target) is FlightScenario.model_fields["target"].annotation
     assert type(flight.camera) is FlightScenario.model_fields["camera"].annotation
     assert flight.camera_model() == full.camera_model()

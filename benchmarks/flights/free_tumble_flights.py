@@ -117,11 +117,9 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     velocity = np.array(start.velocity_m_s) + rotations.rotate(
         q0, np.cross(omega0, body.centre_trf_m)
     )
-    camera, sensor, estimator = (
-        RenderedImages(scenario),
-        OdometrySensor(scenario),
-        JointEstimator(parameters_of(flight), len(flight.chasers)),
-    )
+    camera = RenderedImages(scenario)
+    sensor = OdometrySensor(scenario)
+    estimator = JointEstimator(parameters_of(flight), len(flight.chasers))
     chasers, before, nees = range(len(scenario.chasers)), None, []
     drawn = scenario.perception.name == "statistical"
     views = [ViewErrors(estimator.parameters, scenario.seed, i) for i in chasers]

@@ -85,7 +85,7 @@ def average_quaternion(quaternions: Sequence[Array]) -> Array:
     return -q if q[0] < 0.0 else q
 
 
-class View(NamedTuple):
+class SightedTarget(NamedTuple):
     """Pose of the target, WRF, by one chaser's sighting at ``time_ns`` and its odometry."""
 
     time_ns: int
@@ -104,7 +104,7 @@ class PaperEstimator(Estimator):
         self.parameters = p = parameters if parameters is not None else PaperParameters()
         self._camera = camera
         self._odometry: dict[tuple[int, int], Odometry] = {}
-        self._latest: dict[int, View] = {}
+        self._latest: dict[int, SightedTarget] = {}
         self._poses: deque[tuple[Array, Array]] = deque(maxlen=p.window)
         self._rates: deque[tuple[Array, Array]] = deque(maxlen=p.rate_window)
         self._mean: tuple[int, Array, Array] | None = None
@@ -200,7 +200,7 @@ class PaperEstimator(Estimator):
         q_own, q_seen = rotations.normalize(own.q_wxyz), rotations.normalize(seen.q_wxyz)
         line = so3.to_matrix(mounting) @ np.array(seen.position_m)
         lever = np.array(camera.position_crf_m) + line
-        self._latest[sighting.chaser] = View(
+        self._latest[sighting.chaser] = SightedTarget(
             sighting.sim_time_ns,
             np.array(own.position_m) + so3.to_matrix(q_own) @ lever,
             rotations.normalize(rotations.multiply(q_own, rotations.multiply(mounting, q_seen))),

@@ -23,7 +23,7 @@ from chaserdock_controller.estimation.identification.stage import Identification
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.parameters import TargetParameters
 from chaserdock_controller.estimation.joint.replay import ReplayBuffer
-from chaserdock_controller.estimation.paper import PaperEstimator, PaperParameters, View
+from chaserdock_controller.estimation.paper import PaperEstimator, PaperParameters, SightedTarget
 from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_controller.guidance.activities.detumble import detumbling_of
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
@@ -167,7 +167,7 @@ class JointEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
 class PaperEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
     parameters: PaperParameters
     _odometry: dict[tuple[int, int], Odometry]
-    _latest: dict[int, View]
+    _latest: dict[int, SightedTarget]
     _poses: list[tuple[Array, Array]]
     _rates: list[tuple[Array, Array]]
     _mean: tuple[int, Array, Array] | None

@@ -38,7 +38,7 @@ from .hypotheses import FilterState, is_lost, mixture_covariance, target_state
 from .measurements import mounting_of
 from .parameters import JointParameters, TargetParameters, rows_of
 from .prediction import disturbance, predict_target
-from .replay import ReplayBuffer, TickRecord
+from .replay import FilterTick, ReplayBuffer
 from .state import (
     CHASER,
     FOCAL,
@@ -100,11 +100,14 @@ class JointEstimator(Estimator):
     def update(self, inputs: EstimatorInputs) -> Estimate:
         """Process a tick. Sightings and odometry of ticks that are not kept any more are ignored."""
         records = self._buffer.records
-        record = TickRecord(
+        record = FilterTick(
             time_ns=inputs.time_ns,
             parameters=self.target,
             covered_s=inputs.covered_s,
-            chasers=tuple(dataclasses.replace(c, outdated=None) for c in inputs.chasers),
+            chasers=tuple(
+                c if c.outdated is None else dataclasses.replace(c, outdated=None)
+                for c in inputs.chasers
+            ),
         )
         records.append(record)
         first = len(records) - 1
@@ -253,7 +256,7 @@ class JointEstimator(Estimator):
         return i
 
     def _process(
-        self, before: FilterState | None, record: TickRecord
+        self, before: FilterState | None, record: FilterTick
     ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
         return process_tick(
             before, record, self.chasers, self._mounting, self._with(record.parameters)

@@ -16,14 +16,14 @@ from chaserdock_controller.estimation.types import ChaserMeasurement, EstimatorE
 from .hypotheses import FilterState, apply_shocks
 from .parameters import TargetParameters
 
-Process = Callable[
-    [FilterState | None, "TickRecord"], tuple[FilterState, tuple[EstimatorEvent, ...]]
+TickFunction = Callable[
+    [FilterState | None, "FilterTick"], tuple[FilterState, tuple[EstimatorEvent, ...]]
 ]
 """Maps the state before a tick, and its record, to the state after it."""
 
 
 @dataclass(kw_only=True)
-class TickRecord:
+class FilterTick:
     """What the filter needs to process a tick again, and the state and the events that result.
 
     ``parameters``, with the target's model, apply from the tick before to this one; ``shocks``
@@ -54,7 +54,7 @@ class ReplayBuffer:
     events of records that are.
     """
 
-    records: list[TickRecord] = field(default_factory=list)
+    records: list[FilterTick] = field(default_factory=list)
     base: FilterState | None = None
     pending: list[EstimatorEvent] = field(default_factory=list)
     drained: set[EstimatorEvent] = field(default_factory=set)
@@ -69,13 +69,13 @@ class ReplayBuffer:
         i = bisect_right(self.records, time_ns, key=lambda r: r.time_ns)
         return self.records[i - 1].state if i > 0 else self.base
 
-    def find(self, time_ns: int) -> tuple[int, TickRecord | None]:
+    def find(self, time_ns: int) -> tuple[int, FilterTick | None]:
         """Return the record of ``time_ns``, or None, and the index at which it is or belongs."""
         i = bisect_left(self.records, time_ns, key=lambda r: r.time_ns)
         found = i < len(self.records) and self.records[i].time_ns == time_ns
         return i, self.records[i] if found else None
 
-    def replay(self, first: int, process: Process) -> None:
+    def replay(self, first: int, process: TickFunction) -> None:
         """Process the records from index ``first`` on."""
         state = self.records[first - 1].state if first > 0 else self.base
         for record in self.records[first:]:

@@ -33,7 +33,7 @@ from .hypotheses import (
 from .measurements import CameraMounting
 from .parameters import JointParameters, TargetParameters
 from .prediction import predict
-from .replay import TickRecord
+from .replay import FilterTick
 from .state import (
     CHANNELS,
     SIGHTING_CHANNEL,
@@ -72,7 +72,7 @@ def lost_limits(state: JointState, target: TargetParameters) -> TargetParameters
 
 def process_tick(
     before: FilterState | None,
-    record: TickRecord,
+    record: FilterTick,
     chasers: int,
     mounting: CameraMounting,
     p: JointParameters,
@@ -102,7 +102,7 @@ def process_tick(
     return choose(now, p.target, events), tuple(events)
 
 
-def _propagate(state: JointState, record: TickRecord, p: JointParameters) -> JointState:
+def _propagate(state: JointState, record: FilterTick, p: JointParameters) -> JointState:
     """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured
     for long.
 
@@ -142,13 +142,13 @@ def _with_unknown_command(
     return widened(covariance, rate_variances(velocity, rate), block(i).start)
 
 
-def _stale_ns(record: TickRecord, p: JointParameters) -> int:
+def _stale_ns(record: FilterTick, p: JointParameters) -> int:
     """Return the time before which a measurement is too old for a chaser's state to rest on it."""
     return record.time_ns - round(p.restart_after_s * 1e9)
 
 
 def _report_restarts(
-    state: JointState, record: TickRecord, p: JointParameters, events: list[EstimatorEvent]
+    state: JointState, record: FilterTick, p: JointParameters, events: list[EstimatorEvent]
 ) -> None:
     """Report chasers that are started again although their odometry has arrived."""
     stale = _stale_ns(record, p)

@@ -236,7 +236,9 @@ def nested(kind: type[Struct]) -> list[type[Struct]]:
 
 
 def fields_of(kind: type[Struct]) -> list[str]:
-    """Return a table of a type's own fields; the three that all messages have are described once."""
+    """Return a table of a type's own fields; the three that all messages have are described
+    once.
+    """
     shape = shapes.type_info(kind)
     assert isinstance(shape, shapes.StructType)
     common = (

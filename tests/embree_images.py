@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's renderers
-with them.
+"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's
+renderers with them.
 
 Light as of the renderer: Lambert, Blinn's highlight, hard shadows of the sun. Textures are left
 out. Each pixel has ``samples`` squared rays.

@@ -108,7 +108,9 @@ class SyntheticFlight:
         return EstimatorInputs(self.time_ns, PERIOD_S, chasers, sightings)
 
     def step(self) -> None:
-        """Move everything to the next tick under a feedback that holds the chasers at their places."""
+        """Move everything to the next tick under a feedback that holds the chasers at their
+        places.
+        """
         e, r = self.errors, self.rng
         for i, c in enumerate(self.chasers):
             wrench = np.concatenate([self._pull(i), self._turn(i)]) + r.normal(0, 1, 6) * np.repeat(

@@ -263,7 +263,7 @@ def test_clearance_is_outside_of_keep_out_sphere_and_corridor() -> None:
     assert clearance_m(docking, 0) > np.linalg.norm(entry)
 
 
-# -- the chaser's core ------------------------------------------------------------------------------
+# -- the chaser's core -----------------------------------------------------------------------------
 
 
 def tick_of(scenario: Scenario, tick: int, *controllers: str, revision: int = 0) -> Tick:

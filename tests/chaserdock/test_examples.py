@@ -125,7 +125,9 @@ def test_foreign_controller_imports_only_zenoh_and_msgpack() -> None:
 
 @pytest.mark.slow
 def test_foreign_controller_flies_to_success(tmp_path: Path) -> None:
-    """Criteria of its own: a PD law and an alpha-beta filter are not as good as what they replace."""
+    """Criteria of its own: a PD law and an alpha-beta filter are not as good as what they
+    replace.
+    """
     criteria = (
         "success.steady_position_rms_m=0.03",
         "success.steady_orientation_rms_deg=2.0",

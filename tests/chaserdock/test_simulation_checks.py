@@ -448,7 +448,9 @@ def test_distances_are_not_judged_while_half_of_the_sensors_lie(
 
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_chaser_that_flies_commands_again_is_judged_again(killed: Scenario, lost: bool) -> None:
-    """From 3 s of flown commands on, and of a process that was lost, only if it takes part again."""
+    """From 3 s of flown commands on, and of a process that was lost, only if it takes part
+    again.
+    """
     log = Log(killed)
     log.tick(5)
     log.event(

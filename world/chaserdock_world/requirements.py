@@ -12,7 +12,9 @@ from chaserdock_protocol.scenario import Scenario
 
 
 def require_packages(scenario: Scenario) -> None:
-    """Raise MissingPackageError if a package that the world of a scenario needs is not installed."""
+    """Raise MissingPackageError if a package that the world of a scenario needs is not
+    installed.
+    """
     if scenario.world.engine == "mujoco":
         require_extra("mujoco", "mujoco")
     else:

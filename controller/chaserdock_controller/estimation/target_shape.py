@@ -157,7 +157,9 @@ class ShapeFilter(Struct, frozen=True, eq=False):
         )
 
     def _contradicts(self, matrix: Array, vector: Array) -> bool:
-        """Return whether a view's estimate is farther from this one than their covariances explain."""
+        """Return whether a view's estimate is farther from this one than their covariances
+        explain.
+        """
         values, vectors = np.linalg.eigh(matrix)
         informed = values > 0.05 * max(float(values[-1]), 1e-12)
         basis = vectors[:, informed]

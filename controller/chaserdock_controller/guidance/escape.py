@@ -34,7 +34,8 @@ _MOVE_SAMPLES, _TURN_SAMPLES = 33, 12
 3 % of the move, and every 30 degrees.
 """
 _LONGEST_TURN_S = 600.0
-"""Longest time, s, for which the wait at the goal of a move is checked: as long as a coast counts."""
+"""Longest time, s, for which the wait at the goal of a move is checked: as long as a coast counts.
+"""
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1)[:, None]
 _IMPULSE_SHARES = (0.5, 1.0, 2.0, 4.0)

@@ -19,7 +19,9 @@ compute in single precision.
 
 
 def why_invalid(solution: PoseSolution) -> str:
-    """Return why a solution is not a pose with a positive definite covariance, or an empty string."""
+    """Return why a solution is not a pose with a positive definite covariance, or an empty
+    string.
+    """
     length = math.hypot(*solution.q_wxyz)
     if not abs(length - 1.0) <= _UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"

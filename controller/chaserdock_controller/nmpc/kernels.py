@@ -18,8 +18,8 @@ from .native import LIBRARY, function
 LIMIT, BROKEN = 2, 3
 """Return codes of a chaser's QP, as in native/ipm.c."""
 MAX_ITERATIONS = 40
-"""Most interior-point iterations of a chaser in a solve. Closed loops take 29 at most; one that needs
-more makes none: the best point is flown, and the next tick continues from it.
+"""Most interior-point iterations of a chaser in a solve. Closed loops take 29 at most; one that
+needs more makes none: the best point is flown, and the next tick continues from it.
 """
 
 

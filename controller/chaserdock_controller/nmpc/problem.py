@@ -161,7 +161,9 @@ class NativeProblem(Structure):
 
 
 def native_problem(problem: NmpcInput, params: NmpcParameters) -> NativeProblem:
-    """Return a checked problem for C; it holds addresses of arrays of ``problem`` and ``params``."""
+    """Return a checked problem for C; it holds addresses of arrays of ``problem`` and
+    ``params``.
+    """
     values: list[Any] = [len(problem.states), params.stages, params.dt_s]
     values += map(address_of, (problem.references, problem.target_positions, problem.u_ref))
     for term in params.terms:

@@ -252,7 +252,9 @@ class CompositeIdentification:
         return np.concatenate([by_chaser.get(i, np.zeros(self._n)) for i in self.chasers])
 
     def _wrenches(self) -> Array:
-        """Return the wrenches (6, N n) about the centre of mass of 1 N of every thruster, TRF axes."""
+        """Return the wrenches (6, N n) about the centre of mass of 1 N of every thruster, TRF
+        axes.
+        """
         x = self._estimate
         mounts = [MountedChaser(r, q) for r, q in zip(x.mounts_m, x.mounts_wxyz, strict=True)]
         parts = [m.wrench_to_stack(self._thrusters, x.body.centre_trf_m) for m in mounts]

@@ -237,7 +237,9 @@ def wrench_at_origin(
 
 
 def linearize(z: ChaserMeasurement, mean: Array) -> tuple[Array, Array, Array]:
-    """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k, k)."""
+    """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k,
+    k).
+    """
     k = z.rows
     out = np.empty(k), np.empty((k, _SEEN)), np.empty((k, k))
     function("linearize")(ctypes.byref(z.native), address(mean), *map(address, out))

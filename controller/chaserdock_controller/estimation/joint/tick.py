@@ -162,7 +162,9 @@ def _check_cameras(
     now: FilterState, before: JointState, report: UpdateReport, seen: Mapping[int, Sighting],
     mounting: CameraMounting, p: JointParameters, events: list[EstimatorEvent],
 ) -> FilterState:  # fmt: skip
-    """Report cameras that were dropped or are used again; react to the rejection of most cameras."""
+    """Report cameras that were dropped or are used again; react to the rejection of most
+    cameras.
+    """
     best = max(now.hypotheses, key=lambda h: h.log_likelihood)
     limit, k = p.rejections_to_drop, SIGHTING_CHANNEL
     for i in sorted(seen):

@@ -62,8 +62,8 @@ _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
 _ATTITUDE_TIME_S = 5.0
 """Time constant, s, with which the stack turns to a commanded attitude. Chosen."""
 _PULSE_PERIOD_NS, _PULSE_NS = 600_000_000, 300_000_000
-"""Identifying pulses begin at this interval and last for half of it, ns, so that the rates before and
-after each are measured for as long.
+"""Identifying pulses begin at this interval and last for half of it, ns, so that the rates before
+and after each are measured for as long.
 """
 
 
@@ -82,8 +82,8 @@ class StackState:
     latched, by number.
 
     ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if
-    estimated. ``isolated``, ``failed``: thrusters that chasers report as closed, and that were found
-    stuck, as (chaser, number). ``informative``: see ``IdentifiedStack``.
+    estimated. ``isolated``, ``failed``: thrusters that chasers report as closed, and that were
+    found stuck, as (chaser, number). ``informative``: see ``IdentifiedStack``.
     ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the odometry of the chasers alone:
     with noise, but not late where disturbances act.
     """
@@ -456,7 +456,9 @@ def _isolated(observation: Observation) -> frozenset[tuple[int, int]]:
 
 
 def _mean_omega(own: Sequence[Odometry], q_wxyz: Array) -> Array:
-    """Return the mean angular rate (3,) of chasers in the axes of a body with attitude ``q_wxyz``."""
+    """Return the mean angular rate (3,) of chasers in the axes of a body with attitude
+    ``q_wxyz``.
+    """
     omega_world = np.mean([rotations.rotate(o.q_wxyz, o.omega_rad_s) for o in own], axis=0)
     return rotations.rotate_inverse(q_wxyz, omega_world)
 

@@ -213,6 +213,7 @@ def test_add_of_a_symmetric_target_ignores_what_cannot_be_seen() -> None:
     assert add_m(moved, still, unlike) == pytest.approx(0.005)
 
 
+@pytest.mark.slow
 def test_evaluate_scores_markers_in_both_layouts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

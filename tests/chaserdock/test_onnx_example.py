@@ -110,8 +110,7 @@ def test_network_file_runs_in_the_command(
     written(example, tmp_path / "n.onnx", corners(dataset))
     monkeypatch.setenv("CHASERDOCK_ONNX", str(tmp_path / "n.onnx"))
     words = [
-        "evaluate",
-        "perception",
+        "dataset",
         str(dataset),
         "--perception",
         "onnx_perception:OnnxPerception",
@@ -136,8 +135,7 @@ def test_missing_or_damaged_network_is_one_line(
         path.write_bytes(content)
     monkeypatch.setenv("CHASERDOCK_ONNX", str(path))
     words = [
-        "evaluate",
-        "perception",
+        "dataset",
         str(dataset),
         "--perception",
         "onnx_perception:OnnxPerception",

@@ -95,7 +95,7 @@ class _Innovation(Structure):
     ]
 
 
-class ChaserMeasurement:
+class NativeMeasurement:
     """Measurements of chaser ``i`` of ``n``, of which one may be None.
 
     mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting:
@@ -143,7 +143,7 @@ class JointInnovation:
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)
 
-    def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
+    def innovate(self, z: NativeMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
         """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same
         array or another one).
         """
@@ -152,7 +152,7 @@ class JointInnovation:
         )  # fmt: skip
 
     def correct(
-        self, z: ChaserMeasurement, used: NDArray[np.int64], prior: Array, mean: Array
+        self, z: NativeMeasurement, used: NDArray[np.int64], prior: Array, mean: Array
     ) -> bool:
         """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their
         covariance is not positive.
@@ -163,7 +163,7 @@ class JointInnovation:
             )
         )  # fmt: skip
 
-    def reduce(self, z: ChaserMeasurement, rows: int, covariance: Array) -> None:
+    def reduce(self, z: NativeMeasurement, rows: int, covariance: Array) -> None:
         """Reduce the covariance by the last correction, of so many rows."""
         function("reduce")(c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
@@ -236,7 +236,7 @@ def wrench_at_origin(
     return out
 
 
-def linearize(z: ChaserMeasurement, mean: Array) -> tuple[Array, Array, Array]:
+def linearize(z: NativeMeasurement, mean: Array) -> tuple[Array, Array, Array]:
     """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k,
     k).
     """

@@ -272,7 +272,8 @@ def topic_table() -> list[str]:
         name = topic.kind.__name__
         writer = "every process" if topic.writer == "any" else topic.writer
         rows.append(
-            f"| `{topic.key}` | [{name}](#{name.lower()}) v{messages.VERSION[topic.kind]} | {writer} | {_readers(topic)} "
+            f"| `{topic.key}` | [{name}](#{name.lower()}) v{messages.VERSION[topic.kind]} | "
+            f"{writer} | {_readers(topic)} "
             f"| {_RATES[topic.rate]} | {topic.qos} |"
         )
     return rows

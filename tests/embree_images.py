@@ -127,7 +127,8 @@ def _inside(part: IntArray, same: Mask) -> Mask:
 
 
 def _shade(
-    scene: EmbreeScene, hit: dict[str, Any], seen: IntArray, rays: Array, corners: Array, normals: Array, parts: IntArray,
+    scene: EmbreeScene, hit: dict[str, Any], seen: IntArray, rays: Array, corners: Array,
+    normals: Array, parts: IntArray,
     surfaces: Array, light: Light,
 ) -> tuple[Array, Array, Mask]:  # fmt: skip
     """Return the levels with and without sun, and whether the sun shines, of rays that hit."""

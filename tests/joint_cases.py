@@ -205,7 +205,8 @@ class SyntheticFlight:
             reprojection_rms_px=0.1,
         )
         return Sighting(
-            tick=self.tick, sim_time_ns=self.time_ns, chaser=i, status="seen", solutions=(solution,),
+            tick=self.tick, sim_time_ns=self.time_ns, chaser=i, status="seen",
+            solutions=(solution,),
             marker_ids=(0, 1, 2, 3), corners_px=(), rejected_ids=(),
         )  # fmt: skip
 

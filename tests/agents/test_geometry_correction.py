@@ -108,7 +108,8 @@ def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_
 
 def image_of(pixels: np.ndarray, tick: int) -> Image:
     return Image(
-        tick=tick, sim_time_ns=tick, chaser=0, width_px=480, height_px=270, encoding="mono8", data=pixels.tobytes()
+        tick=tick, sim_time_ns=tick, chaser=0, width_px=480, height_px=270, encoding="mono8",
+        data=pixels.tobytes()
     )  # fmt: skip
 
 

@@ -47,11 +47,13 @@ from source_tree import MODULES, imported, short, tree_of
 
 FORBIDDEN_TYPES = {
     Scenario, Target, Chaser, CameraSection, Effects, Eclipse, EarthSection, Fault, ProcessFaults,
-    ThrusterFailure, Success, TruthSection, ChaserTruth, TargetTruth, CameraTruth, SensorTruth, TruthValues,
+    ThrusterFailure, Success, TruthSection, ChaserTruth, TargetTruth, CameraTruth, SensorTruth,
+    TruthValues,
 }  # fmt: skip
 FORBIDDEN_ANYWHERE = {
     "simulation", "world",
-    "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",
+    "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad",
+    "start_velocity_m_s",
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
     "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
 }  # fmt: skip
@@ -205,7 +207,8 @@ def test_error_in_a_flight_scenario_names_the_path() -> None:
 # -- imports ---------------------------------------------------------------------------------------
 
 FULL_SCENARIO = {
-    "Scenario", "load_scenario", "parse_scenario", "scenario_from_json", "mission", "loading", "Target", "Chaser",
+    "Scenario", "load_scenario", "parse_scenario", "scenario_from_json", "mission", "loading",
+    "Target", "Chaser",
     "CameraSection", "faults_of", "request_scenario", "SCENARIO_KEY",
 }  # fmt: skip
 FLYING_PACKAGES = [

@@ -43,7 +43,10 @@ def install(example: Path, folder: Path) -> dict[str, str]:
         / f"{project['project']['name'].replace('-', '_')}-{project['project']['version']}.dist-info"
     )
     info.mkdir()
-    head = f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: {project['project']['version']}\n"
+    head = (
+        f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: "
+        f"{project['project']['version']}\n"
+    )
     (info / "METADATA").write_text(head)
     groups = project["project"]["entry-points"]
     lines = [

@@ -424,8 +424,8 @@ def test_figures_of_a_published_task_are_reported_and_part_of_the_line(tmp_path:
         assert part in text
     line = text_of(result).splitlines()[1]
     assert (
-        "least margin to the speed limit 0.058 m/s; at most 11.46 deg off the cone's axis; arrived at 1121.6 s"
-        in line
+        "least margin to the speed limit 0.058 m/s; at most 11.46 deg off the cone's axis; arrived "
+        "at 1121.6 s" in line
     )
     assert "aborted" not in line
 

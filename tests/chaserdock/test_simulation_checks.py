@@ -585,7 +585,8 @@ def test_published_commands_are_flown_unless_a_fault_lasts(tmp_path: Path) -> No
         log.flies(0, tick)
         log.flies(1, tick, source="command" if tick < 10 else "hold")
     assert [str(v) for v in log.checks.violations] == [
-        "commands are flown at 8.10 s: chaser/1: has flown no command for 3.1 s, but commands are published"
+        "commands are flown at 8.10 s: chaser/1: has flown no command for 3.1 s, but commands are "
+        "published"
     ]
 
 

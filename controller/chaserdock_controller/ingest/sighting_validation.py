@@ -68,7 +68,8 @@ def valid_sightings(
             events.append(
                 (
                     "warning",
-                    f"chaser {sighting.chaser}: invalid sighting, ignored: {next(iter(reasons.values()))}",
+                    f"chaser {sighting.chaser}: invalid sighting, ignored: "
+                    f"{next(iter(reasons.values()))}",
                 )
             )
             kept = tuple(s for s in sighting.solutions if id(s) not in reasons)

@@ -142,7 +142,8 @@ def solve_tick(
     code, iterations = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     tick = _Tick(
         ctypes.addressof(model), ctypes.addressof(problem), location(states),
-        location(reach_m_per_N), location(w1), location(inputs), w2, budget, MAX_ITERATIONS, location(code),
+        location(reach_m_per_N), location(w1), location(inputs), w2, budget, MAX_ITERATIONS,
+        location(code),
         location(iterations),
     )  # fmt: skip
     function("solve_tick")(ctypes.byref(tick), address(workspace))

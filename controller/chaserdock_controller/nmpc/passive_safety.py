@@ -158,7 +158,9 @@ class PassiveSafetyMonitor:
     def _text(self, chaser: int, found: CoastCertificate, safe: bool) -> str:
         state = "passively safe" if safe else "not passively safe"
         return (
-            f"chaser {chaser}: {state}: without thrust it comes to {found.distance_m:.2f} m of the target after "
-            f"{found.time_s:.0f} s, {found.margin_sigmas:.1f} sigmas from the keep-out of {self._keep_out_m:g} m, in a coast of "
+            f"chaser {chaser}: {state}: without thrust it comes to {found.distance_m:.2f} m of the "
+            "target after "
+            f"{found.time_s:.0f} s, {found.margin_sigmas:.1f} sigmas from the keep-out of "
+            f"{self._keep_out_m:g} m, in a coast of "
             f"{self.duration_s:.0f} s"
         )

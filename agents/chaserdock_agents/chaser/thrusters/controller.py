@@ -123,7 +123,10 @@ class ThrusterController:
         if scale != self._scale and self._scale is not None:
             text = f"wrench limits are {scale:.3f} of the body's"
             if scale < _MIN_SCALE:
-                text = f"the remaining thrusters cannot produce every wrench ({scale:.3f} of the limits)"
+                text = (
+                    f"the remaining thrusters cannot produce every wrench ({scale:.3f} of the "
+                    "limits)"
+                )
             self.events.append(
                 ("warning" if scale < _MIN_SCALE else "info", "thrusters changed", text)
             )

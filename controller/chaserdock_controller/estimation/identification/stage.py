@@ -250,7 +250,10 @@ class StackIdentification:
     def _add_fault(self, fault: StackFault) -> None:
         self.failed.add((fault.chaser, fault.thruster))
         kind = fault.kind.replace("_", " ")
-        text = f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the stack, isolated"
+        text = (
+            f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the "
+            "stack, isolated"
+        )
         self._events.append(("warning", text))
 
     def _by_information(self, found: CompositeIdentification) -> tuple[tuple[int, int], ...]:

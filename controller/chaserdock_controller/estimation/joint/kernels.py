@@ -43,8 +43,10 @@ class MotionParameters(Structure):
         *(
             (name, c_double)
             for name in (
-                "mean_motion", "fade_position", "fade_attitude", "unknown_s", "control_force_share", "control_torque_share",
-                "control_arm", "force_max", "torque_max", "disturbance_force", "disturbance_torque", "latched_acceleration",
+                "mean_motion", "fade_position", "fade_attitude", "unknown_s", "control_force_share",
+                "control_torque_share",
+                "control_arm", "force_max", "torque_max", "disturbance_force", "disturbance_torque",
+                "latched_acceleration",
                 "latched_angular_acceleration",
             )
         ),
@@ -129,7 +131,8 @@ class JointInnovation:
     def __init__(self, n: int, size: int) -> None:
         stride = -(-size // 8) * 8
         sizes = (
-            MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
+            MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride,
+            MOST_ROWS * stride, size,
             _CHANNELS + 1,
         )  # fmt: skip
         *starts, end = itertools.accumulate(sizes, initial=0)
@@ -148,7 +151,8 @@ class JointInnovation:
         array or another one).
         """
         function("innovate")(
-            ctypes.byref(z.native), address(mean), address(prior), address(covariance), self._address, self._work_address
+            ctypes.byref(z.native), address(mean), address(prior), address(covariance),
+            self._address, self._work_address
         )  # fmt: skip
 
     def correct(
@@ -159,7 +163,8 @@ class JointInnovation:
         """
         return bool(
             function("correct", c_int64)(
-                self._n, c_int64(z.rows), address(used), c_int64(len(used)), self._address, address(prior), address(mean)
+                self._n, c_int64(z.rows), address(used), c_int64(len(used)), self._address,
+                address(prior), address(mean)
             )
         )  # fmt: skip
 
@@ -216,7 +221,8 @@ def predict(
     out = np.empty_like(covariance)
     work = scratch(_work_size("predict_workspace", n, len(covariance)))
     arrays: tuple[NDArray[Any], ...] = (
-        target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance, out, work,
+        target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance,
+        out, work,
     )  # fmt: skip
     function("predict")(
         ctypes.byref(motion), c_int64(n), c_int64(len(covariance)), *map(address, arrays)
@@ -231,7 +237,8 @@ def wrench_at_origin(
     moves one with it at ``centre_m`` (3,); see native/motion.c."""
     out = np.empty(6)
     function("wrench_at_origin")(
-        address(wrench), address(centre_m), address(omega_rad_s), c_double(mass_kg), address(inertia), address(out)
+        address(wrench), address(centre_m), address(omega_rad_s), c_double(mass_kg),
+        address(inertia), address(out)
     )  # fmt: skip
     return out
 

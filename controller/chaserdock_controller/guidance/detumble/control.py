@@ -374,11 +374,17 @@ class DetumbleControl:
                 f"{(row > 0.0).sum()} of {len(row)} of chaser {i}"
                 for i, row in zip(active, limits.reshape(len(active), -1), strict=True)
             )
-            return f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
+            return (
+                f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in "
+                "every direction"
+            )
         least = minimum_time(thrusters.wrenches, state.motion.momentum, limits)
         if least is None or least.time_s > self._settings.timeout_s:
             time = "without end" if least is None else f"at least {least.time_s:.0f} s"
-            return f"stopping the stack takes {time}; detumble.timeout_s is {self._settings.timeout_s:g} s"
+            return (
+                f"stopping the stack takes {time}; detumble.timeout_s is "
+                f"{self._settings.timeout_s:g} s"
+            )
         return ""
 
     # -- models ------------------------------------------------------------------------------------

@@ -108,7 +108,9 @@ def hard_case(n: int) -> tuple[Array, NmpcInput]:
 
 @dataclass
 class Flown:
-    """Solve times of all ticks, closed-loop cost, smallest margin of a distance, and failed solves."""
+    """Solve times of all ticks, closed-loop cost, smallest margin of a distance, and failed
+    solves.
+    """
 
     wall_s: Array
     cpu_s: Array

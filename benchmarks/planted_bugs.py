@@ -139,7 +139,8 @@ def main() -> int:
     ]
     if not bugs:
         parser.error(
-            f"no bug is named {' or '.join(options.only)}; there are: {', '.join(p.stem for p in PATCHES)}"
+            f"no bug is named {' or '.join(options.only)}; there are: "
+            f"{', '.join(p.stem for p in PATCHES)}"
         )
     for bug in bugs:
         try:
@@ -178,7 +179,8 @@ def main() -> int:
     ]
     for scenario, seed, found in wrong:
         print(
-            f"seed {seed} of {scenario} fails without a planted bug: {found.invariant}: {found.text}"
+            f"seed {seed} of {scenario} fails without a planted bug: {found.invariant}: "
+            f"{found.text}"
         )
     if flown and not wrong:
         print(f"all {len(flown)} seeds that found a bug pass without it")

@@ -83,7 +83,10 @@ def _members(kind: type) -> Iterator[str]:
         if name.startswith("_"):
             continue
         if inspect.isfunction(member):
-            yield f"### {kind.__name__}.{name}\n{_code(_signature(name, member))}\n\n{_documented(member.__doc__)}\n"
+            yield (
+                "### "
+                f"{kind.__name__}.{name}\n{_code(_signature(name, member))}\n\n{_documented(member.__doc__)}\n"
+            )
         elif isinstance(member, property) or hasattr(member, "func"):
             yield f"### {kind.__name__}.{name}\n{_documented(member.__doc__)}\n"
 

@@ -236,7 +236,9 @@ def nested(kind: type[Struct]) -> list[type[Struct]]:
 
 
 def fields_of(kind: type[Struct]) -> list[str]:
-    """Return a table of a type's own fields; the three that all messages have are described once."""
+    """Return a table of a type's own fields; the three that all messages have are described
+    once.
+    """
     shape = shapes.type_info(kind)
     assert isinstance(shape, shapes.StructType)
     common = (
@@ -270,7 +272,8 @@ def topic_table() -> list[str]:
         name = topic.kind.__name__
         writer = "every process" if topic.writer == "any" else topic.writer
         rows.append(
-            f"| `{topic.key}` | [{name}](#{name.lower()}) v{messages.VERSION[topic.kind]} | {writer} | {_readers(topic)} "
+            f"| `{topic.key}` | [{name}](#{name.lower()}) v{messages.VERSION[topic.kind]} | "
+            f"{writer} | {_readers(topic)} "
             f"| {_RATES[topic.rate]} | {topic.qos} |"
         )
     return rows

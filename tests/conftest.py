@@ -107,5 +107,7 @@ def short_flight(shared_flight: Fly) -> Path:
 
 @pytest.fixture(scope="session")
 def drill_flight(shared_flight: Fly) -> Path:
-    """A six-second flight of ``fault-drill`` without faults, with which faulty ones are compared."""
+    """A six-second flight of ``fault-drill`` without faults, with which faulty ones are
+    compared.
+    """
     return shared_flight("drill", *DRILL)

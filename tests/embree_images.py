@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's renderers
-with them.
+"""Images of a mesh by Embree, an independent ray tracer, and the comparison of the world's
+renderers with them.
 
 Light as of the renderer: Lambert, Blinn's highlight, hard shadows of the sun. Textures are left
 out. Each pixel has ``samples`` squared rays.
@@ -127,7 +127,8 @@ def _inside(part: IntArray, same: Mask) -> Mask:
 
 
 def _shade(
-    scene: EmbreeScene, hit: dict[str, Any], seen: IntArray, rays: Array, corners: Array, normals: Array, parts: IntArray,
+    scene: EmbreeScene, hit: dict[str, Any], seen: IntArray, rays: Array, corners: Array,
+    normals: Array, parts: IntArray,
     surfaces: Array, light: Light,
 ) -> tuple[Array, Array, Mask]:  # fmt: skip
     """Return the levels with and without sun, and whether the sun shines, of rays that hit."""

@@ -93,7 +93,7 @@ def step(
 
 def drain(fleet: ChaserFleet) -> list[tuple[int, str, str]]:
     """Return the phase changes since the last call: chaser, phase, detail."""
-    changes = [(c.chaser, c.phase, c.detail) for c in fleet.changes]
+    changes = [(c.chaser, str(c.phase), c.detail) for c in fleet.changes]
     fleet.drain_events()
     return changes
 

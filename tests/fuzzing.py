@@ -164,7 +164,9 @@ def value_mutator(payload: bytes) -> Callable[[random.Random], bytes]:
 
 
 def garbage_in(message: msgspec.Struct) -> str | None:
-    """Return what is wrong with an accepted message by its type annotations; None if it is valid."""
+    """Return what is wrong with an accepted message by its type annotations; None if it is
+    valid.
+    """
     hints = _hints(type(message))
     for name, kind in hints.items():
         value = getattr(message, name)

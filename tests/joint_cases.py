@@ -108,7 +108,9 @@ class SyntheticFlight:
         return EstimatorInputs(self.time_ns, PERIOD_S, chasers, sightings)
 
     def step(self) -> None:
-        """Move everything to the next tick under a feedback that holds the chasers at their places."""
+        """Move everything to the next tick under a feedback that holds the chasers at their
+        places.
+        """
         e, r = self.errors, self.rng
         for i, c in enumerate(self.chasers):
             wrench = np.concatenate([self._pull(i), self._turn(i)]) + r.normal(0, 1, 6) * np.repeat(
@@ -203,7 +205,8 @@ class SyntheticFlight:
             reprojection_rms_px=0.1,
         )
         return Sighting(
-            tick=self.tick, sim_time_ns=self.time_ns, chaser=i, status="seen", solutions=(solution,),
+            tick=self.tick, sim_time_ns=self.time_ns, chaser=i, status="seen",
+            solutions=(solution,),
             marker_ids=(0, 1, 2, 3), corners_px=(), rejected_ids=(),
         )  # fmt: skip
 

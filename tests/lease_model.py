@@ -208,7 +208,8 @@ class Model:
         stated = (lease.tick, lease.revision, lease.term)
         if lease.term < chaser.stated[2] or stated[:2] < chaser.stated[:2]:
             raise TwoCommanders(
-                f"chaser {lease.chaser} states (tick, revision, term) {stated} after {chaser.stated}"
+                f"chaser {lease.chaser} states (tick, revision, term) {stated} after "
+                f"{chaser.stated}"
             )
         chaser.stated = stated
         for controller in self.all_controllers():
@@ -325,7 +326,8 @@ def main() -> int:
         handovers += sum(a != b for a, b in itertools.pairwise(order))
         seed += 1
     print(
-        f"{seed - arguments.first} walks, {steps} steps, {commanded} commanded ticks, {handovers} changes of commander: "
+        f"{seed - arguments.first} walks, {steps} steps, {commanded} commanded ticks, {handovers} "
+        "changes of commander: "
         "never two commanders"
     )
     return 0

@@ -27,7 +27,8 @@ MU_STOP = 1e-3
 def roll_linearized(model: Model, x: Array, u: Array, limits: Array, mats: Array) -> None:
     """Roll out and linearize: mats (N, D, 12, 12) = [C B], B for inputs scaled by limits (N, 6)."""
     function("roll_linearized")(
-        ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(limits), address(x),
+        ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(limits),
+        address(x),
         address(mats),
     )  # fmt: skip
 
@@ -151,7 +152,8 @@ class QpAnswer:
 
 
 def solve_qp(
-    mats: Array, h: float, model: tuple[Array, ...], stage: IntArray, a: Array, c: Array, w1: float, w2: float,
+    mats: Array, h: float, model: tuple[Array, ...], stage: IntArray, a: Array, c: Array, w1: float,
+    w2: float,
     max_iterations: int = MAX_ITERATIONS,
 ) -> QpAnswer:  # fmt: skip
     """Solve the QP of one chaser: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows

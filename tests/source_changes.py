@@ -38,7 +38,10 @@ class Mutant:
     @property
     def name(self) -> str:
         """Return the file and what replaces what, on one line."""
-        return f"{self.change.file}: {' '.join(self.change.old.split())} -> {' '.join(self.change.new.split())}"
+        return (
+            f"{self.change.file}: {' '.join(self.change.old.split())} -> "
+            f"{' '.join(self.change.new.split())}"
+        )
 
 
 def read_mutants(path: Path = MUTANTS) -> list[Mutant]:
@@ -56,7 +59,8 @@ def apply(changes: Sequence[Change], folder: Path, write: bool = True) -> None:
         source = path.read_text(encoding="utf-8") if path.is_file() else ""
         if source.count(change.old) != 1:
             raise ValueError(
-                f"{change.file} contains the text to replace {source.count(change.old)} times:\n{change.old}"
+                f"{change.file} contains the text to replace {source.count(change.old)} "
+                f"times:\n{change.old}"
             )
         if write:
             path.write_text(source.replace(change.old, change.new), encoding="utf-8")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A log read by independent programs, which are installed into a virtual environment of their own.
 
-- evo_ape on the tracks of ``chaserdock log --export --format tum``: root mean square errors within 1 % of ours;
+- evo_ape on the tracks of ``chaserdock log --export --format tum``: root mean square errors within
+  1 % of ours;
 - pymcap-cli doctor: no error;
 - the reader of the mcap package: every channel has a schema, every message is readable;
 - rerun: draws the log without a window and saves the image to ``--image``. Without a graphics card

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inputs and outputs of a controller tick, and the results that its stages hand to each other.
 
-``Observation``, ``TargetEstimation``, ``GuidanceResult`` and ``PlanResult`` each describe a chaser by
-one object. The first two have one for every chaser of the mission, so that ``chasers[i]`` is chaser
-i; what is not known of it is None.
+``Observation``, ``TargetEstimation``, ``GuidanceResult`` and ``PlanResult`` each describe a chaser
+by one object. The first two have one for every chaser of the mission, so that ``chasers[i]`` is
+chaser i; what is not known of it is None.
 """
 
 from __future__ import annotations
@@ -113,9 +113,9 @@ class ChaserObservation:
     to the others. ``interrupted``: without odometry for a while before this tick, as it sent none
     or this controller received none.
 
-    ``impulse``: on a chaser with ``odometry``. ``last_command``: to one without, (6,); what it flies
-    now is not known. ``ahead``: what acts on it until ``Observation.effective_ns``, as durations (s)
-    and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
+    ``impulse``: on a chaser with ``odometry``. ``last_command``: to one without, (6,); what it
+    flies now is not known. ``ahead``: what acts on it until ``Observation.effective_ns``, as
+    durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
     ``thruster_impulses`` (n,): of its thrusters since the tick before, N s, if it reports them.
     ``isolated``: thrusters that it reports as closed.
     """
@@ -228,8 +228,8 @@ class ChaserEstimate:
     ``own``: None without valid odometry. ``motion_covariance``: (6, 6) of its position and velocity
     relative to the target, WRF, unless passive safety is off; ``relative``: its pose relative to
     the target; both if estimated, with ``own``. ``camera``: the errors of its camera, once they are
-    estimated. ``visible``: it has a sighting of the target in this tick. ``latched``: its latch holds
-    the target. ``doubtful``: its odometry may be wrong.
+    estimated. ``visible``: it has a sighting of the target in this tick. ``latched``: its latch
+    holds the target. ``doubtful``: its odometry may be wrong.
     """
 
     chaser: int
@@ -257,9 +257,9 @@ class StackChaser:
 class IdentifiedStack:
     """Mass properties of the stack and of the target alone, as identified until now.
 
-    ``motion``: of the centre of mass (WRF) and the target's axes. ``failed``: thrusters found stuck,
-    as (chaser, number). ``informative`` returns the thrusters (chaser, number) whose pulses would
-    tell most about the mass properties, the best first.
+    ``motion``: of the centre of mass (WRF) and the target's axes. ``failed``: thrusters found
+    stuck, as (chaser, number). ``informative`` returns the thrusters (chaser, number) whose pulses
+    would tell most about the mass properties, the best first.
     """
 
     stack: MassProperties
@@ -455,9 +455,9 @@ class SolveStatus(NamedTuple):
 class ChaserPlanning:
     """Result of planning for one chaser.
 
-    ``solve``: of this tick, None without one. ``flyable``: the plan that may be flown, an
-    earlier one for a while after a failed solve. ``certificate``: passive safety of its newest plan,
-    where it is monitored.
+    ``solve``: of this tick, None without one. ``flyable``: the plan that may be flown, an earlier
+    one for a while after a failed solve. ``certificate``: passive safety of its newest plan, where
+    it is monitored.
     """
 
     chaser: int

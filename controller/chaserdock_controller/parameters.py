@@ -7,11 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 from chaserdock_protocol.scenario import FlightScenario
-from chaserdock_protocol.scenario.schema import (
-    Controller,
-    ControllerOptions,
-    Limits,
-)
+from chaserdock_protocol.scenario.schema import Controller, ControllerOptions, Limits
 
 from .nmpc import NmpcParameters
 from .nmpc.problem import terms_of

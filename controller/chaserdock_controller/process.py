@@ -49,6 +49,7 @@ _IDLE_RECEIVES = 5
 _PATIENCE_TICKS = 0.5
 """In real time a tick waits for its sightings for this share of its period."""
 _RECEIVE_TIMEOUT_S = 0.2
+"""Longest wait, s, for a message before the process looks whether it is to stop."""
 
 
 def main(options: ProcessOptions) -> int:

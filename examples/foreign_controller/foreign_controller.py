@@ -82,7 +82,9 @@ Q_CRF_IRF = (0.5, -0.5, 0.5, -0.5)  # the camera looks along the body's +X, its 
 
 
 class Target:
-    """Alpha-beta filter: position and velocity in the world, attitude, rate in the target's axes."""
+    """Alpha-beta filter: position and velocity in the world, attitude, rate in the target's
+    axes.
+    """
 
     def __init__(self, alpha=0.15, beta=0.01):
         self.alpha, self.beta, self.time_s = alpha, beta, None

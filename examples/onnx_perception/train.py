@@ -135,7 +135,8 @@ def train(samples, epochs, rng, limit_s=np.inf):
             if share >= 1.0:
                 return weights
         print(
-            f"epoch {epoch + 1}: {np.mean(losses):.4f} of half a crop, {time.process_time() - begin_s:.0f} s of CPU",
+            f"epoch {epoch + 1}: {np.mean(losses):.4f} of half a crop, "
+            f"{time.process_time() - begin_s:.0f} s of CPU",
             flush=True,
         )
     return weights
@@ -190,7 +191,8 @@ def main():
     }
     onnx.save(network(weights, facts), str(options.out))
     print(
-        f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB, sigma {np.round(sigma, 4).tolist()}"
+        f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB, sigma "
+        f"{np.round(sigma, 4).tolist()}"
     )
 
 

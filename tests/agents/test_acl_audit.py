@@ -52,7 +52,8 @@ def test_denied_messages_are_reported_but_not_cached_decisions() -> None:
         f"{HEAD} {put}",
         # another thread: a message, not caching
         f"{OTHER_THREAD} 4fc8 {SUBJECT} is unauthorized to Query (ingress) on rights/x",
-        f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Declare Liveliness Subscriber (ingress) on rights/world/tick",
+        f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Declare Liveliness Subscriber (ingress) on "
+        "rights/world/tick",
     )
     assert parse(*in_advance) == ["chaser-1 may not query x"]
     used = f"{HEAD} Using cached result: 4fc8 is unauthorized to Put (ingress) on rights/world/tick"
@@ -81,7 +82,10 @@ def test_client_without_role_is_reported() -> None:
     "why", ["peer sent no certificates", "invalid peer certificate: BadSignature"]
 )
 def test_client_without_valid_certificate_is_reported(why: str) -> None:
-    line = f"2026-11-22T12:02:55Z  WARN acc-0 ThreadId(05) {TLS_TARGET}: {why}. Hint: increase the limit."
+    line = (
+        f"2026-11-22T12:02:55Z  WARN acc-0 ThreadId(05) {TLS_TARGET}: {why}. Hint: increase the "
+        "limit."
+    )
     assert parse(line) == [f"a client without a certificate of this mission may not connect: {why}"]
     assert parse(line.replace(why, "tls handshake eof")) == []  # a port scan or health check
 
@@ -108,7 +112,8 @@ def test_log_stream_is_parsed_across_arbitrary_chunks_and_other_lines_pass_throu
     lines = [
         f"{HEAD} ACL (ingress): caching permissions for `rights/k` ...",
         f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Put (ingress) on rights/k",
-        f"{HEAD} 4fc8 {SUBJECT} is authorized to Declare Liveliness Subscriber (ingress) on rights/k",
+        f"{HEAD} 4fc8 {SUBJECT} is authorized to Declare Liveliness Subscriber (ingress) on "
+        "rights/k",
         f"{HEAD} 4fc8 {SUBJECT} is authorized to Put (ingress) on rights/mine",
         "another line",
         f"{HEAD} 4fc8 {SUBJECT} is unauthorized to Put (ingress) on rights/real",
@@ -215,5 +220,6 @@ def test_connection_without_certificate_is_rejected_and_logged(
         zenoh.open(config).close()
     assert process.stderr is not None
     assert process.stderr.readline().decode() == (
-        "router: denied: a client without a certificate of this mission may not connect: peer sent no certificates\n"
+        "router: denied: a client without a certificate of this mission may not connect: peer sent "
+        "no certificates\n"
     )

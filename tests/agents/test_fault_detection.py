@@ -170,6 +170,7 @@ def test_a_lost_thruster_is_found_after_some_pulses(
     assert verdict.factor == pytest.approx(left, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
     noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=5e-4)
@@ -180,6 +181,7 @@ def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
         assert case.step(asked, given) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_no_false_alarm_with_another_plant_than_assumed(seed: int) -> None:
     noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=4e-4)

@@ -75,6 +75,7 @@ def test_information_of_a_corrected_mesh_is_about_the_errors_before() -> None:
     )
 
 
+@pytest.mark.slow
 def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_accurate() -> None:
     true = np.array([1.5, -1.2, 0.8])
     boxes = wrong_boxes((true[0] * PANEL_RAD, true[1] * PANEL_RAD), 1.0 + true[2] * SCALE)
@@ -107,7 +108,8 @@ def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_
 
 def image_of(pixels: np.ndarray, tick: int) -> Image:
     return Image(
-        tick=tick, sim_time_ns=tick, chaser=0, width_px=480, height_px=270, encoding="mono8", data=pixels.tobytes()
+        tick=tick, sim_time_ns=tick, chaser=0, width_px=480, height_px=270, encoding="mono8",
+        data=pixels.tobytes()
     )  # fmt: skip
 
 

@@ -71,6 +71,7 @@ def test_nothing_is_acquired_without_a_target(acquisition, image):
     assert acquisition.find(image) == ()
 
 
+@pytest.mark.slow
 def test_target_that_leaves_the_image_is_acquired():
     camera = Camera.from_hfov(960, 540, np.deg2rad(60.0))
     search = Acquisition(camera, TrackerMesh.of_mesh(satellite("geo_servicer", 0.001), 0.0, 0.0))
@@ -91,6 +92,7 @@ def drifting(number, pose):
     )
 
 
+@pytest.mark.slow
 def test_turning_target_is_acquired_over_images_tracked_lost_in_the_dark_and_acquired_again(
     acquisition,
 ):
@@ -118,6 +120,7 @@ def test_turning_target_is_acquired_over_images_tracked_lost_in_the_dark_and_acq
     assert [seen() for _ in range(3)] == [1] * 3
 
 
+@pytest.mark.slow
 def test_lost_target_is_seen_again_from_the_expected_pose_without_a_search(
     acquisition, monkeypatch
 ):
@@ -173,6 +176,7 @@ def test_acquisition_is_spread_over_short_steps_and_its_result_is_that_of_one_ca
     assert np.array_equal(alone.pose.position, spread.pose.position)
 
 
+@pytest.mark.slow
 def test_symmetric_target_gives_hypotheses_of_which_one_is_right():
     boxes = (BOXES[0], Box((0.16, 1.2, 0.012), shade=0.25))
     scene, perception = Scene(CAMERA, boxes=boxes), ModelPerception(CAMERA, mesh_of(boxes))
@@ -265,6 +269,7 @@ def test_search_for_the_sun_behind_a_target_is_spread_over_images(monkeypatch):
     assert max(stated_ms) <= 30.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [167, 171])
 def test_backlit_target_is_tracked_while_it_turns(number):
     """Views of benchmarks/perception.py, `backlit-flight`, in which the track was lost."""

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thrusts into pulses: what is given follows what is asked for, in whole steps and never too short."""
+"""Thrusts into pulses: what is given follows what is asked for, in whole steps and never too
+short.
+"""
 
 from __future__ import annotations
 

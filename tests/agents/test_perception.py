@@ -412,6 +412,7 @@ def test_covariance_matches_the_spread_of_the_solutions(corners: int, expected: 
     assert 5.0 * expected**2 < np.mean(nees) < 7.2 * expected**2
 
 
+@pytest.mark.slow
 def test_the_papers_method_works_where_it_can_and_fails_where_epnp_does():
     scene = Scene("servicer", 1280, 720, LENS, method="paper")
     errors = []

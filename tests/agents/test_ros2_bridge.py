@@ -289,7 +289,8 @@ def test_peer_reads_every_topic(mission: Mission) -> None:
 
 def call(mission: Mission, name: str, kind: str, request: str, **arguments: Any) -> Any:
     client = ROS2ServiceClient(
-        name, kind, request, "bool success\nstring message\n", domain_id=DOMAIN, router_port=mission.ros_port,
+        name, kind, request, "bool success\nstring message\n", domain_id=DOMAIN,
+        router_port=mission.ros_port,
         type_hash=type_hash(kind), timeout=WAIT_S,
     )  # fmt: skip
     try:
@@ -306,7 +307,8 @@ def call(mission: Mission, name: str, kind: str, request: str, **arguments: Any)
         ("/chaser_1/retreat", TRIGGER, "uint8 structure_needs_at_least_one_member", {"structure_needs_at_least_one_member": 0},
          OperatorCommand(command="retreat", chaser=1, operator="ros2"), False),
         ("/chaser_1/goto", GOTO, "float64[3] offset_m", {"offset_m": np.array([1.0, -2.0, 0.5])},
-         OperatorCommand(command="goto", chaser=1, offset_m=(1.0, -2.0, 0.5), operator="ros2"), True),
+         OperatorCommand(command="goto", chaser=1, offset_m=(1.0, -2.0, 0.5), operator="ros2"),
+         True),
         ("/chaser_0/isolate", SELECT_THRUSTER, "uint8 thruster", {"thruster": 7},
          OperatorCommand(command="isolate", chaser=0, thruster=7, operator="ros2"), True),
     ],

@@ -126,6 +126,7 @@ def test_no_tests_near_contact_or_while_held() -> None:
     assert fired(free=False) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("test_s", "finds"), [(10.0, True), (0.0, False)])
 def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -> None:
     """Thruster 11 of tetra12 is not used at the paper's rates: without tests its failure stays

@@ -242,6 +242,7 @@ def test_operator_commands_reach_the_chaser_and_persist() -> None:
     assert not ideal.command(OperatorCommand(command="isolate", chaser=0, thruster=2), 0.0).accepted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thruster", [1, 6])
 def test_stuck_thruster_is_isolated_within_half_a_second(thruster: int) -> None:
     """Closed loop without images: the thruster is isolated and tracking recovers."""

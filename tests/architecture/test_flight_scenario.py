@@ -47,11 +47,13 @@ from source_tree import MODULES, imported, short, tree_of
 
 FORBIDDEN_TYPES = {
     Scenario, Target, Chaser, CameraSection, Effects, Eclipse, EarthSection, Fault, ProcessFaults,
-    ThrusterFailure, Success, TruthSection, ChaserTruth, TargetTruth, CameraTruth, SensorTruth, TruthValues,
+    ThrusterFailure, Success, TruthSection, ChaserTruth, TargetTruth, CameraTruth, SensorTruth,
+    TruthValues,
 }  # fmt: skip
 FORBIDDEN_ANYWHERE = {
     "simulation", "world",
-    "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",
+    "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad",
+    "start_velocity_m_s",
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
     "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
 }  # fmt: skip
@@ -170,9 +172,8 @@ def test_flight_scenario_keeps_its_values_and_types(name: str) -> None:
     full = load_scenario(shipped_scenario(name))
     flight = flight_scenario(full)
     assert type(flight) is FlightScenario
-    assert {type(c) for c in flight.chasers} == {
-        type(flight).model_fields["chasers"].annotation.__args__[0]
-    }  # type: ignore[union-attr]
+    (kind, *_) = get_args(type(flight).model_fields["chasers"].annotation)
+    assert {type(c) for c in flight.chasers} == {kind}
     assert type(flight.target) is FlightScenario.model_fields["target"].annotation
     assert type(flight.camera) is FlightScenario.model_fields["camera"].annotation
     assert flight.camera_model() == full.camera_model()
@@ -206,7 +207,8 @@ def test_error_in_a_flight_scenario_names_the_path() -> None:
 # -- imports ---------------------------------------------------------------------------------------
 
 FULL_SCENARIO = {
-    "Scenario", "load_scenario", "parse_scenario", "scenario_from_json", "mission", "loading", "Target", "Chaser",
+    "Scenario", "load_scenario", "parse_scenario", "scenario_from_json", "mission", "loading",
+    "Target", "Chaser",
     "CameraSection", "faults_of", "request_scenario", "SCENARIO_KEY",
 }  # fmt: skip
 FLYING_PACKAGES = [

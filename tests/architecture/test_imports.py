@@ -33,7 +33,8 @@ MAY_IMPORT = {
     "chaserdock_agents": {"chaserdock_models", "chaserdock_protocol"},
     "chaserdock_controller": {"chaserdock_models", "chaserdock_protocol"},
     "chaserdock": {
-        "chaserdock_models", "chaserdock_protocol", "chaserdock_world", "chaserdock_agents", "chaserdock_controller",
+        "chaserdock_models", "chaserdock_protocol", "chaserdock_world", "chaserdock_agents",
+        "chaserdock_controller",
     },
 }  # fmt: skip
 NAMES = {module_name(path): path for _, path in MODULES}
@@ -252,7 +253,10 @@ def test_processes_start_without_packages_that_only_some_flights_need() -> None:
         "viser",
         "cryptography",
     )
-    program = f"import sys, {', '.join(f'chaserdock_{p}' for p in processes)}, chaserdock.launch.launcher\n"
+    program = (
+        f"import sys, {', '.join(f'chaserdock_{p}' for p in processes)}, "
+        "chaserdock.launch.launcher\n"
+    )
     program += f"print([name for name in {slow} if name in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True

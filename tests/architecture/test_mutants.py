@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of mutants fits the sources, so that ``benchmarks/mutations.py`` can apply every one."""
+"""The table of mutants fits the sources, so that ``benchmarks/mutations.py`` can apply every
+one.
+"""
 
 from __future__ import annotations
 

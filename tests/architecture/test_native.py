@@ -80,7 +80,9 @@ def test_every_instruction_set_gives_the_same_bits(
 def test_every_instruction_set_sees_the_same_bits(
     number: int, distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Corners of large markers and of such with a narrow border, and a pose from a start far off."""
+    """Corners of large markers and of such with a narrow border, and a pose from a start far
+    off.
+    """
     if not has(number):
         pytest.skip(f"this processor has no copy {number}")
     rng = np.random.default_rng(3)
@@ -344,7 +346,9 @@ def test_working_memory_is_enough() -> None:
 
 
 def test_solvers_in_two_threads_plan_as_in_one() -> None:
-    """Every tick of two flights at once, from different states, has the bits of the flight alone."""
+    """Every tick of two flights at once, from different states, has the bits of the flight
+    alone.
+    """
     problem_at, states = swap()
 
     def flown(offset_m: float) -> list[Array]:

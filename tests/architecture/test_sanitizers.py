@@ -30,6 +30,7 @@ def test_every_kernel_has_a_fuzz_target(folder: str) -> None:
     assert set(re.findall(r'\{"(\w+)", \1\}', program)) == kernels - WORKSPACES
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("folder", NATIVE_FOLDERS)
 def test_kernels_stand_any_floating_point_input(folder: str, tmp_path: Path) -> None:
@@ -53,6 +54,7 @@ def test_python_tests_call_all_kernels_under_sanitizers() -> None:
     assert run.returncode == 0, f"{run.stdout[-3000:]}\n{run.stderr[-3000:]}"
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize(
     ("folder", "kernel", "source", "right", "wrong", "finding"),

@@ -306,7 +306,9 @@ def test_cone_and_speed_of_arch_comp_hold_nearby_and_until_the_abort() -> None:
 
 
 def test_an_abort_must_stay_clear_of_the_box() -> None:
-    """The box has a half edge of 0.2 m along the axes of TRF; before the abort it may be entered."""
+    """The box has a half edge of 0.2 m along the axes of TRF; before the abort it may be
+    entered.
+    """
     s, distance = load_scenario(ARCH), np.linspace(900.0, 4.0, 400)
     inside, passing = np.array([[0.1, -0.19, 0.0]]), np.array([[0.1, -0.21, 0.0]])
     flown = np.zeros(401)

@@ -213,11 +213,15 @@ def test_add_of_a_symmetric_target_ignores_what_cannot_be_seen() -> None:
     assert add_m(moved, still, unlike) == pytest.approx(0.005)
 
 
+@pytest.mark.slow
 def test_evaluate_scores_markers_in_both_layouts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = tmp_path / "m"
-    words = "--images 4 --range 0.8 1.0 --phase 0 60 --validation 0.75 --seed 2 --set camera.width_px=960 --set camera.height_px=540"
+    words = (
+        "--images 4 --range 0.8 1.0 --phase 0 60 --validation 0.75 --seed 2 --set "
+        "camera.width_px=960 --set camera.height_px=540"
+    )
     app(
         [
             "dataset",

@@ -151,7 +151,10 @@ def test_documentation_of_releases(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """
     clone = tmp_path / "clone"
     (clone / "docs").mkdir(parents=True)
-    script = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'index.html').write_text('x')\n"
+    script = (
+        "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / "
+        "'index.html').write_text('x')\n"
+    )
     (clone / "docs" / "make_site.py").write_text(script)
     own = ("-c", "user.name=test", "-c", "user.email=test@example.org")
     for command in (

@@ -43,7 +43,10 @@ def install(example: Path, folder: Path) -> dict[str, str]:
         / f"{project['project']['name'].replace('-', '_')}-{project['project']['version']}.dist-info"
     )
     info.mkdir()
-    head = f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: {project['project']['version']}\n"
+    head = (
+        f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: "
+        f"{project['project']['version']}\n"
+    )
     (info / "METADATA").write_text(head)
     groups = project["project"]["entry-points"]
     lines = [
@@ -125,7 +128,9 @@ def test_foreign_controller_imports_only_zenoh_and_msgpack() -> None:
 
 @pytest.mark.slow
 def test_foreign_controller_flies_to_success(tmp_path: Path) -> None:
-    """Criteria of its own: a PD law and an alpha-beta filter are not as good as what they replace."""
+    """Criteria of its own: a PD law and an alpha-beta filter are not as good as what they
+    replace.
+    """
     criteria = (
         "success.steady_position_rms_m=0.03",
         "success.steady_orientation_rms_deg=2.0",

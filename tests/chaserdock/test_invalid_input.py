@@ -45,7 +45,8 @@ INVALID = [
     ("run single --set chasers.0.q_wxyz=[1,1,0,0]", "unit length"),
     ("run single --set name=a/b", "name"),
     (
-        "run two-chaser-tracking --set chasers.1.position_m=[-1.0,0.0,0.0] --set chasers.1.start_offset_m=[-0.2,0.03,0.0]",
+        "run two-chaser-tracking --set chasers.1.position_m=[-1.0,0.0,0.0] --set "
+        "chasers.1.start_offset_m=[-0.2,0.03,0.0]",
         "nearer than limits.min_distance_chasers_m",
     ),
     (
@@ -54,11 +55,13 @@ INVALID = [
     ),
     (
         "run v-bar --set timeline.3.offset_m=[-0.5,0.0,0.0]",
-        "timeline.3.offset_m: 0.5 m from the target, inside the keep-out of limits.min_distance_target_m (0.75 m)",
+        "timeline.3.offset_m: 0.5 m from the target, inside the keep-out of "
+        "limits.min_distance_target_m (0.75 m)",
     ),
     (
         "run v-bar --set approach.cone_deg=40",
-        "from the edge of the cone the target is 40 degrees off the view of chaser 0, whose camera sees 18 degrees",
+        "from the edge of the cone the target is 40 degrees off the view of chaser 0, whose camera "
+        "sees 18 degrees",
     ),
     ("simulate single --seeds=5:3", "must be FIRST:LAST or one number, below 2^32"),
     ("simulate single --seeds=x", "must be FIRST:LAST or one number, below 2^32"),

@@ -101,7 +101,8 @@ def test_a_command_without_its_extra_names_it(
     done = without(package, *command)
     assert done.returncode == 2
     assert done.stderr == (
-        f"chaserdock: {package} is not installed; install chaserdock[{extra}]: pip install 'chaserdock[{extra}]'\n"
+        f"chaserdock: {package} is not installed; install chaserdock[{extra}]: pip install "
+        f"'chaserdock[{extra}]'\n"
     )
 
 

@@ -95,7 +95,9 @@ def test_invalid_network_options_are_one_line(
 
 @pytest.mark.slow
 def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
-    """Every process has only its own keys; the router restarts in flight; the flight is a success."""
+    """Every process has only its own keys; the router restarts in flight; the flight is a
+    success.
+    """
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
     endpoint = f"tls/127.0.0.1:{free_port()}"
     reach = ["-e", endpoint, "--lease", "10"]

@@ -28,7 +28,8 @@ from chaserdock.datasets.types import PoseLabel, read_grey
 from chaserdock.datasets.views import ViewLimits
 
 SETS = (
-    'perception.name="model"', EXACT_CAMERA, "camera.width_px=320", "camera.height_px=180", 'target.model="geo_servicer"',
+    'perception.name="model"', EXACT_CAMERA, "camera.width_px=320", "camera.height_px=180",
+    'target.model="geo_servicer"',
 )  # fmt: skip
 
 
@@ -66,7 +67,8 @@ def written(example: Any, path: Path, landmarks: np.ndarray) -> None:
     ):
         weights.append((0.05 * rng.normal(size=(inputs, outputs)), np.zeros(outputs)))
     facts = {
-        "landmarks_m": json.dumps(landmarks.tolist()), "sigma": json.dumps([0.01] * 6), "most_rms": "0.05",
+        "landmarks_m": json.dumps(landmarks.tolist()), "sigma": json.dumps([0.01] * 6),
+        "most_rms": "0.05",
     }  # fmt: skip
     onnx.save(example.files.network(weights, facts), str(path))
 
@@ -110,8 +112,7 @@ def test_network_file_runs_in_the_command(
     written(example, tmp_path / "n.onnx", corners(dataset))
     monkeypatch.setenv("CHASERDOCK_ONNX", str(tmp_path / "n.onnx"))
     words = [
-        "evaluate",
-        "perception",
+        "dataset",
         str(dataset),
         "--perception",
         "onnx_perception:OnnxPerception",
@@ -136,8 +137,7 @@ def test_missing_or_damaged_network_is_one_line(
         path.write_bytes(content)
     monkeypatch.setenv("CHASERDOCK_ONNX", str(path))
     words = [
-        "evaluate",
-        "perception",
+        "dataset",
         str(dataset),
         "--perception",
         "onnx_perception:OnnxPerception",

@@ -112,13 +112,15 @@ def limited(**limits: float) -> dict[str, Any]:
         (
             {"force_limit_N": 3.4},
             [
-                "chaser 0: largest force on its port: 3.5 N, at most 3.4 N allowed; exceeded from 0.13 s on",
+                "chaser 0: largest force on its port: 3.5 N, at most 3.4 N allowed; exceeded from "
+                "0.13 s on",
             ],
         ),
         (
             {"torque_limit_N_m": 0.05},
             [
-                "chaser 0: largest torque on its port: 0.7 N m, at most 0.05 N m allowed; exceeded from 0.13 s on",
+                "chaser 0: largest torque on its port: 0.7 N m, at most 0.05 N m allowed; exceeded "
+                "from 0.13 s on",
             ],
         ),
     ],
@@ -147,7 +149,8 @@ def test_limits_without_loads_in_the_log_are_not_met(tmp_path: Path) -> None:
     [
         (
             {"force_limit_N": 0.01},
-            "docking.ports.0.force_limit_N: 0.01 N is less than the 0.0194 N that the tumble of 3.22 degrees/s alone "
+            "docking.ports.0.force_limit_N: 0.01 N is less than the 0.0194 N that the tumble of "
+            "3.22 degrees/s alone "
             "exerts on the port of chaser 0",
         ),
         (

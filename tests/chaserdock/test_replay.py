@@ -186,6 +186,7 @@ def test_operator_commands_are_replayed(tmp_path: Path) -> None:
         assert found["controller/command"].alone == [0, extra]
 
 
+@pytest.mark.slow
 def test_replay_command(tmp_path: Path) -> None:
     log = str(GOLDEN)
     status, said = finished("replay", log, "--through", "fusion", "--tolerance", str(TOLERANCE))

@@ -206,11 +206,13 @@ def test_every_figure_is_described() -> None:
     assert [k.name for k in FIGURES if f"`{k.name}`" not in text] == []
 
 
+@pytest.mark.slow
 def test_equal_logs_give_equal_reports(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 4)
     assert report_of(log) == report_of(log)
 
 
+@pytest.mark.slow
 def test_truncated_log_gives_a_report(short_flight: Path, tmp_path: Path) -> None:
     whole = (short_flight / "mission.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -220,6 +222,7 @@ def test_truncated_log_gives_a_report(short_flight: Path, tmp_path: Path) -> Non
     assert "ended at" in page.words
 
 
+@pytest.mark.slow
 def test_report_of_a_flight_without_sightings_names_what_is_missing(tmp_path: Path) -> None:
     page = checked(report_of(made_log(tmp_path / "blind.mcap", 8)))
     assert {"figure-tracking", "figure-cameras", "figure-inputs", "replay"} <= set(page.ids)
@@ -228,6 +231,7 @@ def test_report_of_a_flight_without_sightings_names_what_is_missing(tmp_path: Pa
     assert "made <&>" in page.words  # escaped on the way, or it would be gone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_flight_aborted_at_once_gives_a_report(tmp_path: Path, ticks: int) -> None:
     page = checked(report_of(made_log(tmp_path / "aborted.mcap", ticks)))
@@ -268,6 +272,7 @@ def test_replay_runs_in_a_browser(tmp_path: Path) -> None:
 # -- figures ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_figures_are_written_in_the_requested_format(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8, chasers=2)
     for ending, begins in (("svg", b"<?xml"), ("pdf", b"%PDF")):
@@ -419,8 +424,8 @@ def test_figures_of_a_published_task_are_reported_and_part_of_the_line(tmp_path:
         assert part in text
     line = text_of(result).splitlines()[1]
     assert (
-        "least margin to the speed limit 0.058 m/s; at most 11.46 deg off the cone's axis; arrived at 1121.6 s"
-        in line
+        "least margin to the speed limit 0.058 m/s; at most 11.46 deg off the cone's axis; arrived "
+        "at 1121.6 s" in line
     )
     assert "aborted" not in line
 

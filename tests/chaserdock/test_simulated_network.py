@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scheduler and network of the simulation: order, determinism, and what conditions do to messages."""
+"""Scheduler and network of the simulation: order, determinism, and what conditions do to
+messages.
+"""
 
 from __future__ import annotations
 
@@ -182,7 +184,9 @@ def ack(tick: int) -> RecorderAck:
 def arrivals(
     number: int = 200, mode: str = "realtime", seed: int = 1, **conditions: Any
 ) -> list[tuple[int, float]]:
-    """Number and virtual time of the acknowledgements that the world receives of one every 10 ms."""
+    """Number and virtual time of the acknowledgements that the world receives of one every 10
+    ms.
+    """
     got: list[tuple[int, float]] = []
 
     def run(scheduler: Scheduler) -> None:

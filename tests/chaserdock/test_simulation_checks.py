@@ -448,7 +448,9 @@ def test_distances_are_not_judged_while_half_of_the_sensors_lie(
 
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_chaser_that_flies_commands_again_is_judged_again(killed: Scenario, lost: bool) -> None:
-    """From 3 s of flown commands on, and of a process that was lost, only if it takes part again."""
+    """From 3 s of flown commands on, and of a process that was lost, only if it takes part
+    again.
+    """
     log = Log(killed)
     log.tick(5)
     log.event(
@@ -583,7 +585,8 @@ def test_published_commands_are_flown_unless_a_fault_lasts(tmp_path: Path) -> No
         log.flies(0, tick)
         log.flies(1, tick, source="command" if tick < 10 else "hold")
     assert [str(v) for v in log.checks.violations] == [
-        "commands are flown at 8.10 s: chaser/1: has flown no command for 3.1 s, but commands are published"
+        "commands are flown at 8.10 s: chaser/1: has flown no command for 3.1 s, but commands are "
+        "published"
     ]
 
 

@@ -89,7 +89,8 @@ def test_tracking_error_compares_messages_of_one_tick(mission: LoggedMission) ->
         state.update(topics.ODOMETRY, at)
     assert state.chasers[0].error() is None
     there = Reference(
-        tick=1, chaser=0, phase="hold", phase_time_s=0.0, position_m=(1.0, 0.25, 0.0), q_wxyz=UPRIGHT,
+        tick=1, chaser=0, phase="hold", phase_time_s=0.0, position_m=(1.0, 0.25, 0.0),
+        q_wxyz=UPRIGHT,
         offset_m=(0, 0, 0), min_distance_target_m=0.5,
     )  # fmt: skip
     state.update(topics.REFERENCE, there)
@@ -444,7 +445,8 @@ def sent_clicks(
     head = (
         f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.get_port()}\r\nOrigin: {origin}\r\n"
         "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-        f"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: "
+        f"viser-v{viser.__version__}\r\n\r\n"
     )
     frames = [
         Frame(Opcode.BINARY, msgspec.msgpack.encode(message)).serialize(mask=True)
@@ -516,7 +518,10 @@ def test_viewer_without_a_router_reports_it_and_can_be_stopped() -> None:
     try:
         assert process.stdout is not None
         assert process.stdout.readline().endswith("shows the mission; Ctrl-C ends this\n")
-        line = f"viewer: no router at {endpoint} accepts the connection; is it running? The viewer waits for it.\n"
+        line = (
+            f"viewer: no router at {endpoint} accepts the connection; is it running? The viewer "
+            "waits for it.\n"
+        )
         assert process.stdout.readline() == line
         process.send_signal(signal.SIGTERM)
         assert process.stdout.read() == ""

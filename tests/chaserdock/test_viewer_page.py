@@ -57,7 +57,9 @@ def wait_for(page: Page, text: str) -> None:
 
 @needs_browser
 def test_page_of_a_log_makes_no_external_requests() -> None:
-    """Every request and web socket of the page goes to the viewer; the content of the log is shown."""
+    """Every request and web socket of the page goes to the viewer; the content of the log is
+    shown.
+    """
     requested: list[str] = []
     errors: list[str] = []
     with viewer(str(GOLDEN), "--at", "1.0") as url, chromium() as browser:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shape of a freely rotating body: it stays physical, and its derivatives are those of the motion."""
+"""Shape of a freely rotating body: it stays physical, and its derivatives are those of the
+motion.
+"""
 
 from __future__ import annotations
 

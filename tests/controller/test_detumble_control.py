@@ -31,7 +31,9 @@ SETTLED_S = 2.0
 
 
 def at_command(scenario: Scenario, *chasers: int) -> tuple[StackMission, list[CommandReply]]:
-    """Fly until the estimate has settled and command these chasers to detumble; return the replies."""
+    """Fly until the estimate has settled and command these chasers to detumble; return the
+    replies.
+    """
     mission = StackMission(scenario, RenderedImages(scenario))
     while mission.time_s < SETTLED_S:
         mission.step()

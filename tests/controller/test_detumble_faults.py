@@ -188,6 +188,7 @@ def test_a_stack_of_many_chasers_is_stopped(count: int, plan_s: float | None) ->
     assert flight.impulse_N_s < (1.0 if plan_s is None else 0.85) * flight.least.impulse_N_s
 
 
+@pytest.mark.slow
 def test_a_stopped_stack_turns_to_its_commanded_attitude_and_keeps_it() -> None:
     q = rotations.exp(np.array([0.3, -0.2, 0.1]))
     scenario = stack_scenario(1, (0, 3), wrong_knowledge(1, share=0.1))

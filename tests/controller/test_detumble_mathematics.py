@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mathematics of detumbling: momentum of a stack, wrenches of its thrusters, and their allocation."""
+"""Mathematics of detumbling: momentum of a stack, wrenches of its thrusters, and their
+allocation.
+"""
 
 from __future__ import annotations
 

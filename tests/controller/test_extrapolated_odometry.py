@@ -82,7 +82,8 @@ def test_identification_of_the_stack_takes_measured_odometry_only() -> None:
         for i in chasers:
             position, q = detumble.start_pose(i)
             odometry[i] = Odometry(
-                tick=0, sim_time_ns=0, chaser=i, position_m=tuple(position.tolist()), q_wxyz=tuple(q.tolist()),
+                tick=0, sim_time_ns=0, chaser=i, position_m=tuple(position.tolist()),
+                q_wxyz=tuple(q.tolist()),
                 velocity_m_s=ZERO, omega_rad_s=ZERO,
             )  # fmt: skip
         estimation = latched_estimation(frozenset(chasers), odometry)

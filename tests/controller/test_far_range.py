@@ -97,7 +97,8 @@ def test_goto_out_of_the_approach_cone_is_refused() -> None:
                     {"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-0.2, 0.0, 0.0]}
                 ]
             },
-            r"timeline\.0\.offset_m: 0\.2 m from the target, inside the keep-out of limits\.min_distance_target_m \(0\.35 m\)",
+            r"timeline\.0\.offset_m: 0\.2 m from the target, inside the keep-out of "
+            r"limits\.min_distance_target_m \(0\.35 m\)",
         ),
         (
             {
@@ -105,7 +106,8 @@ def test_goto_out_of_the_approach_cone_is_refused() -> None:
                     {"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-400.0, 0.0, 0.0]}
                 ]
             },
-            r"timeline\.0\.offset_m: 400 m from the target, farther than limits\.max_reference_distance_m",
+            r"timeline\.0\.offset_m: 400 m from the target, farther than "
+            r"limits\.max_reference_distance_m",
         ),
         (
             {
@@ -113,7 +115,8 @@ def test_goto_out_of_the_approach_cone_is_refused() -> None:
                     {"at_s": 1.0, "command": "goto", "chasers": [0], "offset_m": [-50.0, 50.0, 0.0]}
                 ]
             },
-            r"timeline\.0\.offset_m: 45 degrees off the approach axis of chaser 0, outside approach\.cone_deg \(10 degrees\)",
+            r"timeline\.0\.offset_m: 45 degrees off the approach axis of chaser 0, outside "
+            r"approach\.cone_deg \(10 degrees\)",
         ),
         (
             {"approach": {"cone_deg": 60.0}},
@@ -123,7 +126,8 @@ def test_goto_out_of_the_approach_cone_is_refused() -> None:
         ({"orbit": {"semi_major_axis_m": 6e6}}, r"orbit: the orbit lies inside the Earth"),
         (
             {"perception": {"name": "model"}},
-            r"ranging: needs a perception by markers \(default, paper, paper_iterative, statistical\), not 'model'",
+            r"ranging: needs a perception by markers \(default, paper, paper_iterative, "
+            r"statistical\), not 'model'",
         ),
     ],
 )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the joint filter finds of a target that tumbles freely, from what the chasers' cameras see."""
+"""What the joint filter finds of a target that tumbles freely, from what the chasers' cameras
+see.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def test_relative_poses_are_consistent_although_the_inertia_is_wrong(tumble: Tum
 
 
 def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(tumble: TumbleOutcome) -> None:
-    """The stated axes are right here, so that the target spins about an axis of the stated inertia."""
+    """The stated axes are right here, so that the target spins about an axis of the stated
+    inertia.
+    """
     axis = np.linalg.eigh(target_alone().inertia_kg_m2)[1][:, 2]
     values = "{target=true,mass_kg=150.0,inertia_kg_m2=[20.0,22.0,25.0,0.0,0.0,0.0]}"
     changes = [

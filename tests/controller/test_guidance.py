@@ -448,7 +448,9 @@ def test_every_transition_is_unique() -> None:
 
 @pytest.mark.parametrize("mission", [scenario(), capture_scenario()])
 def test_every_phase_and_command_belongs_to_one_activity(mission: Scenario) -> None:
-    """Of those that a kind of docking leads to; isolating and restoring thrusters change no phase."""
+    """Of those that a kind of docking leads to; isolating and restoring thrusters change no
+    phase.
+    """
     stage = GuidanceStage(mission)
     kinds = (None, stage.chasers[0].by_capture)
     activities = [a for a in stage.activities if a.by_capture in kinds]

@@ -440,7 +440,9 @@ def test_chaser_whose_sightings_and_pose_contradict_the_estimate_is_started_agai
 def test_only_a_repeated_misfit_of_the_velocity_passes_for_a_force(
     ticks: int, follows: bool
 ) -> None:
-    """A velocity 6 mm/s off in one tick is noise; in two ticks in a row it may be a stuck thruster."""
+    """A velocity 6 mm/s off in one tick is noise; in two ticks in a row it may be a stuck
+    thruster.
+    """
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 1, 4)
     estimator = estimator_for(flight.errors, 1)
     fly(estimator, flight, 5.0)

@@ -76,9 +76,8 @@ def test_controller_keeps_the_newest_docking_status_and_thruster_report(capture:
 
 @pytest.fixture
 def controller(scenario: Scenario) -> ControllerProcess:
-    made = ControllerProcess(
-        ReplayNode("controller"), scenario, ControllerCore(scenario, lambda: 0.0)
-    )  # type: ignore[arg-type]
+    node: Any = ReplayNode("controller")
+    made = ControllerProcess(node, scenario, ControllerCore(scenario, lambda: 0.0))
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     made.standby.join("c")
     made.standby.update(tick_of(scenario, 0, (0, 1)))

@@ -214,7 +214,9 @@ def test_equal_inputs_give_equal_plans(name: str) -> None:
 
 
 def test_rti_converges_to_ipopts_plan() -> None:
-    """Iterated on a frozen problem, the real-time iteration reaches a point that ipopt agrees with."""
+    """Iterated on a frozen problem, the real-time iteration reaches a point that ipopt agrees
+    with.
+    """
     problem_at, states = far_start(1)
     problem = problem_at(states, 0.0)
     chosen = fresh("rti", 1)

@@ -48,7 +48,8 @@ def state_at(row: Array) -> JointState:
     position, velocity, q, omega = row[None, :3], row[None, 3:6], row[None, 6:10], row[None, 10:]
     known = np.ones(1, dtype=bool)
     return msgspec.structs.replace(
-        empty_state(0, 1), positions_m=position, velocities_m_s=velocity, attitudes_wxyz=q, omegas_rad_s=omega,
+        empty_state(0, 1), positions_m=position, velocities_m_s=velocity, attitudes_wxyz=q,
+        omegas_rad_s=omega,
         alive=known,
     )  # fmt: skip
 
@@ -111,7 +112,8 @@ def odometry(row: Array) -> Odometry:
     return Odometry(
         tick=0, sim_time_ns=0, chaser=0, position_m=vector(row[:3]), velocity_m_s=vector(row[3:6]),
         q_wxyz=vector(row[6:10]), omega_rad_s=vector(row[10:]), position_covariance_m2=zeros,
-        velocity_covariance_m2_s2=zeros, attitude_covariance_rad2=zeros, omega_covariance_rad2_s2=zeros,
+        velocity_covariance_m2_s2=zeros, attitude_covariance_rad2=zeros,
+        omega_covariance_rad2_s2=zeros,
     )  # fmt: skip
 
 

@@ -228,7 +228,9 @@ def test_standby_follows_the_operator_commands_of_the_commander(
 
 
 def held_by(messages: list[ReceivedMessage], holder: str, term: int) -> list[ReceivedMessage]:
-    """Return the messages of a tick in which both controllers take part and one holds all leases."""
+    """Return the messages of a tick in which both controllers take part and one holds all
+    leases.
+    """
     tick = next(r.message for r in messages if r.topic is topics.TICK)
     leases = [granted(tick, i, holder, term) for i in tick.chasers]
     return leases + [r for r in messages if r.topic is not topics.LEASE]

@@ -47,7 +47,9 @@ def test_equal_seed_makes_equal_mutations() -> None:
 
 
 def test_check_finds_invalid_messages() -> None:
-    """The check does not depend on the codec: it also finds messages that the codec would reject."""
+    """The check does not depend on the codec: it also finds messages that the codec would
+    reject.
+    """
     odometry = BY_TYPE[m.Odometry]
     assert garbage_in(odometry) is None
     for name, bad in (

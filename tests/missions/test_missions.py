@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Complete missions with separate processes over Zenoh: success, determinism, contents of the log."""
+"""Complete missions with separate processes over Zenoh: success, determinism, contents of the
+log.
+"""
 
 from __future__ import annotations
 

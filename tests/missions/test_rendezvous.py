@@ -25,6 +25,7 @@ def test_last_leg_starts_at_the_last_hold_point() -> None:
     assert images.chasers == leg.chasers
 
 
+@pytest.mark.slow
 def test_relative_velocity_at_200_m_is_known_well_enough_for_a_passively_safe_move() -> None:
     """After 20 s: the errors agree with their covariance, and the move to the first hold point is
     not refused.

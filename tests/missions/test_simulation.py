@@ -43,6 +43,7 @@ def simulate_elsewhere(out: Path, *overrides: str, env: dict[str, str]) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flown", "overrides"),
     [("short_flight", ("two-chaser-tracking", *SHORT)), ("drill_flight", DRILL)],
@@ -78,6 +79,7 @@ _HARSH = (
 )
 
 
+@pytest.mark.slow
 def test_a_seed_repeats_every_byte_for_any_hash_seed(tmp_path: Path) -> None:
     contents = []
     for k in range(2):

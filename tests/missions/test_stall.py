@@ -183,7 +183,10 @@ def test_run_ignores_a_forged_end_and_names_its_publisher() -> None:
             world.publish(topics.END, MissionEnd(reason="the test ends", complete=True))
     hub.close()
     notices = [(line.what, line.detail) for line in lines if isinstance(line, EventNotice)]
-    text = f"session {intruder.source} publishes on world/end, which is the world's (session {world.source}); ignored"
+    text = (
+        f"session {intruder.source} publishes on world/end, which is the world's (session "
+        f"{world.source}); ignored"
+    )
     assert notices == [("foreign publisher", text)]
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hot standby: takes over from a killed, frozen or disconnected controller, in complete missions."""
+"""Hot standby: takes over from a killed, frozen or disconnected controller, in complete
+missions.
+"""
 
 from __future__ import annotations
 

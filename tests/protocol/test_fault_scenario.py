@@ -95,7 +95,8 @@ LATCHES = [
 BAD_LATCHES = [
     (
         'kind = "latch_open", process = "chaser/2", duration_s = 1',
-        "fault.0: latch_open cannot happen to chaser/2, which has no port; see docking.kind and [[docking.ports]]",
+        "fault.0: latch_open cannot happen to chaser/2, which has no port; see docking.kind and "
+        "[[docking.ports]]",
     ),
     (
         'kind = "latch_slip", process = "chaser/0", duration_s = 1',

@@ -196,7 +196,7 @@ def test_commit_of_a_checkout_tells_changed_files(tmp_path: Path) -> None:
     for command in (["add", "a"], ["commit", "-qm", "a"]):
         subprocess.run([*git, *command], check=True)
     clean = provenance.commit_of.__wrapped__(tmp_path)
-    assert re.fullmatch("[0-9a-f]{12}", clean)
+    assert re.fullmatch("[0-9a-f]{12}", clean or "")
     (tmp_path / "a").write_text("2")
     assert provenance.commit_of.__wrapped__(tmp_path) == f"{clean}-dirty"
 

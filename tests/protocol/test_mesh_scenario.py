@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Targets with a mesh in a scenario: what the flight software knows of it, and errors in its keys."""
+"""Targets with a mesh in a scenario: what the flight software knows of it, and errors in its
+keys.
+"""
 
 from __future__ import annotations
 

@@ -74,7 +74,8 @@ def test_a_principal_point_alone_does_not_make_the_mounting_uncertain() -> None:
     [
         (
             {"grade": "lap"},
-            "navigation.grade: must be one of exact, lab, orbit, poor (got 'lap'); did you mean lab?",
+            "navigation.grade: must be one of exact, lab, orbit, poor (got 'lap'); did you mean "
+            "lab?",
         ),
         (
             {"position_noise_m": -1.0},

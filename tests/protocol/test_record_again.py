@@ -47,6 +47,7 @@ def by_key(log: Path) -> dict[str, list[tuple[str, bytes]]]:
     return dict(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [(), ("--rotate-time", "1"), ("--no-viewer",)], ids=["one file", "rotated", "bare"]
 )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rights: every wrong identity on every key is dropped by the router, every right one gets through."""
+"""Rights: every wrong identity on every key is dropped by the router, every right one gets
+through.
+"""
 
 from __future__ import annotations
 

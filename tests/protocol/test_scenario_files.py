@@ -192,7 +192,8 @@ def test_an_uninstalled_plugin_is_an_error_of_the_file_but_not_of_a_log(
         ),
         (
             ("target.motion=statc",),
-            "--set target.motion=statc: target.motion: must be one of constant_rates, static, torque_free "
+            "--set target.motion=statc: target.motion: must be one of constant_rates, static, "
+            "torque_free "
             "(got 'statc'); did you mean static?",
         ),
         (
@@ -201,7 +202,8 @@ def test_an_uninstalled_plugin_is_an_error_of_the_file_but_not_of_a_log(
         ),
         (
             ("chaser.mass_kg=1e300",),
-            "--set chaser.mass_kg=1e300: chaser.mass_kg: must be a number greater than 0 and at most 1e+12 (got 1e+300)",
+            "--set chaser.mass_kg=1e300: chaser.mass_kg: must be a number greater than 0 and at "
+            "most 1e+12 (got 1e+300)",
         ),
         (
             ("time.picture_hz=5",),
@@ -268,7 +270,8 @@ def test_deep_nesting_is_one_line(file: Path) -> None:
         ),
         (
             "format = 2\nestimator.camera_bias_position_m = 0.1",
-            "set format = 3 and change: estimator.camera_bias_position_m: is now called navigation.camera_shift_m",
+            "set format = 3 and change: estimator.camera_bias_position_m: is now called "
+            "navigation.camera_shift_m",
         ),
     ],
 )
@@ -474,7 +477,10 @@ def test_a_known_target_replaces_the_geometry_of_the_base(file: Path, tmp_path: 
 @pytest.mark.parametrize("key", ["width_px=640", "height_px=480", "hfov_deg=50.0"])
 def test_camera_values_replaced_by_intrinsics_are_an_error(tmp_path: Path, key: str) -> None:
     lens = "{width_px=800,height_px=600,fx_px=700,fy_px=700,cx_px=400,cy_px=300}"
-    error = f"camera.{key.partition('=')[0]}: not used with camera.intrinsics; change camera.intrinsics instead"
+    error = (
+        f"camera.{key.partition('=')[0]}: not used with camera.intrinsics; change "
+        "camera.intrinsics instead"
+    )
     variant = tmp_path / "variant.toml"
     variant.write_text(f'extends = "single"\n[camera]\nintrinsics = {lens}\n')
     assert load_scenario(variant).camera_model().width_px == 800

@@ -64,7 +64,10 @@ def test_client_without_a_router_gives_up(tmp_path: Path, refuses: bool) -> None
     if refuses:
         with router_with_rights(make_keys(tmp_path / "keys")) as endpoint:
             link = client(make_keys(tmp_path / "other-keys"), "operator", endpoint)
-            words = f"no router at {endpoint} accepts the connection; is it running, and are the keys valid"
+            words = (
+                f"no router at {endpoint} accepts the connection; is it running, and are the keys "
+                "valid"
+            )
             with pytest.raises(TransportError, match=words):
                 Node("operator", "operator", replace(link, connect_timeout_s=0.5))
         return

@@ -123,7 +123,9 @@ def test_stop_clears_wrench_and_queue() -> None:
 def test_body_receives_the_integral_of_the_commands(
     commands: list[tuple[int, int]], stops: list[int]
 ) -> None:
-    """``fly_to`` splits the flight at every change: the momentum gained is the commands' integral."""
+    """``fly_to`` splits the flight at every change: the momentum gained is the commands'
+    integral.
+    """
     physics = Physics(scenario())
     a = IdealActuators(BODY)
     for seq, (step, force) in enumerate(commands):

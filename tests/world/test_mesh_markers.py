@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Markers on meshes: closed plates, and poses that the marker perception measures in their images."""
+"""Markers on meshes: closed plates, and poses that the marker perception measures in their
+images.
+"""
 
 from __future__ import annotations
 

@@ -135,7 +135,8 @@ def test_images_equal_those_of_a_ray_tracer() -> None:
     assert inside.sum() > 500
     difference = np.abs(image - expected)
     print(
-        f"inside {difference[inside].mean():.2f}, all of the body {difference[expected > SPACE_LEVEL + 0.5].mean():.2f} grey levels"
+        f"inside {difference[inside].mean():.2f}, all of the body "
+        f"{difference[expected > SPACE_LEVEL + 0.5].mean():.2f} grey levels"
     )
     assert difference[inside].mean() < 1.5
     body = expected > SPACE_LEVEL + 0.5

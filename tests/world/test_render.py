@@ -135,7 +135,9 @@ def test_probe_in_contact_is_painted_before_the_body():
 @given(st.integers(0, 10_000))
 @settings(derandomize=True, deadline=None, max_examples=40)
 def test_paint_order_agrees_with_ray_casting(seed):
-    """Random boxes apart from each other, each of its own shade: the first one a ray hits is seen."""
+    """Random boxes apart from each other, each of its own shade: the first one a ray hits is
+    seen.
+    """
     generator = np.random.default_rng(seed)
     boxes, shades = [], iter(np.linspace(0.3, 1.0, 5))
     while len(boxes) < 5:

@@ -362,7 +362,8 @@ def test_a_clock_that_is_ahead_does_not_act_before_the_command_arrives(
 ) -> None:
     actuators = make_actuators(with_values(clock_offset_s=offset_s), 0)
     command = ActuatorCommand(
-        tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command", force_N=(1.0, 0.0, 0.0),
+        tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command",
+        force_N=(1.0, 0.0, 0.0),
         torque_N_m=(0.0, 0.0, 0.0),
     )  # fmt: skip
     actuators.command(command, 10, 10)
@@ -392,7 +393,8 @@ def impulse_of(s: Any, width_ns: int = 50_000_000) -> Array:
     actuators = make_actuators(s, 0)
     pulse = ThrusterPulse(thruster=0, open_ns=100_000_000, close_ns=100_000_000 + width_ns)
     command = ActuatorCommand(
-        tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command", force_N=(0.0, 0.0, 0.0),
+        tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command",
+        force_N=(0.0, 0.0, 0.0),
         torque_N_m=(0.0, 0.0, 0.0), pulses=(pulse,),
     )  # fmt: skip
     actuators.command(command, 0, 0)

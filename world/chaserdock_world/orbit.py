@@ -30,7 +30,9 @@ asked before, so that it depends only on its time.
 
 
 class TargetOrbit:
-    """States of an orbit at any time from the begin of the mission on, integrated on a fixed grid."""
+    """States of an orbit at any time from the begin of the mission on, integrated on a fixed
+    grid.
+    """
 
     def __init__(self, section: Orbit) -> None:
         self._section, self.j2 = section, section.zonal_coefficient
@@ -40,7 +42,9 @@ class TargetOrbit:
         self.frame_at = lru_cache(maxsize=4)(self._frame_at)
 
     def _state_at(self, time_s: float) -> OrbitState:
-        """Return the state at a time of the mission. The same at every call, in any order of calls."""
+        """Return the state at a time of the mission. The same at every call, in any order of
+        calls.
+        """
         index = int(time_s / _GRID_S)
         while len(self._grid) <= index:
             self._grid.append(propagate(self._grid[-1], _GRID_S, self.j2))
@@ -77,7 +81,9 @@ class TargetOrbit:
 
 
 def to_sun(scenario: Scenario, time_s: float = 0.0) -> tuple[float, float, float]:
-    """Return the direction (3,) to the sun, WRF, any length: of the orbit, or the camera section's."""
+    """Return the direction (3,) to the sun, WRF, any length: of the orbit, or the camera
+    section's.
+    """
     if scenario.orbit is None:
         return scenario.camera.sun_direction
     x, y, z = TargetOrbit(scenario.orbit).to_sun(time_s).tolist()

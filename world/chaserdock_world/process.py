@@ -177,7 +177,9 @@ class World:
         )
 
     def run(self, stop: StopSignal) -> int:
-        """Wait for the processes, simulate all ticks and end the mission; return the exit status."""
+        """Wait for the processes, simulate all ticks and end the mission; return the exit
+        status.
+        """
         if reason := self._wait_for_processes(stop):
             return self._end_mission(0, reason, complete=False)
         self._node.host.finish_startup()

@@ -12,7 +12,9 @@ from chaserdock_protocol.scenario import Scenario
 
 
 def require_packages(scenario: Scenario) -> None:
-    """Raise MissingPackageError if a package that the world of a scenario needs is not installed."""
+    """Raise MissingPackageError if a package that the world of a scenario needs is not
+    installed.
+    """
     if scenario.world.engine == "mujoco":
         require_extra("mujoco", "mujoco")
     else:
@@ -27,9 +29,13 @@ def require_pybullet(
     what else helps.
     """
     if find_spec("pybullet") is None:
-        here = f"Python {sys.version_info.major}.{sys.version_info.minor} on {sys.platform} {platform.machine()}"
+        here = (
+            f"Python {sys.version_info.major}.{sys.version_info.minor} on {sys.platform} "
+            f"{platform.machine()}"
+        )
         raise MissingPackageError(
-            f"{what} needs PyBullet, which is not installed; it has wheels for Python 3.11 on Linux x86_64 only (this is "
+            f"{what} needs PyBullet, which is not installed; it has wheels for Python 3.11 on "
+            "Linux x86_64 only (this is "
             f"{here}); {instead}",
             name="pybullet",
         )

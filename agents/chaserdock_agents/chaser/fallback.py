@@ -199,7 +199,9 @@ def next_state(
 
 
 def hold_setpoint(state: FallbackState, odometry: Odometry, last: LastCommand) -> Setpoint:
-    """Return the setpoint of mode ``hold``: moves with the target and keeps the current attitude."""
+    """Return the setpoint of mode ``hold``: moves with the target and keeps the current
+    attitude.
+    """
     assert state.outward_w is not None
     zero = np.zeros(3)
     q = np.asarray(odometry.q_wxyz)

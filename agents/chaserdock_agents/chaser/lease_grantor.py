@@ -120,7 +120,10 @@ class LeaseGrantor:
         """
         if not self.is_of_holder(command):
             holder = self.holder or "no controller"
-            return f"stale term: {command.commander} {command.instance} sent it, {holder} holds term {self.term}"
+            return (
+                f"stale term: {command.commander} {command.instance} sent it, {holder} holds term "
+                f"{self.term}"
+            )
         if command.term < self.term or commander_of(command.term) != self.holder:
             return f"stale term: sent in term {command.term}, the lease is of term {self.term}"
         return None

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chaser process: receives one message at a time, has it handled, and publishes what follows."""
+"""The chaser process: receives one message at a time, has it handled, and publishes what
+follows.
+"""
 
 from __future__ import annotations
 

@@ -51,7 +51,8 @@ def decode_image(image: Image) -> NDArray[np.uint8]:
     if image.encoding == "mono8":
         if data.size != shape[0] * shape[1]:
             raise BadImage(
-                f"{data.size} bytes; a mono8 image of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
+                f"{data.size} bytes; a mono8 image of {shape[1]} x {shape[0]} has "
+                f"{shape[0] * shape[1]}"
             )
         return data.reshape(shape)
     # Checked first, as OpenCV allocates memory for any size that the header states, and accepts
@@ -197,7 +198,10 @@ def apply_geometry(
         or len(estimate.covariance) != k * k
         or not (sigmas > 0.0).all()
     ):
-        return f"{k} names with {len(estimate.values)} values and {len(estimate.covariance)} covariances"
+        return (
+            f"{k} names with {len(estimate.values)} values and {len(estimate.covariance)} "
+            "covariances"
+        )
     covariance = np.array(estimate.covariance).reshape(k, k) / np.outer(sigmas, sigmas)
     try:
         correct(np.array(estimate.values) / sigmas, covariance)

@@ -74,7 +74,9 @@ _POINT_FIELDS = [
 
 
 class ViewerLayer:
-    """Converts messages to the viewer layer of one file; every file of a rotated log has its own."""
+    """Converts messages to the viewer layer of one file; every file of a rotated log has its
+    own.
+    """
 
     def __init__(self, scenario: FlightScenario, write: Write) -> None:
         self._write = write

@@ -91,7 +91,9 @@ class Recording:
             self._viewer.write(message)
 
     def flush_if_due(self) -> None:
-        """Write what is buffered to the file if it is old enough; call it when no message arrives."""
+        """Write what is buffered to the file if it is old enough; call it when no message
+        arrives.
+        """
         self._writer.flush_if_due()
 
     def _is_full(self) -> bool:

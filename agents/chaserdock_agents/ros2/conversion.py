@@ -160,7 +160,9 @@ def clock(tick: m.Tick) -> ros.rosgraph_msgs__msg__Clock:
 
 
 def image(message: m.Image) -> ros.sensor_msgs__msg__Image:
-    """Return an image with grey levels of 8 bits, decoded if it is compressed. Raises InvalidImage."""
+    """Return an image with grey levels of 8 bits, decoded if it is compressed. Raises
+    InvalidImage.
+    """
     data = np.frombuffer(message.data, np.uint8)
     if message.encoding == "jpeg":
         pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -27,7 +27,9 @@ def services(chasers: int) -> Iterator[tuple[str, str, OperatorCommandName, int]
 
 
 def command_of(verb: OperatorCommandName, chaser: int, request: Any) -> OperatorCommand:
-    """Return the command that a request asks for. Raises Rejected for numbers that are not finite."""
+    """Return the command that a request asks for. Raises Rejected for numbers that are not
+    finite.
+    """
     offset = tuple(request.offset_m.tolist()) if verb == "goto" else None
     thruster = int(request.thruster) if _WITH_ARGUMENT.get(verb) == SELECT_THRUSTER else None
     command = OperatorCommand(

@@ -36,8 +36,10 @@ _POLL_S = 0.02
 """
 
 _DECISION = re.compile(
-    rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: (?P<cached>Using cached result: )?(?P<client>[0-9a-f]+)"
-    r"(?: on (?P<subject>\S+))? is (?P<un>un)?authorized to (?P<what>[\w /]+) \((?P<flow>ingress|egress)\) on (?P<key>.*)"
+    rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: (?P<cached>Using cached result: "
+    rf")?(?P<client>[0-9a-f]+)"
+    r"(?: on (?P<subject>\S+))? is (?P<un>un)?authorized to (?P<what>[\w /]+) "
+    r"\((?P<flow>ingress|egress)\) on (?P<key>.*)"
 )
 _CACHING = re.compile(
     rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: ACL \(\w+\): caching permissions"
@@ -46,7 +48,8 @@ _NO_SUBJECT = re.compile(
     rf".*{TARGET}: (?P<client>[0-9a-f]+) did not match any configured ACL subject"
 )
 _REFUSED = re.compile(
-    rf".*{TLS_TARGET}: (?P<why>peer sent no certificates|invalid peer certificate: \w+|received fatal alert: \w+)"
+    rf".*{TLS_TARGET}: (?P<why>peer sent no certificates|invalid peer certificate: \w+|received "
+    rf"fatal alert: \w+)"
 )
 _NAME = re.compile(r"CertCommonName\((?P<name>[^)]*)\)")
 _LAST_CACHED = "Declare Liveliness Subscriber"

@@ -53,7 +53,9 @@ class BodyShape:
     centre_m: Array
 
     def corrected(self, error: Array) -> BodyShape:
-        """Return the shape that differs by an error (8,), or the nearest one that a body can have."""
+        """Return the shape that differs by an error (8,), or the nearest one that a body can
+        have.
+        """
         inertia = _physical(self.inertia + np.tensordot(error[RATIOS], RATIO_BASIS, 1))
         return BodyShape(inertia, self.centre_m + error[CENTRE_OF_MASS])
 

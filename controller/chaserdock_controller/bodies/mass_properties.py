@@ -108,7 +108,9 @@ def covariance_by_chasers(
 def detach(
     stack: MassProperties, chasers: Sequence[MountedChaser], body: RigidBody
 ) -> MassProperties:
-    """Return the mass properties of the target of a stack: those of the stack without the chasers."""
+    """Return the mass properties of the target of a stack: those of the stack without the
+    chasers.
+    """
     return _transformed(stack, _parts(chasers, body, -1.0))
 
 

@@ -99,7 +99,9 @@ class EstimationStage:
     def _follow_consistency(
         self, o: Observation, seeing: Set[int], target: TargetState
     ) -> list[LogEntry]:
-        """Follow whether the sightings of each chaser agree with the estimate; return the events."""
+        """Follow whether the sightings of each chaser agree with the estimate; return the
+        events.
+        """
         for c in o.chasers:
             if c.interrupted:
                 self.consistency[c.chaser].interrupt(o.time_s)
@@ -117,8 +119,8 @@ class EstimationStage:
         seeing: Set[int],
         cameras: Mapping[int, CameraCalibration],
     ) -> ChaserEstimate:
-        """Return what is known of a chaser with the estimated ``state``; ``known``: the target's pose
-        is.
+        """Return what is known of a chaser with the estimated ``state``; ``known``: the target's
+        pose is.
         """
         i, latched = c.chaser, c.chaser in self.composite.latched
         own = relative = covariance = None

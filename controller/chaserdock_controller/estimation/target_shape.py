@@ -29,6 +29,7 @@ VIEW_CELLS = 80
 FLOOR_SIGMAS = 0.15
 """Standard deviation, as a share of the prior one, of what the views of a target have in common."""
 _GATE_SIGMAS = 4.0
+"""Gate of a pair of views, in standard deviations: rejects 1 of 16,000 consistent ones."""
 _LEAST_BASELINE = 0.3
 """Least distance of two cameras, as a share of the range, that tells the scale."""
 
@@ -156,7 +157,9 @@ class ShapeFilter(Struct, frozen=True, eq=False):
         )
 
     def _contradicts(self, matrix: Array, vector: Array) -> bool:
-        """Return whether a view's estimate is farther from this one than their covariances explain."""
+        """Return whether a view's estimate is farther from this one than their covariances
+        explain.
+        """
         values, vectors = np.linalg.eigh(matrix)
         informed = values > 0.05 * max(float(values[-1]), 1e-12)
         basis = vectors[:, informed]

@@ -160,6 +160,7 @@ class Estimator(Protocol):
 
 
 NO_ESTIMATE_VARIANCE = 1e6
+"""Variance of each component without an estimate, m² or rad²: nothing is known within 1 km."""
 
 
 def no_estimate(time_ns: int) -> TargetState:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Approach corridor of the NMPC: a cone about an axis through the target's centre. Pure functions."""
+"""Approach corridor of the NMPC: a cone about an axis through the target's centre. Pure
+functions.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State machine of one chaser, and what an activity of it has to offer. No I/O; time is an argument.
+"""State machine of one chaser, and what an activity of it has to offer. No I/O; time is an
+argument.
 
 Phases and transitions: ``phases``. Every phase change looks up its target in the transition table,
 and the activity to which the target belongs begins there.
@@ -120,8 +121,8 @@ class ChaserMachine:
     ``position_m`` (3,): its estimated centre, TRF; ``seen``: its state at its port; ``relative``:
     its state relative to the target where passive safety is enforced; each as of the last tick with
     it. ``failure``: why no plan of it can be flown. ``interrupted``: it resumes its approach when
-    the target is seen again. ``abort_margin``: sigmas of its best abort. ``changes``: the log, which
-    all chasers share.
+    the target is seen again. ``abort_margin``: sigmas of its best abort. ``changes``: the log,
+    which all chasers share.
     """
 
     def __init__(self, scenario: FlightScenario, number: int, changes: list[PhaseChange]) -> None:
@@ -192,8 +193,8 @@ class ChaserMachine:
         self.fire(Trigger.TARGET_LOST, now_s, reason)
 
     def follow_sight(self, known: ChaserTick, unseen_s: float) -> None:
-        """Interrupt an approach to a target that no chaser has seen for ``unseen_s``, or by doubtful
-        odometry; resume it afterwards.
+        """Interrupt an approach to a target that no chaser has seen for ``unseen_s``, or by
+        doubtful odometry; resume it afterwards.
         """
         if unseen_s >= GUIDANCE.sight_loss_s or known.doubtful:
             reason = f"no chaser has seen the target for {GUIDANCE.sight_loss_s:g} s"
@@ -256,7 +257,9 @@ class ChaserMachine:
     # -- a tick ------------------------------------------------------------------------------------
 
     def step(self, known: ChaserTick, errors: TrackingErrors) -> None:
-        """Advance the phase by the estimated errors from the reference and by the docking sensor."""
+        """Advance the phase by the estimated errors from the reference and by the docking
+        sensor.
+        """
         self.position_m, self.seen = known.offset_m, known.port
         self._activities[self.phase].step(self, known, errors)
 

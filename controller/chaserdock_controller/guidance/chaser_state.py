@@ -73,12 +73,12 @@ class ChaserTick:
     """What is known of one chaser in a tick.
 
     ``own``: its estimated state, None without odometry; ``invalid``: its odometry is not valid.
-    ``target``: the target's estimate; ``offset_m`` (3,): the chaser's centre, TRF, and ``port``: its
-    state at its port, where the target's pose and its own are known. ``latched``: its latch holds
-    the target. ``doubtful``: its odometry may be wrong. ``acquiring``: it looks for the target in an
-    earlier image; None without a sighting. ``stuck_thrusters``: found in the motion of the stack.
-    ``relative``: its state relative to the target where passive safety is enforced; ``unsafe``: why
-    its plans are not passively safe, or empty.
+    ``target``: the target's estimate; ``offset_m`` (3,): the chaser's centre, TRF, and ``port``:
+    its state at its port, where the target's pose and its own are known. ``latched``: its latch
+    holds the target. ``doubtful``: its odometry may be wrong. ``acquiring``: it looks for the
+    target in an earlier image; None without a sighting. ``stuck_thrusters``: found in the motion of
+    the stack. ``relative``: its state relative to the target where passive safety is enforced;
+    ``unsafe``: why its plans are not passively safe, or empty.
     """
 
     now_s: float

@@ -56,7 +56,10 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
         return f"in phase {phase}; hold first"
     uncertain = scenario.navigation.errors().uncertain_mounting
     if scenario.estimator.name != "joint" or not uncertain:
-        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = joint)"
+        return (
+            "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = "
+            "joint)"
+        )
     return ""
 
 
@@ -68,7 +71,10 @@ def why_not_inspect(scenario: FlightScenario, chaser: int, offset_m: Array, at_r
     if reason := why_not_offset(scenario, chaser, (distance_m, 0.0, 0.0)):
         return reason
     if own_m > 2.0 * distance_m:
-        return f"the chaser is {own_m:.3g} m from the target; fly to less than twice inspection.distance_m ({distance_m:g} m) first"
+        return (
+            f"the chaser is {own_m:.3g} m from the target; fly to less than twice "
+            f"inspection.distance_m ({distance_m:g} m) first"
+        )
     return ""
 
 
@@ -90,7 +96,10 @@ def why_not_off_shape(scenario: FlightScenario, chaser: int, offset_m: ArrayLike
     least_m = scenario.limits.min_distance_shape_m
     if not least_m or (distance_m := shape_distance_m(scenario, chaser, offset_m)) >= least_m:
         return ""
-    return f"there the chaser is {distance_m:.3g} m from the target's shape; allowed are at least {least_m:.3g} m"
+    return (
+        f"there the chaser is {distance_m:.3g} m from the target's shape; allowed are at least "
+        f"{least_m:.3g} m"
+    )
 
 
 def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
@@ -101,7 +110,10 @@ def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) 
     off_deg = angle_deg(scenario.chasers[chaser].position_m, np.asarray(offset_m))
     if off_deg <= cone_deg:
         return ""
-    return f"the offset is {off_deg:.3g} degrees off the approach axis; the approach cone has {cone_deg:g} degrees"
+    return (
+        f"the offset is {off_deg:.3g} degrees off the approach axis; the approach cone has "
+        f"{cone_deg:g} degrees"
+    )
 
 
 def why_not_goto(
@@ -123,7 +135,10 @@ def why_not_goto(
             least_m
             and (apart := shapes_apart_m(scenario, (chaser, offset_m), (j, end_m))) < least_m
         ):
-            return f"there the chaser is {apart:.3g} m from chaser {j} at its goal; allowed are at least {least_m:.3g} m"
+            return (
+                f"there the chaser is {apart:.3g} m from chaser {j} at its goal; allowed are at "
+                f"least {least_m:.3g} m"
+            )
     return ""
 
 

@@ -30,7 +30,12 @@ _COARSE_STEP_S = 60.0
 """
 _SPEED_SHARES = 0.7 ** np.arange(14)
 _MOVE_SAMPLES, _TURN_SAMPLES = 33, 12
+"""States of a move, and of one turn of the target after it, from which the coast is checked: every
+3 % of the move, and every 30 degrees.
+"""
 _LONGEST_TURN_S = 600.0
+"""Longest time, s, for which the wait at the goal of a move is checked: as long as a coast counts.
+"""
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1)[:, None]
 _IMPULSE_SHARES = (0.5, 1.0, 2.0, 4.0)

@@ -86,7 +86,9 @@ class ChaserFleet:
     # -- commands ----------------------------------------------------------------------------------
 
     def due_commands(self, now_s: float) -> list[OperatorCommand]:
-        """Return the commands of the scenario's timeline that are due and were not returned before."""
+        """Return the commands of the scenario's timeline that are due and were not returned
+        before.
+        """
         out = []
         while self._timeline and self._timeline[0].at_s <= now_s + 1e-9:
             entry = self._timeline.pop(0)

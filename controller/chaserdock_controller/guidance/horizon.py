@@ -22,6 +22,9 @@ from .pointing import calibration_turns
 from .trajectories import Escape
 
 _GREATEST_MARGIN_M = 0.1
+"""Largest distance, m, that an uncertain estimate adds to the keep-out: more would push chasers out
+of places that they can hold. Chosen.
+"""
 
 
 def target_path(

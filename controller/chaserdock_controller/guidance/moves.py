@@ -41,7 +41,8 @@ class MovePlanner:
             return ""
         return (
             "no speed makes the move passively safe: the coast after a loss of thrust comes within "
-            f"{self._scenario.limits.min_distance_target_m:g} m of the target (limits.passive_safety)"
+            f"{self._scenario.limits.min_distance_target_m:g} m of the target "
+            "(limits.passive_safety)"
         )
 
     def _safe(

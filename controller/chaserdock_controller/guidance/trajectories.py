@@ -21,8 +21,11 @@ from numpy.typing import ArrayLike
 PEAK_SPEED = 1.875
 """Peak speed of a move of least jerk over its mean."""
 _RAMP_S = 2.0
+"""Time, s, of each change of speed of an approach. Chosen."""
 _SHORTEST_S = 2.0
+"""Shortest duration, s, of a move, however short the way. Chosen."""
 _STOP_S = 3.0
+"""Time, s, in which a moving chaser comes to rest. Chosen."""
 # Factors of the derivatives of powers 1 to 5, and 2 to 5.
 _FIRST = np.arange(1.0, 6.0)[:, None]
 _SECOND = np.array([2.0, 6.0, 12.0, 20.0])[:, None]

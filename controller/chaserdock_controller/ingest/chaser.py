@@ -70,7 +70,9 @@ class ChaserIngest:
         return msgspec.structs.replace(odometry, sim_time_ns=time_ns)
 
     def _limits(self) -> Array:
-        """Return the greatest force and torque (6,) per body axis that the chaser can produce now."""
+        """Return the greatest force and torque (6,) per body axis that the chaser can produce
+        now.
+        """
         report = self.report
         if report is None:
             return self._nominal.copy()

@@ -23,7 +23,9 @@ class CommandHistory:
         self._sent.append((effective_ns, np.array(wrench)))
 
     def segments(self, from_ns: int, to_ns: int) -> list[tuple[int, int, Array]]:
-        """Return what acts between two times as (from, to, wrench); zero before the first command."""
+        """Return what acts between two times as (from, to, wrench); zero before the first
+        command.
+        """
         edges = [from_ns, *sorted({t for t, _ in self._sent if from_ns < t < to_ns}), to_ns]
         out = []
         for begin, end in itertools.pairwise(edges):

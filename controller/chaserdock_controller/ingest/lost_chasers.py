@@ -15,7 +15,11 @@ from chaserdock_protocol.messages import Level, Odometry
 ABSENT_S = 0.3
 """A chaser without odometry for this long is lost."""
 FORGOTTEN_S = 60.0
+"""Time, s, after which the coast of a lost chaser says nothing about its place any more. Chosen."""
 FIRST_M, GROWTH_M_S, MOST_M = 0.02, 0.01, 0.3
+"""Margin around a lost chaser: at first (m), its growth (m/s) by the error of its last velocity and
+by disturbances, and at most (m).
+"""
 
 
 def margin_m(lost_s: float) -> float:
@@ -44,8 +48,8 @@ class LossWatch:
         return self.last if (now_ns - self.last.sim_time_ns) / 1e9 <= FORGOTTEN_S else None
 
     def update(self, odometry: Odometry | None, now_ns: int) -> tuple[Level, str] | None:
-        """Take the odometry of a tick, if there is any; return an event if the chaser was lost, came
-        back or is forgotten.
+        """Take the odometry of a tick, if there is any; return an event if the chaser was lost,
+        came back or is forgotten.
         """
         self.last = odometry or self.last
         before, self.reported = self.reported, self.obstacle(now_ns) is not None

@@ -23,12 +23,19 @@ from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Level, Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
+# Change of position (m) and attitude between two ticks, beyond what motion and stated noise
+# explain, up to which odometry has not jumped: larger than steps of motion capture, smaller than
+# the errors that endanger a docking. Chosen.
 PLAUSIBLE_M = 0.02
 PLAUSIBLE_RAD = math.radians(2.0)
 LONGEST_S = 1.0
 """After a longer gap every state is accepted."""
 _UNIT_WITHIN = 0.1
+"""Deviation of a quaternion's length from 1 that is taken for rounding of its sender."""
 _ROUNDING = 1e-9
+"""Asymmetry and negative eigenvalues of a covariance, as a share of its largest element, that are
+rounding.
+"""
 
 COVARIANCES = (
     "position_covariance_m2",
@@ -40,7 +47,9 @@ COVARIANCES = (
 
 
 def why_invalid(odometry: Odometry) -> str:
-    """Return why an odometry is not the state of a rigid body with covariances, or an empty string."""
+    """Return why an odometry is not the state of a rigid body with covariances, or an empty
+    string.
+    """
     for name in ("position_m", "velocity_m_s", "q_wxyz", "omega_rad_s"):
         if not all(map(math.isfinite, getattr(odometry, name))):
             return f"{name} holds a value that is not finite"
@@ -105,8 +114,8 @@ class OdometryValidation:
     def update(
         self, odometry: Odometry, doubtful: bool = False
     ) -> tuple[Odometry, list[tuple[Level, str]]]:
-        """Return the chaser's next odometry without jumps, and the events to log. ``doubtful``: what
-        was received before it may be wrong."""
+        """Return the chaser's next odometry without jumps, and the events to log. ``doubtful``:
+        what was received before it may be wrong."""
         i, known = odometry.chaser, self.known
         gap_s = 0.0 if known is None else (odometry.sim_time_ns - known.last.sim_time_ns) / 1e9
         if known is None or not 0.0 < gap_s <= LONGEST_S:

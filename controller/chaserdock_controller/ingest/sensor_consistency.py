@@ -10,15 +10,17 @@ from chaserdock_protocol.messages import Level
 DISAGREES_S = 0.6
 """A chaser whose sightings were all rejected for this long is inconsistent."""
 AGREES_S = 0.6
+"""Time, s, for which its sightings must be accepted to be trusted (again): as long as the above."""
 
 
 @dataclass
 class SensorConsistency:
-    """Follows whether the estimator keeps rejecting the sightings of one chaser, by a fault of camera
-    or odometry (``inconsistent``).
+    """Follows whether the estimator keeps rejecting the sightings of one chaser, by a fault of
+    camera or odometry (``inconsistent``).
 
     ``confirmed``: they were accepted for ``AGREES_S`` since its odometry was last interrupted, at
-    ``interrupted_s``. ``agrees``: whether the last one was accepted; ``since_s``: since when it is so.
+    ``interrupted_s``. ``agrees``: whether the last one was accepted; ``since_s``: since when it is
+    so.
     """
 
     chaser: int
@@ -30,8 +32,8 @@ class SensorConsistency:
 
     @property
     def doubtful(self) -> bool:
-        """Return whether the odometry may be wrong: a jump between two of its states would have been
-        noticed, but none before its first state, or while it was interrupted."""
+        """Return whether the odometry may be wrong: a jump between two of its states would have
+        been noticed, but none before its first state, or while it was interrupted."""
         return self.inconsistent and not self.confirmed
 
     def interrupt(self, now_s: float) -> None:

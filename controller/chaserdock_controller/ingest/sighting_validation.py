@@ -11,11 +11,17 @@ import numpy as np
 from chaserdock_protocol.messages import Level, PoseSolution, Sighting
 
 _UNIT_WITHIN = 0.1
+"""Deviation of a quaternion's length from 1 that is taken for rounding of its sender."""
 _ROUNDING = 1e-6
+"""Asymmetry of a covariance, as a share of its largest element, that is rounding: perception may
+compute in single precision.
+"""
 
 
 def why_invalid(solution: PoseSolution) -> str:
-    """Return why a solution is not a pose with a positive definite covariance, or an empty string."""
+    """Return why a solution is not a pose with a positive definite covariance, or an empty
+    string.
+    """
     length = math.hypot(*solution.q_wxyz)
     if not abs(length - 1.0) <= _UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"
@@ -62,7 +68,8 @@ def valid_sightings(
             events.append(
                 (
                     "warning",
-                    f"chaser {sighting.chaser}: invalid sighting, ignored: {next(iter(reasons.values()))}",
+                    f"chaser {sighting.chaser}: invalid sighting, ignored: "
+                    f"{next(iter(reasons.values()))}",
                 )
             )
             kept = tuple(s for s in sighting.solutions if id(s) not in reasons)

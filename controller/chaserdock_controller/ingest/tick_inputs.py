@@ -24,6 +24,9 @@ from chaserdock_controller.interfaces import ChaserInputs, LogEntry, TickInputs
 from .odometry_validation import OdometryValidation
 
 _REMEMBERED_TICKS = 256
+"""Ticks for which it is known whether their sightings were usable; memory is bounded by twice as
+many.
+"""
 
 
 class Mailbox:
@@ -160,7 +163,9 @@ class TickInputCollector:
         )
 
     def _odometry_at(self, i: int, newest: Odometry | None, tick: Tick) -> Odometry | None:
-        """Return the odometry of a tick; a lost one is extrapolated for the lifetime of a command."""
+        """Return the odometry of a tick; a lost one is extrapolated for the lifetime of a
+        command.
+        """
         if newest is None or newest.tick == tick.tick:
             return newest
         if not self._is_lost(topics.ODOMETRY, i, tick):

@@ -31,9 +31,9 @@ class Bounded(Protocol):
 class SolveBudget:
     """Track the duration of a solve: seconds without iterations, and seconds per iteration.
 
-    Both follow an increase immediately and a decrease by `_DECAY` of it per solve, so a disturbed solve counts
-    for a while. ``most``: upper bound of the limit. Raises ValueError for a budget that is not
-    positive.
+    Both follow an increase immediately and a decrease by `_DECAY` of it per solve, so a disturbed
+    solve counts for a while. ``most``: upper bound of the limit. Raises ValueError for a budget
+    that is not positive.
     """
 
     budget_s: float

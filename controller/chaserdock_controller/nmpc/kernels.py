@@ -18,8 +18,8 @@ from .native import LIBRARY, function
 LIMIT, BROKEN = 2, 3
 """Return codes of a chaser's QP, as in native/ipm.c."""
 MAX_ITERATIONS = 40
-"""Most interior-point iterations of a chaser in a solve. Closed loops take 29 at most; one that needs
-more makes none: the best point is flown, and the next tick continues from it.
+"""Most interior-point iterations of a chaser in a solve. Closed loops take 29 at most; one that
+needs more makes none: the best point is flown, and the next tick continues from it.
 """
 
 
@@ -142,7 +142,8 @@ def solve_tick(
     code, iterations = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     tick = _Tick(
         ctypes.addressof(model), ctypes.addressof(problem), location(states),
-        location(reach_m_per_N), location(w1), location(inputs), w2, budget, MAX_ITERATIONS, location(code),
+        location(reach_m_per_N), location(w1), location(inputs), w2, budget, MAX_ITERATIONS,
+        location(code),
         location(iterations),
     )  # fmt: skip
     function("solve_tick")(ctypes.byref(tick), address(workspace))

@@ -32,8 +32,8 @@ from .problem import NmpcParameters
 from .types import Array
 
 MAX_INNER = 500
-"""Most iterations of PANOC in a solve. Chosen; half and twice were not tried, as OpEn takes minutes to
-compile.
+"""Most iterations of PANOC in a solve. Chosen; half and twice were not tried, as OpEn takes minutes
+to compile.
 """
 TOLERANCE = 1e-3
 """Norm of the fixed-point residual at which PANOC stops, for inputs scaled by their limits. Chosen

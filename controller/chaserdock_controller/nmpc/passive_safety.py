@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor of passive safety: whether the coast from any state of a plan stays clear of the target."""
+"""Monitor of passive safety: whether the coast from any state of a plan stays clear of the
+target.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ from chaserdock_controller.interfaces import LogEntry, PlanCertificate, TargetEs
 from .types import CoastSafety
 
 ORBITS = 2.0
-"""Length of a coast in an orbit, in its periods, unless the scenario states one. Chosen: the drift of
-a coast repeats with the orbit.
+"""Length of a coast in an orbit, in its periods, unless the scenario states one. Chosen: the drift
+of a coast repeats with the orbit.
 """
 FREE_SPACE_S = 600.0
 """Length of a coast without an orbit, s, unless the scenario states one. Chosen: 18 m at the 3 cm/s
@@ -72,8 +74,8 @@ class ChaserSafety:
 
 
 class PassiveSafetyMonitor:
-    """Certifies the plans of a tick. ``chasers``: what it knows of each. See ``guidance.escape`` for
-    what follows.
+    """Certifies the plans of a tick. ``chasers``: what it knows of each. See ``guidance.escape``
+    for what follows.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -141,8 +143,8 @@ class PassiveSafetyMonitor:
         return CoastSafety(self._coast, self._keep_out_m, self._sigmas, target.velocity_m_s, kept)
 
     def unsafe(self, chaser: int, time_ns: int) -> str:
-        """Return why a chaser has to abort at ``time_ns``, or an empty string: its plans are not safe
-        for `PERSISTENT_S`.
+        """Return why a chaser has to abort at ``time_ns``, or an empty string: its plans are not
+        safe for `PERSISTENT_S`.
 
         A chaser counts once its plans were safe for `CONVERGED_S`, or `ARMED_AFTER_S` after its
         first plan: until the filter has converged, plans are safe at times only.
@@ -156,7 +158,9 @@ class PassiveSafetyMonitor:
     def _text(self, chaser: int, found: CoastCertificate, safe: bool) -> str:
         state = "passively safe" if safe else "not passively safe"
         return (
-            f"chaser {chaser}: {state}: without thrust it comes to {found.distance_m:.2f} m of the target after "
-            f"{found.time_s:.0f} s, {found.margin_sigmas:.1f} sigmas from the keep-out of {self._keep_out_m:g} m, in a coast of "
+            f"chaser {chaser}: {state}: without thrust it comes to {found.distance_m:.2f} m of the "
+            "target after "
+            f"{found.time_s:.0f} s, {found.margin_sigmas:.1f} sigmas from the keep-out of "
+            f"{self._keep_out_m:g} m, in a coast of "
             f"{self.duration_s:.0f} s"
         )

@@ -139,7 +139,8 @@ def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
     return Model(
         params.dt_s if step_s is None else step_s, params.mass_kg, 1.0 / params.mass_kg,
         (c_double * 9)(*inertia.ravel()),
-        (c_double * 9)(*np.linalg.inv(inertia).ravel()), (c_double * 4)(*nodes), (c_double * 4)(*weights), len(nodes),
+        (c_double * 9)(*np.linalg.inv(inertia).ravel()), (c_double * 4)(*nodes),
+        (c_double * 4)(*weights), len(nodes),
     )  # fmt: skip
 
 
@@ -161,7 +162,9 @@ class NativeProblem(Structure):
 
 
 def native_problem(problem: NmpcInput, params: NmpcParameters) -> NativeProblem:
-    """Return a checked problem for C; it holds addresses of arrays of ``problem`` and ``params``."""
+    """Return a checked problem for C; it holds addresses of arrays of ``problem`` and
+    ``params``.
+    """
     values: list[Any] = [len(problem.states), params.stages, params.dt_s]
     values += map(address_of, (problem.references, problem.target_positions, problem.u_ref))
     for term in params.terms:

@@ -23,8 +23,8 @@ from .types import BUDGET, Array, IntArray, NmpcInput, NmpcPlan
 from .warm_start import Frame, status_of
 
 REACH_SAFETY = 1.5
-"""Safety factor of the bound by which rows that no admissible input can reach are omitted: the bound
-holds for the nonlinear model, rows are linear. 0.75 and 3 keep the same distances.
+"""Safety factor of the bound by which rows that no admissible input can reach are omitted: the
+bound holds for the nonlinear model, rows are linear. 0.75 and 3 keep the same distances.
 """
 
 

@@ -15,8 +15,8 @@ multiplier for the penalty to be exact: at 1e3 the terminal weight pushed chaser
 0.35 m. At 2e5 a plan in 300 ends at its limit of iterations.
 """
 SLACK_L2 = 1e5
-"""L2 weight of the slacks, 1/m^2: it rounds the corner of the L1 price. At half and twice two plans in
-300 of one flight end at their limit of iterations; distances are the same.
+"""L2 weight of the slacks, 1/m^2: it rounds the corner of the L1 price. At half and twice two plans
+in 300 of one flight end at their limit of iterations; distances are the same.
 """
 SLACK_L1_OVER_SLOPE = 10.0
 """Ratio of the L1 weight to the slope of the terminal cost, where that is larger: multipliers grow

@@ -61,8 +61,8 @@ class PlanHistory(PlanningHistory):
         return self._monitors[chaser].failure(time_ns)
 
     def unsafe(self, chaser: int, time_ns: int) -> str:
-        """Return why the plans of a chaser are not passively safe at ``time_ns``, or an empty string;
-        whether it aborts is guidance's matter.
+        """Return why the plans of a chaser are not passively safe at ``time_ns``, or an empty
+        string; whether it aborts is guidance's matter.
         """
         return "" if self._passive_safety is None else self._passive_safety.unsafe(chaser, time_ns)
 

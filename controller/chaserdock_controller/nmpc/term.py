@@ -59,7 +59,9 @@ class CostTerm(Term, ABC):
 
     @abstractmethod
     def cost(self, stage: ChaserStage, weights: Any) -> Any:
-        """Return the cost of a chaser at a stage in CasADi; ``weights`` (W,): those of the stage."""
+        """Return the cost of a chaser at a stage in CasADi; ``weights`` (W,): those of the
+        stage.
+        """
 
 
 @dataclass(frozen=True)

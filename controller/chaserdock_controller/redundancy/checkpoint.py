@@ -209,7 +209,9 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
 
 
 class Checkpoint:
-    """Saves and restores the state of one controller. ``odometry``: the validation of each chaser's."""
+    """Saves and restores the state of one controller. ``odometry``: the validation of each
+    chaser's.
+    """
 
     def __init__(self, core: ControllerCore, odometry: Sequence[OdometryValidation]) -> None:
         self._core, self._odometry = core, odometry
@@ -250,7 +252,9 @@ class Checkpoint:
         return parts
 
     def save(self) -> bytes:
-        """Return the state now. Raises CheckpointError when it contains something other than data."""
+        """Return the state now. Raises CheckpointError when it contains something other than
+        data.
+        """
         parts: dict[str, Any] = {"shape": None, **_read_all(self._parts())}
         frame, identification = self._warm_starts(), self._core.estimation.identification
         estimator, kind = self._core.estimator, _ESTIMATORS.get(type(self._core.estimator))

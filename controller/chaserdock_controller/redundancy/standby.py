@@ -20,6 +20,8 @@ from chaserdock_protocol.transport import ReceivedMessage
 _MISSABLE_TICKS = 10
 """In real time a standby may miss this many ticks and keep its state."""
 _MOST_HELD = 100_000
+"""Messages that a process keeps until it knows its role: bounds its memory; older ones are dropped.
+"""
 
 
 @dataclass

@@ -95,12 +95,14 @@ class Success(Section):
     )
     max_estimate_position_m: Positive | None = Field(
         default=None,
-        description="Largest error of the estimated position of a chaser relative to the target after `settling_s`, m (with "
+        description="Largest error of the estimated position of a chaser relative to the target "
+        "after `settling_s`, m (with "
         "`paper`: of the target's position).",
     )
     max_estimate_orientation_deg: Positive | None = Field(
         default=None,
-        description="Largest error of the estimated attitude of a chaser relative to the target after `settling_s`, degrees "
+        description="Largest error of the estimated attitude of a chaser relative to the target "
+        "after `settling_s`, degrees "
         "(with `paper`: of the target's attitude).",
     )
 

@@ -82,7 +82,8 @@ class EstimatorSection(Section):
 
     name: Name = Field(
         default="joint",
-        description="`joint`: filter of target, chasers, sensors and disturbances. `paper`: the paper's average, with odometry "
+        description="`joint`: filter of target, chasers, sensors and disturbances. `paper`: the "
+        "paper's average, with odometry "
         "taken as exact. Or an installed plugin.",
     )
     target_acceleration_noise: Positive | None = Field(
@@ -133,7 +134,8 @@ class ControllerOptions(Section):
     )
     feed_forward: bool = Field(
         default=True,
-        description="Count the input cost from the force and torque that the reference motion needs. Otherwise from zero, "
+        description="Count the input cost from the force and torque that the reference motion "
+        "needs. Otherwise from zero, "
         "as in the paper.",
     )
     command_lifetime_s: Positive = Field(

@@ -64,13 +64,19 @@ class ThrusterFaultHandler:
     def _refusal(self, command: ThrusterFaultCommand) -> str:
         body, chasers = self._scenario.chaser, len(self._scenario.chasers)
         if not body.thruster_faults_by_command:
-            return "this mission does not allow thruster faults (set chaser.thruster_faults_by_command = true)"
+            return (
+                "this mission does not allow thruster faults (set "
+                "chaser.thruster_faults_by_command = true)"
+            )
         if command.chaser >= chasers:
             return f"there is no chaser {command.chaser}; this mission has 0 to {chasers - 1}"
         if body.actuation != "thrusters":
             return 'the chasers of this mission have no thrusters (chaser.actuation = "ideal")'
         if command.thruster >= len(body.thrusters):
-            return f"there is no thruster {command.thruster}; the body has 0 to {len(body.thrusters) - 1}"
+            return (
+                f"there is no thruster {command.thruster}; the body has 0 to "
+                f"{len(body.thrusters) - 1}"
+            )
         if (command.kind == "weak") != (command.factor is not None):
             return "factor is required for weak and not allowed otherwise"
         if command.factor is not None and not 0.0 <= command.factor <= 1.0:

@@ -83,7 +83,9 @@ def midpoint_torque_of_rates(
 def split_loads(
     bodies: IntArray, loads: Array
 ) -> list[tuple[int, list[float], list[float], list[float]]]:
-    """Return body, principal moments, force and torque of each row of ``RigidBodyEngine.advance``."""
+    """Return body, principal moments, force and torque of each row of
+    ``RigidBodyEngine.advance``.
+    """
     return [
         (b, row[:3], row[3:6], row[6:])
         for b, row in zip(bodies.tolist(), loads.tolist(), strict=True)

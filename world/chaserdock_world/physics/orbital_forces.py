@@ -18,7 +18,9 @@ from chaserdock_world.orbit import TargetOrbit
 
 
 class OrbitalForces:
-    """Forces and torques of an orbit on bodies that an engine integrates with steps of ``step_s``."""
+    """Forces and torques of an orbit on bodies that an engine integrates with steps of
+    ``step_s``.
+    """
 
     def __init__(self, orbit: TargetOrbit, step_s: float, steps_per_tick: int) -> None:
         self._orbit, self._step_s, self._steps_per_tick = orbit, step_s, steps_per_tick

@@ -96,7 +96,9 @@ class Physics:
         return self._latching.port_loads
 
     def command_latch(self, chaser: int, command: Latch, effective_step: int) -> None:
-        """Command a chaser's latch from ``effective_step`` on; ignored for a chaser without a port."""
+        """Command a chaser's latch from ``effective_step`` on; ignored for a chaser without a
+        port.
+        """
         latch = self.latches.get(f"chaser/{chaser}")
         if latch is not None:
             latch.command(command, effective_step)

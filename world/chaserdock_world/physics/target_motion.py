@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of a target that is prescribed: at constant velocity and body rate, whatever touches it."""
+"""Motion of a target that is prescribed: at constant velocity and body rate, whatever touches
+it.
+"""
 
 from __future__ import annotations
 

@@ -180,7 +180,9 @@ def _rays(camera: Camera, origin_px: Array, size_px: tuple[int, int], step_px: i
 
 
 def _albedo_map(generator: np.random.Generator) -> NDArray[np.float32]:
-    """Return reflectance by latitude and longitude: sea with clouds, from noise at several scales."""
+    """Return reflectance by latitude and longitude: sea with clouds, from noise at several
+    scales.
+    """
     clouds = np.zeros((_MAP_ROWS, _MAP_COLUMNS), dtype=np.float32)
     for octave in range(5):
         size = (8 << octave, 4 << octave)

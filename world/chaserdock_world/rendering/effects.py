@@ -96,7 +96,8 @@ class CameraEffects:
         # whole.
         image, noisy = np.ascontiguousarray(image), np.empty(self._shape, dtype=np.uint8)
         function("add_noise")(
-            c_void_p(image.ctypes.data), c_void_p(noise.ctypes.data), c_int64(bank.shape[1]), address(self._sigma),
+            c_void_p(image.ctypes.data), c_void_p(noise.ctypes.data), c_int64(bank.shape[1]),
+            address(self._sigma),
             c_double(sign * self._to_levels), *map(c_int64, self._shape), address(noisy),
         )  # fmt: skip
         return noisy

@@ -17,8 +17,8 @@ from .scene_geometry import Obstacle
 SUN_RADIUS_RAD = 0.00465
 """Angular radius of the sun at 1 AU (696,000 km of 149.6 million km)."""
 _STEP_PX = 4
-"""Stray light is computed on a grid of this step, px, and interpolated: it changes slowly but for the
-sun itself, which is drawn.
+"""Stray light is computed on a grid of this step, px, and interpolated: it changes slowly but for
+the sun itself, which is drawn.
 """
 
 

@@ -18,7 +18,8 @@ from .textures import BLACK, WHITE, marker_cells
 ABOVE_M = 2e-4
 """Height of a marker's front above its plane, so that the surface below does not hide it."""
 _BELOW_M = 1e-3
-"""Depth of a marker's back below its plane, so that no gap is seen beside it on a curved surface."""
+"""Depth of a marker's back below its plane, so that no gap is seen beside it on a curved surface.
+"""
 _PAPER = {
     True: Material("white print", diffuse=WHITE),
     False: Material("black print", diffuse=BLACK),

@@ -49,7 +49,8 @@ _WRINKLES = 256
 # native/mesh.c: Illumination, ShadowMap; bytes of a BodyPose and of a Triangle.
 _ILLUMINATION = np.dtype(
     [
-        ("sun", float, 3), ("sun_share", float), ("ambient", float), ("lamp", float), ("white", float),
+        ("sun", float, 3), ("sun_share", float), ("ambient", float), ("lamp", float),
+        ("white", float),
         ("across", float, 3), ("along", float, 3),
     ]
 )  # fmt: skip
@@ -100,7 +101,8 @@ def _body_of(mesh: TriangleMesh) -> _Body:
     ]
     uv = np.concatenate([_texture_coordinates(part) for part in mesh.parts])
     return _Body(
-        np.ascontiguousarray(soup.corners_m), np.ascontiguousarray(soup.normals), uv, soup.part.astype(np.int64),
+        np.ascontiguousarray(soup.corners_m), np.ascontiguousarray(soup.normals), uv,
+        soup.part.astype(np.int64),
         np.array(rows, dtype=float),
     )  # fmt: skip
 
@@ -248,10 +250,14 @@ class MeshRenderer:
         samples = self._memory("samples", _BAND_ROWS * self._size[0] * _SAMPLES * 8)
         wrinkles = _wrinkles()
         function("draw_meshes")(
-            byref(self._frustum.native), c_int64(self._size[0]), c_int64(self._size[1]), address(camera),
-            c_int64(len(bodies)), address(poses), address(first), address(corners), address(normals), address(uv),
-            address(surface), address(surfaces), address(illumination), address(wrinkles), c_int64(_WRINKLES), address(maps),
-            address(depth), address(placed), address(triangles), address(spans), address(samples), address(canvas),
+            byref(self._frustum.native), c_int64(self._size[0]), c_int64(self._size[1]),
+            address(camera),
+            c_int64(len(bodies)), address(poses), address(first), address(corners),
+            address(normals), address(uv),
+            address(surface), address(surfaces), address(illumination), address(wrinkles),
+            c_int64(_WRINKLES), address(maps),
+            address(depth), address(placed), address(triangles), address(spans), address(samples),
+            address(canvas),
         )  # fmt: skip
 
     def _memory(self, name: str, size: int) -> NDArray[np.uint8]:

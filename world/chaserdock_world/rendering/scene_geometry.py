@@ -54,7 +54,8 @@ outline.
 
 VisibleFace = np.dtype(
     [
-        ("box", float), ("side", float), ("in_front", float), ("width_m", float), ("height_m", float),
+        ("box", float), ("side", float), ("in_front", float), ("width_m", float),
+        ("height_m", float),
         ("centre", float, 3), ("right", float, 3), ("up", float, 3), ("normal", float, 3),
         ("count", float), ("outline_px", float, (10, 2)),
     ]
@@ -156,7 +157,8 @@ def visible_faces(
         np.zeros(2, np.int64),
     )
     function("visible_faces")(
-        byref(frustum.native), address(camera_pose), address(poses), c_int64(n), address(shapes.table),
+        byref(frustum.native), address(camera_pose), address(poses), c_int64(n),
+        address(shapes.table),
         address(_FACE_AXES), address(boxes), address(faces), address(counts),
     )  # fmt: skip
     return boxes[: counts[0]], faces[: counts[1]]
@@ -194,7 +196,8 @@ def place_texture(
     sizes = np.array([patch[1], patch[0], finest[1], finest[0]], dtype=np.int64)
     out, matrix = np.empty(6, dtype=np.int64), np.empty((3, 3))
     overlaps = function("place_texture", c_int64)(
-        byref(frustum.native), address(face), *map(c_double, at), address(sizes[:2]), address(sizes[2:]),
+        byref(frustum.native), address(face), *map(c_double, at), address(sizes[:2]),
+        address(sizes[2:]),
         c_double(FINEST_TEXEL_M), address(out[:4]), address(out[4:]), address(matrix),
     )  # fmt: skip
     return (out[:4].tolist(), out[4:].tolist(), matrix) if overlaps else None

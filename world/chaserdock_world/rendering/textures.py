@@ -121,7 +121,9 @@ def _print(
 
 
 def _coverage(edges: Array, first: int, last: int) -> Array:
-    """Return the share (cells, texels) of each texel first..last - 1 between consecutive ``edges``."""
+    """Return the share (cells, texels) of each texel first..last - 1 between consecutive
+    ``edges``.
+    """
     texels = np.arange(first, last, dtype=float)
     low = np.maximum(edges[:-1, None], texels[None, :])
     high = np.minimum(edges[1:, None], texels[None, :] + 1.0)

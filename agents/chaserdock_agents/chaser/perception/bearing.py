@@ -152,8 +152,8 @@ class BearingFinder:
                 f"{s.radius_px:.1f}" for s in sorted(spots, key=lambda s: -s.flux)[:3]
             )
             raise BearingError(
-                f"no spot of the target's size, a radius of {_blurred(expected.radius_px):.1f} px at {target.range_m:.1f} m"
-                + (f"; the brightest have {sizes} px" if spots else "")
+                f"no spot of the target's size, a radius of {_blurred(expected.radius_px):.1f} px "
+                f"at {target.range_m:.1f} m" + (f"; the brightest have {sizes} px" if spots else "")
             )
         spot, seen = self._choose(plausible, predicted_irf_m, expected.radius_px < _SPOT.star_px)
         ideal = self._camera.undistort(spot.centroid_px)

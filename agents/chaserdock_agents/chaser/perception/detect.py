@@ -51,8 +51,8 @@ class _Windows(NamedTuple):
 # OpenCV's own distance is 0.125.
 _WINDOWS = (_Windows(7, 7, 16, 0.125), _Windows(7, 23, 16, 0.125))
 # A second look, where nothing was found, at twice the cost (9.5 instead of 4.4 ms at 1280 x 960): a
-# window of 3 px for small markers, and candidates inside of each other, such as outer edges of white
-# borders, kept apart.
+# window of 3 px for small markers, and candidates inside of each other, such as outer edges of
+# white borders, kept apart.
 _THOROUGH = _Windows(3, 23, 10, 0.01)
 
 NOTHING = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
@@ -134,7 +134,9 @@ def _detect(
 def region_of(
     camera: Camera, model: TargetModel, position_irf_m: ArrayLike, q_irf_trf_wxyz: ArrayLike
 ) -> Region | None:
-    """Return the image region of a target with this predicted pose; None to search the whole image."""
+    """Return the image region of a target with this predicted pose; None to search the whole
+    image.
+    """
     turn = rotations.to_matrix(q_irf_trf_wxyz)
     points = cuboid_corners(model.size_m) @ turn.T + np.asarray(position_irf_m)
     # The sum is not finite if any coordinate is not.

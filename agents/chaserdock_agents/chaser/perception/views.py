@@ -68,7 +68,8 @@ def count_visible_markers(
     size, cosine = np.empty(markers), np.empty(markers)
     count = function("count_visible_markers", c_int64)(
         _lens(camera), (c_double * 3)(frame_margin_px, right, bottom),
-        address(surface), address(position), c_int64(markers), c_int64(row), address(size), address(cosine),
+        address(surface), address(position), c_int64(markers), c_int64(row), address(size),
+        address(cosine),
     )  # fmt: skip
     return int(count), float(cosine[row])
 

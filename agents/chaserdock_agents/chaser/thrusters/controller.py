@@ -34,8 +34,8 @@ _MIN_SCALE = 0.02
 wrench.
 """
 _HISTORY_NS = 1_000_000_000
-"""Time for which past pulses are kept, ns: more than the interval between two odometries, over which
-impulses are summed, and than the delay of a lock-step message.
+"""Time for which past pulses are kept, ns: more than the interval between two odometries, over
+which impulses are summed, and than the delay of a lock-step message.
 """
 _MAX_PERIOD_NS = 1_000_000_000
 """Upper bound of a carrier period."""
@@ -97,7 +97,9 @@ class ThrusterController:
         return self._report(odometry, given_N_s)
 
     def report_failure(self, thruster: int, kind: FailureKind, factor: float, at_ns: int) -> None:
-        """Take over a failure that the hardware reports; ``factor``: remaining share of the thrust."""
+        """Take over a failure that the hardware reports; ``factor``: remaining share of the
+        thrust.
+        """
         self._add_fault(ThrusterFault(thruster, kind, factor), at_ns, "reported")
 
     def _add_fault(self, fault: ThrusterFault, at_ns: int, how: str) -> None:
@@ -121,7 +123,10 @@ class ThrusterController:
         if scale != self._scale and self._scale is not None:
             text = f"wrench limits are {scale:.3f} of the body's"
             if scale < _MIN_SCALE:
-                text = f"the remaining thrusters cannot produce every wrench ({scale:.3f} of the limits)"
+                text = (
+                    f"the remaining thrusters cannot produce every wrench ({scale:.3f} of the "
+                    "limits)"
+                )
             self.events.append(
                 ("warning" if scale < _MIN_SCALE else "info", "thrusters changed", text)
             )

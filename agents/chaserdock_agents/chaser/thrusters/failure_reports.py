@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test bed: reports planned thruster failures to a chaser when they happen, as its hardware would."""
+"""Test bed: reports planned thruster failures to a chaser when they happen, as its hardware
+would.
+"""
 
 from __future__ import annotations
 

@@ -65,7 +65,9 @@ class FaultMonitor:
             self._free_since_ns = command.sim_time_ns
 
     def reset(self) -> None:
-        """Forget the motion so far: it is not due to the thrusters only, or to others than known."""
+        """Forget the motion so far: it is not due to the thrusters only, or to others than
+        known.
+        """
         self._detector.reset()
 
     def detect(

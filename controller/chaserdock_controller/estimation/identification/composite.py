@@ -35,6 +35,7 @@ from chaserdock_controller.interfaces import StackChaser
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 MASS, CENTRE, INERTIA = slice(12, 13), slice(13, 16), slice(16, 22)
 PROPERTIES = slice(12, 22)
+# First component of the mounts of the chasers, which follow the mass properties.
 _MOUNTS = 22
 _BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate(INERTIA_ROWS):
@@ -251,7 +252,9 @@ class CompositeIdentification:
         return np.concatenate([by_chaser.get(i, np.zeros(self._n)) for i in self.chasers])
 
     def _wrenches(self) -> Array:
-        """Return the wrenches (6, N n) about the centre of mass of 1 N of every thruster, TRF axes."""
+        """Return the wrenches (6, N n) about the centre of mass of 1 N of every thruster, TRF
+        axes.
+        """
         x = self._estimate
         mounts = [MountedChaser(r, q) for r, q in zip(x.mounts_m, x.mounts_wxyz, strict=True)]
         parts = [m.wrench_to_stack(self._thrusters, x.body.centre_trf_m) for m in mounts]

@@ -23,7 +23,10 @@ from .composite import CompositeFilterState, CompositeIdentification
 from .faults import DetectorState, StackFault, StackFaultDetector
 
 _KEPT_S = 15.0
+"""Time, s, for which inputs are kept: the earliest begin of a failure that can be corrected."""
 _SAVE_EVERY_S = 1.0
+"""Time, s, between two states that are kept. The filter repeats at most as much more than needed.
+"""
 _UNCERTAIN_S = 2.0
 """Time before the likeliest begin of a failure in which the thruster may have failed already."""
 _CLOSING_S = 0.4

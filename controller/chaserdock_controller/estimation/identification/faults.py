@@ -27,7 +27,9 @@ _LEAST_MARGIN = 6.0
 
 @dataclass(frozen=True)
 class StackFault:
-    """A failed thruster of a latched chaser. ``ticks``: since when it has failed, at the likeliest."""
+    """A failed thruster of a latched chaser. ``ticks``: since when it has failed, at the
+    likeliest.
+    """
 
     chaser: int
     thruster: int

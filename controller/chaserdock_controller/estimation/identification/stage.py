@@ -39,7 +39,11 @@ _SILENT_S, _SILENT_SHARE = 1.0, 0.02
 their thrust.
 """
 _REFINE_S, _KNOWN_RATIO, _KNOWN_M = 2.0, 0.05, 0.02
+"""The estimator takes over the target's mass properties at this interval (s), once the standard
+deviations of the inertia's ratios and of the centre of mass (m) are below the other two. Chosen.
+"""
 _PULSE_S = 0.3
+"""Length, s, of an identifying pulse (`guidance/detumble/control.py` fires them)."""
 _WATCH_S = 1.0
 """Time over which a pulse's effect is thought to be measured when pulses are compared."""
 _GOOD = (0.02, 0.005, 0.05)
@@ -246,7 +250,10 @@ class StackIdentification:
     def _add_fault(self, fault: StackFault) -> None:
         self.failed.add((fault.chaser, fault.thruster))
         kind = fault.kind.replace("_", " ")
-        text = f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the stack, isolated"
+        text = (
+            f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the "
+            "stack, isolated"
+        )
         self._events.append(("warning", text))
 
     def _by_information(self, found: CompositeIdentification) -> tuple[tuple[int, int], ...]:

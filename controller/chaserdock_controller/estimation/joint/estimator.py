@@ -98,7 +98,9 @@ class JointEstimator(Estimator):
         return state.shape, state.covariance[-SHAPE:, -SHAPE:]
 
     def update(self, inputs: EstimatorInputs) -> Estimate:
-        """Process a tick. Sightings and odometry of ticks that are not kept any more are ignored."""
+        """Process a tick. Sightings and odometry of ticks that are not kept any more are
+        ignored.
+        """
         records = self._buffer.records
         record = FilterTick(
             time_ns=inputs.time_ns,
@@ -217,7 +219,9 @@ class JointEstimator(Estimator):
         return p[own, own] + p[target, target] - cross - cross.T
 
     def cameras(self) -> dict[int, CameraError]:
-        """Return the estimated calibration errors of the cameras after the newest tick, by chaser."""
+        """Return the estimated calibration errors of the cameras after the newest tick, by
+        chaser.
+        """
         s, errors = self.state, {}
         if s is None or not s.target_known or self.parameters.camera_turn_rad == 0.0:
             return {}

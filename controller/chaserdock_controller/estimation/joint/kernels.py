@@ -22,10 +22,13 @@ from chaserdock_controller.bodies.body_shape import SHAPE
 
 from .native import LIBRARY, function
 
+# Numbers of doubles in the kernels' arrays: see native/layout.h.
 TARGET_MEAN, CHASER_MEAN = 13, 44
 MOST_ROWS = 18
 """Largest number of rows that a chaser measures in a tick: 6 of a sighting, 12 of odometry."""
+# Doubles of a sighting, and number of gated channels (`state.CHANNELS`).
 _SEEN = 55
+# See above.
 _CHANNELS = 5
 
 
@@ -40,8 +43,10 @@ class MotionParameters(Structure):
         *(
             (name, c_double)
             for name in (
-                "mean_motion", "fade_position", "fade_attitude", "unknown_s", "control_force_share", "control_torque_share",
-                "control_arm", "force_max", "torque_max", "disturbance_force", "disturbance_torque", "latched_acceleration",
+                "mean_motion", "fade_position", "fade_attitude", "unknown_s", "control_force_share",
+                "control_torque_share",
+                "control_arm", "force_max", "torque_max", "disturbance_force", "disturbance_torque",
+                "latched_acceleration",
                 "latched_angular_acceleration",
             )
         ),
@@ -92,7 +97,7 @@ class _Innovation(Structure):
     ]
 
 
-class ChaserMeasurement:
+class NativeMeasurement:
     """Measurements of chaser ``i`` of ``n``, of which one may be None.
 
     mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting:
@@ -126,7 +131,8 @@ class JointInnovation:
     def __init__(self, n: int, size: int) -> None:
         stride = -(-size // 8) * 8
         sizes = (
-            MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
+            MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride,
+            MOST_ROWS * stride, size,
             _CHANNELS + 1,
         )  # fmt: skip
         *starts, end = itertools.accumulate(sizes, initial=0)
@@ -140,27 +146,29 @@ class JointInnovation:
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)
 
-    def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
+    def innovate(self, z: NativeMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
         """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same
         array or another one).
         """
         function("innovate")(
-            ctypes.byref(z.native), address(mean), address(prior), address(covariance), self._address, self._work_address
+            ctypes.byref(z.native), address(mean), address(prior), address(covariance),
+            self._address, self._work_address
         )  # fmt: skip
 
     def correct(
-        self, z: ChaserMeasurement, used: NDArray[np.int64], prior: Array, mean: Array
+        self, z: NativeMeasurement, used: NDArray[np.int64], prior: Array, mean: Array
     ) -> bool:
         """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their
         covariance is not positive.
         """
         return bool(
             function("correct", c_int64)(
-                self._n, c_int64(z.rows), address(used), c_int64(len(used)), self._address, address(prior), address(mean)
+                self._n, c_int64(z.rows), address(used), c_int64(len(used)), self._address,
+                address(prior), address(mean)
             )
         )  # fmt: skip
 
-    def reduce(self, z: ChaserMeasurement, rows: int, covariance: Array) -> None:
+    def reduce(self, z: NativeMeasurement, rows: int, covariance: Array) -> None:
         """Reduce the covariance by the last correction, of so many rows."""
         function("reduce")(c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
@@ -213,7 +221,8 @@ def predict(
     out = np.empty_like(covariance)
     work = scratch(_work_size("predict_workspace", n, len(covariance)))
     arrays: tuple[NDArray[Any], ...] = (
-        target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance, out, work,
+        target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance,
+        out, work,
     )  # fmt: skip
     function("predict")(
         ctypes.byref(motion), c_int64(n), c_int64(len(covariance)), *map(address, arrays)
@@ -228,13 +237,16 @@ def wrench_at_origin(
     moves one with it at ``centre_m`` (3,); see native/motion.c."""
     out = np.empty(6)
     function("wrench_at_origin")(
-        address(wrench), address(centre_m), address(omega_rad_s), c_double(mass_kg), address(inertia), address(out)
+        address(wrench), address(centre_m), address(omega_rad_s), c_double(mass_kg),
+        address(inertia), address(out)
     )  # fmt: skip
     return out
 
 
-def linearize(z: ChaserMeasurement, mean: Array) -> tuple[Array, Array, Array]:
-    """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k, k)."""
+def linearize(z: NativeMeasurement, mean: Array) -> tuple[Array, Array, Array]:
+    """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k,
+    k).
+    """
     k = z.rows
     out = np.empty(k), np.empty((k, _SEEN)), np.empty((k, k))
     function("linearize")(ctypes.byref(z.native), address(mean), *map(address, out))

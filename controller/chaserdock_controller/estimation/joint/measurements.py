@@ -65,7 +65,7 @@ def measurement(
     mounting: CameraMounting,
     p: JointParameters,
     view: Array | None = None,
-) -> kernels.ChaserMeasurement:
+) -> kernels.NativeMeasurement:
     """Return what chaser ``i`` of ``chasers`` measures in a tick, for the kernels: odometry, a
     solution from ``markers`` markers, or both. ``view`` (6, 6): covariance in whose units the view
     error is; the stated one by default."""
@@ -85,10 +85,10 @@ def measurement(
             noise.white_ratio,
             noise.view_ratio,
         )
-    return kernels.ChaserMeasurement(chasers, i, mounting, measured, sighted)
+    return kernels.NativeMeasurement(chasers, i, mounting, measured, sighted)
 
 
-def linearize(state: JointState, z: kernels.ChaserMeasurement) -> LinearizedMeasurement:
+def linearize(state: JointState, z: kernels.NativeMeasurement) -> LinearizedMeasurement:
     """Return the residual of a measurement, first the sighting: position in IRF, m, rotation in
     TRF, rad; then odometry: position, velocity, attitude, rate."""
     residual, jacobian, noise = kernels.linearize(z, packed(state))

@@ -83,19 +83,22 @@ class TargetParameters:
     """Covariance (9, 9), rows, of the centre of mass (m) and of the elements xx, yy, zz, xy, xz,
     yz of ``inertia_ratios``. Empty: both are exact."""
     initial_velocity_m_s: float = 0.1
-    """Sigma of the unknown velocity at the first sighting: three times that of the paper's target."""
+    """Sigma of the unknown velocity at the first sighting: three times that of the paper's target.
+    """
     initial_omega_rad_s: float = 0.2
     """Sigma of the unknown rate at the first sighting, per axis: covers tumbles of 20 degrees/s."""
     single_marker_scale: float = 3.0
     """Factor on the sigma of a first pose from one marker, whose attitude is nearly ambiguous."""
     reinitialised_velocity_m_s: float = 0.03
-    """Sigma added to the velocity at a restart. It keeps its value: the pose jumped, not the rate."""
+    """Sigma added to the velocity at a restart. It keeps its value: the pose jumped, not the rate.
+    """
     reinitialised_omega_rad_s: float = 0.06
     """The same of the rate."""
     sustained_rejections: int = 10
     """Ticks in a row in which most cameras are rejected, after which the pose is started again."""
     ambiguity_log_odds: float = 10.0
-    """Log odds at which the less likely of two hypotheses is dropped: wrong in 1 of 20,000 cases."""
+    """Log odds at which the less likely of two hypotheses is dropped: wrong in 1 of 20,000 cases.
+    """
     ambiguity_timeout_s: float = 5.0
     """Time after which it is dropped anyway."""
     tracking_s: float = 0.25
@@ -228,7 +231,9 @@ class JointParameters:
         object.__setattr__(self, "camera_turn_rad", turn)
 
     def sighting_noise(self, markers: int) -> SightingNoise:
-        """Return the errors of a sighting of this many markers, 0 for one by shape or by ranging."""
+        """Return the errors of a sighting of this many markers, 0 for one by shape or by
+        ranging.
+        """
         if markers == 0:
             return self.shape
         return self.single_marker if markers == 1 else self.several_markers

@@ -132,7 +132,9 @@ def predict_target(state: JointState, time_ns: int, p: JointParameters) -> tuple
 
 
 def target_covariance(state: JointState) -> Array:
-    """Return the covariance (12, 12) of the target's motion, or (20, 20) of its motion and shape."""
+    """Return the covariance (12, 12) of the target's motion, or (20, 20) of its motion and
+    shape.
+    """
     if state.shape is None:
         return state.covariance[:TARGET, :TARGET]
     size = len(state.covariance)

@@ -27,8 +27,8 @@ class FilterTick:
     """What the filter needs to process a tick again, and the state and the events that result.
 
     ``parameters``, with the target's model, apply from the tick before to this one; ``shocks``
-    change the rates after it. ``chasers``, ``covered_s``: as in ``EstimatorInputs``, without outdated
-    odometry. ``sightings``: those that were exposed at the tick, by chaser.
+    change the rates after it. ``chasers``, ``covered_s``: as in ``EstimatorInputs``, without
+    outdated odometry. ``sightings``: those that were exposed at the tick, by chaser.
     """
 
     time_ns: int

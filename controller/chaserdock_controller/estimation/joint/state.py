@@ -50,6 +50,7 @@ CHASER = 43
 """Components of a chaser's error."""
 EXTRA = CHASER - 12
 """Components that are added to the chaser's own state without a rotation."""
+# Place of sightings in `CHANNELS`.
 SIGHTING_CHANNEL = 0
 CHANNELS = ("sighting", "position", "velocity", "attitude", "rate")
 """Measurements that are gated separately."""

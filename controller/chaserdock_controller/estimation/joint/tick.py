@@ -154,7 +154,10 @@ def _report_restarts(
     stale = _stale_ns(record, p)
     for i in record.odometry:
         if state.alive[i] and state.measured_ns[i] < stale <= state.odometry_ns[i]:
-            text = f"chaser {i}: no measurement supported its estimate for {p.restart_after_s:g} s; started again from its odometry"
+            text = (
+                f"chaser {i}: no measurement supported its estimate for {p.restart_after_s:g} s; "
+                "started again from its odometry"
+            )
             events.append(EstimatorEvent(record.time_ns, "warning", text))
 
 
@@ -162,7 +165,9 @@ def _check_cameras(
     now: FilterState, before: JointState, report: UpdateReport, seen: Mapping[int, Sighting],
     mounting: CameraMounting, p: JointParameters, events: list[EstimatorEvent],
 ) -> FilterState:  # fmt: skip
-    """Report cameras that were dropped or are used again; react to the rejection of most cameras."""
+    """Report cameras that were dropped or are used again; react to the rejection of most
+    cameras.
+    """
     best = max(now.hypotheses, key=lambda h: h.log_likelihood)
     limit, k = p.rejections_to_drop, SIGHTING_CHANNEL
     for i in sorted(seen):
@@ -279,7 +284,10 @@ def _report_odometry(
                 and key not in dropped
             ):
                 overconfident.add(key)
-                text = f"chaser {i}: odometry {name} is overconfident: its noise is larger than stated (NIS {mean:.1f} of 3)"
+                text = (
+                    f"chaser {i}: odometry {name} is overconfident: its noise is larger than "
+                    f"stated (NIS {mean:.1f} of 3)"
+                )
                 events.append(EstimatorEvent(now.time_ns, "warning", text))
             elif mean < 1.5 * 3.0:
                 overconfident.discard(key)

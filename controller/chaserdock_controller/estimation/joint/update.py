@@ -237,14 +237,14 @@ class RunningUpdate:
         self.shape = state.shape
         self.innovation = kernels.JointInnovation(state.chasers, len(self.covariance))
 
-    def values(self, z: kernels.ChaserMeasurement) -> list[float]:
+    def values(self, z: kernels.NativeMeasurement) -> list[float]:
         """Compute the innovation of a measurement; return the squared norm of each channel's
         residual by its innovation covariance, then the determinant of the sighting's."""
         self.innovation.innovate(z, self.mean, self.mean, self.covariance)
         return self.innovation.values.tolist()
 
     def correct(
-        self, z: kernels.ChaserMeasurement, used: NDArray[np.int64], iterations: int
+        self, z: kernels.NativeMeasurement, used: NDArray[np.int64], iterations: int
     ) -> None:
         """Update with the rows ``used`` of the last innovation, linearized ``iterations`` times.
 
@@ -413,7 +413,7 @@ def _update_chaser(
 def _follow(
     running: RunningUpdate,
     i: int,
-    z: kernels.ChaserMeasurement,
+    z: kernels.NativeMeasurement,
     channels: Sequence[_Channel],
     gates: _Gates,
     change: Array,

@@ -72,7 +72,9 @@ class DetumbleActivity(Activity):
         self._refusal = self._why_not(able | self._in(*DETUMBLING)) if able else ""
 
     def conclude(self, observation: Observation) -> None:
-        """Advance the phases of chasers that move the stack by its motion, and set their thrusts."""
+        """Advance the phases of chasers that move the stack by its motion, and set their
+        thrusts.
+        """
         now_s = observation.time_s
         identify_s = self._fleet.scenario.detumble.identification.duration_s
         for chaser in self._fleet.chasers:

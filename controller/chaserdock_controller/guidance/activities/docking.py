@@ -47,8 +47,10 @@ class DockingActivity(Activity):
         if gap >= 0.0 and lateral <= GUIDANCE.in_line_m:
             return ""
         return (
-            f"the reference is {lateral:.2f} m beside the port's axis, {gap:.2f} m before the port; allowed are "
-            f"at most {GUIDANCE.in_line_m:g} m beside and at least 0 m before: retreat or goto first"
+            f"the reference is {lateral:.2f} m beside the port's axis, {gap:.2f} m before the "
+            "port; allowed are "
+            f"at most {GUIDANCE.in_line_m:g} m beside and at least 0 m before: retreat or goto "
+            "first"
         )
 
     def start(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> None:

@@ -49,7 +49,9 @@ class RetreatActivity(Activity):
             chaser.step(known, errors)  # the next attempt begins with this tick
 
     def conclude(self, observation: Observation) -> None:
-        """Compute the margins of the best aborts where passive safety is enforced, once a second."""
+        """Compute the margins of the best aborts where passive safety is enforced, once a
+        second.
+        """
         escapes = self._moves.escapes
         renew = observation.tick % self._fleet.scenario.time.rate_hz == 0
         for chaser in self._fleet.chasers:

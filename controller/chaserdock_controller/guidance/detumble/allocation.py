@@ -18,13 +18,17 @@ import numpy as np
 from chaserdock_models.arrays import Array
 
 _REGULARIZATION = 1e-2
+"""Quadratic cost of thrusts, against a linear cost of 1 for the largest thrust: makes the solution
+unique and continuous, and costs at most 1 % of the thrust.
+"""
 _SCALE_FIRST = 1e3
 """Weight of the scale over that of the thrusts. A gain in scale that costs more thrust than this is
 not taken (below 1e-3).
 """
 _EQUALITY = 5  # daqp's codes for an equality constraint and for success
-_SOLVED = 1
+_SOLVED = 1  # see above
 _NOTHING = 1e-12
+"""Norm of a wrench (N, N m) that is rounding, not a request."""
 _TOLERANCE = 1e-5
 """Wrench (N, N m) that is within the tolerance of the solver: no more is given in a direction that
 cannot be served.

@@ -60,7 +60,11 @@ moving.
 """
 _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
 _ATTITUDE_TIME_S = 5.0
+"""Time constant, s, with which the stack turns to a commanded attitude. Chosen."""
 _PULSE_PERIOD_NS, _PULSE_NS = 600_000_000, 300_000_000
+"""Identifying pulses begin at this interval and last for half of it, ns, so that the rates before
+and after each are measured for as long.
+"""
 
 
 class StackTask(Enum):
@@ -78,8 +82,8 @@ class StackState:
     latched, by number.
 
     ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if
-    estimated. ``isolated``, ``failed``: thrusters that chasers report as closed, and that were found
-    stuck, as (chaser, number). ``informative``: see ``IdentifiedStack``.
+    estimated. ``isolated``, ``failed``: thrusters that chasers report as closed, and that were
+    found stuck, as (chaser, number). ``informative``: see ``IdentifiedStack``.
     ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the odometry of the chasers alone:
     with noise, but not late where disturbances act.
     """
@@ -370,11 +374,17 @@ class DetumbleControl:
                 f"{(row > 0.0).sum()} of {len(row)} of chaser {i}"
                 for i, row in zip(active, limits.reshape(len(active), -1), strict=True)
             )
-            return f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
+            return (
+                f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in "
+                "every direction"
+            )
         least = minimum_time(thrusters.wrenches, state.motion.momentum, limits)
         if least is None or least.time_s > self._settings.timeout_s:
             time = "without end" if least is None else f"at least {least.time_s:.0f} s"
-            return f"stopping the stack takes {time}; detumble.timeout_s is {self._settings.timeout_s:g} s"
+            return (
+                f"stopping the stack takes {time}; detumble.timeout_s is "
+                f"{self._settings.timeout_s:g} s"
+            )
         return ""
 
     # -- models ------------------------------------------------------------------------------------
@@ -452,7 +462,9 @@ def _isolated(observation: Observation) -> frozenset[tuple[int, int]]:
 
 
 def _mean_omega(own: Sequence[Odometry], q_wxyz: Array) -> Array:
-    """Return the mean angular rate (3,) of chasers in the axes of a body with attitude ``q_wxyz``."""
+    """Return the mean angular rate (3,) of chasers in the axes of a body with attitude
+    ``q_wxyz``.
+    """
     omega_world = np.mean([rotations.rotate(o.q_wxyz, o.omega_rad_s) for o in own], axis=0)
     return rotations.rotate_inverse(q_wxyz, omega_world)
 

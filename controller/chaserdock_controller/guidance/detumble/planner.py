@@ -22,6 +22,7 @@ _STEP_S = 0.5
 _FEEDBACK_S = 0.6
 """The feedback takes over this long before the end of the plan."""
 _RENEWAL_PROGRAMMES = 6
+"""Linear programmes that improve a plan when it is renewed: as many as compare first plans."""
 _SEARCH_S, _SEARCH_SHARE = 0.5, 0.1
 """The stack coasts for this long, but at most for this share of the planned time, until a first
 plan begins.
@@ -37,6 +38,7 @@ _FIRST_GUESSES = 5
 as the best.
 """
 _NEXT_GUESSES = 2
+"""Other guesses that are tried at a renewal; each takes `_FIRST_PROGRAMMES` programmes."""
 _OTHER_GAIN = 0.05
 """Share of the cost by which a plan from another guess must be cheaper to replace the present one.
 """

@@ -27,6 +27,7 @@ _PENALTY = 30.0
 best direction.
 """
 _LEAST_RADIUS = 0.002
+"""Smallest trust region, as a share of a thruster's whole step; the search ends below it."""
 _ACCEPT = 0.05
 """Share of a predicted improvement that must be real for a step to be taken."""
 

@@ -13,7 +13,9 @@ from chaserdock_controller.nmpc.term import ChaserStage, CostTerm, pointer, requ
 
 @dataclass(frozen=True)
 class PositionCost(CostTerm):
-    """Weight (1/m^2) |p - p_ref|^2 at every stage; ``weight_final_position`` is added at the last."""
+    """Weight (1/m^2) |p - p_ref|^2 at every stage; ``weight_final_position`` is added at the
+    last.
+    """
 
     weight_position: float
     weight_final_position: float

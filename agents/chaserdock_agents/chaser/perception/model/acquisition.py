@@ -373,7 +373,9 @@ class Acquisition:
         )
 
     def _unexplained(self, t: _Templates, i: int, fit: _SilhouetteFit) -> float:
-        """Return the share of the grey levels that no light explains, plus that of the silhouette."""
+        """Return the share of the grey levels that no light explains, plus that of the
+        silhouette.
+        """
         inside = np.flatnonzero((t.owners[i] >= 0) & (fit.mask > 0.0))
         inside = inside[:: max(1, len(inside) // _SEARCH.template_points)]
         if len(inside) < 30:

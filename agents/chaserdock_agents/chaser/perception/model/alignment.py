@@ -385,7 +385,8 @@ class _Matches:
 
 
 def _match(
-    pyramid: Pyramid, points: ControlPoints, modes: Array, prior: PoseInCamera, reach_px: int, iterations: int, inlier_px: float
+    pyramid: Pyramid, points: ControlPoints, modes: Array, prior: PoseInCamera, reach_px: int,
+    iterations: int, inlier_px: float
 ) -> _Matches | None:  # fmt: skip
     """Match the profiles of control points, displaced by ``modes``, and fit the pose; None for too
     few matches.
@@ -400,8 +401,10 @@ def _match(
     pose, residual, weight = pose_array(prior), np.empty(n), np.empty(n)
     correlation, rows, work = np.empty(n), np.empty((n, 6)), np.empty(2 * n)
     inside = function("align_points", c_int64)(
-        camera, address(image), settings, address(at), address(ahead), address(points.profiles), address(points.border_m),
-        c_int64(n), address(pose), address(residual), address(weight), address(correlation), address(rows), address(work),
+        camera, address(image), settings, address(at), address(ahead), address(points.profiles),
+        address(points.border_m),
+        c_int64(n), address(pose), address(residual), address(weight), address(correlation),
+        address(rows), address(work),
     )  # fmt: skip
     if inside < MIN_POINTS or int((weight > 0.0).sum()) < MIN_POINTS:
         return None

@@ -134,7 +134,8 @@ def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:
 
 
 def _view_steps(
-    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, even: Lighting, previous: Lighting | None
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, even: Lighting,
+    previous: Lighting | None
 ) -> Steps[Lighting]:  # fmt: skip
     """Return, in steps, the light of a target whose points ``even`` explains, light from
     everywhere: on a side in the shade a sun behind the target brightens no more than rims, which
@@ -300,7 +301,8 @@ def lit_points(
 
 
 def _points_in(
-    mesh: TrackerMesh, pose: PoseInCamera, window: PixelWindow, view: SyntheticView, pixels: NDArray[np.int64],
+    mesh: TrackerMesh, pose: PoseInCamera, window: PixelWindow, view: SyntheticView,
+    pixels: NDArray[np.int64],
     grey: Array | float = 0.0,
 ) -> LitPoints:  # fmt: skip
     """Return the points that n pixels (n,) of a view show, with their grey levels ``grey`` in the
@@ -322,7 +324,8 @@ def _points_in(
 
 
 def points_on(
-    mesh: TrackerMesh, owners: NDArray[np.integer], at_trf: Array, to_camera_trf: Array, grey: Array | float, rotation: Array
+    mesh: TrackerMesh, owners: NDArray[np.integer], at_trf: Array, to_camera_trf: Array,
+    grey: Array | float, rotation: Array
 ) -> LitPoints:  # fmt: skip
     """Return n points on the triangles ``owners`` (n,), with grey levels (n,), at (n, 3), seen in
     directions (n, 3), all in TRF.
@@ -342,7 +345,8 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
     k, n = len(maps.to_sun_trf), len(points.rows)
     out, work = np.empty((k, 3)), np.empty(2 * n)
     function("rate_suns")(
-        address(points.rows), c_int64(n), address(maps.to_sun_trf), address(maps.settings), address(maps.depths),
+        address(points.rows), c_int64(n), address(maps.to_sun_trf), address(maps.settings),
+        address(maps.depths),
         c_int64(k), c_double(_LIGHT.least_ambient), address(out), address(work),
     )  # fmt: skip
     return out
@@ -354,7 +358,8 @@ def direct_light(points: LitPoints, maps: ShadowMaps, k: int) -> NDArray[np.floa
     """
     out = np.empty(len(points.rows), np.float32)
     function("direct_light")(
-        address(points.rows), c_int64(len(out)), (c_double * 3)(*maps.to_sun_trf[k]), (c_double * 12)(*maps.settings[k]),
+        address(points.rows), c_int64(len(out)), (c_double * 3)(*maps.to_sun_trf[k]),
+        (c_double * 12)(*maps.settings[k]),
         address(maps.depths[k]), address(out),
     )  # fmt: skip
     return out

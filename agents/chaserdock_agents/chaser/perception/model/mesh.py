@@ -121,7 +121,8 @@ class TrackerMesh:
             or not 4 <= len(triangles) <= MAX_TRIANGLES
         ):
             raise MeshError(
-                f"a tracker mesh has 4 to {MAX_TRIANGLES} triangles of shape (m, 3), not {triangles.shape}; simplify the mesh"
+                f"a tracker mesh has 4 to {MAX_TRIANGLES} triangles of shape (m, 3), not "
+                f"{triangles.shape}; simplify the mesh"
             )
         if triangles.min() < 0 or triangles.max() >= len(vertices):
             raise MeshError(f"triangles must index the {len(vertices)} vertices")
@@ -273,7 +274,8 @@ class TrackerMesh:
         vertices, triangles, _, _ = self.contiguous
         for row, depth in zip(settings, depths, strict=True):
             function("shadow_map")(
-                (c_double * 12)(*row), address(vertices), address(triangles), c_int64(len(triangles)), address(depth)
+                (c_double * 12)(*row), address(vertices), address(triangles),
+                c_int64(len(triangles)), address(depth)
             )  # fmt: skip
         return ShadowMaps(np.array(to_sun_trf, dtype=float, order="C"), settings, depths)
 

@@ -96,8 +96,10 @@ def render(
     )
     function("render_mesh")(
         (c_double * 4)(*window.lens), c_int64(h), c_int64(w), c_int64(samples), address(at),
-        address(vertices), address(triangles), address(normals), address(surfaces), c_int64(len(triangles)),
+        address(vertices), address(triangles), address(normals), address(surfaces),
+        c_int64(len(triangles)),
         (c_double * 6)(*settings), (c_double * 12)(*shadow_settings), address(depth),
-        address(view.grey), address(view.coverage), address(view.nearest), address(view.owner), address(facing), address(work),
+        address(view.grey), address(view.coverage), address(view.nearest), address(view.owner),
+        address(facing), address(work),
     )  # fmt: skip
     return view

@@ -210,7 +210,8 @@ def rough_prior_steps(
 
 
 def _settling_steps(
-    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting, levels: tuple[int, ...], modes: Array | None
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting,
+    levels: tuple[int, ...], modes: Array | None
 ) -> Steps[tuple[Alignment, Lighting] | None]:  # fmt: skip
     """Align the two finest levels, and improve light and pose again until the pose settles; None if
     it does not.

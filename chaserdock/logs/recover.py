@@ -7,7 +7,7 @@ import mmap
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,8 @@ _Content = Attachment | Metadata | list[StoredRecord] | int
 _INDEX_HEAD = struct.Struct("<HI")
 _INDEX_ENTRY_BYTES = 16
 _NO_SCHEMA = 0
-_FIRST_PRIVATE_OPCODE = 0x80
+_KNOWN = frozenset({*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)})
+"""Opcodes of the format, and those that are left to applications."""
 _OUTSIDE_CHUNKS = (Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA)
 """Records of a file with chunks, in any of which the search behind damage may end. Those inside
 a damaged chunk are not trusted."""
@@ -156,10 +157,12 @@ def _count_losses(data: mmap.mmap, summary: Summary | None, copy: _Copy, walk: _
         found.lost_messages = None
     else:
         found.lost_messages = walk.indexed_losses + found.messages_without_channel
-    if summary is not None and summary.data_crc and copy.unchunked and not found.broken_records:
-        # Such a message has no other checksum.
-        if zlib.crc32(data[: summary.data_end]) != summary.data_crc:
-            found.unchecked = copy.unchunked
+    if (
+        summary is not None
+        and summary.data_crc not in (0, zlib.crc32(data[: summary.data_end]))
+        and not found.broken_records
+    ):
+        found.unchecked = copy.unchunked  # such a message has no other checksum
 
 
 class _Walk:
@@ -191,6 +194,8 @@ class _Walk:
                 behind_damage, place = True, following
                 continue
             opcode, content, place = record
+            if opcode == Opcode.DATA_END:
+                return
             if isinstance(content, int):
                 if behind_damage:
                     self.indexed_losses += content
@@ -204,21 +209,18 @@ class _Walk:
                 self._channels |= {r.id for r in content if isinstance(r, Channel)}
             yield opcode, content
 
-    def _head(self, place: int, kinds: tuple[int, ...] | None = None) -> tuple[int, int] | None:
+    def _head(self, place: int, kinds: Collection[int] | None = None) -> tuple[int, int] | None:
         """Return opcode and end of the record at ``place`` if its head may be one."""
         if place + RECORD_HEAD.size > self._end:
             return None
         opcode, length = RECORD_HEAD.unpack_from(self._data, place)
-        if kinds is None:
-            known = Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= _FIRST_PRIVATE_OPCODE
-        else:
-            known = opcode in kinds
+        known = opcode in (_KNOWN if kinds is None else kinds)
         following = place + RECORD_HEAD.size + length
         fits = length <= MAX_RECORD_BYTES and following <= self._end
         return (opcode, following) if known and fits else None
 
     def _record(
-        self, place: int, kinds: tuple[int, ...] | None = None
+        self, place: int, kinds: Collection[int] | None = None
     ) -> tuple[int, _Content, int] | None:
         """Return opcode, content and end of the record at ``place`` if it is intact."""
         head = self._head(place, kinds)
@@ -241,7 +243,7 @@ class _Walk:
             self._chunked = self._search(place + 1, (Opcode.CHUNK,)) < self._end
         return self._search(place + 1, _OUTSIDE_CHUNKS if self._chunked else _WITHOUT_CHUNKS)
 
-    def _search(self, place: int, kinds: tuple[int, ...]) -> int:
+    def _search(self, place: int, kinds: Collection[int]) -> int:
         # Opcode, and a length of at most MAX_RECORD_BYTES.
         heads = re.compile(
             b"[" + re.escape(bytes(kinds)) + rb"](?=.{3}[\x00-\x08]\x00{4})", re.DOTALL
@@ -256,11 +258,12 @@ class _Walk:
         """Return whether a record that was found by searching is one: another one, or the end,
         follows it, and a message has a known channel.
         """
-        if opcode == Opcode.MESSAGE and isinstance(content, list):
-            return all(
-                isinstance(r, McapMessage) and r.channel_id in self._channels for r in content
-            ) and (following == self._end or self._head(following) is not None)
-        return following == self._end or self._head(following) is not None
+        if following != self._end and self._head(following) is None:
+            return False
+        return opcode != Opcode.MESSAGE or all(
+            isinstance(r, McapMessage) and r.channel_id in self._channels
+            for r in (content if isinstance(content, list) else ())
+        )
 
     def _count_damage(self, place: int, following: int) -> bool:
         """Count the damage from ``place`` to ``following``; return whether an index that follows

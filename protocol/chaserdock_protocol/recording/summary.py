@@ -76,16 +76,21 @@ def find_summary(data: mmap.mmap) -> Summary | None:
 
 
 def _stated_end(data: mmap.mmap) -> int | None:
-    """Return the end of the data by the footer of a whole file with a summary; None otherwise."""
+    """Return the end of the data by the footer of a whole file with a summary; None
+    otherwise.
+    """
     place = len(data) - len(MCAP0_MAGIC) - _FOOTER_BYTES
     if place < 0 or data[place : place + RECORD_HEAD.size] != _FOOTER:
         return None
     footer = _footer_at(data, place)
     end = footer.summary_start - _DATA_END_BYTES
-    # A file that lacks its beginning has all of its offsets wrong.
-    if not 0 < end < place or not (footer.summary_crc or data[end : end + len(_DATA_END)] == _DATA_END):
+    if not 0 < end < place:
         return None
-    return end if _is_intact(data, footer.summary_start, place) else None
+    if data[end : end + len(_DATA_END)] == _DATA_END:
+        return end
+    # A file that lacks its beginning has all of its offsets wrong, and so no matching checksum.
+    known = footer.summary_crc and _is_intact(data, footer.summary_start, place)
+    return end if known else None
 
 
 def _footer_at(data: mmap.mmap, place: int) -> Footer:

@@ -25,8 +25,8 @@ from chaserdock_protocol.recording.summary import read_summary
 
 
 class FileInfo(msgspec.Struct):
-    """A file of a log. ``closed``, ``cut_bytes`` and ``library``: as in
-    ``recording.scan.FileState``. ``lost``: number of messages that it lacks by its statistics.
+    """A file of a log. ``closed``, ``cut_bytes``, ``library``, ``rewritten``: as
+    in ``recording.scan.FileState``. ``lost``: number of messages that it lacks by its statistics.
     """
 
     path: str
@@ -35,6 +35,7 @@ class FileInfo(msgspec.Struct):
     cut_bytes: int
     recovered: bool
     library: str
+    rewritten: bool
     lost: int
 
 
@@ -131,7 +132,8 @@ def info_of(log: LogSource) -> LogInfo:
     if (begin_s := late_begin_s(log)) is not None:
         missing.append(late_begin_line(begin_s))
     # Our recorder knows what it missed; another tool may have left out what came last.
-    if files[-1].closed and state.rewritten and topics.END.key_of() not in keys:
+    last = files[-1]
+    if last.closed and last.rewritten and topics.END.key_of() not in keys:
         missing.append(f"ends at {round(sim_time_s, 2)} s without the end of the mission")
     return LogInfo(
         scenario=name,
@@ -157,6 +159,7 @@ def _file_info(path: Path, state: FileState, messages: int) -> FileInfo:
         cut_bytes=state.cut_bytes,
         recovered=state.recovered,
         library=state.library,
+        rewritten=state.rewritten,
         lost=0 if stated is None else max(0, stated.message_count - messages),
     )
 
@@ -195,7 +198,7 @@ def info_lines(info: LogInfo) -> list[str]:
             end += "; recovered"
         if f.lost:
             end += f"; lacks {f.lost} messages that its statistics count"
-        if not f.library.startswith("chaserdock"):
+        if f.rewritten:
             end += f"; written by {f.library or 'an unknown tool'}"
         lines.append(f"{f.path}: {f.bytes / 1e6:.1f} MB, {end}")
     lines += info.missing

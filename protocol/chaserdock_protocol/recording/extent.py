@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.messages import Tick
 
 from .scan import VIEWER_PREFIX, LogSource, log_files, stored_messages
 from .schema_migrations import decode_logged
@@ -30,7 +31,7 @@ def late_begin_s(source: LogSource) -> float | None:
         if key == topics.TICK.key_of():
             encoding = channel.metadata.get("zenoh_encoding", "")
             try:
-                tick = decode_logged(topics.TICK.kind, stored.data, encoding)
+                tick = decode_logged(Tick, stored.data, encoding)
             except Rejected:
                 continue
             return first_s if tick.seq > 0 else None

@@ -134,7 +134,10 @@ def info_of(log: LogSource) -> LogInfo:
     # Our recorder knows what it missed; another tool may have left out what came last.
     last = files[-1]
     if last.closed and last.rewritten and topics.END.key_of() not in keys:
-        missing.append(f"ends at {round(sim_time_s, 2)} s without the end of the mission")
+        missing.append(
+            f"ends at {round(sim_time_s, 2)} s without the end of the mission; later messages may "
+            "be missing"
+        )
     return LogInfo(
         scenario=name,
         seed=seed,

@@ -9,6 +9,7 @@ import struct
 import zlib
 from collections.abc import Collection, Iterator
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,9 @@ from chaserdock_protocol.recording.scan import (
     with_checksum,
 )
 from chaserdock_protocol.recording.summary import Summary, find_summary
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, MessageIndex, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
@@ -35,6 +37,9 @@ _Content = Attachment | Metadata | list[StoredRecord] | int
 """Content of a record: of an index the number of its messages."""
 _INDEX_HEAD = struct.Struct("<HI")
 _INDEX_ENTRY_BYTES = 16
+_CHUNK_HEAD = struct.Struct("<QQQII")
+"""Times, size and checksum of a chunk, and the length of the name of its compression."""
+_SIZE = struct.Struct("<Q")
 _NO_SCHEMA = 0
 _KNOWN = frozenset({*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)})
 """Opcodes of the format, and those that are left to applications."""
@@ -42,6 +47,17 @@ _OUTSIDE_CHUNKS = (Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode
 """Records of a file with chunks, in any of which the search behind damage may end. Those inside
 a damaged chunk are not trusted."""
 _WITHOUT_CHUNKS = (*_OUTSIDE_CHUNKS, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_WITH_LENGTHS: dict[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.MESSAGE_INDEX: MessageIndex,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.METADATA: Metadata,
+}
+"""Records that state the lengths of their fields. A message does not: it counts only where another
+record follows it."""
 _WITH_DATA = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.METADATA)
 
 
@@ -224,13 +240,42 @@ class _Walk:
     ) -> tuple[int, _Content, int] | None:
         """Return opcode, content and end of the record at ``place`` if it is intact."""
         head = self._head(place, kinds)
-        if head is None:
-            return None
+        record = None if head is None else self._record_until(place, *head)
+        if record is None and self._data[place] == Opcode.CHUNK:
+            # Its length may be what is wrong: a chunk states its size again inside.
+            end = self._chunk_end(place)
+            record = None if end is None else self._record_until(place, Opcode.CHUNK, end)
+        return record
+
+    def _record_until(self, place: int, opcode: int, end: int) -> tuple[int, _Content, int] | None:
+        content = self._data[place + RECORD_HEAD.size : end]
         try:
-            content = _parse(head[0], self._data[place + RECORD_HEAD.size : head[1]])
+            if not self._continues(end) and not _is_exact(opcode, content):
+                return None
+            return opcode, _parse(opcode, content), end
         except DAMAGE:
             return None
-        return head[0], content, head[1]
+
+    def _continues(self, place: int) -> bool:
+        """Return whether a record may begin at ``place``, whole or cut off, or the data end."""
+        if place == self._end or self._head(place) is not None:
+            return True
+        head = self._data[place : place + RECORD_HEAD.size]
+        if self._ended or len(head) < RECORD_HEAD.size:
+            return not self._ended
+        opcode, length = RECORD_HEAD.unpack(head)
+        return opcode in _KNOWN and length <= MAX_RECORD_BYTES
+
+    def _chunk_end(self, place: int) -> int | None:
+        begin = place + RECORD_HEAD.size + _CHUNK_HEAD.size
+        if begin > self._end:
+            return None
+        *_, name_bytes = _CHUNK_HEAD.unpack_from(self._data, place + RECORD_HEAD.size)
+        begin += name_bytes + _SIZE.size
+        if begin > self._end:
+            return None
+        end = begin + _SIZE.unpack_from(self._data, begin - _SIZE.size)[0]
+        return end if end <= self._end else None
 
     def _next(self, place: int) -> int:
         """Return where the next intact record begins behind the damaged one at ``place``; the end
@@ -258,7 +303,7 @@ class _Walk:
         """Return whether a record that was found by searching is one: another one, or the end,
         follows it, and a message has a known channel.
         """
-        if following != self._end and self._head(following) is None:
+        if not self._continues(following):
             return False
         return opcode != Opcode.MESSAGE or all(
             isinstance(r, McapMessage) and r.channel_id in self._channels
@@ -280,6 +325,16 @@ class _Walk:
         lossy = not alone or opcode in _WITH_DATA
         self.unknown_losses += lossy
         return alone and opcode == Opcode.CHUNK
+
+
+def _is_exact(opcode: int, content: bytes) -> bool:
+    """Return whether a record ends where its own fields end. Raises one of ``DAMAGE``."""
+    kind = _WITH_LENGTHS.get(opcode)
+    if kind is None:
+        return False
+    stream = ReadDataStream(BytesIO(content))
+    kind.read(stream)
+    return stream.count == len(content)
 
 
 def _parse(opcode: int, content: bytes) -> _Content:

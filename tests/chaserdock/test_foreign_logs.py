@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import pytest
 from chaserdock_protocol.recording.log import LogError, read_log, read_scenario
 from chaserdock_protocol.recording.scan import RECORD_HEAD, stored_messages
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.records import Chunk, Message
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import Writer
 from mcap_writers import LAYOUTS, OPTIONS, copy_log, places
 
 from chaserdock.cli.main import app
@@ -74,51 +77,76 @@ def test_every_way_of_writing_is_read_and_copied(
         assert read_scenario(out) == read_scenario(source)
 
 
-@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("writer", [w for w in WRITERS if "without chunks" not in w])
 @pytest.mark.parametrize("where", [0, 3, -1])
-def test_damage_costs_one_record_and_is_stated(
+def test_a_damaged_chunk_costs_itself_and_is_stated(
     writer: str, where: int, source: Path, expected: Content, tmp_path: Path
 ) -> None:
-    """A wrong bit in the content, or in the length, of the first, the fourth, or the last one."""
+    """A wrong bit in the size that the first, the fourth or the last one states inside."""
     log = copy_log(source, tmp_path / "log", **WRITERS[writer])
-    whole, unchunked = log.read_bytes(), "without" in writer
-    hits = places(whole, Opcode.MESSAGE if unchunked else Opcode.CHUNK)
-    begin, end = hits[where]
-    held = _messages_of(whole, begin, unchunked)
-    for place in (begin + 2, begin + 7, (begin + end) // 2):
-        if place > begin + 8 and (unchunked or "no checksums" in writer):
-            continue  # nothing can tell
-        data = bytearray(whole)
-        data[place] ^= 0x10
-        log.write_bytes(data)
-        out = tmp_path / f"{place}.mcap"
-        found = recover(log, out)
-        saved = content_of(out)
-        assert is_part(saved, expected)
-        assert not found.complete
-        # Channels that only the damaged chunk declares are lost with it.
-        declared = "no declarations" not in writer and "no summary" not in writer
-        assert len(saved) == len(expected) - held or (where != -1 and not declared)
-        if "no statistics" not in writer and "no summary" not in writer:
-            assert found.lost_messages == len(expected) - len(saved)
-            assert f"lost: {found.lost_messages} of {len(expected)} messages" in loss_lines(found)
-        else:
-            assert found.lost_messages in (None, len(expected) - len(saved))
-            assert any(line.startswith("lost: ") for line in loss_lines(found))
+    data = bytearray(log.read_bytes())
+    begin, _ = places(data, Opcode.CHUNK)[where]
+    held = _messages_of(data, begin)
+    data[begin + 9 + 17] ^= 0x10
+    log.write_bytes(data)
+    found = recover(log, tmp_path / "out")
+    saved = content_of(tmp_path / "out")
+    assert is_part(saved, expected)
+    # Channels that only this chunk declares are lost with it.
+    declared = "no declarations" not in writer and "no summary" not in writer
+    assert len(saved) == len(expected) - held or (where != -1 and not declared)
+    _check_statement(found, len(saved), len(expected), writer)
 
 
-def _messages_of(data: bytes, place: int, unchunked: bool) -> int:
-    """Number of messages of a record, by the official library."""
-    from io import BytesIO
+@pytest.mark.parametrize("writer", [w for w in WRITERS if "without chunks" in w])
+@pytest.mark.parametrize("where", [0, 3, -1])
+@pytest.mark.parametrize("byte", [0, 2, 7])
+def test_a_damaged_message_costs_no_more_than_the_one_before(
+    writer: str, where: int, byte: int, source: Path, expected: Content, tmp_path: Path
+) -> None:
+    """A wrong bit in its opcode or length. The one before has no checksum, and nothing that states
+    its length, either.
+    """
+    log = copy_log(source, tmp_path / "log", **WRITERS[writer])
+    data = bytearray(log.read_bytes())
+    data[places(data, Opcode.MESSAGE)[where][0] + byte] ^= 0x10
+    log.write_bytes(data)
+    found = recover(log, tmp_path / "out")
+    saved = content_of(tmp_path / "out")
+    assert is_part(saved, expected)
+    assert 1 <= len(expected) - len(saved) <= 2
+    _check_statement(found, len(saved), len(expected), writer)
 
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Chunk, Message
-    from mcap.stream_reader import breakup_chunk
 
-    if unchunked:
-        return 1
-    content = data[place + RECORD_HEAD.size :]
-    inside = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))))
+def _check_statement(found: Recovered, saved: int, expected: int, writer: str) -> None:
+    assert not found.complete
+    if "no statistics" in writer or "no summary" in writer:
+        assert found.lost_messages in (None, expected - saved)
+        assert any(line.startswith("lost: ") for line in loss_lines(found))
+    else:
+        assert found.lost_messages == expected - saved
+        assert f"lost: {found.lost_messages} of {expected} messages" in loss_lines(found)
+
+
+@pytest.mark.parametrize("byte", [2, 3, 7])
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "without chunks"])
+def test_a_chunk_of_a_wrong_length_is_read_by_the_size_inside(
+    byte: int, layout: str, source: Path, expected: Content, tmp_path: Path
+) -> None:
+    log = copy_log(source, tmp_path / "log", **LAYOUTS[layout])
+    for where in (0, 3, -1):
+        data = bytearray(log.read_bytes())
+        data[places(data, Opcode.CHUNK)[where][0] + byte] ^= 0x10
+        (tmp_path / "damaged").write_bytes(data)
+        found = recover(tmp_path / "damaged", tmp_path / f"{where}")
+        assert found.complete
+        assert content_of(tmp_path / f"{where}") == expected
+
+
+def _messages_of(data: bytes | bytearray, chunk: int) -> int:
+    """Number of messages of the chunk at this offset, by the official library."""
+    content = BytesIO(data[chunk + RECORD_HEAD.size :])
+    inside = breakup_chunk(Chunk.read(ReadDataStream(content)))
     return sum(isinstance(record, Message) for record in inside)
 
 
@@ -128,8 +156,8 @@ def test_an_index_behind_a_damaged_chunk_counts_its_messages(
     """In a log without end, which has no statistics."""
     log = copy_log(source, tmp_path / "log")
     data = bytearray(log.read_bytes())
-    begin, end = places(data, Opcode.CHUNK)[1]
-    held = _messages_of(data, begin, unchunked=False)
+    begin, end = places(data, Opcode.CHUNK)[-3]
+    held = _messages_of(data, begin)
     data[(begin + end) // 2] ^= 1
     last = places(data, Opcode.CHUNK)[-1][0]
     log.write_bytes(data[:last])
@@ -159,7 +187,7 @@ def test_a_file_without_its_first_bytes_is_recovered(
         content_of(log)
     found = recover(log, tmp_path / "out")
     saved = content_of(tmp_path / "out")
-    held = sum(_messages_of(data, hits[k][0], unchunked) for k in range(3))
+    held = 3 if unchunked else sum(_messages_of(data, hits[k][0]) for k in range(3))
     assert saved == expected[held:]
     assert found.lost_messages == held
     assert found.lost_attachments == 4  # three attachments and a metadata record
@@ -175,12 +203,10 @@ def test_a_message_without_checksum_may_be_wrong_and_that_is_said(
     found = recover(log, tmp_path / "out")
     assert (found.lost_messages, found.complete) == (0, False)
     assert found.unchecked == found.messages
-    assert "one of them may be wrong" in loss_lines(found)[0]
+    assert f"one of {found.messages} messages, which have no checksum" in loss_lines(found)[0]
 
 
 def test_a_channel_without_schema_is_kept(tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
     with (tmp_path / "log").open("wb") as file:
         writer = Writer(file)
         writer.start(library="other tool")
@@ -236,9 +262,7 @@ def test_a_copy_without_attachments_says_what_that_costs(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = copy_log(source, tmp_path / "log", attachments="none")
-    with pytest.raises(SystemExit if False else BaseException) as caught:
-        app(["log", str(log), "--json"], standalone_mode=False)
-    assert getattr(caught.value, "exit_code", None) == 1
+    assert app(["log", str(log), "--json"], standalone_mode=False) == 1
     info = json.loads(capsys.readouterr().out)
     assert (info["scenario"], info["seed"]) == (None, None)
     assert info["missing"][0].startswith("holds no scenario")
@@ -285,20 +309,8 @@ def test_the_command_states_the_loss_with_status_1(
     begin, end = places(data, Opcode.CHUNK)[-1]
     data[(begin + end) // 2] ^= 0x10
     log.write_bytes(data)
-    status, said = _run(capsys, "log", str(log), "--recover", str(tmp_path / "out"))
-    held = _messages_of(bytes(data), begin, False) if False else None
-    assert status == 1
-    found: Recovered = recover(log, tmp_path / "again")
-    assert f"lost: {found.lost_messages} of {len(expected)} messages" in said
-    assert held is None
-
-
-def _run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[Any, str]:
-    try:
-        app(list(words), standalone_mode=False)
-    except BaseException as ended:
-        return getattr(ended, "exit_code", None), capsys.readouterr().out
-    return 0, capsys.readouterr().out
-
-
-_ = struct
+    words = ["log", str(log), "--recover", str(tmp_path / "out")]
+    assert app(words, standalone_mode=False) == 1
+    lost = len(expected) - len(content_of(tmp_path / "out"))
+    assert lost > 0
+    assert f"lost: {lost} of {len(expected)} messages" in capsys.readouterr().out

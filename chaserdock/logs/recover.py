@@ -71,7 +71,7 @@ class Recovered(msgspec.Struct):
     ``lost_messages``: by them, or by the index behind a damaged chunk; None where some are lost
     and nothing states how many. ``lost_attachments``: lost attachments and metadata records, by the
     statistics. ``unchecked``: messages without a checksum of their own, one of which may be wrong,
-    as the checksum over all data does not match.
+    as the checksum over all data does not match. ``ended``: whether the data have an end mark.
     """
 
     messages: int = 0
@@ -84,6 +84,7 @@ class Recovered(msgspec.Struct):
     lost_messages: int | None = 0
     lost_attachments: int = 0
     unchecked: int = 0
+    ended: bool = True
 
     @property
     def complete(self) -> bool:
@@ -97,11 +98,10 @@ def loss_lines(found: Recovered) -> list[str]:
     if f.skipped_bytes:
         lines.append(f"{f.skipped_bytes} bytes are not readable")
     if f.lost_messages is None:
-        damaged = [f"{f.broken_records} damaged records"] if f.broken_records else []
-        cut = ["the last record, which is cut off"] if f.cut_bytes else []
-        lines.append(
-            f"lost: what {' and '.join(damaged + cut)} held; nothing states how many messages"
-        )
+        plural = "" if f.broken_records == 1 else "s"
+        places = [f"{f.broken_records} damaged record{plural}"] if f.broken_records else []
+        places += ["the last record, which is cut off"] if f.cut_bytes else []
+        lines.append(f"lost: messages of {' and of '.join(places)}; nothing states how many")
     elif f.lost_messages:
         of = "" if f.stated_messages is None else f" of {f.stated_messages}"
         lines.append(f"lost: {f.lost_messages}{of} messages")
@@ -116,6 +116,8 @@ def loss_lines(found: Recovered) -> list[str]:
             f"the checksum over all data does not match: one of {f.unchecked} messages, which have "
             "no checksum of their own, may be wrong"
         )
+    if not f.ended:
+        lines.append("the log was not closed: what its writer had not yet written is not in it")
     return lines
 
 
@@ -190,7 +192,7 @@ class _Walk:
     """
 
     def __init__(self, data: mmap.mmap, summary: Summary | None) -> None:
-        self.found = Recovered()
+        self.found = Recovered(ended=summary is not None)
         self.indexed_losses = self.unknown_losses = 0
         self._data, self._ended = data, summary is not None
         self._end = len(data) if summary is None else summary.data_end

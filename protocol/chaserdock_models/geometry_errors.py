@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of a known mesh as independent parameters, each with its standard deviation and the
-displacement of every vertex by it.
+"""Describe the errors of a known mesh by independent parameters, for trackers and for the
+controller.
 
-The parameters: a turn of each joint about each body axis, the scale of what is not on a joint, and
-the visible border of solar panels, whose grid of cells a known mesh does not have. Trackers
-estimate them with the pose, the controller fuses them.
+Each parameter has a standard deviation, and displaces every vertex by a known vector per standard
+deviation. There is a rotation of each joint about each body axis, the scale of what is not on a
+joint, and the visible border of solar panels, whose grid of cells a known mesh does not have.
+Trackers estimate the parameters with the pose; the controller fuses them.
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ _RIM_SIGMA_M = 0.001
 
 @dataclass(frozen=True)
 class GeometryParameter:
-    """An error of the geometry: ``name``, such as ``panel_left x``, ``scale`` or ``rim``;
-    ``sigma``: standard deviation, rad, as a share, or m."""
+    """One parameter of a mesh's errors.
+
+    ``name``: such as ``panel_left x`` (a joint and an axis), ``scale`` or ``rim``. ``sigma``: its
+    prior standard deviation; rad for a joint, relative for the scale, m for the rim.
+    """
 
     name: str
     sigma: float
@@ -35,8 +39,9 @@ class GeometryParameter:
 def geometry_parameters(
     mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float
 ) -> tuple[GeometryParameter, ...]:
-    """Return the parameters of a mesh, in the order of `error_modes`; none without a standard
-    deviation.
+    """Return the parameters of a mesh, in the order of `error_modes`.
+
+    Leaves out those whose standard deviation is zero; the rim alone is no parameter.
     """
     turns = (
         [f"{joint} {axis}" for joint in mesh.joints for axis in "xyz"]

@@ -206,8 +206,10 @@ def hole_m(part: MeshPart) -> Array | None:
 
 
 def _edge_balance(part: MeshPart) -> tuple[IntArray, IntArray]:
-    """Return the edges (n, 2), lower vertex first, and how many more triangles (n,) use each
-    upwards than downwards.
+    """Return the edges (n, 2), lower vertex index first, and the balance (n,) of their directions.
+
+    Balance: number of triangles that run along an edge upwards, less those that run downwards. It
+    is 0 where two triangles of opposite direction share the edge.
     """
     ends = np.concatenate(
         [part.triangles[:, [0, 1]], part.triangles[:, [1, 2]], part.triangles[:, [2, 0]]]

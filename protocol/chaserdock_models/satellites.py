@@ -173,8 +173,9 @@ def _dish(radius_m: float, depth_m: float, wall_m: float) -> list[tuple[float, f
 def _wings(
     bus_half_m: float, panel_m: Vector3, boom_m: float, tilt_rad: float, tolerance_m: float
 ) -> list[MeshPart]:
-    """Return two solar panels on booms along +Y ("north") and -Y ("south"), turned about the boom
-    by ``tilt_rad``.
+    """Return two solar panels on booms along +Y ("north") and -Y ("south").
+
+    ``tilt_rad``: rotation of the panels about the boom.
     """
     parts = []
     for label, side in (("north", 1.0), ("south", -1.0)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Track a setpoint by a second-order control law: the safe command where there is no plan."""
+"""Track a setpoint by a second-order control law: the safe command without a plan."""
 
 from __future__ import annotations
 

@@ -238,6 +238,8 @@ class FaultLayer:
             damaged: Any = codec.decode(topic.kind, bytes(data))
         except Rejected:
             return None
+        # A message of another tick, chaser or sender does not count as this one. In lock-step the
+        # reader would wait for this one without end, so that damage to these fields is a loss.
         # Not accepted for this one: in lock-step the reader would wait on.
         same = all(
             getattr(damaged, name, None) == getattr(message, name, None)

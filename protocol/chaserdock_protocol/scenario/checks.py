@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks across several sections of a scenario. Each raises ValueError with the path of what is
+"""Check a scenario across its sections. Every check raises ValueError with the path of what is
 wrong.
 """
 
@@ -70,7 +70,7 @@ def check_flight(scenario: FlightScenario) -> None:
 
 
 def check_consistent(scenario: Scenario) -> None:
-    """Run the other checks, which need the full scenario."""
+    """Run the checks that need the full scenario."""
     _check_start_positions(scenario)
     _check_orbit(scenario)
     _check_mesh(scenario)
@@ -140,9 +140,7 @@ def _check_references(scenario: FlightScenario) -> None:
 
 
 def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> float:
-    """Return the distance (m) of a chaser's shape at an offset (3,), TRF, from the cuboids of the
-    target's shape.
-    """
+    """Return the distance (m) of a chaser at an offset (3,), TRF, from the cuboids of the target."""
     pose = _reference_pose(scenario, chaser, offset_m)
     return distance_from_cuboids(
         box_table(scenario.target_model().boxes), box_table(scenario.chaser.boxes()), *pose
@@ -469,8 +467,9 @@ def _check_detumble(scenario: FlightScenario) -> None:
 
 
 def _check_stopping_time(scenario: Scenario) -> None:
-    """Check that detumbling is not longer than allowed even if all thrusters could always push
-    where it helps most.
+    """Check that detumbling can end within the allowed time.
+
+    It takes as if all thrusters could always push where they help most.
     """
     for k, entry in _detumblings(scenario):
         linear, angular, force_N, torque_N_m, mass_kg = _momentum_and_thrust(
@@ -489,9 +488,11 @@ def _check_stopping_time(scenario: Scenario) -> None:
 def _momentum_and_thrust(
     scenario: Scenario, chasers: set[int]
 ) -> tuple[float, float, float, float, float]:
-    """Return linear (N s) and angular momentum (N m s) of the target at the start with these
-    chasers fixed to it, upper bounds of force and torque of their plume-free thrusters in any
-    direction, and the mass."""
+    """Return what bounds the time to stop the target with these chasers fixed to it.
+
+    Linear (N s) and angular momentum (N m s) at the start; upper bounds of force (N) and torque (N
+    m) of the plume-free thrusters in any direction; the mass (kg).
+    """
     target, body, mounted = scenario.target, scenario.chaser, {}
     omega = np.array(target.omega_rad_s)
     inertias = [target.inertia_tensor]
@@ -528,8 +529,8 @@ def _momentum_and_thrust(
 def _largest_sum(vectors: Array) -> float:
     """Return an upper bound of the length of the sum of some of these vectors (3, n).
 
-    The largest sum of components along a direction, over directions of which one is within 0.15 rad
-    of any other.
+    It is the largest sum of components along a direction, of a set of which one is within 0.15 rad
+    of any direction.
     """
     k = np.arange(400) + 0.5
     z, turn = 1.0 - 2.0 * k / len(k), math.pi * (1.0 + math.sqrt(5.0)) * k

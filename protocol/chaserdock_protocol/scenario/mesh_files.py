@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read mesh files (GLB, glTF, OBJ, STL, PLY) through trimesh; every problem is one line that says
-what would be right.
+"""Read mesh files (GLB, glTF, OBJ, STL, PLY) through trimesh.
 
-A part is a node of the file with its material. What the format cannot say (texture, density,
-joints) is in the extras of nodes and scene under ``EXTRAS``, as `chaserdock target --mesh` writes
-them.
+Every problem is one line that says what would be right. A part is a node of the file with its
+material. What the format cannot say (texture, density, joints) is in the extras of nodes and scene
+under ``EXTRAS``, as `chaserdock target --mesh` writes them.
 """
 
 from __future__ import annotations
@@ -39,8 +38,9 @@ _UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (100
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh that was read, what was changed or assumed (``notes``), and the deviation by
-    decimation.
+    """A mesh that was read.
+
+    ``notes``: what was changed or assumed. ``deviation_m``: by decimation.
     """
 
     mesh: TriangleMesh

@@ -15,7 +15,9 @@ from .messages import Lease, Tick, WrenchCommand
 from .topics import CONTROLLERS
 
 LEASE_S, LEASE_MAX_S = 0.18, 2.0
-"""Shortest and longest lease; each covers at least two ticks."""
+"""Shortest and longest lease, s; every lease covers at least two ticks. Shorter: a standby takes
+over sooner; longer: a slow machine changes its commander less often.
+"""
 
 
 def lease_ticks(rate_hz: float) -> int:

@@ -23,7 +23,10 @@ def require_packages(scenario: Scenario) -> None:
 
 def require_pybullet(
     what: str = "the world",
-    instead: str = "elsewhere, pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\" (--set world.engine=mujoco)",
+    instead: str = (
+        "elsewhere, pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\" "
+        "(--set world.engine=mujoco)"
+    ),
 ) -> None:
     """Raise MissingPackageError if PyBullet, which ``what`` needs, is not installed; ``instead``:
     what else helps.

@@ -43,7 +43,7 @@ from chaserdock_protocol.recording.scan import VIEWER_PREFIX
 from chaserdock_protocol.scenario import FlightScenario
 
 Write = Callable[[str, tuple[str, str, bytes], bytes, int], None]
-"""``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
+"""Signature of ``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
 
 SHOWN = frozenset(
     {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of one recording: verbatim and viewer layer, with rotation by size or time."""
+"""Write the files of one recording: verbatim and viewer layer, with rotation by size or time."""
 
 from __future__ import annotations
 

@@ -163,14 +163,17 @@ class FaultLayer:
         """
         if message.tick >= 0:
             self.apply_process_faults(message.tick)
+
         key = topic.key_of(place)
         out = self._release_delayed(key, message.tick)
+
         for k, fault in self._receipt:
             if not self._affects(k, fault, topic, place, message):
                 continue
             self._count(fault, None)
             sender = sender_of(topic, place, self.name, message)
             lost = [LostMessage(message.tick, message.sim_time_ns, sender)] if self.lockstep else []
+
             if fault.kind == "duplicate":
                 return [*out, message, message, *self._release_overtaken(key)]
             if fault.kind == "delay":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packages that only some scenarios need of the world, and what to do without them."""
+"""Check for packages that only some scenarios need of the world, and state what to do without them."""
 
 from __future__ import annotations
 

@@ -114,6 +114,7 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
             rejected_ids=(),
             detail=str(error)[:500],
         )
+
     solutions, detail = tuple(_solution(pose) for pose in seen.solutions), ""
     rejected = tuple(int(i) for i in seen.rejected_ids)
     if image.ranging is not None and isinstance(perception, FarPerception):
@@ -123,6 +124,7 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
                 return _without_markers(header, far, rejected)
         except BearingError as error:
             detail = "" if solutions else str(error)
+
     return Sighting(
         **header,
         status="seen" if solutions else "nothing",

@@ -126,6 +126,7 @@ class ViewerLayer:
                 time_ns,
             )
             shapes.append((f"chaser/{i}", self._scenario.chaser.size_m, _CHASER_COLOUR))
+
         entities = [
             fox.SceneEntity(
                 timestamp=stamp,
@@ -137,6 +138,7 @@ class ViewerLayer:
             for frame, size_m, colour in shapes
         ]
         self._put("scene", fox.SceneUpdate(entities=entities), time_ns)
+
         body = self._scenario.chaser
         chaser = (
             _mesh_points(satellite(body.mesh, _SPACING_M))

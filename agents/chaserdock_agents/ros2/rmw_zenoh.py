@@ -74,8 +74,8 @@ def endpoint_token(
 class Attachment:
     """Attachment of a message or request.
 
-    ``number``: of the message of its publisher, or of the request of its client, from 1. Time: wall
-    clock, ns. Identity of the sender.
+    ``number``: counts the messages of a publisher, or the requests of a client, from 1.
+    ``time_ns``: wall clock. ``gid``: identity of the sender.
     """
 
     number: int

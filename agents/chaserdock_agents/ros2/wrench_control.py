@@ -187,7 +187,7 @@ class WrenchControl:
         self._node.publish(topics.WRENCH, command, chaser)
 
     def _complete_tick(self) -> None:
-        """Renew the leases of chasers without a wrench while another chaser has a valid one.
+        """Renew the leases of chasers without a wrench until the newest wrench of any has expired.
 
         Without a majority, give the leases back.
         """

@@ -42,11 +42,13 @@ def main(options: ProcessOptions) -> int:
     if link.tls is not None:
         link = replace(link, access_control=access_control(link.namespace, MAX_CHASERS))
         log = ZenohLog(link.namespace)
+
     try:
         node = Node(NAME, "operator", link)
     except ChaserdockError as error:
         print_status(NAME, str(error))
         return 2
+
     stop, watched = options.stop_signal(), _WatchedProcess(options.until or "")
     auditor = _AuditLogger(node, log) if log is not None else None
     try:

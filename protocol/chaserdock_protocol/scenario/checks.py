@@ -48,6 +48,7 @@ def check_flight(scenario: FlightScenario) -> None:
     _check_detumble(scenario)
     _check_hold_points(scenario)
     _check_approach_cone(scenario)
+
     if scenario.ranging is not None and scenario.perception.name not in MARKER_PERCEPTIONS:
         raise ValueError(
             f"ranging: needs a perception by markers ({', '.join(MARKER_PERCEPTIONS)}), not "
@@ -57,6 +58,7 @@ def check_flight(scenario: FlightScenario) -> None:
         raise ValueError(
             'plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"'
         )
+
     if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
         raise ValueError(
             'limits.passive_safety: needs the covariance of estimator.name = "joint", '
@@ -174,6 +176,7 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
             'limits.min_distance_shape_m: needs controller.solver = "rti", not '
             f"{scenario.controller.solver!r}"
         )
+
     places = [(f"chasers.{i}.position_m", i, c.position_m) for i, c in enumerate(scenario.chasers)]
     places += [
         (f"timeline.{k}.offset_m", i, e.offset_m)
@@ -181,12 +184,14 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
         for i in e.chasers
         if e.offset_m and i < len(scenario.chasers)
     ]
+
     for name, i, offset_m in places:
         if (distance_m := shape_distance_m(scenario, i, offset_m)) < least_m:
             raise ValueError(
                 f"{name}: chaser {i} is {distance_m:.3g} m from the target's shape there, nearer "
                 f"than limits.min_distance_shape_m ({least_m:g} m) allows"
             )
+
     for (i, a), (j, b) in combinations(enumerate(c.position_m for c in scenario.chasers), 2):
         if (distance_m := shapes_apart_m(scenario, (i, a), (j, b))) < least_m:
             raise ValueError(
@@ -370,10 +375,12 @@ def _check_truth(scenario: Scenario) -> None:
         key := next((k for k in sorted(given) if getattr(scenario.truth.target, k)), None)
     ):
         raise ValueError(f'truth.target.{key}: needs target.motion = "torque_free"')
+
     latches = scenario.truth.latch
     key = next((k for k in sorted(latches.model_fields_set) if getattr(latches, k)), None)
     if key and scenario.docking.kind != "capture":
         raise ValueError(f'truth.latch.{key}: latches exist only with docking.kind = "capture"')
+
     named: set[int | None] = set()
     for k, values in enumerate(scenario.truth.values):
         path, name = (
@@ -502,6 +509,7 @@ def _momentum_and_thrust(
         turn = rotations.to_matrix(mounted[i].q_wxyz)
         inertias.append(turn @ np.diag(body.inertia) @ turn.T)
         places.append(mounted[i].position_m)
+
     masses = np.array([target.mass_kg] + [body.mass_kg] * len(mounted))
     centre = masses @ np.array(places) / masses.sum()
     velocity = rotations.rotate_inverse(target.q_wxyz, target.velocity_m_s) + np.cross(
@@ -511,6 +519,7 @@ def _momentum_and_thrust(
         inertia @ omega + mass * np.cross(place - centre, np.cross(omega, place - centre))
         for inertia, mass, place in zip(inertias, masses, places, strict=True)
     )
+
     free = np.concatenate(list(plume_free_thrusters(scenario, chasers).values()))
     limits = np.where(free, np.tile(thrusts_max(body.thrusters), len(mounted)), 0.0)
     own = wrench_matrix(body.thrusters)

@@ -69,6 +69,7 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
         raise ScenarioError(f"{path}: contains no triangles; a target needs closed surfaces")
     if len(parts) > MAX_PARTS:
         raise ScenarioError(f"{path}: has {len(parts)} parts; join them to at most {MAX_PARTS}")
+
     parts = _with_unique_names(parts)
     mesh = TriangleMesh(path.stem, tuple(parts), _joints(path, scene, scale, np.array(origin_m)))
     _check_size(path, mesh, scale)
@@ -76,6 +77,7 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
         raise ScenarioError(
             f"{path}: has {mesh.triangle_count:,} triangles; simplify it to at most {_MOST_READ:,}"
         )
+
     mesh = replace(mesh, parts=tuple(_closed(path, part, notes) for part in mesh.parts))
     before = mesh.triangle_count
     mesh, deviation_m = decimation.limited(mesh, MAX_TRIANGLES)
@@ -209,6 +211,7 @@ def _material(name: str, geometry: Any, notes: list[str]) -> Material:
             )
         notes.append(f"{name}: no material; it is drawn in uniform grey of reflectance 0.5")
         return Material("grey")
+
     label = str(getattr(given, "name", None) or "material")[:64]
     image = getattr(given, "baseColorTexture", None) or getattr(given, "image", None)
     share = 1.0
@@ -219,6 +222,7 @@ def _material(name: str, geometry: Any, notes: list[str]) -> Material:
         notes.append(f"{name}: no texture; uniform surface of {label!r}") if not _has_colour(
             given
         ) else None
+
     if hasattr(given, "baseColorFactor"):
         return _of_pbr(label, given, share)
     diffuse = (

@@ -57,6 +57,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
         config = zenoh.Config.from_file(str(link.config)) if link.config else zenoh.Config()
     except zenoh.ZError as error:
         raise TransportError(f"Zenoh configuration {link.config}: {error}") from None
+
     values: dict[str, Any] = {
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
@@ -75,6 +76,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
     values |= {
         name: value for name, value in retry.items() if config.get_json(name) in ("null", None)
     }
+
     if link.config is None:
         values |= {
             "mode": link.mode,
@@ -87,6 +89,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
         values |= _tls_values(link.tls)
     if link.access_control is not None:
         values["access_control"] = link.access_control
+
     try:
         config.insert_json5("namespace", json.dumps(link.namespace))
         for name, value in values.items():

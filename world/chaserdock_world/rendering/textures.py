@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Textures of a target's faces: markers, exactly averaged over the area of each texel.
+"""Draw textures of a target's faces: markers, exactly averaged over the area of each texel.
 
 A texel's value is the mean over its area at every resolution, so that rendering from a coarser
 texture blurs a marker but does not shift its edges.
@@ -17,7 +17,7 @@ from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, fac
 from numpy.typing import NDArray
 
 FINEST_TEXEL_M = 0.00025
-"""Width of a texel of a face: half a pixel of the default camera at 0.5 m; nearer, texels are
+"""Width of the finest texel, m: half a pixel of the default camera at 0.5 m. Nearer, texels are
 interpolated.
 """
 # Reflectance of the printed white and black.
@@ -121,7 +121,7 @@ def _print(
 
 
 def _coverage(edges: Array, first: int, last: int) -> Array:
-    """Return the share (cells, texels) of each texel first..last - 1 between consecutive
+    """Return the share (cells, texels) of texels first..last - 1 that lies between consecutive
     ``edges``.
     """
     texels = np.arange(first, last, dtype=float)

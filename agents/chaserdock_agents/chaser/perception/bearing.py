@@ -290,12 +290,14 @@ def find_spots(image: NDArray[np.uint8], radius_px: float) -> list[Spot]:
     # No shape extends beyond four times its radius; ``_shape_at`` decides.
     largest = 4.0 * _blurred(radius_px) + 2.0 * _SPOT.margin_px
     share = min(max(_SPOT.saturation_px / radius_px, _SPOT.saturation_min), _SPOT.saturation_max)
+
     level = float(np.median(image))
     sigma = max(1.4826 * float(np.median(np.abs(image - level))), 1.0)
     _, bright = cv2.threshold(
         image, level + max(_SPOT.levels, _SPOT.sigmas * sigma), 1, cv2.THRESH_BINARY
     )
     _, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+
     height, width = image.shape
     spots = []
     for label, (x, y, w, h, area) in enumerate(stats.tolist()):

@@ -21,8 +21,8 @@ _MIN_PERIMETER_PX = 40.0
 # Margin around a predicted target: share of its size in the image, and px. Wider: a less accurate
 # prediction suffices; narrower: less time.
 _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
-# Shorter side, px, below which images and regions are not halved: their markers are too small at
-# half size.
+# Shorter side, px, below which images and regions are not halved. Smaller: less time; larger: fewer
+# small markers are lost at half size.
 _HALVED_PX = 300
 # Share of the image above which a region is not used: it would hardly save time.
 _REGION_LIMIT = 0.7

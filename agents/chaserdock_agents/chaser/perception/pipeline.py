@@ -101,6 +101,7 @@ class Perception:
         image = np.ascontiguousarray(image)
         if self.method != "default":
             return self._estimate_paper(image)
+
         region = (
             None if predicted is None else detect.region_of(self.camera, self.model, *predicted)
         )
@@ -108,6 +109,7 @@ class Perception:
             sighting = self._estimate_in(image, region)
             if sighting.solutions:
                 return sighting
+
         sighting = self._estimate_in(image, None)
         rejected = sighting.rejected_ids
         if sighting.solutions or len(set(rejected)) < len(

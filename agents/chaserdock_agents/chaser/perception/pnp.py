@@ -289,9 +289,11 @@ def _consensus(seen: _DetectedMarkers) -> tuple[PoseInCamera, list[int]] | None:
             best = score, candidate, candidate_error
         if support == len(which) and max(candidate_error) < _FINE_GATE_PX:
             break  # all are inliers: no other candidate is needed
+
     if best is None:
         return None
     _, pose, error = best
+
     used = _one_of_each(which, error, _COARSE_GATE_PX)
     for _ in range(3):
         refined = _refined(seen.part(used), pose)

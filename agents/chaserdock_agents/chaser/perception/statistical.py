@@ -75,6 +75,7 @@ class StatisticalPerception:
         table = self._table
         m = len(table.ids)
         pose = np.concatenate([position, rotations.to_matrix(q).ravel()])
+
         seen, px, covariance, error = (
             np.empty(m, np.int64),
             np.empty((m, 4, 2)),
@@ -92,10 +93,12 @@ class StatisticalPerception:
             c_int64(m),
             *map(address, (pose, white, *outputs)),
         )
+
         if count < 0:
             return _NOTHING
         if count == 0:
             return self._by_range(position, q, white) or _NOTHING
+
         found = TargetPose(
             position + error[:3],
             rotations.multiply(q, rotations.exp(error[3:])),

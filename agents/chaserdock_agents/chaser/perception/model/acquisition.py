@@ -228,6 +228,7 @@ class Acquisition:
         if region is None:
             return ()
         candidates = yield from self._candidates(pyramid, region)
+
         coarse: list[Alignment] = []
         for pose in candidates:
             levels = levels_of(pyramid, self._mesh, pose)
@@ -237,6 +238,7 @@ class Acquisition:
             if light is not None:
                 aligned = yield from pose_steps(pyramid, self._mesh, pose, light, levels[:1])
                 coarse += [aligned] if aligned is not None else []
+
         coarse.sort(key=lambda a: -a.score)
         fine: list[Found] = []
         tried: list[PoseInCamera] = []
@@ -256,6 +258,7 @@ class Acquisition:
             if self._looks_right(pyramid, *refined):
                 least = max(least, start.score - _SEARCH.worse_start)
                 fine.append(refined)
+
         fine.sort(key=lambda found: -found[0].score)
         return tuple(f for f in fine if f[0].score > fine[0][0].score - _SEARCH.ambiguous_score)
 
@@ -487,12 +490,14 @@ def _make_templates(mesh: TrackerMesh, radii: float) -> _Templates:
     light = Lighting(np.array([0.0, 0.0, -1.0]), shadows=False)
     masks = np.zeros((_SEARCH.templates, _SEARCH.side_px**2), dtype=np.float32)
     owners = np.full((_SEARCH.templates, _SEARCH.side_px**2), -1, dtype=np.int16)
+
     turns, spread, centre = (
         np.empty((_SEARCH.templates, 3, 3)),
         np.empty(_SEARCH.templates),
         np.empty((_SEARCH.templates, 2)),
     )
     middle, whole = (_SEARCH.side_px - 1) / 2.0, 0.45 * _SEARCH.side_px * math.sqrt(radii**2 - 1.0)
+
     for i, q in enumerate(quaternions):
         pose = PoseInCamera(np.array([0.0, 0.0, distance]), rotations.to_matrix(q))
         view = render(
@@ -505,6 +510,8 @@ def _make_templates(mesh: TrackerMesh, radii: float) -> _Templates:
         flat = np.column_stack([x - middle, y - middle]) / whole
         centre[i] = flat.mean(axis=0)
         spread[i] = math.sqrt(float(((flat - centre[i]) ** 2).sum(axis=1).mean()))
+
+        # Render the view again, centred and scaled to the common size.
         focal = _SEARCH.spread_px / spread[i]
         lens = (focal, focal, middle - focal * centre[i, 0], middle - focal * centre[i, 1])
         view = render(

@@ -229,6 +229,7 @@ def control_points(
     synthetic = render(mesh, pose, window, light)
     patch = image_window(pyramid, k, window, left, top)
     view, gain = in_grey_levels(synthetic, patch)
+
     spread = _SPREAD_PX.get(k, 0.4)
     view = np.asarray(cv2.GaussianBlur(view, (0, 0), spread), dtype=np.float32)
     h, w = view.shape
@@ -237,6 +238,7 @@ def control_points(
     points, ahead = np.empty((most, 3)), np.empty((most, 3))
     profiles, owners = np.empty((most, _MATCH.profile)), np.empty(most, dtype=np.int64)
     work = np.empty(h * w + cells * 5 * _MATCH.per_cell_most)
+
     vertices, triangles, _, _ = mesh.contiguous
     at = pose_array(pose)
     least = _MATCH.least_gradient[light.shadows]
@@ -249,6 +251,7 @@ def control_points(
         ),
         address(points), address(ahead), address(profiles), address(owners), address(work),
     )  # fmt: skip
+
     if n < MIN_POINTS:
         return None
     points, owners = points[:n].copy(), owners[:n].copy()
@@ -257,6 +260,7 @@ def control_points(
     if used.sum() < MIN_POINTS:
         return None
     points, owners = points[used], owners[used]
+
     displaced, border = mesh.mode_displacements(owners, points), mesh.border_of(owners)
     behind = light.to_sun_irf is not None and light.to_sun_irf[2] > _MATCH.behind_z
     dim = behind or light.weak or (light.shadows and light.direct == 0.0)

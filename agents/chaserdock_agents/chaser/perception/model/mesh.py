@@ -65,8 +65,8 @@ class MeshError(ValueError):
 class ShadowMaps:
     """Depth maps of a mesh towards k directions of the sun.
 
-    ``directions`` (k, 3): unit vectors in TRF. ``depths`` (k, size, size). ``settings`` (k, 12): as
-    in native/mesh.c.
+    ``to_sun_trf`` (k, 3): unit vectors in TRF. ``settings`` (k, 12): as in native/mesh.c.
+    ``depths`` (k, size, size).
     """
 
     to_sun_trf: Array
@@ -133,10 +133,12 @@ class TrackerMesh:
             )
         if triangles.min() < 0 or triangles.max() >= len(vertices):
             raise MeshError(f"triangles must index the {len(vertices)} vertices")
+
         if reflectance.shape != (len(triangles),) or not np.all(
             (reflectance >= 0.0) & (reflectance <= 1.0)
         ):
             raise MeshError(f"reflectance must be {len(triangles)} numbers from 0 to 1")
+
         for name, values, shape in (
             ("gloss", self.gloss, (len(triangles), 2)),
             ("texture", self.texture, (len(triangles),)),

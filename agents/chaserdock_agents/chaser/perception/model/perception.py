@@ -290,8 +290,8 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
             near = _light_near(pyramid, mesh, found.pose, track.light)
             light = (yield from near) if view_is_next else None
             return PoseTrack(found, light or track.light, track.last.pose, track.age + 1)
-    levels = levels_of(pyramid, mesh, prior)
 
+    levels = levels_of(pyramid, mesh, prior)
     if not levels:
         return missed
     known = track.age + 1 == _KEY_EVERY and not track.missed
@@ -307,6 +307,7 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
         found = track_points(pyramid, track.last.points, prior, modes)
         if is_valid(found):
             return PoseTrack(found, track.light, track.last.pose, track.age + 1)
+
     refined = yield from prior_steps(pyramid, mesh, prior, modes)
     if refined and is_valid(refined[0]):
         return PoseTrack(*refined)

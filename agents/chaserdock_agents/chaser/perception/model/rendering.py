@@ -83,6 +83,7 @@ def render(
         np.empty(shape, np.float32),
         np.empty(shape, np.int32),
     )
+
     at = pose_array(pose)
     if light.to_sun_irf is None:
         lamp_distance = max(float(np.linalg.norm(pose.position)), 1e-3)
@@ -94,6 +95,7 @@ def render(
         if light.shadows:
             maps = mesh.shadow_maps((pose.rotation.T @ light.to_sun_irf)[None], _SHADOW_TEXELS)
             shadow_settings, depth = tuple(maps.settings[0].tolist()), maps.depths
+
     facing, work = (
         np.empty((len(triangles), 3)),
         np.empty(3 * samples * samples * h * w, np.float32),

@@ -71,12 +71,11 @@ class TrackingParameters:
     start_share: float = 0.02
     # Rotation of starts around a prior.
     start_rad: float = math.radians(3.0)
-    # Light and view are repeated until the pose settles: if its share of inliers is smaller than
-    # this, once,
+    # Share of inliers of a pose from a rough prior, below which light and view are repeated once.
     settled_share: float = 0.85
-    # and while it turns by more than this from the view that it comes from,
+    # Rotation of a pose from the view that it comes from, above which they are repeated.
     settled_rad: float = math.radians(0.5)
-    # at most so many times. A pose that still turns is rejected.
+    # Most repetitions. A pose that still turns is rejected.
     most_repeated: int = 3
 
 

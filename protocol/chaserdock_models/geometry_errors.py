@@ -59,8 +59,8 @@ def geometry_parameters(
 
 
 def error_modes(mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float) -> Array:
-    """Return the displacements (k, n, 3), m, of the vertices of all parts by one standard deviation
-    of each parameter.
+    """Return the displacements (k, n, 3), m, of all vertices by one standard deviation of each
+    parameter.
     """
     known = _vertices(mesh.parts)
     modes = []

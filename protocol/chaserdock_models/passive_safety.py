@@ -43,8 +43,10 @@ class CoastCertificate:
 
 @dataclass(frozen=True)
 class ClosestApproaches:
-    """Closest approach of the coast from each of M states: ``margin_sigmas``, ``distance_m`` and
-    ``time_s`` (M,), as in ``CoastCertificate``."""
+    """Closest approach of the coast from each of M states.
+
+    ``margin_sigmas``, ``distance_m`` and ``time_s`` (M,), as in ``CoastCertificate``.
+    """
 
     margin_sigmas: Array
     distance_m: Array
@@ -87,8 +89,9 @@ class CoastModel:
         )
 
     def closest(self, states: Array, covariance: Array, keep_out_m: float) -> ClosestApproaches:
-        """Return the approach with the smallest margin of the coast from each of the states (M, 6);
-        arguments as in ``certify``.
+        """Return the approach of smallest margin of the coast from each of the states (M, 6).
+
+        Arguments as in ``certify``.
         """
         return self._closest_in(np.arange(len(self._times_s) - 1), states, covariance, keep_out_m)
 
@@ -209,8 +212,9 @@ class CoastModel:
 
 
 def _columns(states: Array) -> Array:
-    """Return states (M, 6) as columns (6, P) for the kernels: P is the next multiple of four, and
-    the last state is repeated.
+    """Return states (M, 6) as columns (6, P) for the kernels.
+
+    P is the next multiple of four; the last state is repeated.
     """
     count = -(-len(states) // 4) * 4
     columns = np.empty((6, count))

@@ -36,8 +36,11 @@ class RangingErrors:
 
 @dataclass(frozen=True, eq=False)
 class RangedPose:
-    """A measured pose: position (3,) m in IRF, rotation (4,) TRF to IRF, covariance (6, 6) over
-    position (IRF axes) and rotation (TRF axes), and the bearing's standard deviation in pixels."""
+    """Measured pose of the target.
+
+    Position (3,), m, in IRF; rotation (4,) TRF to IRF. Covariance (6, 6) over position (IRF axes)
+    and rotation (TRF axes). Standard deviation of the bearing in pixels.
+    """
 
     position_m: Array
     q_wxyz: Array
@@ -47,8 +50,10 @@ class RangedPose:
 
 @dataclass(frozen=True, eq=False)
 class RangeReading:
-    """Distance (m) of TRF's origin from the optical centre with its standard deviation, and the
-    sent attitude, TRF to IRF (4,).
+    """Measured range of the target, and the attitude that it sends.
+
+    Range: distance (m) of TRF's origin from the optical centre, with standard deviation. Attitude:
+    TRF to IRF (4,).
     """
 
     range_m: float

@@ -382,11 +382,11 @@ def satellite_names() -> tuple[str, ...]:
 
 @lru_cache
 def satellite(name: str, tolerance_m: float = FINE_M) -> TriangleMesh:
-    """Return a shipped satellite; the origin is its centre of mass, to 0.1 mm, but that of the
-    cuboid for `chaser_body`.
+    """Return a shipped satellite.
 
-    Raises ValueError, listing the known names, for an unknown one, and for a tolerance that is not
-    positive.
+    The origin is its centre of mass, to 0.1 mm; that of ``chaser_body`` is the centre of the
+    cuboid. Raises ValueError for an unknown name, listing the known ones, and for a tolerance that
+    is not positive.
     """
     if name not in _SATELLITES:
         raise ValueError(f"unknown satellite {name!r}; known: {', '.join(satellite_names())}")

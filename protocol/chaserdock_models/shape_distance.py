@@ -66,10 +66,9 @@ def moved(table: Array, positions_m: ArrayLike, q_wxyz: ArrayLike) -> Array:
 
 
 def signed_distance(table: Array, point_m: ArrayLike) -> tuple[float, Array]:
-    """Return the least signed distance (m) of a point (3,) from the cuboids of a table (C, 15), and
-    its gradient (3,).
+    """Return the least signed distance (m) of a point (3,) from cuboids, and its gradient (3,).
 
-    Infinity without cuboids.
+    ``table`` (C, 15); without cuboids the distance is infinite.
     """
     best, gradient = np.inf, np.zeros(3)
     for row in table:

@@ -67,8 +67,11 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
 
 
 def check_numbers(message: Struct) -> None:
-    """Raise Rejected unless every float is finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of
-    unit length and no variance negative."""
+    """Raise Rejected for an invalid number in a message.
+
+    Every float must be finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of unit length, no
+    variance negative.
+    """
     if not _passes_fast_check(message):
         _check_fields(message)
 

@@ -113,8 +113,9 @@ SquareOfParameters = Annotated[tuple[float, ...], Meta(max_length=64 * 64)]
 
 
 class ExpectedPose(Struct, frozen=True, kw_only=True):
-    """Pose of the target in the camera of a chaser that is expected at ``sim_time_ns``; in the
-    frames of ``PoseSolution``.
+    """Pose of the target that is expected in a chaser's camera at ``sim_time_ns``.
+
+    Frames as in ``PoseSolution``.
     """
 
     sim_time_ns: Count
@@ -451,9 +452,9 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
 
 
 class MassEstimate(Struct, frozen=True, kw_only=True):
-    """Estimated mass properties of a body: centre of mass and inertia about it in TRF axes, the
-    latter as xx, yy, zz, xy, xz, yz.
+    """Estimated mass properties of a body.
 
+    Centre of mass, and inertia about it, in TRF axes; inertia as xx, yy, zz, xy, xz, yz.
     ``covariance`` is row-major (10, 10) over (mass, centre of mass, inertia).
     """
 
@@ -464,12 +465,12 @@ class MassEstimate(Struct, frozen=True, kw_only=True):
 
 
 class StackEstimate(Message, frozen=True, kw_only=True):
-    """Identified mass properties at ``sim_time_ns``: of the ``stack`` of the target and
-    ``chasers``, and of the ``target`` alone.
+    """Mass properties identified in flight, at ``sim_time_ns``.
 
-    ``thrust_factors``: estimated over stated thrust of every thruster, chaser after chaser.
-    ``failed``: for each chaser the thrusters that the motion of the stack shows to be stuck.
-    Without chasers both bodies are the freely tumbling target.
+    ``stack``: of the target with ``chasers``. ``target``: of the target alone. ``thrust_factors``:
+    estimated over stated thrust of every thruster, chaser after chaser. ``failed``: for each chaser
+    the thrusters that the motion of the stack shows to be stuck. Without chasers both bodies are
+    the freely tumbling target.
     """
 
     chasers: ChaserIds

@@ -279,8 +279,9 @@ def _image(image: Image, stamp: fox.Timestamp) -> fox.CompressedImage | fox.RawI
 
 
 def _detections(sighting: Sighting, stamp: fox.Timestamp) -> fox.ImageAnnotations:
-    """Return the outlines of the used markers; a viewer's pixel origin is a corner of the first
-    pixel, not its centre.
+    """Return the outlines of the used markers.
+
+    A viewer's pixel origin is a corner of the first pixel, not its centre.
     """
     u, v = sighting.corners_px[0::2], sighting.corners_px[1::2]
     corners = [fox.Point2(x=a + 0.5, y=b + 0.5) for a, b in zip(u, v, strict=False)]

@@ -150,8 +150,9 @@ def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike)
 
 
 def shapes_apart_m(scenario: FlightScenario, *places: tuple[int, ArrayLike]) -> float:
-    """Return the distance (m) between the shapes of two chasers at offsets (3,), TRF: ``places``
-    are (chaser, offset).
+    """Return the distance (m) between the shapes of two chasers.
+
+    ``places``: chaser and offset (3,), TRF, of each.
     """
     one, other = (_reference_pose(scenario, i, offset_m) for i, offset_m in places)
     return distance_between(box_table(scenario.chaser.boxes()), one, other)
@@ -412,8 +413,9 @@ def _check_latched(scenario: Scenario) -> None:
 
 
 def _check_load_limits(scenario: Scenario) -> None:
-    """Check that the ports carry what the tumble at the start exerts once their chaser is latched,
-    with nominal masses.
+    """Check that the ports carry the load of the tumble at the start, once their chaser is latched.
+
+    With nominal masses.
     """
     if scenario.docking.kind != "capture":
         return

@@ -55,11 +55,11 @@ def read_surface(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 
 
 
 def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0)) -> MeshFile:
-    """Read a mesh file; ``scale`` is the factor to metres, ``origin_m`` the point of the file that
-    becomes the origin.
+    """Read a mesh file.
 
-    Raises ScenarioError with one line for a file that is not a mesh, is not closed, or has an
-    absurd size.
+    ``scale``: factor from the file's unit to metres. ``origin_m``: point of the file that becomes
+    the origin. Raises ScenarioError with one line for a file that is not a mesh, is not closed, or
+    has an absurd size.
     """
     scene, notes = _load(path), []
     parts = [
@@ -163,8 +163,9 @@ def _part(
 
 
 def _welded(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
-    """Join vertices of one place, which files split at creases, round them to 32 bits, and drop
-    triangles without area.
+    """Join vertices at one place, and drop triangles without area.
+
+    Files split vertices at creases. Coordinates are rounded to 32 bits.
     """
     vertices = vertices.astype(np.float32).astype(float)
     grain = max(float(np.ptp(vertices, axis=0).max()) * _WELD_SHARE, 1e-12)
@@ -243,8 +244,9 @@ def _has_colour(material: Any) -> bool:
 
 
 def _of_pbr(label: str, given: Any, share: float) -> Material:
-    """Return a material of metallic-roughness shading: a metal reflects mostly in its highlight,
-    whose exponent is 2 / r^4 - 2.
+    """Return the material of metallic-roughness shading.
+
+    A metal reflects mostly in its highlight, whose exponent is 2 / r^4 - 2 at the roughness r.
     """
     factor = given.baseColorFactor
     grey = 1.0 if factor is None else _grey(np.asarray(factor, dtype=float)[None, :3] / 255.0)

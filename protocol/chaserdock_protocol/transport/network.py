@@ -206,8 +206,9 @@ class Machine:
         return end
 
     def finish_startup(self) -> None:
-        """Exclude the objects created so far from garbage collection, which would otherwise pause
-        the flight for some 10 ms.
+        """Exclude the objects created so far from garbage collection.
+
+        It would otherwise pause the flight for some 10 ms.
         """
         gc.collect()
         gc.freeze()

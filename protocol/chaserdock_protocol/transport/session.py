@@ -171,8 +171,9 @@ def ignore_foreign_publishers(
 
 
 def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
-    """Make a node ignore messages on the world's keys that are not the world's, and publish a
-    warning about each session.
+    """Make a node ignore messages of other sessions on the world's keys.
+
+    Publishes a warning about each such session.
     """
 
     def warn(detail: str, newest: Message | None) -> None:

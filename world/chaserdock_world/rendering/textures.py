@@ -41,11 +41,11 @@ def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
 
 
 def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marker, Array, int]]:
-    """Return the markers on one face of a box, each with its centre (2,) in the face's axes (x
-    right, y up; metres) and the number of counter-clockwise quarter turns of its image.
+    """Return the markers on one face of a box, with their places and rotations.
 
-    Raises ValueError for a marker in the face's plane whose rotation is not a multiple of a quarter
-    turn.
+    Place: centre (2,) in the face's axes (x right, y up; m). Rotation: number of counter-clockwise
+    quarter turns of the marker's image. Raises ValueError for a marker in the face's plane whose
+    rotation is not a multiple of a quarter turn.
     """
     found = []
     q_box_face = face_rotation(face)

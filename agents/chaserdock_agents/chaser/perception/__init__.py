@@ -45,11 +45,12 @@ class FarPerception:
 
 
 def make_perception(scenario: FlightScenario, single_images: bool = False) -> PerceptionMethod:
-    """Return the perception that the scenario names: a built-in one, or an installed
-    ``chaserdock.perceptions`` entry point, a function of (camera: Camera, target: TargetModel).
+    """Return the perception that the scenario names.
 
-    ``single_images``: images do not follow each other, so that an acquisition ends in the image in
-    which it begins. Raises PluginError for a perception that is not installed.
+    It is built in, or an installed ``chaserdock.perceptions`` entry point, which is a function of
+    (camera: Camera, target: TargetModel). ``single_images``: images do not follow each other, so
+    that an acquisition ends in the image in which it begins. Raises PluginError for a perception
+    that is not installed.
     """
     camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:

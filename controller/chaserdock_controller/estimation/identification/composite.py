@@ -488,7 +488,9 @@ class CompositeIdentification:
         )
 
     def target(self, body: RigidBody) -> MassProperties:
-        """Return the mass properties of the target alone. ``body``: mass properties of each chaser."""
+        """Return the mass properties of the target alone. ``body``: mass properties of each
+        chaser.
+        """
         return detach(self.stack, [c.mounting for c in self.members], body)
 
     @property

@@ -26,7 +26,8 @@ _KEPT_S = 15.0
 _SAVE_EVERY_S = 1.0
 """Time, s, between two saved states. The filter repeats at most this much more than needed."""
 _UNCERTAIN_S = 2.0
-"""Time, s, before the likeliest begin of a failure in which the thruster may already have failed.
+"""Time, s, before the likeliest begin of a failure in which the thruster may already have
+failed.
 """
 _CLOSING_S = 0.4
 """Time, s, after a detection in which the shut-off valve may still be open."""

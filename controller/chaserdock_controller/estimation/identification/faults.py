@@ -69,7 +69,9 @@ class StackFaultDetector:
         return DetectorState(self._signatures.copy(), self.gains.copy(), self._ticks.copy())
 
     def load(self, state: DetectorState) -> None:
-        """Replace the state by a saved one. Raises ValueError if that belongs to other thrusters."""
+        """Replace the state by a saved one. Raises ValueError if that belongs to other
+        thrusters.
+        """
         if state.signatures.shape != self._signatures.shape or not (
             len(state.gains) == len(state.ticks) == len(self.gains)
         ):

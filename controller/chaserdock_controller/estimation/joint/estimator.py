@@ -97,7 +97,9 @@ class JointEstimator(Estimator):
         return state.shape, state.covariance[-SHAPE:, -SHAPE:]
 
     def update(self, inputs: EstimatorInputs) -> Estimate:
-        """Process a tick. Sightings and odometry of ticks that are no longer buffered are ignored."""
+        """Process a tick. Sightings and odometry of ticks that are no longer buffered are
+        ignored.
+        """
         records = self._buffer.records
         record = FilterTick(
             time_ns=inputs.time_ns,
@@ -267,7 +269,9 @@ class JointEstimator(Estimator):
 
 @lru_cache(maxsize=64)
 def _pose_rows(chasers: tuple[int, ...]) -> IntArray:
-    """Return the rows (n, 12) of a covariance that hold the poses of the target and of each chaser."""
+    """Return the rows (n, 12) of a covariance that hold the poses of the target and of each
+    chaser.
+    """
     ids = np.array(chasers, dtype=np.int64)
     poses = np.broadcast_to(POSE, (len(ids), 6))
     return np.concatenate([poses, TARGET + CHASER * ids[:, None] + POSE], axis=1)

@@ -156,7 +156,9 @@ def _target_difference(a: JointState, b: JointState) -> Array:
 def count_measurements(
     state: FilterState, accepted: Sequence[int], rejected: Sequence[int]
 ) -> FilterState:
-    """Return the state with the chasers whose measurements were accepted or rejected at its time."""
+    """Return the state with the chasers whose measurements were accepted or rejected at its
+    time.
+    """
     return replace(
         state,
         last_accepted_ns=state.time_ns if accepted else state.last_accepted_ns,

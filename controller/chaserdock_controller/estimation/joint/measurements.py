@@ -103,7 +103,9 @@ def linearize(state: JointState, z: kernels.NativeMeasurement) -> LinearizedMeas
 
 
 def odometry_noise(odometry: Odometry, p: JointParameters) -> Array:
-    """Return the covariance (12, 12) of the white noise of odometry: the stated one plus the floor."""
+    """Return the covariance (12, 12) of the white noise of odometry: the stated one plus the
+    floor.
+    """
     floors = (p.floor_position_m, p.floor_velocity_m_s, p.floor_attitude_rad, p.floor_omega_rad_s)
     stated = (
         odometry.position_covariance_m2,

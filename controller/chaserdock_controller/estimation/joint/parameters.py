@@ -34,8 +34,8 @@ SciPy).
 """
 TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-5, 1e-5)}
 """Process noise of the target by motion model: square roots of the spectral densities of white
-acceleration (m/s²/√Hz) and angular acceleration (rad/s²/√Hz). A free target has none; the values
-bound the filter's memory.
+acceleration (m/s²/√Hz) and angular acceleration (rad/s²/√Hz). A free target has none; the
+values bound the filter's memory.
 """
 
 

@@ -161,7 +161,7 @@ class ChaserMachine:
                 self._activities |= dict.fromkeys(activity.phases, activity)
                 self._answering |= dict.fromkeys(activity.commands, activity)
 
-    # -- phase changes -------------------------------------------------------------------------------
+    # -- phase changes -----------------------------------------------------------------------------
 
     def fire(
         self, trigger: Trigger, now_s: float, reason: str = "", place_m: Array | None = None
@@ -289,7 +289,7 @@ class ChaserMachine:
         assert self.position_m is not None
         return stay(self.position_m, now_s)
 
-    # -- conditions for plan and commands -------------------------------------------------------------
+    # -- conditions for plan and commands ----------------------------------------------------------
 
     def is_attached(self, known: ChaserTick) -> bool:
         """Return whether the chaser is latched and is to stay, or cannot leave. Its actuators are

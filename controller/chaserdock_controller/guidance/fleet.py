@@ -129,7 +129,7 @@ class ChaserFleet:
             return chaser.thrusters.command(command, now_s)
         return chaser.command(command, now_s)
 
-    # -- who blocks whom ------------------------------------------------------------------------------
+    # -- who blocks whom ---------------------------------------------------------------------------
 
     def goals_besides(self, chaser: ChaserMachine) -> dict[int, Array]:
         """Return the goals (3,), TRF, of the other chasers after the commands of this tick."""

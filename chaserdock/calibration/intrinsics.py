@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration of camera matrix and distortion from images of a board, with OpenCV.
+"""Calibrates camera matrix and distortion from images of a board, with OpenCV.
 
-Outlier images are excluded and named: those with an RMS error above three times the median and
-above half a pixel. This does not compensate for a board that is not flat.
+Outlier images are excluded and named: those whose RMS error exceeds three times the median and half
+a pixel. This does not compensate for a board that is not flat.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 LEAST_IMAGES = 6
-"""Usable images: twice the three that determine a camera matrix (Z. Zhang, 2000), for distortion
-and for outliers."""
+"""Least number of usable images: twice the three that determine a camera matrix (Z. Zhang, 2000),
+to cover distortion and outliers.
+"""
 _LEAST_CORNERS = 8
-"""Corners in an image: twice the four that determine the pose of a plane."""
+"""Least number of corners in an image: twice the four that determine the pose of a plane."""
 _OUTLIER_RATIO, _OUTLIER_PX = 3.0, 0.5
 """RMS error of an outlier: above this multiple of the median, and above this many pixels, which
-sharp corners do not reach."""
+sharp corners do not exceed.
+"""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -39,8 +41,8 @@ class TooFew(Exception):
 
 @dataclass(frozen=True)
 class Board:
-    """A calibration board. ``points_m`` (n, 3): inner corners, in board axes. ``charuco``: OpenCV's
-    board; None for a chessboard, which has ``size`` corners.
+    """A calibration board. ``points_m`` (n, 3): inner corners, board axes. ``charuco``: OpenCV's
+    board. A chessboard has None there and ``size`` corners.
     """
 
     points_m: NDArray[np.float32]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Input of one process from a log, tick by tick."""
+"""Reads the input of one process from a log, tick by tick."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from chaserdock_protocol.scenario import Scenario, flight_scenario_json
 from chaserdock_protocol.topics import Role, Topic
 from chaserdock_protocol.transport import RawSample
 
-# Generous bound on the delay of messages at a recorder in a lock-step flight, in ticks.
+# Bound on the delay of messages at a recorder in a lock-step flight, in ticks; generous.
 _LATE_TICKS = 64
 
 
 class CheckError(ChaserdockError):
-    """A check is impossible with the given arguments."""
+    """The given process, log or command cannot be checked."""
 
 
 @dataclass
 class RecordedTick:
-    """One recorded tick: the world's messages in ``opening``, the answers of the other processes in
-    ``answers``.
+    """One recorded tick. ``opening``: the world's messages. ``answers``: those of the other
+    processes.
 
-    ``exposure_ns``: the time of the process' own image, None without one.
+    ``exposure_ns``: time of the process' own image, None without one.
     """
 
     tick: Tick

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lower bound of the transient tracking error: the optimum under the actuators' limits, for any
-controller.
+"""Lower bound of the transient tracking error for any controller: the optimum under the actuators'
+limits.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.rotations import rotate
 
-# Three-point Gauss: exact for the fourth-degree square of a parabola.
+# Three-point Gauss quadrature is exact for the fourth-degree square of a parabola.
 _GAUSS = ((0.5 - np.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(0.15), 5 / 18))
 
 

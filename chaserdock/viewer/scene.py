@@ -24,12 +24,16 @@ from .snapshot import MissionState, Pose, pose_of
 
 ViewFrom = Literal["beside the target", "on the target", "the world"]
 VIEWS: tuple[ViewFrom, ...] = get_args(ViewFrom)
-"""Frame fixed on the screen: world axes at the target's position; target frame; world frame."""
+"""Frames that can be fixed on the screen: world axes at the target's position; target frame; world
+frame.
+"""
 
 TRAIL_S = 60.0
-"""Time (s) of the path behind each chaser. Chosen."""
+"""Time (s) of the path drawn behind each chaser. Larger: more of the manoeuvre, more crossing
+lines.
+"""
 _VIEW_M = 0.22
-"""Length (m) of the drawn field of view of a camera. Chosen."""
+"""Length (m) of the drawn camera frustum; for display only, about the size of a chaser."""
 _STARS_M = 100.0
 """Distance of the stars, m: far outside the scene."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -40,7 +44,7 @@ def _rgb(colour: str) -> tuple[int, int, int]:
 
 
 class SceneView:
-    """Scene of one mission. The pose of the root node ``/scene`` realizes the fixed frame."""
+    """Scene of one mission. The pose of the root node ``/scene`` keeps the chosen frame fixed."""
 
     def __init__(self, server: viser.ViserServer, scenario: FlightScenario) -> None:
         self._scenario = scenario
@@ -111,7 +115,7 @@ class SceneView:
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
 
     def _add_space(self) -> None:
-        """Add the stars of the simulated images on black, whatever the theme of the page."""
+        """Add the stars of the simulated images, on black whatever the theme of the page."""
         self._scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
         directions, levels = star_field()
         self._scene.add_point_cloud(

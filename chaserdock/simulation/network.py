@@ -380,7 +380,9 @@ class SimulatedHost:
         return EPOCH_NS + round(self.now_s() * 1e9)
 
     def pause(self, timeout_s: float | None, over: Callable[[], bool] = lambda: False) -> None:
-        """Wait for a time of the host's clock, or until ``over``; the task is woken for that."""
+        """Wait for a time of the host's clock or until ``over``, which is tested whenever the task
+        is woken.
+        """
         end_s = None if timeout_s is None else self._scheduler.now_s + timeout_s / self._rate
         while not over() and (end_s is None or self._scheduler.now_s < end_s):
             self._scheduler.pause(None if end_s is None else end_s - self._scheduler.now_s)

@@ -47,7 +47,7 @@ OF_CHASERS = (
     topics.SAFETY,
 )
 OF_ALL = (topics.TICK, topics.TARGET, topics.STACK, topics.SOLVER, topics.END)
-"""Topics of the state: of each chaser (OF_CHASER), of the mission (OF_ALL). Within a tick their
+"""Topics of the state: of each chaser (OF_CHASERS), of the mission (OF_ALL). Within a tick their
 order is causal.
 """
 

@@ -24,7 +24,7 @@ fails.
 OPENED_TICKS = 200
 """Ticks whose opening times are kept: more than a frozen world opens at once when it continues."""
 GAP_S = 1.1
-"""Pause of commands (s), at a hand-over, after which they count as published anew: 1 s, which a new
+"""Pause (s) of published commands after which the time to fly one starts again: 1 s, which a new
 holder of leases has for its first command (docs/redundancy.md), plus a tick of 10 Hz.
 """
 PLAN_SHARE = 1e-3

@@ -238,6 +238,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
     """
     success, changes, skipped = scenario.success, {}, []
     end_s = min(scenario.steady_until_s or scenario.duration_s, scenario.duration_s)
+
     for name, from_s, until_s in (
         ("steady_position_rms_m", scenario.settling_s, end_s),
         ("steady_orientation_rms_deg", scenario.settling_s, end_s),
@@ -249,6 +250,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
             skipped.append(
                 f"success.{name}: the flight ends at {until_s:g} s, settling_s is {from_s:g} s"
             )
+
     for name, command in (("docked", "approach"), ("latched", "approach"), ("reached", "goto")):
         late = {
             i: first_s
@@ -263,6 +265,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
                 f"its {command} is at {first_s:g} s"
                 for i, first_s in late.items()
             ]
+
     if late := _late_arrivals(scenario):
         assert success.arrival is not None
         left = tuple(i for i in success.arrival.chasers if i not in late)
@@ -272,6 +275,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"is at {first_s:g} s"
             for i, first_s in late.items()
         ]
+
     first_s = min((e.at_s for e in scenario.timeline if e.command == "detumble"), default=None)
     if success.detumbled is not None and first_s is not None and first_s >= scenario.duration_s:
         changes["detumbled"] = None
@@ -279,6 +283,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"success.detumbled: the flight ends at {scenario.duration_s:g} s, detumble is at "
             f"{first_s:g} s"
         )
+
     return scenario.model_copy(update={"success": success.model_copy(update=changes)}), skipped
 
 

@@ -517,12 +517,15 @@ def load_flight(log: LogSource) -> RecordedFlight:
     c = _Collector()
     for record in read_log(log):
         c.add(record)
+
     digest = hashlib.sha256()
     for key in sorted(c.hashes):
         digest.update(f"{key} {c.hashes[key]:064x}\n".encode())
+
     rejected: Counter[str] = Counter()
     for health in c.health.values():
         rejected.update(health.rejected)
+
     solves = c.solves.table()
     return RecordedFlight(
         scenario=scenario,

@@ -74,6 +74,7 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
     rows = np.arange(0, len(target.time_s), max(1, -(-len(target.time_s) // _MOST_SAMPLES)))
     if rows[-1] != len(target.time_s) - 1:
         rows = np.append(rows, len(target.time_s) - 1)
+
     chasers, reach_m = [], 0.3
     for i in flight.flown:
         own = flight.truth[f"chaser/{i}"]
@@ -82,6 +83,7 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
         distance = np.linalg.norm(own.position_m[mine] - target.position_m[mine], axis=1)
         # Distant chasers must not shrink all others.
         reach_m = max(reach_m, min(float(distance.max()), 3.0))
+
         outcomes = traces.image_outcomes.get(i)
         reference = flight.references.get(i)
         chasers.append(
@@ -97,6 +99,7 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
                 "error_mm": [float(f"{1e3 * e:.3g}") for e in position[mine]],
             }
         )
+
     scene = scene_of(flight.scenario)
     return {
         "times": _numbers(target.time_s[rows], 3),

@@ -190,14 +190,17 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         if body.mesh
         else box_faces(Box(body.size_m, shade=0.42))
     )
+
     mesh = scenario.target.nominal_mesh(_FACET_M)
     target = (
         [face for box in model.boxes for face in box_faces(box, model)]
         if mesh is None
         else mesh_faces(mesh)
     )
+
     if body.probe_reach_m > front:
         chaser += _probe(front, body.probe_reach_m)
+
     camera = scenario.camera_model()
     edges = (
         (0, 0),
@@ -205,6 +208,7 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         (camera.width_px, camera.height_px),
         (0, camera.height_px),
     )
+
     rays = [
         [
             (u - camera.cx_px) / camera.fx_px * view_m,
@@ -213,6 +217,7 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         ]
         for u, v in edges
     ]
+
     origin = np.array(camera.position_crf_m)
     corners = rotations.rotate(camera.q_crf_irf_wxyz, np.array(rays)) + origin
     return Scene(

@@ -261,6 +261,7 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
     s = flight.scenario
     chasers: dict[str, dict[str, Any]] = {}
     until = s.steady_until_s or s.duration_s
+
     for i in flight.flown if "target" in flight.truth else ():
         name = f"chaser/{i}"
         time_s, position, angle = tracking_errors(flight, i)
@@ -283,6 +284,7 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             "thruster_impulse_N_s": flight.thruster_impulse_N_s[name],
             "propellant_kg": flight.propellant_kg[name],
         }
+
         relative = _pose_figures(relative_errors(flight, i), s.settling_s)
         if relative["nees_mean"] is not None:
             chasers[str(i)]["relative_estimate"] = relative
@@ -292,13 +294,16 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             chasers[str(i)]["rendezvous"] = found
         if i in flight.safety:
             chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
+
     between = [
         float(flight.truth[f"chaser/{i}"].distance_to(flight.truth[f"chaser/{j}"]).min())
         for i, j in combinations(flight.flown, 2)
     ]
+
     errors = estimate_errors(flight)
     late = errors["time_s"] >= s.settling_s
     end_s = float(flight.truth["target"].time_s[-1]) if "target" in flight.truth else 0.0
+
     result: dict[str, Any] = {
         "scenario": s.name,
         "seed": s.seed,
@@ -335,10 +340,12 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "rejected": flight.rejected,
         "digest": flight.digest,
     }
+
     if flight.plumes:
         result["plumes"] = {body: asdict(totals) for body, totals in sorted(flight.plumes.items())}
     if (stack := stack_rest(flight)) is not None:
         result["stack"] = stack
+
     judged, result["not_judged"] = judged_criteria(s)
     result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
@@ -379,6 +386,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         out.append(f"ended at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
     if result["collisions"] > s.success.max_collisions:
         out.append(f"{result['collisions']} collisions, at most {s.success.max_collisions} allowed")
+
     nearest = result["min_distance_chasers_m"]
     if (
         s.success.keep_distances
@@ -389,6 +397,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             f"two chasers came within {nearest:.3f} m; the limit is "
             f"{s.limits.min_distance_chasers_m:g} m"
         )
+
     for i, c in result["chasers"].items():
         distance = c["min_distance_target_m"]
         limit = nearest_allowed_m(s, int(i))
@@ -410,6 +419,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             s.success.steady_orientation_rms_deg,
             "deg",
         )
+
     out += capture_failures(result, s)
     out += overloads(result, s)
     out += rest_failures(result, s)

@@ -79,9 +79,11 @@ def write_video(
         )
     if not part_s[0] < part_s[1]:
         raise ChaserdockError(f"a video from {part_s[0]:g} s to {part_s[1]:g} s has no length")
+
     flight = load_flight(log)
     if "target" not in flight.truth:
         raise LogError(f"{log}: holds no motion of the target; nothing to film")
+
     number = 0
     with errors_of_writing(out), av.open(str(out), "w") as container:
         stream: Any = container.add_stream(_CODECS[ending], rate=fps)
@@ -92,6 +94,7 @@ def write_video(
             stream.options = {"crf": "21", "preset": "medium", "movflags": "+faststart"}
         elif ending == ".webp":
             stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
+
         for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
             report_progress(time_s)
             image = av.VideoFrame.from_ndarray(frame, format="bgr24")
@@ -100,6 +103,7 @@ def write_video(
             number += 1
         if number:
             container.mux(stream.encode())
+
     if not number:
         out.unlink(missing_ok=True)
         after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
@@ -181,15 +185,18 @@ class _ExternalView:
         self.scene = scene_of(flight.scenario)
         sun = np.array(to_sun(flight.scenario))
         self.sun = sun / np.linalg.norm(sun)
+
         self.numbers = flight.flown
         self.target = target = flight.truth["target"]
         self._verdict = "success" if summary_of(flight)["success"] else "not successful"
+
         self._begin_s, self._end_s = part_s[0], min(float(target.time_s[-1]), part_s[1])
         self._span_s = max(self._end_s - self._begin_s, 1e-3)
         self._sky: BgrImage | None = None
         self._mesh = flight.scenario.target.nominal_mesh()
         self._renderers: dict[tuple[int, int], BodyRenderer] = {}
         self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
+
         reach, distances, speeds = 0.3, {}, {}
         for i, own in self.chasers.items():
             away_m = own.distance_to(target)
@@ -202,6 +209,7 @@ class _ExternalView:
         self._graphs = (_graph("distance / m", distances), _graph("closing / mm/s", speeds))
         # Distant chasers must not shrink all others.
         self.distance_m = 3.5 * min(reach, 3.0)
+
         self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
         self.phases = {
             i: flight.references[i].phases if i in flight.references else [] for i in self.numbers

@@ -122,6 +122,7 @@ def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Cali
     views: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
     shapes = [p.shape for p in images.values() if p is not None]
     usual = max(sorted(set(shapes)), key=shapes.count) if shapes else (0, 0)
+
     for name, image in images.items():
         if image is None:
             excluded[name] = "not an image"
@@ -133,22 +134,27 @@ def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Cali
                 excluded[name] = f"{len(px)} corners of the board found, {_LEAST_CORNERS} needed"
             else:
                 views[name] = (points, px)
+
+    # Calibrate without the worst image until none is an outlier.
     while True:
         if len(views) < LEAST_IMAGES:
             reasons = "".join(f"\n{name}: {reason}" for name, reason in excluded.items())
             raise TooFew(f"{len(views)} usable images, at least {LEAST_IMAGES} are needed{reasons}")
+
         points = [v[0] for v in views.values()]
         px = [v[1] for v in views.values()]
         size = (usual[1], usual[0])
         # The type stubs require initial matrices, which OpenCV treats as optional.
         solve: Any = cv2.calibrateCameraExtended
         total, matrix, lens, _, _, sigma, _, each = solve(points, px, size, None, None)
+
         rms = dict(zip(views, np.ravel(each).tolist(), strict=True))
         worst = max(rms, key=lambda name: rms[name])
         if rms[worst] <= max(_OUTLIER_RATIO * float(np.median(list(rms.values()))), _OUTLIER_PX):
             break
         excluded[worst] = f"outlier: RMS error {rms[worst]:.2f} px"
         del views[worst]
+
     return Calibration(
         usual[1],
         usual[0],

@@ -134,6 +134,7 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
                 turns[message.tick] = RecordedTick(message)
         exposure_ns = message.sim_time_ns if isinstance(message, Image) else None
         waiting.setdefault(message.tick, []).append((inputs.index(record.topic), raw, exposure_ns))
+
     played = []
     for tick in range(most):
         if tick not in turns:
@@ -143,11 +144,13 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
             (turn.opening if inputs[rank].writer == "world" else turn.answers).append(raw)
             turn.exposure_ns = exposure_ns if exposure_ns is not None else turn.exposure_ns
         played.append(turn)
+
     if not played:
         raise CheckError(
             f"{log}: its first tick expects no answer of {process}; give a log that begins at tick "
             "0"
         )
+
     return Recorded(scenario, flight_scenario_json(scenario), played)
 
 

@@ -105,12 +105,15 @@ class InProcessMission:
         ideal = scenario.chaser.actuation == "ideal"
         if not ideal and (actuator_gain != 1.0 or solve_delay_s is not None):
             raise ValueError('actuator_gain and solve_delay_s need chaser.actuation = "ideal"')
+
         self.scenario = scenario
         self.perception = perception
         self.chasers = range(len(scenario.chasers))
+
         estimator = PerfectEstimator(scenario.target) if perception is None else None
         flight = flight_scenario(scenario)
         self.controller = ControllerCore(flight, time.perf_counter, estimator)
+
         self.physics = Physics(scenario)
         self.actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in self.chasers}
         rendered = perception.visions if isinstance(perception, RenderedImages) else None
@@ -123,12 +126,14 @@ class InProcessMission:
             )
             for i in self.chasers
         ]
+
         self.tick = 0
         self.contacts: set[tuple[str, str]] = set()
         self.touches: list[ProbeTouch] = []
         self.events: list[tuple[float, str, str]] = []
         self.thruster_events: list[tuple[float, int, str]] = []
         self.propellant_kg = 0.0
+
         self._gain, self._solve_delay_s = actuator_gain, solve_delay_s
         self._busy_until_ns = 0
         self._odometry_sensor = OdometrySensor(scenario)

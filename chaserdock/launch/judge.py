@@ -47,22 +47,26 @@ def judge_mission(
         mission = join(node, node.host.unique_id(), stop, timeout_s)
         if mission is None:
             return STOPPED
+
         folder = out / run_name(mission)
         full = request_scenario(node, mission, stop)
         if full is None:
             return STOPPED
         scenario = scenario_from_json(full, "the world's scenario")
+
         reporter = ProgressReporter(scenario, show)
         # Keys differ between the parties of a mission on several hosts: each has its own folder.
         address = MissionAddress(namespace=link.namespace, endpoint=",".join(link.connect))
         reporter.report(start_line(scenario, mission.mode, folder, address))
         ignore_foreign_publishers(node, mission.source, reporter.report_foreign)
+
         try:
             failure = _watch(node, reporter, stop, world_timeout_s)
         finally:
             reporter.close()
         if stop():
             return STOPPED
+
         log = folder / LOG_NAME
         if not log.exists():
             raise JudgeError(
@@ -73,6 +77,7 @@ def judge_mission(
                 failure
                 or f"the recorder did not close its log within {LOG_CLOSED_S:g} s after the end"
             )
+
         outcome = judge(Fleet(), folder, failure, reporter)
         print_outcome(outcome, show)
         _write_page(log)

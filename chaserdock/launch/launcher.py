@@ -292,6 +292,7 @@ def fly_mission(
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
     require_packages(scenario)
+
     folder = folder or _new_folder(path.stem)
     output = folder / "processes"
     if keys is not None:
@@ -302,16 +303,20 @@ def fly_mission(
         raise RunError(
             f"{folder} contains a mission.mcap; a log is never overwritten, choose another --out"
         )
+
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{folder}: cannot be created: {error.strerror or error}") from None
+
     namespace = namespace or f"run-{uuid.uuid4().hex[:12]}"
     # After the lease a silent peer counts as lost. In lock-step the mission waits for a stopped
     # process instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
+
     fleet, observers, hub = Fleet(), Fleet(), None
     reporter = ProgressReporter(scenario, show, emit)
+
     try:
         if keys is not None:
             keys = keys.resolve()
@@ -320,15 +325,18 @@ def fly_mission(
             )
         else:
             hub, endpoint = open_hub(namespace, lease_ms, port=port)
+
         address = MissionAddress(
             namespace=namespace, endpoint=endpoint, keys=None if keys is None else str(keys)
         )
         write_address(folder, address)
         reporter.report(start_line(scenario, mode, folder, address))
         reporter.refresh()
+
         network = network_options(namespace, endpoint, lease_ms, keys)
         if viewer_port is not None:
             observers.start("viewer", ["view", "--port", str(viewer_port), *network], output)
+
         stall = ["--stall-s", f"{stall_s:g}"]
         start_all(fleet, scenario, path, folder, mode, overrides, [*network, *stall])
         failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
@@ -409,16 +417,19 @@ def watch(
     """
     hub.subscribe(topics.END)
     reporter.subscribe(hub)
+
     stopping = False
     measured_s = 0.0
     silence = StallTimer(time.monotonic)
     end: MissionEnd | None = None
     world: str | None = None
+
     while end is None:
         if world is None and (world := find_world(hub)) is not None:
             ignore_foreign_publishers(hub, world, reporter.report_foreign)
         if world is None:
             time.sleep(0.1)  # messages wait: it is unknown whether the world sent them
+
         received = None if world is None else hub.receive(0.1)
         if not reporter.flying or (received is not None and received.topic is topics.TICK):
             silence.reset()
@@ -426,19 +437,24 @@ def watch(
             reporter.update(received.message)
             if isinstance(received.message, MissionEnd):
                 end = received.message
+
         reporter.refresh()
+
         if time.monotonic() - measured_s > 2.0:
             measured_s = time.monotonic()
             fleet.measure()
+
         if stop_requested() and not stopping:
             stopping = True
             reporter.print_text("stopping: the log is being closed")
             fleet.children[0].process.send_signal(signal.SIGTERM)
+
         failure = None if end is not None else _premature_end(fleet, reporter, stopping)
         if silence.update() > silent_s and end is None:
             failure = f"world: hangs; no tick for {silence.waited_s:.0f} s"
         if failure is not None:
             return failure
+
     fleet.wait(_END_TIMEOUT_S)
     return STOPPED_BY_OPERATOR if stopping else _failure_at_end(fleet, end)
 

@@ -72,12 +72,14 @@ def info_of(log: LogSource) -> LogInfo:
     rejected: Counter[str] = Counter()
     files: list[FileInfo] = []
     viewer, sent = 0, [0, 0]
+
     for path in log_files(log):
         state = FileState()
         for channel, stored in stored_messages(path, state):
             if channel.topic.startswith(VIEWER_PREFIX):
                 viewer += 1
                 continue
+
             key = keys.get(channel.topic)
             time_s = stored.log_time / 1e9
             if key is None:
@@ -89,14 +91,17 @@ def info_of(log: LogSource) -> LogInfo:
                 min(sent[0] or stored.publish_time, stored.publish_time),
                 max(sent[1], stored.publish_time),
             ]
+
             seq = _seq_of(
                 channel.topic, stored.data, channel.metadata.get("zenoh_encoding", ""), rejected
             )
             if seq is not None:
                 gaps.update(channel.topic, seq)
                 key.lost = gaps.lost[channel.topic]
+
         size = path.stat().st_size
         files.append(FileInfo(str(path), size, state.closed, state.cut_bytes, state.recovered))
+
     return LogInfo(
         scenario=scenario.name,
         seed=scenario.seed,

@@ -69,6 +69,7 @@ def simulate(
     conditions = scenario.simulation
     lockstep = conditions.mode == "lockstep"
     network = SimulatedNetwork(scheduler, conditions, scenario.seed, lockstep, tap)
+
     options = ProcessOptions(
         link=Link(network=network),
         scenario=path,
@@ -79,6 +80,7 @@ def simulate(
         compressed_log=False,  # it is read once, if at all
         signals=False,
     )
+
     printed = io.StringIO()
     collecting = gc.isenabled()
     gc.disable()
@@ -92,6 +94,7 @@ def simulate(
     finally:
         if collecting:
             gc.enable()
+
     return SimulatedFlight(
         folder=folder,
         statuses={t.name: None if t.killed else t.result for t in tasks if t.name not in stalled},

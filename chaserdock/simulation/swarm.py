@@ -108,11 +108,13 @@ def draw_case(
         len(scenario.chasers),
         scenario.duration_s,
     )
+
     case: Case = {"extends": name, "name": f"seed-{seed}", "seed": seed % 2**32}
     if not images:
         case["perception"] = {"name": "statistical"}
     standby = scenario.controller.standby or draw.random() < 0.5
     case["controller"] = {"standby": standby}
+
     kinds = [kind for kind in KINDS if draw.random() < 0.25]
     ports = [i for i in range(chasers) if scenario.docking.port_of(i) is not None]
     kinds += [kind for kind in LATCH_KINDS if ports and draw.random() < 0.25]
@@ -124,6 +126,7 @@ def draw_case(
         if standby and fault["process"] == "controller" and draw.random() < 0.3:
             fault["process"] = "standby"
     case["fault"] = faults
+
     case["simulation"] = _draw_network(draw, chasers, end_s, standby)
     if mode is not None:
         case["simulation"]["mode"] = mode
@@ -131,12 +134,15 @@ def draw_case(
         case["truth"] = truth
     if commands := _draw_commands(draw, scenario):
         case["timeline"] = commands
+
     devices = random.Random(f"devices {seed}")
     faults += _draw_device_faults(devices, scenario)
     if failures := _draw_thruster_failures(devices, scenario):
         case["thruster_failure"] = failures
+
     # A stream of its own, so that other seeds fly as they did before this fault existed.
     faults += _draw_other_faults(random.Random(f"others {seed}"), scenario, standby)
+
     if seed % LONG_EVERY == 0:
         case["duration_s"] = _long_enough_s(case, scenario)
     return case

@@ -52,6 +52,7 @@ class SceneView:
         scene.configure_default_lights(cast_shadow=False)
         self._root = scene.add_frame("/scene", show_axes=False)
         self._add_space()
+
         bodies = scene_of(scenario)
         self._target = self._body("/scene/target", shapes.mesh_of(bodies.target))
         self._estimate = scene.add_frame("/scene/estimate", axes_length=0.25, axes_radius=0.003)
@@ -59,17 +60,20 @@ class SceneView:
         self._lines(
             "/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0
         )
+
         self._keep_out_m = scenario.limits.min_distance_target_m
         self._keep_out = self._lines(
             "/scene/estimate/keep_out", shapes.sphere(self._keep_out_m), (176, 118, 128), 1.0
         )
         self._keep_out.visible = False
+
         self._chasers: list[Any] = []
         self._plans: list[Any] = []
         self._references: list[Any] = []
         self._trails: list[Any] = []
         self._corridors: list[Any] = []
         self._frustums: list[Any] = []
+
         camera = scenario.camera_model()
         for i in range(len(scenario.chasers)):
             colour = _rgb(COLOURS[i % len(COLOURS)])
@@ -78,6 +82,7 @@ class SceneView:
             scene.add_label(
                 f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2])
             )
+
             self._frustums.append(
                 scene.add_camera_frustum(
                     f"{name}/camera",
@@ -92,6 +97,7 @@ class SceneView:
                     cast_shadow=False,
                 )
             )
+
             self._plans.append(
                 self._lines(f"/scene/plan_{i}", shapes.polyline(np.zeros((0, 3))), colour, 3.0)
             )
@@ -100,15 +106,18 @@ class SceneView:
                     f"/scene/reference_{i}", axes_length=0.08, axes_radius=0.0025, visible=False
                 )
             )
+
             trail = self._lines(
                 f"/scene/estimate/trail_{i}", shapes.polyline(np.zeros((0, 3))), colour, 1.0
             )
             self._trails.append(trail)
+
             corridor = shapes.corridor_of(scenario, i)
             if corridor is not None:
                 self._corridors.append(
                     self._lines(f"/scene/estimate/corridor_{i}", corridor, colour, 1.0)
                 )
+
         self.view: ViewFrom = VIEWS[0]
         far = 2.0 * max(math.hypot(*c.position_m) for c in scenario.chasers)
         server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)

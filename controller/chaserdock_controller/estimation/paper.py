@@ -221,6 +221,7 @@ class PaperEstimator(Estimator):
             for c, view in sorted(self._latest.items())
             if view.time_ns >= horizon
         }
+
         removed: set[int] = set()
         if len(views) > 2:
             middle = np.median([position for position, _ in views.values()], axis=0)
@@ -229,6 +230,7 @@ class PaperEstimator(Estimator):
                 for c, (x, _) in views.items()
                 if float(np.linalg.norm(x - middle)) > p.outlier_position_m
             }
+
             # Median attitude: the one with the smallest sum of angles to the others.
             centre = min(
                 views, key=lambda c: (sum(_angle(views[c][1], q) for _, q in views.values()), c)
@@ -236,8 +238,10 @@ class PaperEstimator(Estimator):
             removed |= {
                 c for c in views if _angle(views[centre][1], views[c][1]) > p.outlier_attitude_rad
             }
+
         self._rejected = tuple(sorted(removed & fresh))
         self._seen = len((views.keys() - removed) & fresh)
+
         kept = [views[c] for c in views if c not in removed]
         if kept:
             self._append(

@@ -85,9 +85,12 @@ class ReferenceBuilder:
         torque_free = s.target.motion == "torque_free"
         path, k = target_path(body, torque_free, start, step_s, self._stages), self._stages + 1
         nodes, middles = path.at(slice(k)), path.at(slice(k, None))
+
+        # References at the nodes and, for the feed-forward, at the middles of the stages.
         times_s = start.time_ns / 1e9 + np.arange(k, dtype=float) * step_s
         both_s = np.concatenate([times_s, times_s[:-1] + step_s / 2])
         (positions, velocities, accelerations), q_off = self._offsets(chasers, both_s, path)
+
         u_ref = np.zeros((len(chasers), self._stages, 6))
         if s.controller.feed_forward:
             u_ref = reference.feed_forward(
@@ -101,6 +104,7 @@ class ReferenceBuilder:
                 middles.alpha_rad_s2,
                 middles.acceleration_m_s2,
             )
+
         margins = self._margins_m(
             [start.covariance if r is None else r.covariance for r in relative]
         )
@@ -112,11 +116,13 @@ class ReferenceBuilder:
             for c, r, d in zip(chasers, relative, distances.tolist(), strict=True)
         ]
         distances = distances + np.minimum(margins, np.maximum(room, 0.0))
+
         boxes = clearance = None
         if self._boxes is not None:
             boxes = moved(self._boxes, nodes.positions_m, nodes.q_wxyz)
             kept = np.array([c.min_distance_shape_m() for c in chasers])
             clearance = np.where(kept > 0.0, kept + margins, 0.0)
+
         return HorizonReference(
             chasers=tuple(c.number for c in chasers),
             references=reference.references_on(

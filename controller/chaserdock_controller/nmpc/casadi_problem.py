@@ -170,10 +170,12 @@ def build_nlp(
         state = x
         variables += state if multiple else []
         inputs = [symbol(f"u_{i}_{k}", 6) for i in range(n)] if k < d else [ca.DM.zeros(6)] * n
+
         for i in range(n):
             aim = u_ref[i][:, k] if k < d else ca.DM.zeros(6)
             at = (state[i], references[i][:, k], targets[:, k], inputs[i], aim)
             cost += cost_of(*at, ca.DM(weights[k]))
+
         if k < d:
             variables += inputs
             x = [step(a, u) for a, u in zip(state, inputs, strict=True)]
@@ -183,6 +185,7 @@ def build_nlp(
                 constraints += [b - a for a, b in zip(propagated, x, strict=True)]
                 if k == 0:
                     constraints += [a - b for a, b in zip(state, x0, strict=True)]
+
         if k > 0:
             margin = margins_of(
                 ca.horzcat(*state),

@@ -159,18 +159,21 @@ def _build(
         .with_max_outer_iterations(1)
         .with_max_duration_micros(_NEVER_US)
     )
+
     build = (
         og.config.BuildConfiguration()
         .with_build_directory(str(cache))
         .with_build_mode("release")
         .with_build_python_bindings()
     )
+
     meta = og.config.OptimizerMeta().with_optimizer_name(name)
     cache.mkdir(parents=True, exist_ok=True)
     # opengen writes temporary files into the current folder.
     with contextlib.chdir(cache):
         builder = og.builder.OpEnOptimizerBuilder(problem, meta, build, solver)
         builder.with_verbosity_level(logging.WARNING).with_generate_not_build_flag(True).build()
+
     # opengen would compile the solver twice and its dependencies again for each problem.
     target = cache / "target"
     completed = subprocess.run(
@@ -182,6 +185,7 @@ def _build(
     )
     if completed.returncode:
         raise RuntimeError(f"cargo failed to compile the OpEn solver:\n{completed.stderr}")
+
     built = next(
         path for path in (target / "release").glob(f"*{name}.*") if path.suffix in _LIBRARY_SUFFIXES
     )

@@ -77,12 +77,14 @@ class OutputStage:
         """Return all messages of a tick."""
         o, out = observation, TickOutputs(target=target_message(observation, estimation))
         out.replies = list(guidance.replies)
+
         periodic = o.tick % self._scenario.time.rate_hz == 0
         if estimation.stack is not None and periodic:
             out.stack = stack_message(o, estimation.stack)
         shape, geometry = estimation.shape, None
         if shape is not None and (shape.changed or periodic):
             geometry = geometry_estimate(shape)
+
         events = [*o.events, *estimation.events, *guidance.events, *planning.events]
         chasers = [
             ChaserResult(*parts)
@@ -90,15 +92,18 @@ class OutputStage:
                 o.chasers, estimation.chasers, guidance.directives, planning.chasers, strict=True
             )
         ]
+
         for c in chasers:
             if c.estimate.own is not None:
                 command = self._command(o, estimation, guidance, c, c.estimate.own, out, events)
                 expected = self._expected(o, estimation, c.estimate)
                 out.wrenches[c.seen.chaser] = self._send(o, c, command, geometry, expected)
+
         for c in chasers:
             if c.seen.invalid:
                 command = self._coast(c, events)
                 out.wrenches[c.seen.chaser] = self._send(o, c, command, geometry, None)
+
         for sent in self.sent:
             sent.forget_before(o.time_ns)
         out.safety = {
@@ -106,6 +111,7 @@ class OutputStage:
             for c in chasers
             if c.planning.certificate is not None
         }
+
         out.solver = solver_message(o, self._scenario.controller.solver, planning)
         out.events = [event_message(o, level, text) for level, text in events]
         return out

@@ -102,6 +102,7 @@ class StackIdentification:
         """
         latched = {c.chaser for c in estimation.chasers if c.latched}
         present = {c.chaser for c in estimation.chasers if c.own is not None}
+
         if not latched:
             self._composite = None
             if estimation.stack is not None:
@@ -110,6 +111,7 @@ class StackIdentification:
         if not estimation.known or not latched & present:
             self._composite = None
             return None
+
         states = {
             c.chaser: body_state(c.measured)
             for c in observation.chasers
@@ -122,9 +124,11 @@ class StackIdentification:
             composite = self._composite = self._begin(estimation, states)
         else:
             self._predict(composite, observation)
+
         fault = composite.update(states, self._suspects(composite.filter))
         if fault is not None:
             self._add_fault(fault)
+
         found = composite.filter
         self.target = found.target(self._scenario.chaser)
         return IdentifiedStack(

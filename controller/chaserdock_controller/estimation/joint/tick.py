@@ -230,13 +230,16 @@ def _start(
     supports = [support(first, pose) for pose in poses[first]]
     kept = [pose for pose, n in zip(poses[first], supports, strict=True) if n == max(supports)]
     scale = p.target.single_marker_scale**2 if len(seen[first].marker_ids) == 1 else 1.0
+
     others = {i: sighting for i, sighting in seen.items() if i != first}
     results = []
     for pose in kept:
         results.append(update(start_target(s, pose, rates, scale), {}, others, mounting, p))
+
     report = max(results, key=lambda r: r[0].log_likelihood)[1]
     ambiguous = ", ambiguous: two hypotheses" if len(kept) > 1 else ""
     events.append(EstimatorEvent(now.time_ns, "info", f"{action} by chaser {first}{ambiguous}"))
+
     started = tuple(r[0] for r in results)
     now = replace(now, hypotheses=started, ambiguous_since_ns=now.time_ns, collective=0)
     return count_measurements(now, (first, *report.accepted), report.rejected)

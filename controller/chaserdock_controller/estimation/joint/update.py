@@ -109,24 +109,29 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
     attitudes, omegas = state.attitudes_wxyz.copy(), state.omegas_rad_s.copy()
     positions[i], velocities[i] = odometry.position_m, odometry.velocity_m_s
     attitudes[i], omegas[i] = so3.normalize(np.array(odometry.q_wxyz)), odometry.omega_rad_s
+
     extra, alive = state.extra.copy(), state.alive.copy()
     extra[i], alive[i] = 0.0, True
     rejections, nis = state.rejections.copy(), state.nis.copy()
     rejections[i], nis[i] = 0, 3.0
     measured = state.measured_ns.copy()
     measured[i] = state.time_ns
+
+    # The other states keep their estimates, but are no longer correlated with this chaser.
     covariance = state.covariance.copy()
     covariance[block(i), :] = covariance[:, block(i)] = 0.0
     own = np.zeros((CHASER, CHASER))
     e = np.arange(12, CHASER)
     own[e, e] = chaser_prior(p)
     own[:12, :12] = odometry_noise(odometry, p)
+
     # The measured state is the true one plus its error, hence the negative correlation.
     for part, drift in ((POSITION, POSITION_DRIFT), (ATTITUDE, ATTITUDE_DRIFT), (RATE, GYRO_BIAS)):
         prior = own[drift, drift].copy()
         own[part, part] += prior
         own[part, drift] = own[drift, part] = -prior
     covariance[block(i), block(i)] = own
+
     return replace(
         state,
         positions_m=positions,
@@ -387,11 +392,13 @@ def _update_chaser(
     solution = _likeliest(running, i, sighting, mounting, p)
     if odometry is None and solution is None:
         return {}
+
     view = _view_units(running.state, i, markers, p)
     z = measurement(chasers, i, odometry, solution, markers, mounting, p, view)
     channels = _channels(
         odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry
     )
+
     gates = _gate(running, i, channels, running.values(z), p)
     if not all(gates.fits.values()) and any(
         not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES
@@ -399,14 +406,17 @@ def _update_chaser(
         gates = _follow(
             running, i, z, channels, gates, _unexpected_motion(i, running, p), _ODOMETRY, p
         )
+
     if (
         new_views
         and view is not None
         and p.rejections_to_new_view <= gates.rejections[SIGHTING_CHANNEL] <= p.rejections_to_drop
     ):
         gates = _follow(running, i, z, channels, gates, _new_view(i, running), _SIGHTING, p)
+
     running.rejections[i], running.nis[i] = gates.rejections, gates.nis
     running.log_likelihood = gates.log_likelihood
+
     used = _rows(tuple(c.rows for c in channels if gates.fits[c.number]))
     if len(used):
         nonlinear = (

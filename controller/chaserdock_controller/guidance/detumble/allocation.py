@@ -75,16 +75,20 @@ def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation
         np.isfinite(wrenches).all() and np.isfinite(wrench).all() and np.isfinite(limits_N).all()
     ):
         raise ValueError("wrenches and limits must be finite")
+
     thrusts = np.zeros(len(limits_N))
     able = limits_N > 0.0
     force, torque = units_of(wrenches[:, able], limits_N[able])
     units = np.array([force] * 3 + [torque] * 3)
+
     asked = wrench / units
     size = float(np.linalg.norm(asked))
     if size <= _NOTHING:
         return StackAllocation(thrusts, 1.0)
     if not able.any():
         return StackAllocation(thrusts, 0.0)
+
+    # Variables: each thrust over its limit, then the scale times the size of the request.
     rows = np.hstack(
         [wrenches[:, able] * limits_N[able] / units[:, None], -(asked / size)[:, None]]
     )
@@ -94,11 +98,13 @@ def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation
     upper = np.concatenate([np.ones(n - 1), [size], zeros])
     lower = np.concatenate([np.zeros(n), zeros])
     sense = np.array([0] * n + [_EQUALITY] * 6, dtype=np.int32)
+
     x, _, flag, _ = daqp.solve(
         _REGULARIZATION * np.eye(n), cost, np.ascontiguousarray(rows), upper, lower, sense
     )
     if flag != _SOLVED:
         raise RuntimeError(f"allocation of the stack's thrusters: daqp failed with flag {flag}")
+
     thrusts[able] = np.clip(x[:-1], 0.0, 1.0) * limits_N[able]
     return StackAllocation(thrusts, float(np.clip(x[-1] / size, 0.0, 1.0)))
 

@@ -37,7 +37,7 @@ class Cone:
 
     def room_m(self, offset_m: ArrayLike) -> float:
         """Return the distance (m) of a point ``offset_m`` (3,), TRF, from the cone's surface,
-        positive inside. Below the apex it is the distance from the apex plane.
+        positive inside. Behind the apex the surface counts as extended.
         """
         offset = np.asarray(offset_m, dtype=float)
         along = float(offset @ self.axis)

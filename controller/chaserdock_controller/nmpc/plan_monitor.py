@@ -44,8 +44,8 @@ class PlanMonitor:
         self._time_ns = time_ns
 
     def flyable(self, time_ns: int) -> ChaserPlan | None:
-        """Return the plan that the chaser may fly at ``time_ns``: the newest one, at most
-        `FAILED_S` old.
+        """Return the plan that the chaser may fly at ``time_ns``: the last usable one. None once
+        there was no usable one for `FAILED_S`.
         """
         return None if self._has_failed(time_ns) else self._last
 

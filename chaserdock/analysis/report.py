@@ -50,6 +50,7 @@ def report_of(log: Path) -> str:
     result = summary_of(flight)
     every = decimation(flight.world.ticks)
     traces = load_traces(log, range(len(flight.scenario.chasers)), every)
+
     missing: list[str] = []
     figures = []
     for kind, figure in draw_figures(flight, traces):
@@ -62,6 +63,7 @@ def report_of(log: Path) -> str:
             f"<figcaption>{escape(kind.caption)}</figcaption>\n<div "
             f'class="wide">{svg}</div></figure>'
         )
+
     replay, script = "", ""
     if "target" in flight.truth:
         data = replay_data(flight, traces, small_images(log, flight))
@@ -73,6 +75,7 @@ def report_of(log: Path) -> str:
         script = f"{stored}\n<script>\n{code}</script>"
     else:
         missing.insert(0, "3-D replay: the log holds no ground truth of the target.")
+
     body = [
         _head(flight, result),
         _outcome(result),

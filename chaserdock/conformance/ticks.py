@@ -111,6 +111,7 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
             f"{log}: flown in real time; a check needs a lock-step log, in which every tick is "
             "complete"
         )
+
     role, number = role_of(process, len(scenario.chasers))
     inputs = input_topics(role)
     keys = [
@@ -120,6 +121,7 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
             _places(number, len(scenario.chasers)) if "{chaser}" in topic.key else (None,)
         )
     ]
+
     turns: dict[int, RecordedTick] = {}
     waiting: dict[int, list[tuple[int, RawSample, int | None]]] = {}
     for record in read_log(log, keys):

@@ -179,6 +179,7 @@ class InProcessMission:
         """Fly one tick, with these operator commands."""
         timing, states = self.scenario.timing, self.states()
         time_ns = timing.tick_time_ns(self.tick)
+
         docking = {
             x.chaser: docking_status(x, self.tick, time_ns) for x in self.physics.latches.values()
         }
@@ -188,14 +189,17 @@ class InProcessMission:
             x.chaser: self.physics.port_loads[name].take()
             for name, x in self.physics.latches.items()
         }
+
         odometry = {i: self.measure(i, time_ns, states) for i in self.chasers}
         reports = {}
         for i in self.chasers:
             if (report := self._sense(odometry[i], docking.get(i))) is not None:
                 reports[i] = report
+
         sightings = ()
         if self.perception is not None and timing.has_images(self.tick):
             sightings = tuple(self.perception(i, self.tick, time_ns, states) for i in self.chasers)
+
         outputs = None
         if time_ns >= self._busy_until_ns:
             received = tuple(
@@ -205,8 +209,10 @@ class InProcessMission:
                 for i, o in odometry.items()
             )
             outputs = self._control(TickInputs(self.tick, time_ns, received, sightings, commands))
+
         errors = {i: self.tracking_error(i, states, outputs) for i in self.chasers}
         actuator_commands, delivered = self._act(outputs, odometry, time_ns)
+
         record = TickRecord(
             self.tick,
             time_ns,

@@ -42,6 +42,7 @@ def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultR
     failures = list(s.get("failures", [])) or (
         [outcome.last_words or "ended without output"] if outcome.status else []
     )
+
     row: ResultRow = {
         "run": flight.name,
         "index": index,
@@ -52,17 +53,21 @@ def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultR
         "digest": s.get("digest", ""),
         "log": outcome.log or "",
     }
+
     row |= {
         f"vary.{k}": v if isinstance(v, int | float | str | bool) else json.dumps(v)
         for k, v in flight.varied.items()
     }
+
     chasers = s.get("chasers", {}).values()
     for name, path, combine in _OF_CHASERS:
         values = [v for c in chasers if (v := _value_at(c, path)) is not None]
         row[name] = float(combine(values)) if values else math.nan
     row["docked"] = sum(bool(c.get("docked")) for c in chasers)
+
     row["collisions"] = int(s.get("collisions", 0))
     row["min_distance_chasers_m"] = _number(s.get("min_distance_chasers_m"))
+
     for key, value in s.get("target_estimate", {}).items():
         row[f"estimate_{key}"] = _number(value)
     if flight.alone is not None and flight.alone.floor:

@@ -255,6 +255,7 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
 
     section: dict[str, Any] = {"mode": draw.choice(["lockstep", "realtime", "realtime"])}
     section["latency_s"] = draw.choice([0.0, 0.0005, 0.002, 0.01])
+
     for key, values in (
         ("jitter_s", [0.0005, 0.002, 0.01]),
         ("loss", [0.001, 0.01, 0.05]),
@@ -263,17 +264,20 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
     ):
         if draw.random() < 0.3:
             section[key] = draw.choice(values)
+
     if draw.random() < 0.3:
         section["partition"] = [
             # All others are on the world's side.
             {**window(), "processes": sorted(draw.sample(names[1:], draw.choice([1, 1, 2])))}
             for _ in range(draw.choice([1, 1, 2]))
         ]
+
     if draw.random() < 0.25:
         reader = draw.choice([*names, "recorder"])
         section["slow"] = [
             {**window(), "process": reader, "each_s": draw.choice([0.001, 0.005, 0.02])}
         ]
+
     if draw.random() < 0.3:
         wrong = draw.sample(names, draw.choice([1, 2]))
         section["clock"] = [
@@ -286,6 +290,7 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
         ]
         for clock in section["clock"]:
             clock["drift"] = max(-0.05, min(0.05, clock["drift"]))
+
     return section
 
 

@@ -152,16 +152,19 @@ class PaperEstimator(Estimator):
         """Return the newest combined pose, whatever the time: the method does not predict."""
         if self._mean is None:
             return no_estimate(time_ns)
+
         p = self.parameters
         combined_ns, position, q = self._mean
         age_s = (time_ns - combined_ns) * 1e-9
         status = (
             "lost" if age_s > p.lost_s else "predicting" if age_s > p.tracking_s else "tracking"
         )
+
         velocity, omega = np.zeros(3), np.zeros(3)
         if self._rates:
             velocity = np.mean([v for v, _ in self._rates], axis=0)
             omega = np.mean([w for _, w in self._rates], axis=0)
+
         sigma = (
             p.sigma_position_m,
             p.sigma_velocity_m_s,
@@ -169,6 +172,7 @@ class PaperEstimator(Estimator):
             p.sigma_omega_rad_s,
         )
         covariance = np.diag(np.repeat(np.square(sigma), 3))
+
         return TargetState(
             time_ns,
             position.copy(),

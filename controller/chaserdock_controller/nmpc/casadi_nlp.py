@@ -127,9 +127,12 @@ class MultipleShootingSolver(CoupledSolver, ABC):
         task = frame.begin(problem, shift_s, ids)
         u = task.start.copy()
         n, d = len(u), frame.params.stages
+
         nlp, program = self._programs[n]
         x, limits = frame.rolled(task, u), task.problem.input_max
         floor = row_floor(nlp, frame.params, task.problem)
+
+        # Start and bounds of the variables and the constraints, in the order of `Nlp`.
         start, low, high, bottom, top = [], [], [], [], []
         input_columns = []
         for k in range(d + 1):
@@ -143,6 +146,7 @@ class MultipleShootingSolver(CoupledSolver, ABC):
             defects = np.zeros((13 * n if k < d else 0) + (13 * n if k == 0 else 0))
             bottom += [defects, floor[k - 1] if k > 0 else slack]
             top += [defects, slack + np.inf]
+
         result = program(
             x0=np.concatenate(start),
             p=pack(frame.params, task.problem),
@@ -151,17 +155,20 @@ class MultipleShootingSolver(CoupledSolver, ABC):
             lbg=np.concatenate(bottom),
             ubg=np.concatenate(top),
         )
+
         stats = program.stats()
         flat = np.array(result["x"]).ravel()
         solution = np.stack(
             [flat[at : at + 6 * n].reshape(n, 6) for at in input_columns[:d]], axis=1
         )
+
         code = str(stats.get("return_status", ""))
         solved = bool(stats["success"]) or code in self.SOLVED
         iterations = int(stats.get("iter_count", 0))
         late = not solved and (
             code in self.LIMITED or stats.get("unified_return_status") == "SOLVER_RET_LIMITED"
         )
+
         usable = (solved or late) and bool(np.isfinite(solution).all())
         if usable:
             u = np.clip(solution, -limits[:, None, :], limits[:, None, :])

@@ -118,24 +118,30 @@ class PlanningStage:
             for monitor in self.monitors:
                 monitor.forget()
             return self._result(observation.time_ns, None, (), 0.0, ())
+
         own = [_own(estimation.chasers[i]) for i in horizon.chasers]
         limits = np.array([observation.chasers[i].input_limits for i in horizon.chasers])
         disturbances = np.array(
             [_bounded(m.disturbance, row) for m, row in zip(own, limits, strict=True)]
         )
+
+        # The solver sees the input plus the disturbance: leave the actuators room to cancel it.
         states = np.array([m.at_effect for m in own])
         problem = self.problem(horizon, states, limits - np.abs(disturbances))
         lost = {c.chaser: c.lost for c in observation.chasers if c.lost is not None}
         problem = with_lost_chasers(
             problem, self._parameters, tuple(lost.values()), observation.effective_ns
         )
+
         enforced = {d.chaser for d in guidance.directives if d.abort_margin is not None}
         if self._passive_safety is not None and enforced:
             safety = self._passive_safety.restriction(horizon.chasers, enforced, estimation)
             problem = replace(problem, coast_safety=safety)
+
         since_ns = 0 if self._last_solve_ns is None else observation.time_ns - self._last_solve_ns
         if self._budget is not None:
             cast(Bounded, self.solver).max_iterations = self._budget.iterations()
+
         plan: NmpcPlan | None = None
         events: tuple[LogEntry, ...] = ()
         start_s = self._now_s()
@@ -147,10 +153,12 @@ class PlanningStage:
             plan = None
             events = (("error", f"solver error: {type(error).__name__}: {error}"),)
         wall_s = self._now_s() - start_s
+
         if self._budget is not None and plan is not None:
             self._budget.note(wall_s, int(plan.iterations.sum()))
         if plan is not None:
             plan = _without(plan, disturbances)
+
         self._follow(horizon.chasers, plan, observation)
         if self._passive_safety is not None and plan is not None:
             events += self._passive_safety.update(

@@ -47,8 +47,11 @@ _EVERYTHING = Selection()
 
 class BopWriter:
     """Writes a dataset into ``folder``: ``camera.json``, ``models``, ``models_eval``, ``train`` and
-    ``val``. Raises OSError, and DatasetError for a camera with lens distortion, which the format
-    does not have."""
+    ``val``.
+
+    Raises OSError, and DatasetError for a camera with lens distortion, which the format does not
+    support.
+    """
 
     def __init__(
         self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Describe a log and check that it is complete."""
+"""Describes a log, and checks that it is complete."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from chaserdock_protocol.recording.summary import read_summary
 
 
 class FileInfo(msgspec.Struct):
-    """A file of a log. ``closed``, ``cut_bytes``, ``library``, ``rewritten``: as
-    in ``recording.scan.FileState``. ``lost``: number of messages that it lacks by its statistics.
+    """A file of a log. ``closed``, ``cut_bytes``, ``library``, ``rewritten``: as in
+    ``recording.scan.FileState``. ``lost``: number of messages that it lacks by its statistics.
     """
 
     path: str
@@ -40,7 +40,7 @@ class FileInfo(msgspec.Struct):
 
 
 class KeyInfo(msgspec.Struct):
-    """What a log holds of a key: number and bytes of its messages, first and last simulated time
+    """Content of a log for one key: number and bytes of messages, first and last simulated time
     (s). ``lost``: gaps in their sequence numbers.
     """
 
@@ -53,9 +53,9 @@ class KeyInfo(msgspec.Struct):
 
 
 class LogInfo(msgspec.Struct):
-    """A log. ``rejected``: invalid messages by key and reason. ``viewer``: messages of the viewer
-    layer. ``missing``: what it lacks of its mission, a line each. ``scenario`` and ``seed``: None
-    without scenario.
+    """Content of a log. ``rejected``: number of invalid messages by key and reason. ``viewer``:
+    messages of the viewer layer. ``missing``: what it lacks of its mission, a line each.
+    ``scenario`` and ``seed``: None where the log holds no scenario.
     """
 
     scenario: str | None
@@ -71,7 +71,7 @@ class LogInfo(msgspec.Struct):
 
     @property
     def whole(self) -> bool:
-        """Whether every file was closed, no message is missing and every message is valid."""
+        """Return whether every file is closed and nothing is missing or invalid."""
         lost = any(k.lost for k in self.keys) or any(f.lost for f in self.files)
         return (
             all(f.closed and not f.recovered for f in self.files)
@@ -82,8 +82,8 @@ class LogInfo(msgspec.Struct):
 
 
 def info_of(log: LogSource) -> LogInfo:
-    """Read all of a log, check every checksum and message. Raises LogError where it is damaged, and
-    for a log without a message of ours.
+    """Read a whole log and check every checksum and message. Raises LogError where it is damaged,
+    and for a log without a message of ours.
     """
     name, seed, run, missing = None, None, dict[str, str](), list[str]()
     no_scenario: NoScenario | None = None
@@ -96,11 +96,13 @@ def info_of(log: LogSource) -> LogInfo:
             "holds no scenario: it can be read and exported as bare messages by other tools, but "
             "not judged, shown or replayed"
         )
+
     keys: dict[str, KeyInfo] = {}
     gaps = SequenceGaps()
     rejected: Counter[str] = Counter()
     files: list[FileInfo] = []
     viewer, sent = 0, [0, 0]
+
     for path in log_files(log):
         state, messages = FileState(), 0
         for channel, stored in stored_messages(path, state):
@@ -108,6 +110,7 @@ def info_of(log: LogSource) -> LogInfo:
             if channel.topic.startswith(VIEWER_PREFIX):
                 viewer += 1
                 continue
+
             key = keys.get(channel.topic)
             time_s = stored.log_time / 1e9
             if key is None:
@@ -119,6 +122,7 @@ def info_of(log: LogSource) -> LogInfo:
                 min(sent[0] or stored.publish_time, stored.publish_time),
                 max(sent[1], stored.publish_time),
             ]
+
             seq = _seq_of(
                 channel.topic, stored.data, channel.metadata.get("zenoh_encoding", ""), rejected
             )
@@ -126,6 +130,7 @@ def info_of(log: LogSource) -> LogInfo:
                 gaps.update(channel.topic, seq)
                 key.lost = gaps.lost[channel.topic]
         files.append(_file_info(path, state, messages))
+
     if no_scenario is not None and not any(topics.topic_of_key(key) for key in keys):
         raise no_scenario
     sim_time_s = max((k.last_s for k in keys.values()), default=0.0)
@@ -138,6 +143,7 @@ def info_of(log: LogSource) -> LogInfo:
             f"ends at {round(sim_time_s, 2)} s without the end of the mission; later messages may "
             "be missing"
         )
+
     return LogInfo(
         scenario=name,
         seed=seed,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recover the readable messages of a log that is cut off or damaged into a new log."""
+"""Copies the readable messages of a damaged or cut off log into a new one."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Recovered(msgspec.Struct):
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is known to be lost or wrong."""
+        """Return whether nothing is known to be lost or wrong."""
         return self.lost_messages == 0 and not self.lost_attachments and not self.unchecked
 
 
@@ -175,12 +175,12 @@ def _count_losses(data: mmap.mmap, summary: Summary | None, copy: _Copy, walk: _
         found.lost_messages = None
     else:
         found.lost_messages = walk.indexed_losses + found.messages_without_channel
-    if (
-        summary is not None
-        and summary.data_crc not in (0, zlib.crc32(data[: summary.data_end]))
-        and not found.broken_records
-    ):
-        found.unchecked = copy.unchunked  # such a message has no other checksum
+
+    # A message outside of chunks has no other checksum.
+    if summary is not None and summary.data_crc and copy.unchunked and not found.broken_records:
+        with memoryview(data) as everything, everything[: summary.data_end] as covered:
+            matches = zlib.crc32(covered) == summary.data_crc
+        found.unchecked = 0 if matches else copy.unchunked
 
 
 class _Walk:
@@ -203,24 +203,28 @@ class _Walk:
     def __iter__(self) -> Iterator[tuple[int, _Content]]:
         starts = self._data[: len(MCAP0_MAGIC)] == MCAP0_MAGIC
         place = len(MCAP0_MAGIC) if starts else 0
-        behind_damage = uncounted = False
+        counting = uncounted = False
+
         while place < self._end:
             record = self._record(place)
             if record is None:
                 following = self._next(place)
-                uncounted = self._count_damage(place, following)
-                behind_damage, place = True, following
+                counting = uncounted = self._count_damage(place, following)
+                place = following
                 continue
+
             opcode, content, place = record
             if opcode == Opcode.DATA_END:
+                self.found.ended = True
                 return
-            if isinstance(content, int):
-                if behind_damage:
+            if isinstance(content, int):  # an index
+                if counting:
                     self.indexed_losses += content
                     self.unknown_losses -= uncounted
                     uncounted = False
                 continue
-            behind_damage = uncounted = False
+
+            counting = uncounted = False
             if opcode in (Opcode.CHUNK, Opcode.MESSAGE) and self._chunked is None:
                 self._chunked = opcode == Opcode.CHUNK
             if opcode == Opcode.CHANNEL and isinstance(content, list):

@@ -26,7 +26,7 @@ from chaserdock_protocol.recording.scan import (
     parse_record,
     with_checksum,
 )
-from chaserdock_protocol.recording.summary import Summary, find_summary
+from chaserdock_protocol.recording.summary import FileSummary, find_summary
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, MessageIndex, Metadata, Schema
@@ -36,11 +36,11 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 _Content = Attachment | Metadata | list[StoredRecord] | int
 """Content of a record: of an index the number of its messages."""
 _INDEX_HEAD = struct.Struct("<HI")
-_INDEX_ENTRY_BYTES = 16
+_INDEX_ENTRY_BYTES = 16  # time and offset of a message, 8 bytes each (MCAP specification)
 _CHUNK_HEAD = struct.Struct("<QQQII")
 """Times, size and checksum of a chunk, and the length of the name of its compression."""
 _SIZE = struct.Struct("<Q")
-_NO_SCHEMA = 0
+_NO_SCHEMA = 0  # number, which the MCAP specification reserves
 _KNOWN = frozenset({*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)})
 """Opcodes of the format, and those that are left to applications."""
 _OUTSIDE_CHUNKS = (Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA)
@@ -164,7 +164,7 @@ def _recover(data: mmap.mmap, target: Any, source: str) -> Recovered:
     return walk.found
 
 
-def _count_losses(data: mmap.mmap, summary: Summary | None, copy: _Copy, walk: _Walk) -> None:
+def _count_losses(data: mmap.mmap, summary: FileSummary | None, copy: _Copy, walk: _Walk) -> None:
     found, stated = walk.found, None if summary is None else summary.statistics
     if stated is not None:
         found.stated_messages = stated.message_count
@@ -191,7 +191,7 @@ class _Walk:
     ``unknown_losses``: number of damaged records of which that is not known.
     """
 
-    def __init__(self, data: mmap.mmap, summary: Summary | None) -> None:
+    def __init__(self, data: mmap.mmap, summary: FileSummary | None) -> None:
         self.found = Recovered(ended=summary is not None)
         self.indexed_losses = self.unknown_losses = 0
         self._data, self._ended = data, summary is not None
@@ -362,7 +362,7 @@ class _Copy:
     ``other_records``: number of attachments and metadata records.
     """
 
-    def __init__(self, writer: Writer, found: Recovered, summary: Summary | None) -> None:
+    def __init__(self, writer: Writer, found: Recovered, summary: FileSummary | None) -> None:
         self.unchunked = self.other_records = 0
         self._writer, self._found = writer, found
         # A closed log repeats them: the chunk that declares them may be lost.

@@ -21,10 +21,10 @@ from .scan import DAMAGE, RECORD_HEAD, parse_record
 
 _DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
 _DATA_END_BYTES = len(_DATA_END) + 4
-_FOOTER_CONTENT_BYTES = 20
+_FOOTER_CONTENT_BYTES = 20  # two offsets of 8 bytes and a checksum (MCAP specification)
 _FOOTER = RECORD_HEAD.pack(Opcode.FOOTER, _FOOTER_CONTENT_BYTES)
 _FOOTER_BYTES = len(_FOOTER) + _FOOTER_CONTENT_BYTES
-_CRC_BYTES = 4
+_CRC_BYTES = 4  # CRC-32
 _SUMMARY_KINDS = (
     Opcode.SCHEMA,
     Opcode.CHANNEL,
@@ -38,7 +38,7 @@ _SUMMARY_KINDS = (
 
 
 @dataclass
-class Summary:
+class FileSummary:
     """Summary of a file: ``channels`` and ``schemas`` by number, and ``statistics``, where the
     writer repeats them. ``data_end``: offset at which the data end; ``data_crc``: checksum over
     them, 0 for none.
@@ -51,13 +51,13 @@ class Summary:
     statistics: Statistics | None = None
 
 
-def read_summary(path: Path) -> Summary | None:
+def read_summary(path: Path) -> FileSummary | None:
     """Return the summary of a file, None for one without. Raises OSError."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         return find_summary(data)
 
 
-def find_summary(data: mmap.mmap) -> Summary | None:
+def find_summary(data: mmap.mmap) -> FileSummary | None:
     """Return the summary in the bytes of a file; None where the data have no end.
 
     Where the summary is damaged, only the end of the data is known.
@@ -104,13 +104,13 @@ def _is_intact(data: mmap.mmap, begin: int, footer: int) -> bool:
     return stated in (0, zlib.crc32(data[begin : footer + _FOOTER_BYTES - _CRC_BYTES]))
 
 
-def _parse(data: mmap.mmap, data_end: int) -> Summary:
+def _parse(data: mmap.mmap, data_end: int) -> FileSummary:
     head = data_end + RECORD_HEAD.size
     begin = place = data_end + _DATA_END_BYTES
     crc = 0
     if data[data_end:head] == _DATA_END and place <= len(data):
         crc = int.from_bytes(data[head:place], "little")
-    summary, unknown = Summary(data_end, crc), Summary(data_end, crc)
+    summary, unknown = FileSummary(data_end, crc), FileSummary(data_end, crc)
     while place + RECORD_HEAD.size <= len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, place)
         following = place + RECORD_HEAD.size + length
@@ -129,7 +129,7 @@ def _parse(data: mmap.mmap, data_end: int) -> Summary:
     return summary
 
 
-def _add(summary: Summary, opcode: int, content: bytes) -> None:
+def _add(summary: FileSummary, opcode: int, content: bytes) -> None:
     if opcode == Opcode.STATISTICS:
         summary.statistics = Statistics.read(ReadDataStream(BytesIO(content)))
     for record in parse_record(opcode, content):

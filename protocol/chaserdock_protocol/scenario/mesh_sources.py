@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read the bytes of mesh files and of the files that they name, checked at the boundary.
+
+Only regular files of bounded size are read, and a mesh names files of its own folder only. A pipe
+or device never blocks.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from pathlib import Path
+from urllib.parse import unquote
+
+MOST_BYTES = 1 << 30
+"""Size of a file that is read, bytes: that of five million triangles as text."""
+MOST_TRIANGLES = 5_000_000
+"""Triangles of a file, 250 for each that is drawn: bounds time and memory of reading it."""
+_MOST_PIXELS = 1 << 26
+"""Pixels of a texture, 8192 x 8192: stops an image that unpacks to gigabytes."""
+_COUNT = re.compile(rb"^\s*element\s+(\w+)\s+(\S+)", re.MULTILINE)
+
+
+class MeshError(ValueError):
+    """A mesh file that cannot be read; the text says what is wrong and what would be right."""
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a regular file. Raises MeshError."""
+    try:
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise MeshError("no such mesh file") from None
+    except (OSError, ValueError) as error:
+        raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    with os.fdopen(number, "rb") as file:
+        status = os.fstat(number)
+        if not stat.S_ISREG(status.st_mode):
+            raise MeshError("not a regular file; a mesh is read from a file, no pipe or device")
+        if status.st_size > MOST_BYTES:
+            raise MeshError(
+                f"has {status.st_size / 1e9:.1f} GB; simplify it to at most {MOST_BYTES / 1e9:.1f}"
+            )
+        return file.read(MOST_BYTES)
+
+
+class ReferencedFiles:
+    """Files that a mesh file names, beside it or below; also a resolver of trimesh.
+
+    ``refused``: reasons why files that trimesh asked for are not read.
+    """
+
+    def __init__(self, mesh: Path) -> None:
+        self._folder = mesh.parent.resolve()
+        self.file_name = mesh.name
+        self.refused: list[str] = []
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file. Raises MeshError, which names it."""
+        if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]+:", name):
+            raise MeshError(f"refers to {name[:80]!r}; put the file beside the mesh instead")
+        try:
+            path = (self._folder / name.strip().replace("\\", "/")).resolve()
+            inside = path.is_relative_to(self._folder)
+        except (OSError, ValueError, RuntimeError):  # a name with a zero byte, a loop of links
+            raise MeshError(f"refers to {name[:80]!r}, which is not the name of a file") from None
+        if not inside:
+            raise MeshError(f"refers to {name[:80]!r} outside its folder; put it beside the mesh")
+        try:
+            return read_bytes(path)
+        except MeshError as error:
+            reason = str(error).replace("no such mesh file", "which does not exist")
+            raise MeshError(f"refers to {name[:80]!r}: {reason}") from None
+
+    def get(self, name: str) -> bytes:
+        """Return the content of a file for trimesh, which goes on without those that it lacks.
+
+        Options before the name of a texture (MTL) are skipped. Raises FileNotFoundError.
+        """
+        try:
+            return self.read(name)
+        except MeshError as error:
+            last = name.split()[-1] if name.split() else ""
+            if name.strip().startswith("-") and last != name.strip():
+                return self.get(last)
+            self.refused.append(str(error))
+            raise FileNotFoundError(name) from None
+
+    __getitem__ = get
+
+    def read_uri(self, uri: str) -> bytes:
+        """Return the content of a relative URI with percent codes. Raises MeshError."""
+        return self.read(unquote(uri))
+
+
+def check_counts(data: bytes, suffix: str) -> None:
+    """Check that the counts in the head of a file fit its size. Raises MeshError."""
+    counts: list[tuple[str, str]] = []
+    if suffix == ".ply":
+        head = data[: data.find(b"end_header")] if b"end_header" in data else b""
+        counts = [(a.decode(), b.decode("ascii", "replace")) for a, b in _COUNT.findall(head)]
+        if not head.startswith(b"ply"):
+            raise MeshError("it does not begin with 'ply' or has no 'end_header'")
+    elif suffix == ".off":
+        lines = (line.split(b"#")[0].split() for line in data[:10_000].splitlines())
+        words = [word.decode("ascii", "replace") for line in lines for word in line]
+        if not words or words[0].upper() not in ("OFF", "COFF"):
+            raise MeshError("it does not begin with 'OFF'")
+        counts = list(zip(("vertex", "face"), words[1:3], strict=False))
+    elif suffix == ".stl" and not data.lstrip().startswith(b"solid"):
+        if len(data) < 84:
+            raise MeshError(f"it has {len(data)} bytes; a binary STL has 84 or more")
+        triangles = int.from_bytes(data[80:84], "little")
+        if len(data) - 84 != 50 * triangles:
+            raise MeshError(
+                f"its head says {triangles:,} triangles; it has bytes for {(len(data) - 84) // 50:,}"
+            )
+    for what, text in counts:
+        if not text.isdecimal() or int(text) > len(data):
+            raise MeshError(f"its head says {text[:20]} of {what!r}; it has {len(data):,} bytes")
+
+
+def check_triangles(count: int) -> None:
+    """Raise MeshError for more triangles than are read."""
+    if count > MOST_TRIANGLES:
+        raise MeshError(
+            f"has {count:,} or more triangles; simplify it to at most {MOST_TRIANGLES:,}"
+        )
+
+
+def printable(name: str) -> str:
+    """Return the name of a material as one line of at most 64 characters."""
+    return "".join(c if c.isprintable() else "_" for c in name)[:64] or "material"
+
+
+def plain_name(name: str) -> str:
+    """Return the name of a part, as scenarios write it."""
+    return re.sub(r"[^A-Za-z0-9._-]", "_", name).lstrip("._-")[:60] or "part"
+
+
+def check_pixels(width: int, height: int) -> None:
+    """Check the size of a texture before it is unpacked. Raises MeshError."""
+    if width * height > _MOST_PIXELS:
+        raise MeshError(
+            f"has a texture of {width} x {height} pixels; reduce it to at most 8192 x 8192"
+        )

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from .arrays import Array, BoolArray, IntArray
-from .meshes import MeshPart, open_edges
+from .meshes import Material, MeshPart, open_edges, unshared_edges
 
 _MOST_SURFACES = 2_000
 """Surfaces of a part of which each is compared with each: bounds the time of a few seconds."""
@@ -32,6 +32,74 @@ def repaired(part: MeshPart) -> tuple[MeshPart, tuple[str, ...]]:
         return part, notes
     part, note = _outwards(part)
     return part, (*notes, *note)
+
+
+def joined(parts: list[MeshPart], grain_m: float) -> tuple[list[MeshPart], tuple[str, ...]]:
+    """Join parts that are closed only together, as exporters write a body of several materials.
+
+    Vertices within ``grain_m`` are one. The material is the mean by area; the name that of the
+    first. Returns the parts and what was changed; parts that stay open are as before.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    open_parts = [k for k, part in enumerate(parts) if unshared_edges(part)]
+    if len(open_parts) < 2:
+        return parts, ()
+    points = np.concatenate([parts[k].vertices_m for k in open_parts])
+    owner = np.repeat(np.arange(len(open_parts)), [len(parts[k].vertices_m) for k in open_parts])
+    place = welded(points, grain_m)[1]
+    held = coo_array((np.ones(len(owner), dtype=bool), (owner, place))).tocsr()
+    _, group = connected_components(held @ held.T, directed=False)
+    notes, dropped = [], set[int]()
+    out = list(parts)
+    for number in np.unique(group).tolist():
+        members = [parts[open_parts[k]] for k in np.flatnonzero(group == number)]
+        if len(members) < 2 or len({part.joint for part in members}) > 1:
+            continue
+        whole = _union(members, grain_m)
+        if open_edges(repaired(whole)[0]):
+            continue
+        at = [open_parts[k] for k in np.flatnonzero(group == number)]
+        out[at[0]] = whole
+        dropped.update(at[1:])
+        names = ", ".join(part.name for part in members[:4])
+        more = f" and {len(members) - 4} more" if len(members) > 4 else ""
+        notes.append(
+            f"{names}{more}: closed only together; joined, with the mean of their materials"
+        )
+    return [part for k, part in enumerate(out) if k not in dropped], tuple(notes)
+
+
+def _union(parts: list[MeshPart], grain_m: float) -> MeshPart:
+    """Return parts as one, with their mean material by area."""
+    starts = np.cumsum([0, *(len(part.vertices_m) for part in parts)])
+    first, place = welded(np.concatenate([part.vertices_m for part in parts]), grain_m)
+    corners = [part.triangles + at for part, at in zip(parts, starts, strict=False)]
+    triangles = place[np.concatenate(corners)]
+    distinct = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    area = np.array([_areas(part).sum() for part in parts])
+    share = area / max(area.sum(), 1e-30)
+    materials = [part.material for part in parts]
+
+    def mean(values: list[float]) -> float:
+        return round(float(share @ values), 4)
+
+    material = Material(
+        materials[0].name if len({m.name for m in materials}) == 1 else "mean of several",
+        mean([m.diffuse for m in materials]),
+        mean([m.specular for m in materials]),
+        mean([m.shininess for m in materials]),
+    )
+    vertices = np.concatenate([part.vertices_m for part in parts])[first]
+    return MeshPart(parts[0].name, material, vertices, triangles[distinct], parts[0].joint)
+
+
+def welded(vertices: Array, grain_m: float) -> tuple[IntArray, IntArray]:
+    """Join vertices (n, 3) of one place: the first of each (k,), and the place (n,) of each."""
+    cells = np.round((vertices - vertices.min(axis=0)) / grain_m).astype(np.int64)
+    _, first, place = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    return first, place.reshape(-1)
 
 
 def _single(part: MeshPart) -> tuple[MeshPart, tuple[str, ...]]:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from chaserdock_models import decimation
 from chaserdock_models.arrays import Array, IntArray, Vector3
-from chaserdock_models.mesh_repair import repaired
+from chaserdock_models.mesh_repair import repaired, welded
 from chaserdock_models.meshes import (
     Material,
     MeshPart,
@@ -105,6 +105,9 @@ def _read(path: Path, scale: float, origin_m: Array) -> MeshFile:
         _check_numbers(solid)
     _check_size(placed, scale, origin_m)
     parts = _with_unique_names([_part(solid) for solid in placed])
+    low, high = TriangleMesh("", tuple(parts), {}).bounds_m()
+    parts, changes = joined(parts, _grain_m(high - low))
+    notes.extend(changes)
     joints = {
         name: tuple((scale * np.array(at) - origin_m).tolist()) for name, at in joints.items()
     }
@@ -183,7 +186,7 @@ def _trimesh_scene(data: bytes, suffix: str, files: ReferencedFiles) -> Any:
     options: dict[str, Any] = {}
     if suffix == ".obj":
         data = _absolute_indices(data)
-        options = {"split_objects": True, "group_material": False}
+        options = {"split_objects": True, "group_material": True}
     if suffix == ".dae":
         if importlib.util.find_spec("collada") is None:
             raise _Refused("COLLADA needs another package: pip install pycollada; or export a GLB")
@@ -228,8 +231,9 @@ def _solids(scene: Any, suffix: str, notes: list[str]) -> Iterator[Solid]:
     order = {name: k for k, name in enumerate(scene.geometry)}
     placed = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
     check_triangles(sum(len(getattr(scene.geometry[g], "faces", ())) for *_, g in placed))
+    names = _object_names(scene) if suffix == ".obj" else {}
     for node, transform, name in sorted(placed, key=lambda row: (order[row[2]], row[0])):
-        geometry, plain = scene.geometry[name], plain_name(str(node))
+        geometry, plain = scene.geometry[name], plain_name(names.get(name, str(node)))
         if not hasattr(geometry, "faces"):
             notes.append(f"{plain}: points or lines are ignored")
             continue
@@ -245,6 +249,18 @@ def _solids(scene: Any, suffix: str, notes: list[str]) -> Iterator[Solid]:
         if np.linalg.det(transform[:3, :3]) < 0.0:
             triangles = triangles[:, ::-1]
         yield Solid(plain, vertices, triangles, _material(plain, geometry, notes), {})
+
+
+def _object_names(scene: Any) -> dict[str, str]:
+    """Return the names of objects (OBJ) of one material by the names that trimesh gives to their
+    geometries, which end in that of the material.
+    """
+    bases: dict[str, list[str]] = {}
+    for name, geometry in scene.geometry.items():
+        material = getattr(getattr(geometry.visual, "material", None), "name", None)
+        base = name.removesuffix(f"_{material}") if material else name
+        bases.setdefault(base or name, []).append(name)
+    return {names[0]: base for base, names in bases.items() if len(names) == 1}
 
 
 def _check_numbers(solid: Solid) -> None:
@@ -275,13 +291,14 @@ def _welded(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
     triangles without area.
     """
     vertices = vertices.astype(np.float32).astype(float)
-    low = vertices.min(axis=0)
-    grain = max(float(np.ptp(vertices, axis=0).max()) * _WELD_SHARE, 1e-12)
-    cells = np.round((vertices - low) / grain).astype(np.int64)
-    _, first, where = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    triangles = where.reshape(-1)[triangles]
+    first, place = welded(vertices, _grain_m(np.ptp(vertices, axis=0)))
+    triangles = place[triangles]
     distinct = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     return vertices[first], triangles[distinct]
+
+
+def _grain_m(size_m: Array) -> float:
+    return max(float(size_m.max()) * _WELD_SHARE, 1e-12)
 
 
 def _with_unique_names(parts: list[MeshPart]) -> list[MeshPart]:
@@ -333,13 +350,14 @@ def _material(name: str, geometry: Any, notes: list[str]) -> Material:
         notes.append(f"{name}: its image texture is drawn as its mean, reflectance {share:.2f}")
     if is_pbr:
         factor = given.baseColorFactor
-        grey = (share or 1.0) * (1.0 if factor is None else _grey_of_bytes(factor))
+        grey = 1.0 if factor is None else _grey_of_bytes(factor)
+        grey *= 1.0 if share is None else share
         rough = given.roughnessFactor
         return metallic_roughness(label, grey, 0.0, 1.0 if rough is None else float(rough))
     diffuse = _grey_of_mtl(given, "kd") if share is None else share
     if diffuse is None:
         notes.append(f"{name}: {label!r} has no diffuse colour; its reflectance is taken as 0.5")
-    gloss = float(np.ravel(given.glossiness or 0.0)[0])
+    gloss = float(np.ravel(given.kwargs.get("ns", 0.0))[0])
     return phong(
         label, 0.5 if diffuse is None else diffuse, _grey_of_mtl(given, "ks") or 0.0, gloss
     )

@@ -31,7 +31,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
-        raise MeshError("no such mesh file") from None
+        raise MeshError("no such file") from None
     except (OSError, ValueError) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     with os.fdopen(number, "rb") as file:
@@ -70,8 +70,7 @@ class ReferencedFiles:
         try:
             return read_bytes(path)
         except MeshError as error:
-            reason = str(error).replace("no such mesh file", "which does not exist")
-            raise MeshError(f"refers to {name[:80]!r}: {reason}") from None
+            raise MeshError(f"refers to {name[:80]!r}: {error}") from None
 
     def get(self, name: str) -> bytes:
         """Return the content of a file for trimesh, which goes on without those that it lacks.

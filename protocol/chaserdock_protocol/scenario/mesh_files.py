@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from chaserdock_models import decimation
 from chaserdock_models.arrays import Array, IntArray, Vector3
-from chaserdock_models.mesh_repair import repaired, welded
+from chaserdock_models.mesh_repair import joined, repaired, welded
 from chaserdock_models.meshes import (
     Material,
     MeshPart,

@@ -195,8 +195,9 @@ def _trimesh_scene(data: bytes, suffix: str, files: ReferencedFiles) -> Any:
     trimesh.util.log.setLevel(logging.CRITICAL)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")  # of foreign numbers; what is read is checked
+        resolver: Any = files  # of trimesh's resolvers, loaders use `get` and `file_name` only
         return trimesh.load_scene(
-            io.BytesIO(data), file_type=suffix[1:], resolver=files, process=False, **options
+            io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options
         )
 
 

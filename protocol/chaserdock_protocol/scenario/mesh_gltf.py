@@ -13,11 +13,12 @@ import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.meshes import Material
+from numpy.typing import NDArray
 
 from .mesh_materials import channel_means, grey_of, metallic_roughness, open_image, phong
 from .mesh_sources import (
@@ -176,10 +177,8 @@ class Gltf:
 
     def _triangles(self, primitive: Any, vertices: int) -> IntArray:
         """Return the triangles (m, 3) of a primitive. Raises MeshError."""
-        if "indices" in primitive:
-            corners = self.accessor(primitive["indices"], 1, integers=True)[:, 0].astype(np.int64)
-        else:
-            corners = np.arange(vertices)
+        given = primitive.get("indices")
+        corners = np.arange(vertices) if given is None else self.indices(given)
         if corners.max(initial=-1) >= vertices:
             raise MeshError(
                 f"has a triangle with vertex {corners.max()}, of {vertices} vertices; export it anew"
@@ -196,20 +195,30 @@ class Gltf:
             raise MeshError(f"has a primitive of {len(corners)} corners, mode {mode!r}")
         return corners.reshape(-1, 3)
 
-    def accessor(self, number: Any, width: int, integers: bool = False) -> Array | IntArray:
+    def accessor(self, number: Any, width: int) -> Array:
         """Return the rows (n, width) of an accessor; normalized integers as fractions.
 
         Raises MeshError.
         """
-        key = ("accessor", number, integers)
+        key = ("accessor", number, width)
         if key not in self._read:
-            self._read[key] = self._rows(self._item("accessors", number), number, width, integers)
-        found: Array = self._read[key]
-        if found.shape[1] != width:
-            raise MeshError(f"accessor {number} has {found.shape[1]} columns in place of {width}")
-        return found
+            held = self._item("accessors", number)
+            rows = self._rows(held, number, width)
+            out = rows.astype(float)
+            if held.get("normalized") and rows.dtype.kind != "f":
+                out = np.maximum(out / np.iinfo(rows.dtype).max, -1.0)
+            self._read[key] = out
+        return self._read[key]
 
-    def _rows(self, held: Any, number: Any, width: int, integers: bool) -> Array:
+    def indices(self, number: Any) -> IntArray:
+        """Return the whole numbers (n,) of an accessor. Raises MeshError."""
+        rows = self._rows(self._item("accessors", number), number, 1)
+        if rows.dtype.kind != "u":
+            raise MeshError(f"accessor {number} has numbers of vertices that are not whole")
+        return rows[:, 0].astype(np.int64)
+
+    def _rows(self, held: Any, number: Any, width: int) -> NDArray[Any]:
+        """Return the rows (n, width) of an accessor as they are stored. Raises MeshError."""
         kind = _COMPONENTS.get(held.get("componentType"))
         columns = _WIDTHS.get(held.get("type", ""))
         count = held.get("count")
@@ -219,46 +228,30 @@ class Gltf:
             raise MeshError(f"accessor {number} has {columns} columns in place of {width}")
         if count > 3 * MOST_TRIANGLES:
             raise MeshError(f"accessor {number} has {count:,} rows; simplify the mesh")
-        if integers and kind[1] != "u":
-            raise MeshError(f"accessor {number} has numbers of vertices that are not whole")
+        rows = np.zeros((count, columns), dtype=kind)
         if "bufferView" in held:
-            at = held.get("byteOffset", 0)
-            rows = self._view_rows(held["bufferView"], at, count, kind, columns, number)
-        else:
-            rows = np.zeros((count, columns), dtype=kind)
-        if "sparse" in held:
-            rows = self._sparse(rows, held["sparse"], number)
-        if integers:
-            return rows
-        out = rows.astype(float)
-        if held.get("normalized") and kind[1] != "f":
-            out = np.maximum(out / np.iinfo(kind).max, -1.0)
+            rows = self._view_rows(held, count, kind, columns, number)
+        return self._sparse(rows, held["sparse"], number) if "sparse" in held else rows
+
+    def _sparse(self, rows: NDArray[Any], sparse: Any, number: Any) -> NDArray[Any]:
+        """Return rows with the sparse values of their accessor. Raises MeshError."""
+        where, values = _of(sparse, "indices", dict), _of(sparse, "values", dict)
+        count, kind = sparse.get("count"), _COMPONENTS.get(where.get("componentType", 0), "")
+        if not _is_whole(count) or "u" not in kind or count > len(rows):
+            raise MeshError(f"accessor {number} has sparse values without valid count and indices")
+        index = self._view_rows(where, count, kind, 1, number)[:, 0].astype(np.int64)
+        if index.max(initial=-1) >= len(rows):
+            raise MeshError(f"accessor {number} has sparse values of rows that do not exist")
+        out = rows.copy()
+        out[index] = self._view_rows(values, count, rows.dtype.str, rows.shape[1], number)
         return out
 
-    def _sparse(self, rows: Array, sparse: Any, number: Any) -> Array:
-        count, where, values = sparse.get("count"), sparse.get("indices"), sparse.get("values")
-        if not _is_whole(count) or not isinstance(where, dict) or not isinstance(values, dict):
-            raise MeshError(f"accessor {number} has sparse values without count, indices or values")
-        kind = _COMPONENTS.get(where.get("componentType"), "")
-        if not kind or kind[1] != "u" or count > len(rows):
-            raise MeshError(f"accessor {number} has sparse values with indices that are not whole")
-        at = where.get("byteOffset", 0)
-        index = self._view_rows(where.get("bufferView"), at, count, kind, 1, number)[:, 0]
-        if index.max(initial=0) >= max(len(rows), 1):
-            raise MeshError(f"accessor {number} has sparse values of rows that do not exist")
-        rows = rows.copy()
-        rows[index] = self._view_rows(
-            values.get("bufferView"), values.get("byteOffset", 0), count, rows.dtype.str,
-            rows.shape[1], number,
-        )  # fmt: skip
-        return rows
-
     def _view_rows(
-        self, view: Any, at: Any, count: int, kind: str, columns: int, number: Any
-    ) -> Array:
-        """Return rows (count, columns) of a buffer view, from byte ``at`` on. Raises MeshError."""
-        data, stride = self._view(view)
-        size = columns * np.dtype(kind).itemsize
+        self, held: Any, count: int, kind: str, columns: int, number: Any
+    ) -> NDArray[Any]:
+        """Return the rows (count, columns) that an object refers to. Raises MeshError."""
+        data, stride = self._view(held.get("bufferView"))
+        at, size = held.get("byteOffset", 0), columns * np.dtype(kind).itemsize
         stride = stride or size
         if (
             not _is_whole(at)
@@ -492,7 +485,7 @@ def _dict_or_empty(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _is_whole(value: Any) -> bool:
+def _is_whole(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 

@@ -34,7 +34,7 @@ def read_bytes(path: Path) -> bytes:
         raise MeshError("no such file") from None
     except (OSError, ValueError) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    with os.fdopen(number, "rb") as file:
+    try:
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
             raise MeshError("not a regular file; a mesh is read from a file, no pipe or device")
@@ -42,7 +42,12 @@ def read_bytes(path: Path) -> bytes:
             raise MeshError(
                 f"has {status.st_size / 1e9:.1f} GB; simplify it to at most {MOST_BYTES / 1e9:.1f}"
             )
-        return file.read(MOST_BYTES)
+        with open(number, "rb", closefd=False) as file:
+            return file.read(MOST_BYTES)
+    except OSError as error:
+        raise MeshError(f"cannot be read: {error.strerror or error}") from None
+    finally:
+        os.close(number)
 
 
 class ReferencedFiles:

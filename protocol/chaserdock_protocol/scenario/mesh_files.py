@@ -97,12 +97,13 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
 
 
 def _read(path: Path, scale: float, origin_m: Array) -> MeshFile:
-    solids, joints, notes = _load(path)
-    if not solids:
-        raise MeshError("contains no triangles; a target needs closed surfaces")
-    placed = [replace(s, vertices=scale * s.vertices - origin_m) for s in solids]
-    for solid in placed:
-        _check_numbers(solid)
+    with np.errstate(over="ignore", invalid="ignore"):  # of foreign numbers, checked here
+        solids, joints, notes = _load(path)
+        if not solids:
+            raise MeshError("contains no triangles; a target needs closed surfaces")
+        placed = [replace(s, vertices=scale * s.vertices - origin_m) for s in solids]
+        for solid in placed:
+            _check_numbers(solid)
     _check_size(placed, scale, origin_m)
     parts = _with_unique_names([_part(solid) for solid in placed])
     low, high = TriangleMesh("", tuple(parts), {}).bounds_m()
@@ -152,9 +153,9 @@ def _load(path: Path) -> Content:
     except _Refused as error:
         raise MeshError(str(error)) from None
     except Exception as error:  # readers of foreign formats raise whatever they stumble over
-        text = (str(error).strip().splitlines() or [""])[0][:200]
-        text = text if isinstance(error, MeshError) else f"{type(error).__name__} {text}"
-        raise MeshError(f"not a {suffix[1:].upper()} mesh: {text}") from None
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+        remedy = "" if ";" in reason else "; export it anew"
+        raise MeshError(f"not a {suffix[1:].upper()} mesh: {reason}{remedy}") from None
 
 
 class _Refused(Exception):
@@ -193,7 +194,7 @@ def _trimesh_scene(data: bytes, suffix: str, files: ReferencedFiles) -> Any:
         if b"<!DOCTYPE" in data or b"<!ENTITY" in data or data.startswith(b"PK"):
             raise _Refused("COLLADA with a document type, or in an archive; export a GLB instead")
     trimesh.util.log.setLevel(logging.CRITICAL)
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of foreign numbers; what is read is checked
         resolver: Any = files  # of trimesh's resolvers, loaders use `get` and `file_name` only
         return trimesh.load_scene(
@@ -205,7 +206,9 @@ def _absolute_indices(data: bytes) -> bytes:
     """Return an OBJ file whose faces count from the start: negative indices count back from the
     line of the face, where trimesh counts back from the end of the file.
     """
-    if not re.search(rb"^\s*f[ \t].*-\d", data, re.MULTILINE):
+    if re.search(rb"^[ \t]*f[ \t](?:.*[ \t])?0+(?:[/ \t\r]|$)", data, re.MULTILINE):
+        raise MeshError("has a face with vertex 0, where the first is 1; export it anew")
+    if not re.search(rb"^[ \t]*f[ \t].*-\d", data, re.MULTILINE):
         return data
     seen = {b"v": 0, b"vt": 0, b"vn": 0}
     kinds = (b"v", b"vt", b"vn")
@@ -243,7 +246,9 @@ def _solids(scene: Any, suffix: str, notes: list[str]) -> Iterator[Solid]:
         vertices = np.asarray(geometry.vertices, dtype=float)
         triangles = np.asarray(geometry.faces, dtype=np.int64)
         if triangles.min() < 0 or triangles.max() >= len(vertices):
-            raise MeshError(f"part {plain!r} has a triangle of a vertex that does not exist")
+            raise MeshError(
+                f"part {plain!r} has a triangle of a vertex that does not exist; export it anew"
+            )
         if suffix == ".dae":
             vertices = vertices * _stated_unit_m(geometry)
         vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
@@ -266,9 +271,8 @@ def _object_names(scene: Any) -> dict[str, str]:
 
 def _check_numbers(solid: Solid) -> None:
     """Raise MeshError for a vertex that is not a number in 32 bits, as it is stored."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        if not np.isfinite(solid.vertices.astype(np.float32)).all():
-            raise MeshError(f"part {solid.name!r} has a vertex that is not a number")
+    if not np.isfinite(solid.vertices.astype(np.float32)).all():
+        raise MeshError(f"part {solid.name!r} has a vertex that is not a number; export it anew")
 
 
 def _part(solid: Solid) -> MeshPart:

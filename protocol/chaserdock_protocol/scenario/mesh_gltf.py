@@ -20,12 +20,13 @@ from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.meshes import Material
 from numpy.typing import NDArray
 
-from .mesh_materials import channel_means, grey_of, metallic_roughness, open_image, phong
+from .mesh_materials import channel_means, grey_of, metallic_roughness, phong
 from .mesh_sources import (
     MOST_TRIANGLES,
     MeshError,
     ReferencedFiles,
     check_triangles,
+    open_image,
     plain_name,
     printable,
 )

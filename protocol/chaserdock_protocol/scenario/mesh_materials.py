@@ -7,15 +7,13 @@ mean.
 
 from __future__ import annotations
 
-import io
-import warnings
 from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.meshes import Material
 
-from .mesh_sources import MeshError, check_pixels
+from .mesh_sources import MeshError
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Share of red, green and blue in luminance (ITU-R BT.709)."""
@@ -36,32 +34,17 @@ def linear_of(encoded: Array) -> Array:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-def open_image(data: bytes, name: str) -> Any:
-    """Return an image of Pillow from the bytes of a file. Raises MeshError."""
-    from PIL import Image  # needed for meshes with textures only
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a bomb is refused by its size below
-            return Image.open(io.BytesIO(data))
-    except Exception as error:  # Pillow raises whatever its decoders stumble over
-        if "decompression bomb" in str(error):
-            raise MeshError(f"{name}: has too many pixels; reduce it to 8192 x 8192") from None
-        raise MeshError(f"{name}: not an image that can be read; use PNG or JPEG") from None
-
-
 def channel_means(image: Any, is_srgb: bool) -> Array:
     """Return the means of red, green and blue (3,), linear, of an image of Pillow.
 
-    Raises MeshError for an image that is too large or damaged.
+    Raises MeshError for a damaged image.
     """
-    check_pixels(*image.size)
     levels = np.linspace(0.0, 1.0, 256)
     try:
         if image.mode.startswith(("I", "F")):  # 16 bits of grey
             image = image.point(lambda v: v / 257.0).convert("L")
         counts = np.reshape(image.convert("RGB").histogram(), (3, 256))
-    except Exception as error:  # as above
+    except Exception as error:  # Pillow raises whatever its decoders stumble over
         raise MeshError(f"has a texture that cannot be read: {str(error)[:80]}") from None
     return counts @ (linear_of(levels) if is_srgb else levels) / counts.sum(axis=1)
 

@@ -7,10 +7,13 @@ or device never blocks.
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import stat
+import warnings
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 MOST_BYTES = 1 << 30
@@ -20,6 +23,11 @@ MOST_TRIANGLES = 5_000_000
 _MOST_PIXELS = 1 << 26
 """Pixels of a texture, 8192 x 8192: stops an image that unpacks to gigabytes."""
 _COUNT = re.compile(rb"^\s*element\s+(\w+)\s+(\S+)", re.MULTILINE)
+
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".gif", ".webp")
+_GREY = re.compile(rb"^([ \t]*k[ads])[ \t]+(\S+)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+"""A grey in a material file by one number, for which trimesh drops all materials of the file."""
 
 
 class MeshError(ValueError):
@@ -83,7 +91,10 @@ class ReferencedFiles:
         Options before the name of a texture (MTL) are skipped. Raises FileNotFoundError.
         """
         try:
-            return self.read(name)
+            data = self.read(name)
+            if name.lower().endswith(_IMAGES):
+                open_image(data, f"texture {name[:80]!r}")
+            return _GREY.sub(rb"\1 \2 \2 \2", data) if name.lower().endswith(".mtl") else data
         except MeshError as error:
             last = name.split()[-1] if name.split() else ""
             if name.strip().startswith("-") and last != name.strip():
@@ -143,9 +154,20 @@ def plain_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]", "_", name).lstrip("._-")[:60] or "part"
 
 
-def check_pixels(width: int, height: int) -> None:
-    """Check the size of a texture before it is unpacked. Raises MeshError."""
-    if width * height > _MOST_PIXELS:
+def open_image(data: bytes, name: str) -> Any:
+    """Return an image of Pillow, whose pixels are unpacked when they are used. Raises MeshError."""
+    from PIL import Image  # needed for meshes with textures only
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of bombs, which are refused by their size
+            image = Image.open(io.BytesIO(data))
+    except Image.DecompressionBombError:
+        raise MeshError(f"{name} has too many pixels; reduce it to at most 8192 x 8192") from None
+    except Exception:  # Pillow raises whatever its readers stumble over
+        raise MeshError(f"{name} is not an image that can be read; use PNG or JPEG") from None
+    if image.width * image.height > _MOST_PIXELS:
         raise MeshError(
-            f"has a texture of {width} x {height} pixels; reduce it to at most 8192 x 8192"
+            f"{name} has {image.width} x {image.height} pixels; reduce it to at most 8192 x 8192"
         )
+    return image

@@ -10,6 +10,7 @@ import os
 import site
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -240,7 +241,8 @@ def test_mesh_far_from_its_origin_is_refused_with_the_offset(tmp_path: Path) -> 
 def test_collada_has_the_unit_that_it_states(tmp_path: Path) -> None:
     solid = BOX.copy()
     solid.apply_scale(100.0)
-    text = solid.export(file_type="dae").decode()
+    exported: Any = solid.export(file_type="dae")
+    text = exported.decode()
     unit = '<unit name="centimeter" meter="0.01"/>'
     text = text.replace("<up_axis>", f"{unit}<up_axis>")
     (tmp_path / "cm.dae").write_text(text)

@@ -62,9 +62,8 @@ def _info(shape: TargetShape) -> dict[str, Any]:
 
 def read_models(folder: Path) -> TargetShape:
     """Return the shape of the only model of a folder. Raises DatasetError."""
-    from chaserdock_protocol.scenario.mesh_files import (
-        trimesh_scene,
-    )  # needs trimesh, slow to import
+    # Needs trimesh, which is slow to import.
+    from chaserdock_protocol.scenario.mesh_files import trimesh_scene
 
     info_file = folder / "models_info.json"
     infos = read_object(info_file)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Repair of surfaces from files: triangles that disagree with their neighbours, surfaces that face
-inwards, and triangles that exist twice.
+"""Repair surfaces from files.
+
+Triangles that disagree with their neighbours or face inwards are turned, those that exist twice are
+dropped, and parts that are closed only together are joined.
 """
 
 from __future__ import annotations
@@ -118,8 +120,9 @@ def _single(part: MeshPart) -> tuple[MeshPart, tuple[str, ...]]:
 
 
 def _edges(part: MeshPart) -> tuple[IntArray, IntArray]:
-    """Return the number of the edge (3 m,) of each side of each triangle, and how many sides (n,)
-    an edge has.
+    """Return the edges of triangles.
+
+    The number of the edge (3 m,) of each side of each triangle, and the sides (n,) of each edge.
     """
     ends = np.concatenate([part.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
     keys = ends.min(axis=1) * len(part.vertices_m) + ends.max(axis=1)
@@ -128,8 +131,9 @@ def _edges(part: MeshPart) -> tuple[IntArray, IntArray]:
 
 
 def _neighbours(part: MeshPart) -> tuple[IntArray, IntArray, BoolArray]:
-    """Return the pairs of triangles that share an edge of two sides, and whether they pass it in
-    the same direction, and so disagree.
+    """Return the pairs of triangles (k,), (k,) that share an edge, and whether they disagree (k,).
+
+    Those that disagree pass the edge in the same direction. Edges of more than two sides count not.
     """
     edge, uses = _edges(part)
     sides = np.flatnonzero(uses[edge] == 2)

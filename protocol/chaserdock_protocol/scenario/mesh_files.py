@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read mesh files (GLB, glTF, and OBJ, STL, PLY, OFF, COLLADA through trimesh); every problem is
-one line that says what would be right.
+"""Read mesh files: GLB and glTF, and OBJ, STL, PLY, OFF and COLLADA through trimesh.
 
-A part is a primitive of a node of the file with its material. What the format cannot say (texture,
-density, joints) is in the extras of nodes and scene under ``EXTRAS``, as `chaserdock target --mesh`
-writes them.
+Every problem is one line that says what would be right. A part is a primitive of a node of the file
+with its material. What the format cannot say (texture, density, joints) is in the extras of nodes
+and scene under ``EXTRAS``, as `chaserdock target --mesh` writes them.
 """
 
 from __future__ import annotations
@@ -68,8 +67,9 @@ _UNITS = (
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh that was read, what was changed or assumed (``notes``), and the deviation by
-    decimation.
+    """A mesh that was read.
+
+    ``notes``: what was changed or assumed. ``deviation_m``: by decimation.
     """
 
     mesh: TriangleMesh
@@ -84,11 +84,11 @@ def read_surface(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 
 
 
 def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0)) -> MeshFile:
-    """Read a mesh file; ``scale`` is the factor to metres, ``origin_m`` the point of the file that
-    becomes the origin.
+    """Read a mesh file.
 
-    Raises ScenarioError with one line for a file that is not a mesh, is not closed, or has an
-    absurd size.
+    ``scale``: factor from the file's unit to metres. ``origin_m``: point of the file that becomes
+    the origin. Raises ScenarioError with one line for a file that is not a mesh, is not closed, or
+    has an absurd size.
     """
     try:
         return _read(path, scale, np.array(origin_m))
@@ -173,8 +173,9 @@ def _few(solids: Iterator[Solid]) -> list[Solid]:
 
 
 def trimesh_scene(path: Path) -> Any:
-    """Return the scene of a file as trimesh reads it, checked at the boundary. Raises MeshError,
-    and what trimesh raises.
+    """Return the scene of a file as trimesh reads it, checked at the boundary.
+
+    Raises MeshError, and what trimesh raises.
     """
     data = read_bytes(path)
     check_counts(data, path.suffix.lower())
@@ -203,8 +204,9 @@ def _trimesh_scene(data: bytes, suffix: str, files: ReferencedFiles) -> Any:
 
 
 def _absolute_indices(data: bytes) -> bytes:
-    """Return an OBJ file whose faces count from the start: negative indices count back from the
-    line of the face, where trimesh counts back from the end of the file.
+    """Return an OBJ file whose faces count from the start. Raises MeshError for an index of 0.
+
+    Negative indices count back from the line of the face; trimesh counts from the end of the file.
     """
     if re.search(rb"^[ \t]*f[ \t](?:.*[ \t])?0+(?:[/ \t\r]|$)", data, re.MULTILINE):
         raise MeshError("has a face with vertex 0, where the first is 1; export it anew")
@@ -258,8 +260,9 @@ def _solids(scene: Any, suffix: str, notes: list[str]) -> Iterator[Solid]:
 
 
 def _object_names(scene: Any) -> dict[str, str]:
-    """Return the names of objects (OBJ) of one material by the names that trimesh gives to their
-    geometries, which end in that of the material.
+    """Return the names of objects (OBJ) of one material, by the names of their geometries.
+
+    Trimesh appends the name of the material.
     """
     bases: dict[str, list[str]] = {}
     for name, geometry in scene.geometry.items():
@@ -292,8 +295,9 @@ def _part(solid: Solid) -> MeshPart:
 
 
 def _welded(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
-    """Join vertices of one place, which files split at creases, round them to 32 bits, and drop
-    triangles without area.
+    """Join vertices at one place, and drop triangles without area.
+
+    Files split vertices at creases. Coordinates are rounded to 32 bits.
     """
     vertices = vertices.astype(np.float32).astype(float)
     first, place = welded(vertices, _grain_m(np.ptp(vertices, axis=0)))
@@ -409,8 +413,9 @@ def _check_size(solids: list[Solid], scale: float, origin_m: Array) -> None:
 
 
 def _closed(part: MeshPart, notes: list[str]) -> MeshPart:
-    """Return a part with its triangles counter-clockwise. Raises MeshError for one that is not
-    closed.
+    """Return a part with its triangles counter-clockwise.
+
+    Raises MeshError for one that is not closed.
     """
     part, changes = repaired(part)
     at = hole_m(part)

@@ -50,8 +50,9 @@ def channel_means(image: Any, is_srgb: bool) -> Array:
 
 
 def metallic_roughness(label: str, grey: float, metallic: float, roughness: float) -> Material:
-    """Return a material of metallic-roughness shading: a metal reflects mostly in its highlight,
-    whose exponent is 2 / r^4 - 2.
+    """Return the material of metallic-roughness shading.
+
+    A metal reflects mostly in its highlight, whose exponent is 2 / r^4 - 2 at the roughness r.
     """
     metallic, roughness = float(np.clip(metallic, 0, 1)), float(np.clip(roughness, 0.1, 1.0))
     shininess = float(np.clip(2.0 / roughness**4 - 2.0, 1.0, 200.0))

@@ -37,7 +37,7 @@ from .errors import ScenarioError
 from .mesh_gltf import Solid, parse_gltf
 from .mesh_materials import channel_means, grey_of, metallic_roughness, phong
 from .mesh_sources import (
-    MeshError,
+    MeshFileError,
     ReferencedFiles,
     check_counts,
     check_triangles,
@@ -92,7 +92,7 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
     """
     try:
         return _read(path, scale, np.array(origin_m))
-    except MeshError as error:
+    except MeshFileError as error:
         raise ScenarioError(f"{path}: {error}") from None
 
 
@@ -100,7 +100,7 @@ def _read(path: Path, scale: float, origin_m: Array) -> MeshFile:
     with np.errstate(over="ignore", invalid="ignore"):  # of foreign numbers, checked here
         solids, joints, notes = _load(path)
         if not solids:
-            raise MeshError("contains no triangles; a target needs closed surfaces")
+            raise MeshFileError("contains no triangles; a target needs closed surfaces")
         placed = [replace(s, vertices=scale * s.vertices - origin_m) for s in solids]
         for solid in placed:
             _check_numbers(solid)
@@ -122,7 +122,7 @@ def _read(path: Path, scale: float, origin_m: Array) -> MeshFile:
             f"{1e3 * deviation_m:.2f} mm"
         )
         if mesh.triangle_count > 2 * MAX_TRIANGLES:
-            raise MeshError(
+            raise MeshFileError(
                 f"{before:,} triangles in many parts or with many handles; simplify it "
                 f"to {MAX_TRIANGLES:,}"
             )
@@ -134,10 +134,10 @@ Content = tuple[list[Solid], dict[str, Vector3], list[str]]
 
 
 def _load(path: Path) -> Content:
-    """Return the content of a file. Raises MeshError."""
+    """Return the content of a file. Raises MeshFileError."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise MeshError(f"not a mesh file; its name must end in {', '.join(SUFFIXES)}")
+        raise MeshFileError(f"not a mesh file; its name must end in {', '.join(SUFFIXES)}")
     data = read_bytes(path)
     files = ReferencedFiles(path)
     try:
@@ -151,11 +151,11 @@ def _load(path: Path) -> Content:
         notes += [f"{reason}; drawn without it" for reason in dict.fromkeys(files.refused)]
         return solids, {}, notes
     except _Refused as error:
-        raise MeshError(str(error)) from None
+        raise MeshFileError(str(error)) from None
     except Exception as error:  # readers of foreign formats raise whatever they stumble over
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
         remedy = "" if ";" in reason else "; export it anew"
-        raise MeshError(f"not a {suffix[1:].upper()} mesh: {reason}{remedy}") from None
+        raise MeshFileError(f"not a {suffix[1:].upper()} mesh: {reason}{remedy}") from None
 
 
 class _Refused(Exception):
@@ -175,7 +175,7 @@ def _few(solids: Iterator[Solid]) -> list[Solid]:
 def trimesh_scene(path: Path) -> Any:
     """Return the scene of a file as trimesh reads it, checked at the boundary.
 
-    Raises MeshError, and what trimesh raises.
+    Raises MeshFileError, and what trimesh raises.
     """
     data = read_bytes(path)
     check_counts(data, path.suffix.lower())
@@ -204,12 +204,12 @@ def _trimesh_scene(data: bytes, suffix: str, files: ReferencedFiles) -> Any:
 
 
 def _absolute_indices(data: bytes) -> bytes:
-    """Return an OBJ file whose faces count from the start. Raises MeshError for an index of 0.
+    """Return an OBJ file whose faces count from the start. Raises MeshFileError for an index of 0.
 
     Negative indices count back from the line of the face; trimesh counts from the end of the file.
     """
     if re.search(rb"^[ \t]*f[ \t](?:.*[ \t])?0+(?:[/ \t\r]|$)", data, re.MULTILINE):
-        raise MeshError("has a face with vertex 0, where the first is 1; export it anew")
+        raise MeshFileError("has a face with vertex 0, where the first is 1; export it anew")
     if not re.search(rb"^[ \t]*f[ \t].*-\d", data, re.MULTILINE):
         return data
     seen = {b"v": 0, b"vt": 0, b"vn": 0}
@@ -233,7 +233,7 @@ def _absolute_indices(data: bytes) -> bytes:
 
 
 def _solids(scene: Any, suffix: str, notes: list[str]) -> Iterator[Solid]:
-    """Yield the nodes of a scene of trimesh. Raises MeshError."""
+    """Yield the nodes of a scene of trimesh. Raises MeshFileError."""
     order = {name: k for k, name in enumerate(scene.geometry)}
     placed = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
     check_triangles(sum(len(getattr(scene.geometry[g], "faces", ())) for *_, g in placed))
@@ -248,7 +248,7 @@ def _solids(scene: Any, suffix: str, notes: list[str]) -> Iterator[Solid]:
         vertices = np.asarray(geometry.vertices, dtype=float)
         triangles = np.asarray(geometry.faces, dtype=np.int64)
         if triangles.min() < 0 or triangles.max() >= len(vertices):
-            raise MeshError(
+            raise MeshFileError(
                 f"part {plain!r} has a triangle of a vertex that does not exist; export it anew"
             )
         if suffix == ".dae":
@@ -273,13 +273,15 @@ def _object_names(scene: Any) -> dict[str, str]:
 
 
 def _check_numbers(solid: Solid) -> None:
-    """Raise MeshError for a vertex that is not a number in 32 bits, as it is stored."""
+    """Raise MeshFileError for a vertex that is not a number in 32 bits, as it is stored."""
     if not np.isfinite(solid.vertices.astype(np.float32)).all():
-        raise MeshError(f"part {solid.name!r} has a vertex that is not a number; export it anew")
+        raise MeshFileError(
+            f"part {solid.name!r} has a vertex that is not a number; export it anew"
+        )
 
 
 def _part(solid: Solid) -> MeshPart:
-    """Return a solid as a part with welded vertices. Raises MeshError."""
+    """Return a solid as a part with welded vertices. Raises MeshFileError."""
     vertices, triangles = _welded(solid.vertices, solid.triangles)
     extras = solid.extras.get(EXTRAS)
     if extras is None:
@@ -287,7 +289,7 @@ def _part(solid: Solid) -> MeshPart:
     try:
         material = SurfaceMaterial.model_validate(extras.get("material", {})).material()
     except (ValidationError, AttributeError):
-        raise MeshError(
+        raise MeshFileError(
             f"part {solid.name!r}: its extras {EXTRAS!r} must be as `chaserdock target "
             "--mesh` writes them"
         ) from None
@@ -325,7 +327,7 @@ def _with_unique_names(parts: list[MeshPart]) -> list[MeshPart]:
 
 
 def _joints(scene: dict[str, Any]) -> dict[str, Vector3]:
-    """Return the positions of joints in a scene's extras, in the file's unit. Raises MeshError."""
+    """Return the positions of joints in a scene's extras, in the file's unit. Raises MeshFileError."""
     extras = scene.get("extras")
     held = extras.get(EXTRAS, {}) if isinstance(extras, dict) else {}
     try:
@@ -390,7 +392,7 @@ def _grey_of_bytes(colours: Any) -> float:
 
 
 def _check_size(solids: list[Solid], scale: float, origin_m: Array) -> None:
-    """Raise MeshError for a mesh of a size or at a distance that no target has."""
+    """Raise MeshFileError for a mesh of a size or at a distance that no target has."""
     low = np.min([s.vertices[s.triangles].min(axis=(0, 1)) for s in solids], axis=0)
     high = np.max([s.vertices[s.triangles].max(axis=(0, 1)) for s in solids], axis=0)
     size = float((high - low).max())
@@ -401,12 +403,12 @@ def _check_size(solids: list[Solid], scale: float, origin_m: Array) -> None:
             if _SMALLEST_M <= size * factor <= _LARGEST_M
         ]
         hint = f"; if it is {'; if '.join(fitting)}" if fitting else ""
-        raise MeshError(
+        raise MeshFileError(
             f"is {size:.4g} m long; a target measures {_SMALLEST_M} to {_LARGEST_M:g} m{hint}"
         )
     if max(np.abs(low).max(), np.abs(high).max()) > 2.0 * _LARGEST_M:
         middle = ", ".join(f"{v:.4g}" for v in (low + high) / 2.0 + origin_m)
-        raise MeshError(
+        raise MeshFileError(
             f"lies {np.linalg.norm((low + high) / 2.0):.4g} m from its origin; "
             f"mesh_origin_m = [{middle}] puts its middle there"
         )
@@ -415,7 +417,7 @@ def _check_size(solids: list[Solid], scale: float, origin_m: Array) -> None:
 def _closed(part: MeshPart, notes: list[str]) -> MeshPart:
     """Return a part with its triangles counter-clockwise.
 
-    Raises MeshError for one that is not closed.
+    Raises MeshFileError for one that is not closed.
     """
     part, changes = repaired(part)
     at = hole_m(part)
@@ -423,15 +425,15 @@ def _closed(part: MeshPart, notes: list[str]) -> MeshPart:
         x, y, z = at.tolist()
         where = f"{open_edges(part)} open edges, one near ({x:.3f}, {y:.3f}, {z:.3f}) m"
         if unshared_edges(part):
-            raise MeshError(
+            raise MeshFileError(
                 f"part {part.name!r} has a hole: {where}; "
                 "close its surface (a sheet needs a thickness)"
             )
-        raise MeshError(
+        raise MeshFileError(
             f"part {part.name!r} has no inside: {where}, where more than two triangles meet or a "
             "surface has one side; make it manifold"
         )
     if not volume_m3(part) > _SMALLEST_M3:
-        raise MeshError(f"part {part.name!r} encloses no volume; give it a thickness")
+        raise MeshFileError(f"part {part.name!r} encloses no volume; give it a thickness")
     notes.extend(f"{part.name}: {change}" for change in changes)
     return part

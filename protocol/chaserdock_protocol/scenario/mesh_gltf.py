@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from .mesh_materials import channel_means, grey_of, metallic_roughness, phong
 from .mesh_sources import (
     MOST_TRIANGLES,
-    MeshError,
+    MeshFileError,
     ReferencedFiles,
     check_triangles,
     open_image,
@@ -77,7 +77,7 @@ class Gltf:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """The scene that is shown, or one of all roots. Raises MeshError."""
+        """The scene that is shown, or one of all roots. Raises MeshFileError."""
         if self.tree.get("scenes"):
             return self._item("scenes", self.tree.get("scene", 0))
         nodes = self._list("nodes")
@@ -85,7 +85,7 @@ class Gltf:
         return {"nodes": [k for k in range(len(nodes)) if k not in children]}
 
     def solids(self) -> Iterator[Solid]:
-        """Yield the primitives of the scene, in the order of its nodes. Raises MeshError."""
+        """Yield the primitives of the scene, in the order of its nodes. Raises MeshFileError."""
         placed = self._placed()
         triangles = 0
         for number, transform in placed.items():
@@ -118,26 +118,28 @@ class Gltf:
                 yield Solid(name, vertices, corners, material, _dict_or_empty(extras))
 
     def _placed(self) -> dict[int, Array]:
-        """Return the transform (4, 4) to the scene of each node in it. Raises MeshError."""
+        """Return the transform (4, 4) to the scene of each node in it. Raises MeshFileError."""
         placed: dict[int, Array] = {}
         waiting = [(k, np.eye(4)) for k in reversed(_of(self.scene, "nodes", list, []))]
         while waiting:
             number, parent = waiting.pop()
             node = self._item("nodes", number)
             if number in placed:
-                raise MeshError(f"node {number} has two parents or is its own; export it as a tree")
+                raise MeshFileError(
+                    f"node {number} has two parents or is its own; export it as a tree"
+                )
             placed[number] = parent @ _transform(node, number)
             children = _of(node, "children", list, [])
             waiting += [(k, placed[number]) for k in reversed(children)]
             if "EXT_mesh_gpu_instancing" in _of(node, "extensions", dict, {}):
-                raise MeshError(_unsupported("EXT_mesh_gpu_instancing"))
+                raise MeshFileError(_unsupported("EXT_mesh_gpu_instancing"))
         return placed
 
     def _positions(self, primitive: Any, node: Any, mesh: Any, placed: dict[int, Array]) -> Array:
         """Return the vertices (n, 3) of a primitive, deformed by morph targets and skin."""
         attributes = _of(primitive, "attributes", dict)
         if "POSITION" not in attributes:
-            raise MeshError("has a primitive without POSITION")
+            raise MeshFileError("has a primitive without POSITION")
         self._refuse_compressed(primitive, attributes["POSITION"])
         vertices = self.accessor(attributes["POSITION"], 3)
         targets = _of(primitive, "targets", list, [])
@@ -150,38 +152,40 @@ class Gltf:
         skin = self._item("skins", node["skin"])
         joints = _of(skin, "joints", list)
         if any(k not in placed for k in joints):
-            raise MeshError("has a skin whose joints are not in the scene; apply its armature")
+            raise MeshFileError("has a skin whose joints are not in the scene; apply its armature")
         moves = np.array([placed[k] for k in joints])
         if "inverseBindMatrices" in skin:
             inverse = self.accessor(skin["inverseBindMatrices"], 16).reshape(-1, 4, 4)
             if len(inverse) < len(joints):
-                raise MeshError("has a skin with fewer matrices than joints")
+                raise MeshFileError("has a skin with fewer matrices than joints")
             moves = moves @ inverse[: len(joints)].transpose(0, 2, 1)
         where = self._like(attributes["JOINTS_0"], 4, vertices).astype(np.int64)
         share = self._like(attributes.get("WEIGHTS_0"), 4, vertices)
         if where.max(initial=0) >= len(joints):
-            raise MeshError("has a vertex of a joint that does not exist")
+            raise MeshFileError("has a vertex of a joint that does not exist")
         long = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1)
         return np.einsum("nk,nkij,nj->ni", share, moves[where], long)[:, :3]
 
     def _like(self, number: Any, width: int, vertices: Array) -> Array:
         found = self.accessor(number, width)
         if len(found) != len(vertices):
-            raise MeshError(f"accessor {number} has {len(found)} rows for {len(vertices)} vertices")
+            raise MeshFileError(
+                f"accessor {number} has {len(found)} rows for {len(vertices)} vertices"
+            )
         return found
 
     def _refuse_compressed(self, primitive: Any, position: Any) -> None:
         held = _of(primitive, "extensions", dict, {})
         accessor = self._item("accessors", position)
         if "KHR_draco_mesh_compression" in held and "bufferView" not in accessor:
-            raise MeshError(_unsupported("KHR_draco_mesh_compression"))
+            raise MeshFileError(_unsupported("KHR_draco_mesh_compression"))
 
     def _triangles(self, primitive: Any, vertices: int) -> IntArray:
-        """Return the triangles (m, 3) of a primitive. Raises MeshError."""
+        """Return the triangles (m, 3) of a primitive. Raises MeshFileError."""
         given = primitive.get("indices")
         corners = np.arange(vertices) if given is None else self.indices(given)
         if corners.max(initial=-1) >= vertices:
-            raise MeshError(
+            raise MeshFileError(
                 f"has a triangle with vertex {corners.max()}, of {vertices} vertices; export it anew"
             )
         mode = primitive.get("mode", 4)
@@ -193,13 +197,13 @@ class Gltf:
             first = np.broadcast_to(corners[:1], max(len(corners) - 2, 0))
             return np.stack([first, corners[1:-1], corners[2:]], axis=1)
         if mode != 4 or len(corners) % 3:
-            raise MeshError(f"has a primitive of {len(corners)} corners, mode {mode!r}")
+            raise MeshFileError(f"has a primitive of {len(corners)} corners, mode {mode!r}")
         return corners.reshape(-1, 3)
 
     def accessor(self, number: Any, width: int) -> Array:
         """Return the rows (n, width) of an accessor; normalized integers as fractions.
 
-        Raises MeshError.
+        Raises MeshFileError.
         """
         key = ("accessor", number, width)
         if key not in self._read:
@@ -212,37 +216,39 @@ class Gltf:
         return self._read[key]
 
     def indices(self, number: Any) -> IntArray:
-        """Return the whole numbers (n,) of an accessor. Raises MeshError."""
+        """Return the whole numbers (n,) of an accessor. Raises MeshFileError."""
         rows = self._rows(self._item("accessors", number), number, 1)
         if rows.dtype.kind != "u":
-            raise MeshError(f"accessor {number} has numbers of vertices that are not whole")
+            raise MeshFileError(f"accessor {number} has numbers of vertices that are not whole")
         return rows[:, 0].astype(np.int64)
 
     def _rows(self, held: Any, number: Any, width: int) -> NDArray[Any]:
-        """Return the rows (n, width) of an accessor as they are stored. Raises MeshError."""
+        """Return the rows (n, width) of an accessor as they are stored. Raises MeshFileError."""
         kind = _COMPONENTS.get(held.get("componentType"))
         columns = _WIDTHS.get(held.get("type", ""))
         count = held.get("count")
         if kind is None or columns is None or not _is_whole(count):
-            raise MeshError(f"accessor {number} has no valid componentType, type and count")
+            raise MeshFileError(f"accessor {number} has no valid componentType, type and count")
         if columns != width:
-            raise MeshError(f"accessor {number} has {columns} columns in place of {width}")
+            raise MeshFileError(f"accessor {number} has {columns} columns in place of {width}")
         if count > 3 * MOST_TRIANGLES:
-            raise MeshError(f"accessor {number} has {count:,} rows; simplify the mesh")
+            raise MeshFileError(f"accessor {number} has {count:,} rows; simplify the mesh")
         rows = np.zeros((count, columns), dtype=kind)
         if "bufferView" in held:
             rows = self._view_rows(held, count, kind, columns, number)
         return self._sparse(rows, held["sparse"], number) if "sparse" in held else rows
 
     def _sparse(self, rows: NDArray[Any], sparse: Any, number: Any) -> NDArray[Any]:
-        """Return rows with the sparse values of their accessor. Raises MeshError."""
+        """Return rows with the sparse values of their accessor. Raises MeshFileError."""
         where, values = _of(sparse, "indices", dict), _of(sparse, "values", dict)
         count, kind = sparse.get("count"), _COMPONENTS.get(where.get("componentType", 0), "")
         if not _is_whole(count) or "u" not in kind or count > len(rows):
-            raise MeshError(f"accessor {number} has sparse values without valid count and indices")
+            raise MeshFileError(
+                f"accessor {number} has sparse values without valid count and indices"
+            )
         index = self._view_rows(where, count, kind, 1, number)[:, 0].astype(np.int64)
         if index.max(initial=-1) >= len(rows):
-            raise MeshError(f"accessor {number} has sparse values of rows that do not exist")
+            raise MeshFileError(f"accessor {number} has sparse values of rows that do not exist")
         out = rows.copy()
         out[index] = self._view_rows(values, count, rows.dtype.str, rows.shape[1], number)
         return out
@@ -250,7 +256,7 @@ class Gltf:
     def _view_rows(
         self, held: Any, count: int, kind: str, columns: int, number: Any
     ) -> NDArray[Any]:
-        """Return the rows (count, columns) that an object refers to. Raises MeshError."""
+        """Return the rows (count, columns) that an object refers to. Raises MeshFileError."""
         data, stride = self._view(held.get("bufferView"))
         at, size = held.get("byteOffset", 0), columns * np.dtype(kind).itemsize
         stride = stride or size
@@ -259,7 +265,7 @@ class Gltf:
             or stride < size
             or (count and at + (count - 1) * stride + size > len(data))
         ):
-            raise MeshError(f"accessor {number} exceeds its buffer; the file is cut or damaged")
+            raise MeshFileError(f"accessor {number} exceeds its buffer; the file is cut or damaged")
         if not count:
             return np.zeros((0, columns), dtype=kind)
         block = np.ndarray((count, size), np.uint8, data, at, (stride, 1))
@@ -271,7 +277,7 @@ class Gltf:
         if "EXT_meshopt_compression" in _of(view, "extensions", dict, {}):
             buffer = self._item("buffers", view.get("buffer"))
             if "uri" not in buffer and (view.get("buffer") != 0 or self.binary is None):
-                raise MeshError(_unsupported("EXT_meshopt_compression"))
+                raise MeshFileError(_unsupported("EXT_meshopt_compression"))
         data = self._buffer(view.get("buffer"))
         at, length, stride = (
             view.get("byteOffset", 0),
@@ -279,9 +285,11 @@ class Gltf:
             view.get("byteStride", 0),
         )
         if not (_is_whole(at) and _is_whole(length) and _is_whole(stride)):
-            raise MeshError(f"buffer view {number} has no valid byteOffset and byteLength")
+            raise MeshFileError(f"buffer view {number} has no valid byteOffset and byteLength")
         if at + length > len(data):
-            raise MeshError(f"buffer view {number} exceeds its buffer; the file is cut or damaged")
+            raise MeshFileError(
+                f"buffer view {number} exceeds its buffer; the file is cut or damaged"
+            )
         return data[at : at + length], stride
 
     def _buffer(self, number: Any) -> bytes:
@@ -293,10 +301,10 @@ class Gltf:
             elif number == 0 and self.binary is not None:
                 data = self.binary
             else:
-                raise MeshError(f"buffer {number} has no content; the file is cut or damaged")
+                raise MeshFileError(f"buffer {number} has no content; the file is cut or damaged")
             length = held.get("byteLength")
             if not _is_whole(length) or len(data) < length:
-                raise MeshError(
+                raise MeshFileError(
                     f"buffer {number} has {len(data)} of {length} bytes; the file is cut or damaged"
                 )
             self._read[key] = data
@@ -304,16 +312,16 @@ class Gltf:
 
     def _uri(self, uri: Any) -> bytes:
         if not isinstance(uri, str):
-            raise MeshError("has a uri that is not a text")
+            raise MeshFileError("has a uri that is not a text")
         if not uri.startswith("data:"):
             return self.files.read_uri(uri)
         head, comma, text = uri.partition(",")
         if not comma or not head.endswith(";base64"):
-            raise MeshError("has data in its JSON that is not base64")
+            raise MeshFileError("has data in its JSON that is not base64")
         try:
             return base64.b64decode(text, validate=True)
         except (binascii.Error, ValueError) as error:
-            raise MeshError(f"has data in its JSON that is not base64: {error}") from None
+            raise MeshFileError(f"has data in its JSON that is not base64: {error}") from None
 
     def _material(self, name: str, primitive: Any) -> Material:
         """Return the material of a primitive, with the defaults of the specification."""
@@ -369,12 +377,12 @@ class Gltf:
         return grey
 
     def _texture(self, held: Any) -> Any:
-        """Return the image of a texture. Raises MeshError."""
+        """Return the image of a texture. Raises MeshFileError."""
         texture = self._item("textures", _of(held, "index", int))
         extensions = _of(texture, "extensions", dict, {})
         source = texture.get("source", _of(extensions, "EXT_texture_webp", dict, {}).get("source"))
         if source is None:
-            raise MeshError(_unsupported(next(iter(extensions), "texture without an image")))
+            raise MeshFileError(_unsupported(next(iter(extensions), "texture without an image")))
         key = ("image", source)
         if key not in self._read:
             image = self._item("images", source)
@@ -384,7 +392,7 @@ class Gltf:
                 else self._view(image.get("bufferView"))[0]
             )
             if data.startswith(b"\xabKTX 20"):
-                raise MeshError(_unsupported("KHR_texture_basisu"))
+                raise MeshFileError(_unsupported("KHR_texture_basisu"))
             self._read[key] = open_image(data, f"image {source}")
         return self._read[key]
 
@@ -392,56 +400,56 @@ class Gltf:
         return _of(self.tree, key, list, [])
 
     def _item(self, key: str, number: Any) -> dict[str, Any]:
-        """Return an element of a list of the file. Raises MeshError."""
+        """Return an element of a list of the file. Raises MeshFileError."""
         rows = self._list(key)
         if not _is_whole(number) or number >= len(rows) or not isinstance(rows[number], dict):
-            raise MeshError(f"refers to {key}[{number}], of {len(rows)}; export it anew")
+            raise MeshFileError(f"refers to {key}[{number}], of {len(rows)}; export it anew")
         return rows[number]
 
 
 def parse_gltf(data: bytes, files: ReferencedFiles, binary: bool) -> Gltf:
-    """Return the content of a GLB (``binary``) or glTF file. Raises MeshError."""
+    """Return the content of a GLB (``binary``) or glTF file. Raises MeshFileError."""
     chunk = None
     if binary:
         data, chunk = _chunks(data)
     try:
         tree = json.loads(data.decode("utf-8-sig"))
     except RecursionError:
-        raise MeshError("its JSON is nested too deeply") from None
+        raise MeshFileError("its JSON is nested too deeply") from None
     except ValueError as error:
-        raise MeshError(f"its JSON is not valid: {error}") from None
+        raise MeshFileError(f"its JSON is not valid: {error}") from None
     if not isinstance(tree, dict):
-        raise MeshError("its JSON is not an object")
+        raise MeshFileError("its JSON is not an object")
     version = str(_of(tree, "asset", dict, {}).get("version", "1"))
     if version.split(".")[0] != "2":
-        raise MeshError(f"it is glTF {version[:10]}; convert it to glTF 2.0")
+        raise MeshFileError(f"it is glTF {version[:10]}; convert it to glTF 2.0")
     for name in _of(tree, "extensionsRequired", list, []):
         if name not in _SUPPORTED and not str(name).startswith("KHR_materials_"):
-            raise MeshError(_unsupported(str(name)[:80]))
+            raise MeshFileError(_unsupported(str(name)[:80]))
     return Gltf(tree, chunk, files)
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the JSON of a GLB file, and its binary chunk if it has one. Raises MeshError."""
+    """Return the JSON of a GLB file, and its binary chunk if it has one. Raises MeshFileError."""
     if data[:4] != b"glTF":
-        raise MeshError("it does not begin with 'glTF'")
+        raise MeshFileError("it does not begin with 'glTF'")
     if len(data) < 20:
-        raise MeshError("the file is cut or damaged")
+        raise MeshFileError("the file is cut or damaged")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise MeshError(f"it is glTF {version}; convert it to glTF 2.0")
+        raise MeshFileError(f"it is glTF {version}; convert it to glTF 2.0")
     if length > len(data):
-        raise MeshError(f"it has {len(data)} of {length} bytes; the file is cut or damaged")
+        raise MeshFileError(f"it has {len(data)} of {length} bytes; the file is cut or damaged")
     found: list[tuple[int, bytes]] = []
     at = 12
     while at + 8 <= length:
         size, kind = struct.unpack_from("<II", data, at)
         if at + 8 + size > length:
-            raise MeshError("a chunk exceeds the file; it is cut or damaged")
+            raise MeshFileError("a chunk exceeds the file; it is cut or damaged")
         found.append((kind, data[at + 8 : at + 8 + size]))
         at += 8 + size
     if not found or found[0][0] != 0x4E4F534A:
-        raise MeshError("its first chunk is not JSON")
+        raise MeshFileError("its first chunk is not JSON")
     return found[0][1], next((body for kind, body in found[1:] if kind == 0x004E4942), None)
 
 
@@ -451,7 +459,7 @@ def _unsupported(name: str) -> str:
 
 
 def _transform(node: Any, number: int) -> Array:
-    """Return the transform (4, 4) of a node to its parent. Raises MeshError."""
+    """Return the transform (4, 4) of a node to its parent. Raises MeshFileError."""
     out = np.eye(4)
     try:
         if "matrix" in node:
@@ -466,19 +474,21 @@ def _transform(node: Any, number: int) -> Array:
             out[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), dtype=float).reshape(3)
             out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), dtype=float).reshape(3)
     except (TypeError, ValueError, OverflowError):
-        raise MeshError(f"node {number} has a transform that is not one") from None
+        raise MeshFileError(f"node {number} has a transform that is not one") from None
     if not np.isfinite(out).all():
-        raise MeshError(f"node {number} has a transform that is not a number")
+        raise MeshFileError(f"node {number} has a transform that is not a number")
     return out
 
 
 def _of(held: Any, key: str, kind: type, default: Any = None) -> Any:
-    """Return a value of an object, of the right type. Raises MeshError."""
+    """Return a value of an object, of the right type. Raises MeshFileError."""
     if not isinstance(held, dict):
-        raise MeshError(f"has a {type(held).__name__} where its JSON needs an object with {key!r}")
+        raise MeshFileError(
+            f"has a {type(held).__name__} where its JSON needs an object with {key!r}"
+        )
     value = held.get(key, default)
     if not isinstance(value, kind):
-        raise MeshError(f"its JSON needs {key!r} as {kind.__name__}")
+        raise MeshFileError(f"its JSON needs {key!r} as {kind.__name__}")
     return value
 
 
@@ -493,7 +503,7 @@ def _is_whole(value: Any) -> TypeGuard[int]:
 def _number(held: Any, key: str) -> float:
     value = held.get(key, 1.0)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise MeshError(f"its {key} is not a number")
+        raise MeshFileError(f"its {key} is not a number")
     return float(value)
 
 
@@ -503,5 +513,5 @@ def _colour(held: Any, key: str) -> Array:
     try:
         out = np.array(value, dtype=float)[:3].reshape(3)
     except (TypeError, ValueError, IndexError):
-        raise MeshError(f"its {key} is not a colour") from None
+        raise MeshFileError(f"its {key} is not a colour") from None
     return out

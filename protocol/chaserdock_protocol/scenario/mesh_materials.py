@@ -13,7 +13,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.meshes import Material
 
-from .mesh_sources import MeshError
+from .mesh_sources import MeshFileError
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Share of red, green and blue in luminance (ITU-R BT.709)."""
@@ -25,7 +25,7 @@ def grey_of(rgb: Array) -> float:
     """Return the mean luminance of linear colours (n, 3), 0 to 1."""
     mean = float((np.asarray(rgb, dtype=float) @ _LUMINANCE).mean())
     if not np.isfinite(mean):
-        raise MeshError("has a colour that is not a number")
+        raise MeshFileError("has a colour that is not a number")
     return round(float(np.clip(mean, 0.0, 1.0)), 4)
 
 
@@ -37,7 +37,7 @@ def linear_of(encoded: Array) -> Array:
 def channel_means(image: Any, is_srgb: bool) -> Array:
     """Return the means of red, green and blue (3,), linear, of an image of Pillow.
 
-    Raises MeshError for a damaged image.
+    Raises MeshFileError for a damaged image.
     """
     levels = np.linspace(0.0, 1.0, 256)
     try:
@@ -45,7 +45,7 @@ def channel_means(image: Any, is_srgb: bool) -> Array:
             image = image.point(lambda v: v / 257.0).convert("L")
         counts = np.reshape(image.convert("RGB").histogram(), (3, 256))
     except Exception as error:  # Pillow raises whatever its decoders stumble over
-        raise MeshError(f"has a texture that cannot be read: {str(error)[:80]}") from None
+        raise MeshFileError(f"has a texture that cannot be read: {str(error)[:80]}") from None
     return counts @ (linear_of(levels) if is_srgb else levels) / counts.sum(axis=1)
 
 

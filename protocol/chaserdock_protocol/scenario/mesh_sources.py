@@ -30,30 +30,32 @@ _GREY = re.compile(rb"^([ \t]*k[ads])[ \t]+(\S+)[ \t\r]*$", re.MULTILINE | re.IG
 """A grey in a material file by one number, for which trimesh drops all materials of the file."""
 
 
-class MeshError(ValueError):
+class MeshFileError(ValueError):
     """A mesh file that cannot be read; the text says what is wrong and what would be right."""
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a regular file. Raises MeshError."""
+    """Return the content of a regular file. Raises MeshFileError."""
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
-        raise MeshError("no such file") from None
+        raise MeshFileError("no such file") from None
     except (OSError, ValueError) as error:
-        raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise MeshFileError(
+            f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from None
     try:
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
-            raise MeshError("not a regular file; a mesh is read from a file, no pipe or device")
+            raise MeshFileError("not a regular file; a mesh is read from a file, no pipe or device")
         if status.st_size > MOST_BYTES:
-            raise MeshError(
+            raise MeshFileError(
                 f"has {status.st_size / 1e9:.1f} GB; simplify it to at most {MOST_BYTES / 1e9:.1f}"
             )
         with open(number, "rb", closefd=False) as file:
             return file.read(MOST_BYTES)
     except OSError as error:
-        raise MeshError(f"cannot be read: {error.strerror or error}") from None
+        raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
     finally:
         os.close(number)
 
@@ -70,20 +72,24 @@ class ReferencedFiles:
         self.refused: list[str] = []
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file. Raises MeshError, which names it."""
+        """Return the content of a file. Raises MeshFileError, which names it."""
         if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]+:", name):
-            raise MeshError(f"refers to {name[:80]!r}; put the file beside the mesh instead")
+            raise MeshFileError(f"refers to {name[:80]!r}; put the file beside the mesh instead")
         try:
             path = (self._folder / name.strip().replace("\\", "/")).resolve()
             inside = path.is_relative_to(self._folder)
         except (OSError, ValueError, RuntimeError):  # a name with a zero byte, a loop of links
-            raise MeshError(f"refers to {name[:80]!r}, which is not the name of a file") from None
+            raise MeshFileError(
+                f"refers to {name[:80]!r}, which is not the name of a file"
+            ) from None
         if not inside:
-            raise MeshError(f"refers to {name[:80]!r} outside its folder; put it beside the mesh")
+            raise MeshFileError(
+                f"refers to {name[:80]!r} outside its folder; put it beside the mesh"
+            )
         try:
             return read_bytes(path)
-        except MeshError as error:
-            raise MeshError(f"refers to {name[:80]!r}: {error}") from None
+        except MeshFileError as error:
+            raise MeshFileError(f"refers to {name[:80]!r}: {error}") from None
 
     def get(self, name: str) -> bytes:
         """Return the content of a file for trimesh, which goes on without those that it lacks.
@@ -95,7 +101,7 @@ class ReferencedFiles:
             if name.lower().endswith(_IMAGES):
                 open_image(data, f"texture {name[:80]!r}")
             return _GREY.sub(rb"\1 \2 \2 \2", data) if name.lower().endswith(".mtl") else data
-        except MeshError as error:
+        except MeshFileError as error:
             last = name.split()[-1] if name.split() else ""
             if name.strip().startswith("-") and last != name.strip():
                 return self.get(last)
@@ -105,41 +111,43 @@ class ReferencedFiles:
     __getitem__ = get
 
     def read_uri(self, uri: str) -> bytes:
-        """Return the content of a relative URI with percent codes. Raises MeshError."""
+        """Return the content of a relative URI with percent codes. Raises MeshFileError."""
         return self.read(unquote(uri))
 
 
 def check_counts(data: bytes, suffix: str) -> None:
-    """Check that the counts in the head of a file fit its size. Raises MeshError."""
+    """Check that the counts in the head of a file fit its size. Raises MeshFileError."""
     counts: list[tuple[str, str]] = []
     if suffix == ".ply":
         head = data[: data.find(b"end_header")] if b"end_header" in data else b""
         counts = [(a.decode(), b.decode("ascii", "replace")) for a, b in _COUNT.findall(head)]
         if not head.startswith(b"ply"):
-            raise MeshError("it does not begin with 'ply' or has no 'end_header'")
+            raise MeshFileError("it does not begin with 'ply' or has no 'end_header'")
     elif suffix == ".off":
         lines = (line.split(b"#")[0].split() for line in data[:10_000].splitlines())
         words = [word.decode("ascii", "replace") for line in lines for word in line]
         if not words or words[0].upper() not in ("OFF", "COFF"):
-            raise MeshError("it does not begin with 'OFF'")
+            raise MeshFileError("it does not begin with 'OFF'")
         counts = list(zip(("vertex", "face"), words[1:3], strict=False))
     elif suffix == ".stl" and not data.lstrip().startswith(b"solid"):
         if len(data) < 84:
-            raise MeshError(f"it has {len(data)} bytes; a binary STL has 84 or more")
+            raise MeshFileError(f"it has {len(data)} bytes; a binary STL has 84 or more")
         triangles = int.from_bytes(data[80:84], "little")
         if len(data) - 84 != 50 * triangles:
-            raise MeshError(
+            raise MeshFileError(
                 f"its head says {triangles:,} triangles; it has bytes for {(len(data) - 84) // 50:,}"
             )
     for what, text in counts:
         if not text.isdecimal() or int(text) > len(data):
-            raise MeshError(f"its head says {text[:20]} of {what!r}; it has {len(data):,} bytes")
+            raise MeshFileError(
+                f"its head says {text[:20]} of {what!r}; it has {len(data):,} bytes"
+            )
 
 
 def check_triangles(count: int) -> None:
-    """Raise MeshError for more triangles than are read."""
+    """Raise MeshFileError for more triangles than are read."""
     if count > MOST_TRIANGLES:
-        raise MeshError(
+        raise MeshFileError(
             f"has {count:,} or more triangles; simplify it to at most {MOST_TRIANGLES:,}"
         )
 
@@ -155,7 +163,7 @@ def plain_name(name: str) -> str:
 
 
 def open_image(data: bytes, name: str) -> Any:
-    """Return an image of Pillow, whose pixels are unpacked when they are used. Raises MeshError."""
+    """Return an image of Pillow, whose pixels are unpacked when they are used. Raises MeshFileError."""
     from PIL import Image  # needed for meshes with textures only
 
     try:
@@ -163,11 +171,13 @@ def open_image(data: bytes, name: str) -> Any:
             warnings.simplefilter("ignore")  # of bombs, which are refused by their size
             image = Image.open(io.BytesIO(data))
     except Image.DecompressionBombError:
-        raise MeshError(f"{name} has too many pixels; reduce it to at most 8192 x 8192") from None
+        raise MeshFileError(
+            f"{name} has too many pixels; reduce it to at most 8192 x 8192"
+        ) from None
     except Exception:  # Pillow raises whatever its readers stumble over
-        raise MeshError(f"{name} is not an image that can be read; use PNG or JPEG") from None
+        raise MeshFileError(f"{name} is not an image that can be read; use PNG or JPEG") from None
     if image.width * image.height > _MOST_PIXELS:
-        raise MeshError(
+        raise MeshFileError(
             f"{name} has {image.width} x {image.height} pixels; reduce it to at most 8192 x 8192"
         )
     return image

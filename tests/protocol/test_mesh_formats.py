@@ -182,7 +182,7 @@ def test_changed_bytes_never_end_in_a_traceback(tmp_path: Path, suffix: str) -> 
     path = tmp_path / f"x{suffix}"
     BOX.export(str(path))
     whole, rng = path.read_bytes(), np.random.default_rng(0)
-    for _ in range(120):
+    for _ in range(60):
         data = bytearray(whole)
         for at in rng.integers(0, len(data), 3):
             data[at] = rng.choice([0, 255, 32, 45, 57, 47, data[at] ^ 1])

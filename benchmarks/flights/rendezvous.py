@@ -227,13 +227,6 @@ def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
     )
 
 
-def last_leg(scenario: Scenario, wait_s: float = 20.0, images: bool = False) -> Scenario:
-    """Return the scenario from its last hold point on.
-
-    ``images``: with images and markers in place of statistical perception and ranging.
-    """
-    part = leg(scenario, len(scenario.timeline) - 1, wait_s)
-    if not images:
-        return part
-    perception = part.perception.model_copy(update={"name": "default"})
-    return part.model_copy(update={"perception": perception, "ranging": None})
+def last_leg(scenario: Scenario, wait_s: float = 20.0) -> Scenario:
+    """Return the scenario from its last hold point on."""
+    return leg(scenario, len(scenario.timeline) - 1, wait_s)

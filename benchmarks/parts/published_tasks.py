@@ -19,7 +19,6 @@ from flights.published_tasks import (
     fly_scenario,
 )
 
-
 QUICK_S = 300.0
 """Duration of a scenario with ``--quick``."""
 

@@ -208,7 +208,8 @@ def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
     """Return the part of a scenario that begins with command ``index`` of its timeline and ends
     before the next command but one.
 
-    It starts at rest at the place before, and waits there for ``wait_s``.
+    It starts at rest at the place before, and waits there for ``wait_s``: longer than `HOLD_S`, as
+    the estimate is off at first.
     """
     timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
     begin_s, following = timeline[index].at_s - wait_s, timeline[index : index + 2]
@@ -227,6 +228,6 @@ def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
     )
 
 
-def last_leg(scenario: Scenario, wait_s: float = 20.0) -> Scenario:
+def last_leg(scenario: Scenario) -> Scenario:
     """Return the scenario from its last hold point on."""
-    return leg(scenario, len(scenario.timeline) - 1, wait_s)
+    return leg(scenario, len(scenario.timeline) - 1)

@@ -470,16 +470,16 @@ GROUP = Group(
     {
         "exact": described(
             flights_of(
-                "exact", {f"{t} {n}": partial(exact, t, n) for n in (2, 1) for t in TARGETS}, 20, 2
+                "exact", {f"{t} {n}": partial(exact, t, n) for n in (2, 1) for t in TARGETS}, 20, 1
             ),
             "Fly with cameras as calibrated, beside the paper's perception and estimator.",
         ),
         "errors": described(
-            flights_of("errors", {f"{t} 2": partial(errors, t, 2) for t in TARGETS}, 20, 2),
+            flights_of("errors", {f"{t} 2": partial(errors, t, 2) for t in TARGETS}, 20, 1),
             "Fly with drawn calibration errors and heavy noise.",
         ),
         "calibrate": described(
-            flights_of("calibrate", {"servicer 1": partial(calibrate, "servicer")}, 20, 2),
+            flights_of("calibrate", {"servicer 1": partial(calibrate, "servicer")}, 20, 1),
             "Fly the manoeuvre that estimates a camera's mounting.",
         ),
         "acquire": described(

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 import psutil
+from chaserdock_agents.chaser.vision import Vision
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.rendering.cameras import Cameras
 from common import ROOT, Figures, Group, Options, chaserdock_command
 
-from chaserdock.experiments import perception
 from chaserdock.experiments.in_process import InProcessMission
 from chaserdock.experiments.perception import RenderedImages
 from chaserdock.logs import open_log
@@ -81,7 +81,7 @@ class Clock:
 def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
     """Return median seconds of processor time per tick by part, in one process."""
     clock = Clock()
-    kept = [(perception, "look"), (Cameras, "image")]
+    kept = [(Vision, "look"), (Cameras, "image")]
     before = [getattr(owner, name) for owner, name in kept]
     for (owner, name), part in zip(kept, ("perceive", "render"), strict=True):
         clock.wrap(owner, name, part)
@@ -167,7 +167,7 @@ def measure(n: int, ticks: int, duration_s: float) -> dict[str, float]:
 
 def scale(options: Options) -> Figures:
     """Measure a tick with 1 to 16 chasers by part, and missions in lock-step."""
-    sizes = options.chasers or ([1, 2, 4] if options.quick else [1, 2, 4, 8, 16])
+    sizes = options.chasers or ([1, 4] if options.quick else [1, 2, 4, 8, 16])
     names = (*PARTS, *(("transport", "record", "cpu", "wall") if options.seconds else ("sum",)))
     print("ms per tick; cpu: all processes; wall: in lock-step, on this machine")
     print(f"{'N':>3}" + "".join(f"{name:>11}" for name in names))

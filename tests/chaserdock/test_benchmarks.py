@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from chaserdock_protocol.scenario import load_scenario
 from common import (
     SHARED,
     BenchmarkFailed,
@@ -24,6 +25,7 @@ from common import (
     parts_of,
 )
 from harness import ROOT
+from parts import scale
 
 COMMANDS = sorted(
     path.stem
@@ -145,3 +147,12 @@ def test_a_part_below_its_bar_fails_the_command_after_the_others(
     figures = json.loads(path.read_text(encoding="utf-8"))
     assert figures["bad_s"] == 2.0
     assert figures["good_s"] == 1.0
+
+
+@pytest.mark.slow
+def test_every_part_of_a_tick_is_timed(tmp_path: Path) -> None:
+    """``mission.py --only scale`` wraps methods of the flight software by name."""
+    path = tmp_path / "scenario.toml"
+    path.write_text(scale.first(1), encoding="utf-8")
+    spent_s = scale.parts_of(load_scenario(path), 3)
+    assert all(spent_s[part] > 0.0 for part in scale.PARTS)

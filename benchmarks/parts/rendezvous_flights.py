@@ -111,7 +111,7 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--abort-scenario", default="v-bar", metavar="NAME", help="of aborts")
 
 
-SCENARIOS = ("v-bar", "r-bar", "v-bar-images")
+SCENARIOS = ("v-bar", "r-bar")
 GROUP = Group(
     {
         **{
@@ -122,5 +122,4 @@ GROUP = Group(
     },
     ("flights", "first", "set"),
     add_options,
-    on_request=("v-bar-images",),
 )

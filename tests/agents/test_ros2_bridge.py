@@ -302,18 +302,41 @@ def call(mission: Mission, name: str, kind: str, request: str, **arguments: Any)
 @pytest.mark.parametrize(
     ("name", "kind", "request_text", "arguments", "command", "accepted"),
     [
-        ("/chaser_0/approach", TRIGGER, "uint8 structure_needs_at_least_one_member", {"structure_needs_at_least_one_member": 0},
-         OperatorCommand(command="approach", chaser=0, operator="ros2"), True),
-        ("/chaser_1/retreat", TRIGGER, "uint8 structure_needs_at_least_one_member", {"structure_needs_at_least_one_member": 0},
-         OperatorCommand(command="retreat", chaser=1, operator="ros2"), False),
-        ("/chaser_1/goto", GOTO, "float64[3] offset_m", {"offset_m": np.array([1.0, -2.0, 0.5])},
-         OperatorCommand(command="goto", chaser=1, offset_m=(1.0, -2.0, 0.5), operator="ros2"),
-         True),
-        ("/chaser_0/isolate", SELECT_THRUSTER, "uint8 thruster", {"thruster": 7},
-         OperatorCommand(command="isolate", chaser=0, thruster=7, operator="ros2"), True),
+        (
+            "/chaser_0/approach",
+            TRIGGER,
+            "uint8 structure_needs_at_least_one_member",
+            {"structure_needs_at_least_one_member": 0},
+            OperatorCommand(command="approach", chaser=0, operator="ros2"),
+            True,
+        ),
+        (
+            "/chaser_1/retreat",
+            TRIGGER,
+            "uint8 structure_needs_at_least_one_member",
+            {"structure_needs_at_least_one_member": 0},
+            OperatorCommand(command="retreat", chaser=1, operator="ros2"),
+            False,
+        ),
+        (
+            "/chaser_1/goto",
+            GOTO,
+            "float64[3] offset_m",
+            {"offset_m": np.array([1.0, -2.0, 0.5])},
+            OperatorCommand(command="goto", chaser=1, offset_m=(1.0, -2.0, 0.5), operator="ros2"),
+            True,
+        ),
+        (
+            "/chaser_0/isolate",
+            SELECT_THRUSTER,
+            "uint8 thruster",
+            {"thruster": 7},
+            OperatorCommand(command="isolate", chaser=0, thruster=7, operator="ros2"),
+            True,
+        ),
     ],
     ids=["approach", "retreat", "goto", "isolate"],
-)  # fmt: skip
+)
 def test_peer_calls_services(
     mission: Mission,
     name: str,

@@ -140,17 +140,31 @@ def malformed_messages() -> list[tuple[str, bytes, str]]:
     shape = msgspec.to_builtins(wrench) | {"force_N": [1.0, 2.0]}
     return [
         (topics.ODOMETRY.key_of(0), codec.encode(odometry), encoding_of(Odometry)),
-        (topics.WRENCH.key_of(0), codec.encode(msgspec.structs.replace(wrench, force_N=(math.nan, 0.0, 0.0))),
-         encoding_of(WrenchCommand)),
-        (topics.SIGHTING.key_of(0), codec.encode(msgspec.structs.replace(sighting, solutions=(turned,))),
-         encoding_of(Sighting)),
+        (
+            topics.WRENCH.key_of(0),
+            codec.encode(msgspec.structs.replace(wrench, force_N=(math.nan, 0.0, 0.0))),
+            encoding_of(WrenchCommand),
+        ),
+        (
+            topics.SIGHTING.key_of(0),
+            codec.encode(msgspec.structs.replace(sighting, solutions=(turned,))),
+            encoding_of(Sighting),
+        ),
         (topics.WRENCH.key_of(0), msgspec.msgpack.encode(shape), encoding_of(WrenchCommand)),
-        (topics.WRENCH.key_of(0), codec.encode(wrench), "application/msgpack;chaserdock.WrenchCommand.v99"),
-        (topics.WRENCH.key_of(0), codec.encode(msgspec.structs.replace(wrench, chaser=1)), encoding_of(WrenchCommand)),
+        (
+            topics.WRENCH.key_of(0),
+            codec.encode(wrench),
+            "application/msgpack;chaserdock.WrenchCommand.v99",
+        ),
+        (
+            topics.WRENCH.key_of(0),
+            codec.encode(msgspec.structs.replace(wrench, chaser=1)),
+            encoding_of(WrenchCommand),
+        ),
         (topics.SIGHTING.key_of(0), codec.encode(sighting)[:-4], encoding_of(Sighting)),
         (topics.ACTUATORS.key_of(0), b"\xc1 junk", "text/plain"),
         (topics.TICK.key_of(), b"", "application/msgpack;chaserdock.Tick.v1"),
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.slow

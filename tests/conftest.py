@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from harness import DRILL, SHORT, run
+from hypothesis import settings
 
 Fly = Callable[..., Path]
 
@@ -27,6 +28,10 @@ sys.dont_write_bytecode = False
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+
+# No verdict depends on the speed of the machine.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 FAST_S = 1.0
 """Processor time (s) that a test without the mark `slow` may take; others are reported."""

@@ -34,9 +34,9 @@ UNDISTURBED: dict[str, dict[str, Any]] = {
 """What is changed of each scenario: one flies by images, one in MuJoCo."""
 SEEDS: tuple[tuple[str, dict[str, Any], tuple[int, ...]], ...] = (
     ("fault-drill", {}, (12,)),
-    ("four-chaser-docking", EARLY_DOCKING, (1, 2)),
-    ("docking-contact", {}, (1, 2)),
-    ("swap", {}, (1, 2)),
+    ("four-chaser-docking", EARLY_DOCKING, (1,)),
+    ("docking-contact", {}, (1,)),
+    ("swap", {}, (1,)),
 )
 """Scenarios, what is changed of them, and the seeds by which ``simulate`` disturbs them."""
 
@@ -67,5 +67,4 @@ def test_disturbed_mission_violates_no_invariant(
     path = tmp_path / f"{name}.toml"
     path.write_text(toml_document({"extends": name, **changes}), encoding="utf-8")
     flown = fly_seed(SeedOptions(str(path)), seed)
-    print(name, seed, flown.outcome, flown.case)
     assert [str(violation) for violation in flown.violations] == []

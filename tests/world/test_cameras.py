@@ -189,7 +189,8 @@ def test_camera_mounted_to_the_left_sees_the_target_on_the_right():
         ("camera.earth={direction=[0.0, 0.0, 0.0]}", "direction"),
         ("target.model=nowhere.toml", r"nowhere\.toml"),
         (
-            "camera.intrinsics={width_px=640,height_px=480,fx_px=1,fy_px=1,cx_px=1,cy_px=1,distortion=[1.0]}",
+            "camera.intrinsics={width_px=640,height_px=480,fx_px=1,fy_px=1,cx_px=1,cy_px=1,"
+            "distortion=[1.0]}",
             "distortion",
         ),
     ],

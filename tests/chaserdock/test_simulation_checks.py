@@ -340,6 +340,7 @@ def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> N
 # -- invariants ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_documentation_is_that_of_the_checks() -> None:
     command = [sys.executable, str(ROOT / "docs" / "make_invariants.py"), "--print"]
     made = subprocess.run(command, capture_output=True, text=True, check=True).stdout

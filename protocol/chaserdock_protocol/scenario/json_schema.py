@@ -74,8 +74,8 @@ def number_text(value: float) -> str:
 
 
 def range_text(node: SchemaNode, every: bool = False) -> str:
-    """Return the range of a number in words; ``every``: including the bound that all numbers
-    have.
+    """Return the range of a number in words; ``every``: including the bound that all
+    numbers have.
     """
     bounds = {
         k: node[k]

@@ -408,8 +408,8 @@ class Acquisition:
 
 
 def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
-    """Return the mask (h, w) of the largest connected region brighter than the background, or
-    None.
+    """Return the mask (h, w) of the largest connected region brighter than the background,
+    or None.
     """
     level = float(np.median(image)) + _SEARCH.min_contrast
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)

@@ -316,8 +316,8 @@ def _points_in(
     pixels: NDArray[np.int64],
     grey: Array | float = 0.0,
 ) -> LitPoints:  # fmt: skip
-    """Return the points of a view at ``pixels`` (n,), with their grey levels ``grey`` in the
-    image.
+    """Return the points of a view at ``pixels`` (n,), with their grey levels ``grey`` in
+    the image.
     """
     row, column = np.divmod(pixels, window.width)
     fx, fy, cx, cy = window.lens

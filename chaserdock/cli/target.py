@@ -29,8 +29,8 @@ def target(
         str,
         typer.Argument(
             metavar="TARGET",
-            help="mesh file (.glb, .gltf, .obj, .stl, .ply, .off or .dae), target file (.toml), shipped target "
-            "(paper, servicer) or satellite (geo_servicer, cubesat_12u, chaser_body)",
+            help="mesh file (.glb, .gltf, .obj, .stl, .ply, .off or .dae), target file (.toml), "
+            "shipped target (paper, servicer) or satellite (geo_servicer, cubesat_12u, chaser_body)",
         ),
     ],
     scale: Annotated[

@@ -327,7 +327,7 @@ def _with_unique_names(parts: list[MeshPart]) -> list[MeshPart]:
 
 
 def _joints(scene: dict[str, Any]) -> dict[str, Vector3]:
-    """Return the positions of joints in a scene's extras, in the file's unit. Raises MeshFileError."""
+    """Return the positions of joints in a scene's extras, in the file's unit. Raises _Refused."""
     extras = scene.get("extras")
     held = extras.get(EXTRAS, {}) if isinstance(extras, dict) else {}
     try:

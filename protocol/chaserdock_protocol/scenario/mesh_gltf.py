@@ -186,7 +186,8 @@ class Gltf:
         corners = np.arange(vertices) if given is None else self.indices(given)
         if corners.max(initial=-1) >= vertices:
             raise MeshFileError(
-                f"has a triangle with vertex {corners.max()}, of {vertices} vertices; export it anew"
+                f"has a triangle with vertex {corners.max()}, of {vertices} vertices; "
+                "export it anew"
             )
         mode = primitive.get("mode", 4)
         if mode == _STRIP:

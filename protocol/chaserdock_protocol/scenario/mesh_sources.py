@@ -135,7 +135,8 @@ def check_counts(data: bytes, suffix: str) -> None:
         triangles = int.from_bytes(data[80:84], "little")
         if len(data) - 84 != 50 * triangles:
             raise MeshFileError(
-                f"its head says {triangles:,} triangles; it has bytes for {(len(data) - 84) // 50:,}"
+                f"its head says {triangles:,} triangles; "
+                f"it has bytes for {(len(data) - 84) // 50:,}"
             )
     for what, text in counts:
         if not text.isdecimal() or int(text) > len(data):
@@ -163,7 +164,7 @@ def plain_name(name: str) -> str:
 
 
 def open_image(data: bytes, name: str) -> Any:
-    """Return an image of Pillow, whose pixels are unpacked when they are used. Raises MeshFileError."""
+    """Return an image of Pillow, which unpacks its pixels on use. Raises MeshFileError."""
     from PIL import Image  # needed for meshes with textures only
 
     try:

@@ -30,7 +30,8 @@ def target(
         typer.Argument(
             metavar="TARGET",
             help="mesh file (.glb, .gltf, .obj, .stl, .ply, .off or .dae), target file (.toml), "
-            "shipped target (paper, servicer) or satellite (geo_servicer, cubesat_12u, chaser_body)",
+            "shipped target (paper, servicer) or satellite (geo_servicer, cubesat_12u, "
+            "chaser_body)",
         ),
     ],
     scale: Annotated[

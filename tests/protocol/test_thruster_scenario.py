@@ -99,7 +99,6 @@ def test_keys_override_the_predefined_body() -> None:
         ({"chaser": {"thrusters": [THRUSTER] * 25}}, "chaser.thrusters"),
         ({"chaser": {"modulation": {"carrier_hz": 7}}}, "multiple of chaser.modulation.carrier_hz (960, 7)"),
         ({"chaser": {"modulation": {"carrier_hz": 120}}}, "shorter than the shortest pulse"),
-        ({"chaser": {"modulation": {"resolution_s": 0.2}}}, "at most half a carrier period"),
         ({"thruster_failure": [{"chaser": 1, "thruster": 0, "at_s": 1, "kind": "stuck_on"}]}, "there is no chaser 1"),
         ({"thruster_failure": [{"chaser": 0, "thruster": 12, "at_s": 1, "kind": "stuck_on"}]}, "there is no thruster 12"),
         ({"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "weak"}]}, "factor goes with"),

@@ -27,6 +27,10 @@ class GuidanceParameters:
     """Time for which a chaser must keep the corridor's limits before it flies in."""
     in_line_m: float = 0.3
     """Greatest distance from its port's axis from which a chaser flies straight to its corridor."""
+    corridor_margin_m: float = 0.1
+    """A chaser waits if its corridor comes nearer to one in use, between body centres, than the
+    least distance between chasers and this: both may be 0.03 m off (`docking.corridor.lateral_m`),
+    and need some cm to brake."""
     release_s: float = 1.0
     """A latch that is closed for this long after the command to release it does not open."""
     stack_rest_s: float = 0.5

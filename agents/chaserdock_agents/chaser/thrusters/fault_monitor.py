@@ -41,11 +41,8 @@ class FaultMonitor:
         self._noise = noise_of(scenario.navigation.errors())
         variance = quiescent_variance(self._noise, body)
         information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
-        # Neither pulses of whole periods nor pulses below the noise can test a single thruster.
-        testable = (
-            body.modulation.modulator == "pwm"
-            and _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
-        )
+        # Pulses below the noise cannot test a single thruster.
+        testable = _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
         self._self_test = ThrusterSelfTest(
             allocator,
             min_pulse_N_s,

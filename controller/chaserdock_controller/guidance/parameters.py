@@ -33,6 +33,8 @@ class GuidanceParameters:
     and need some cm to brake."""
     release_s: float = 1.0
     """A latch that is closed for this long after the command to release it does not open."""
+    identify_s: float = 10.0
+    """Length of the manoeuvre that shows the mass properties of a stack: 16 pulses of 0.6 s."""
     stack_rest_s: float = 0.5
     """Time for which a stack must be below its limits to count as stopped."""
     stack_moving_s: float = 0.2

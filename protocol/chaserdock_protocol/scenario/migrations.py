@@ -88,6 +88,7 @@ _REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
             ("docking", "verify_position_m"): 0.005,
             ("docking", "verify_angle_deg"): 0.5,
             ("detumble", "response_s"): 0.5,
+            ("detumble", "identification", "duration_s"): 10.0,
             ("chaser", "modulation", "resolution_s"): 0.001,
             ("chaser", "modulation", "schmitt_on"): 0.75,
             ("chaser", "modulation", "schmitt_off"): 0.25,

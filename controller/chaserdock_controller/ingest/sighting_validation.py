@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from chaserdock_protocol.messages import Level, PoseSolution, Sighting
 
-_UNIT_WITHIN = 0.1
-"""Deviation of a quaternion's length from 1 that is taken for rounding of its sender."""
+from .odometry_validation import UNIT_WITHIN
+
 _ROUNDING = 1e-6
 """Asymmetry of a covariance, as a share of its largest element, that is rounding: perception may
 compute in single precision.
@@ -23,7 +23,7 @@ def why_invalid(solution: PoseSolution) -> str:
     string.
     """
     length = math.hypot(*solution.q_wxyz)
-    if not abs(length - 1.0) <= _UNIT_WITHIN:
+    if not abs(length - 1.0) <= UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"
     covariance = np.array(solution.covariance).reshape(6, 6)
     if np.abs(covariance - covariance.T).max() > _ROUNDING * np.abs(covariance).max():
@@ -37,7 +37,7 @@ def why_invalid(solution: PoseSolution) -> str:
 
 def _are_valid(solutions: Sequence[PoseSolution]) -> bool:
     """Return whether ``why_invalid`` finds nothing in any solution, without a call for each."""
-    if not all(abs(math.hypot(*s.q_wxyz) - 1.0) <= _UNIT_WITHIN for s in solutions):
+    if not all(abs(math.hypot(*s.q_wxyz) - 1.0) <= UNIT_WITHIN for s in solutions):
         return False
     covariances = np.array([s.covariance for s in solutions]).reshape(-1, 6, 6)
     largest = np.abs(covariances).max(axis=(1, 2))

@@ -40,7 +40,7 @@ from .warm_start import check_plan
 
 _ATTACHED_FACTOR = 1.2
 """Input limit of an attached chaser, in terms of the largest input that following the target needs:
-room for feedback. 0.6 and 2.4 change no bit of `docking-contact`.
+room for feedback. It acts where others are planned beside it, as in `four-chaser-capture`.
 """
 _ATTACHED_MARGIN = 1e-3
 """Added to that limit, N and N m: the solver needs some where the target does not move."""

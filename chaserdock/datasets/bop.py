@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.camera import Camera
+from chaserdock_models.camera import Camera, focal_and_centre
 from chaserdock_models.meshes import TriangleMesh
 from numpy.typing import NDArray
 
@@ -87,7 +87,7 @@ class BopWriter:
 
 def check_camera(camera: Camera) -> None:
     """Raise DatasetError for a camera with lens distortion."""
-    if camera.distortion:
+    if camera.distorts:
         raise DatasetError(
             "camera.intrinsics.distortion: the BOP format has no lens distortion; use --format "
             "speed+, or a camera without it"
@@ -145,8 +145,8 @@ def read_bop(folder: Path) -> LabelledDataset:
         raise DatasetError(
             f"{folder}: cam_K differs between images; a perception is made for one camera"
         )
-    fx, fy, cx, cy = (float(first[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     try:
+        fx, fy, cx, cy = focal_and_centre(first)
         camera = Camera(size[0], size[1], fx, fy, cx, cy)
     except ValueError as error:
         raise DatasetError(f"{folder / 'camera.json'}: {error}") from None

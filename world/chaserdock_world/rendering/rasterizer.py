@@ -75,8 +75,7 @@ class Renderer:
     """Renders what ``camera`` sees of a target and of other bodies.
 
     Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard
-    deviation of a Gaussian. Raises ValueError if the camera's distortion is not invertible
-    everywhere in the image.
+    deviation of a Gaussian.
     """
 
     def __init__(
@@ -88,7 +87,6 @@ class Renderer:
     ):
         self.camera = camera
         self.model = model
-        self._point_spread_px = point_spread_px
         # By box, face and the number of times its width and height are halved; coarser levels are
         # made on demand.
         self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {
@@ -97,7 +95,8 @@ class Renderer:
             for face in range(6)
         }
         # The canvas is the ideal image; with lens distortion it extends beyond the frame.
-        self._lens = Lens(camera)
+        self._lens = Lens(camera, point_spread_px)
+        self._point_spread_px = self._lens.canvas_spread_px
         self._origin, self._size = self._lens.origin_px, self._lens.size_px
         self._background = Background(camera, self._origin, self._size, earth)
         self._frustum = Frustum(camera, self._origin, self._size)

@@ -18,6 +18,7 @@ from . import rotations
 from .arrays import Array
 from .lenses import Lens, LensModel, lens_of
 
+
 def focal_and_centre(matrix: ArrayLike) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy of a camera matrix (3, 3). Raises ValueError for one with skew, and for
     one that is none.

@@ -84,8 +84,10 @@ class Lens(ABC):
 
     def distort(self, ideal: Array) -> Array:
         """Return the distorted coordinates; NaN beyond ``valid_radius``."""
-        out = self._map(ideal)
-        if math.isfinite(self.valid_radius):
+        if math.isinf(self.valid_radius):
+            return self._map(ideal)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            out = self._map(ideal)
             out[~(_square(ideal) < self.valid_radius**2)] = np.nan
         return out
 
@@ -162,7 +164,7 @@ class _Perspective(Lens):
         """Return where the image neither turns back nor jumps."""
         r2 = _square(ideal)
         k4, k5, k6 = self._k[5:8]
-        xx, xy, yx, yy = self._flat_jacobian(ideal)
+        xx, xy, yx, yy = self._flat_jacobian(ideal[..., 0], ideal[..., 1])
         return (xx * yy - xy * yx > 0.0) & (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)) > 0.0)
 
     def _map(self, ideal: Array) -> Array:
@@ -171,29 +173,24 @@ class _Perspective(Lens):
 
     def _flat(self, ideal: Array) -> Array:
         """Distort without the sensor's tilt."""
+        return np.stack(self._flat_xy(ideal[..., 0], ideal[..., 1]), axis=-1)
+
+    def _flat_xy(self, x: Array, y: Array) -> tuple[Array, Array]:
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._k[:12]
-        x, y = ideal[..., 0], ideal[..., 1]
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        rational, prism = len(self.coefficients) > 5, len(self.coefficients) > 8
-        if rational:
+        if len(self.coefficients) > 5:
             radial = radial / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        return np.stack(
-            [
-                x * radial
-                + 2.0 * p1 * x * y
-                + p2 * (r2 + 2.0 * x * x)
-                + (r2 * (s1 + r2 * s2) if prism else 0.0),
-                y * radial
-                + p1 * (r2 + 2.0 * y * y)
-                + 2.0 * p2 * x * y
-                + (r2 * (s3 + r2 * s4) if prism else 0.0),
-            ],
-            axis=-1,
-        )
+        u = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        v = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        if len(self.coefficients) > 8:
+            u, v = u + r2 * (s1 + r2 * s2), v + r2 * (s3 + r2 * s4)
+        return u, v
 
     def jacobian(self, ideal: Array) -> Array:
-        flat = np.stack(self._flat_jacobian(ideal), axis=-1).reshape(*ideal.shape, 2)
+        flat = np.stack(self._flat_jacobian(ideal[..., 0], ideal[..., 1]), axis=-1).reshape(
+            *ideal.shape, 2
+        )
         if self._tilt is None:
             return flat
         at = self._flat(ideal)
@@ -202,10 +199,9 @@ class _Perspective(Lens):
         turn = self._tilt[:2, :2] - seen[..., :, None] * self._tilt[2, :2]
         return turn / w[..., None, None] @ flat
 
-    def _flat_jacobian(self, ideal: Array) -> tuple[Array, Array, Array, Array]:
+    def _flat_jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Return the Jacobian of `_flat` by rows."""
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._k[:12]
-        x, y = ideal[..., 0], ideal[..., 1]
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         # By r^2, twice: it is multiplied by derivatives of r^2, 2 x and 2 y.
@@ -226,7 +222,7 @@ class _Perspective(Lens):
     def _invert(self, distorted: Array, tolerance: float) -> Array:
         if self._tilt is not None:
             distorted = _project(np.linalg.inv(self._tilt), distorted)
-        if len(self.coefficients) > 5:
+        if len(self.coefficients) > 5 or math.isfinite(self.valid_radius):
             return self._newton(distorted, tolerance)
         ideal = distorted.copy()
         error = distorted
@@ -245,27 +241,26 @@ class _Perspective(Lens):
         radii, images = self._radial_table
         seen = np.sqrt(_square(distorted))
         start = np.interp(seen, images, radii)
-        ideal = distorted * (start / np.maximum(seen, 1e-300))[:, None]
-        active = np.arange(len(ideal))
+        scale = start / np.maximum(seen, 1e-300)
+        u, v = distorted[:, 0].copy(), distorted[:, 1].copy()
+        ideal = np.empty((2, len(u)))
+        x, y = u * scale, v * scale
+        active = np.arange(len(u))
         for _ in range(_NEWTON_ROUNDS):
-            at = ideal[active]
-            error = distorted[active] - self._flat(at)
-            xx, xy, yx, yy = self._flat_jacobian(at)
+            at_u, at_v = self._flat_xy(x, y)
+            right, down = u - at_u, v - at_v
+            xx, xy, yx, yy = self._flat_jacobian(x, y)
             turn = xx * yy - xy * yx
-            step = np.stack(
-                [
-                    (yy * error[:, 0] - xy * error[:, 1]) / turn,
-                    (xx * error[:, 1] - yx * error[:, 0]) / turn,
-                ],
-                axis=-1,
-            )
-            at = at + step
-            far = np.sqrt(_square(at)) / self.valid_radius
-            ideal[active] = at / np.maximum(far, 1.0)[:, None]
-            active = active[~np.all(np.abs(step) <= tolerance, axis=-1)]
+            dx, dy = (yy * right - xy * down) / turn, (xx * down - yx * right) / turn
+            x, y = x + dx, y + dy
+            shrink = np.maximum(np.sqrt(x * x + y * y) / self.valid_radius, 1.0)
+            x, y = x / shrink, y / shrink
+            ideal[:, active] = x, y
+            open_ = ~((np.abs(dx) <= tolerance) & (np.abs(dy) <= tolerance))
+            active, x, y, u, v = (a[open_] for a in (active, x, y, u, v))
             if not len(active):
                 break
-        return ideal
+        return ideal.T.copy()
 
     @cached_property
     def _radial_table(self) -> tuple[Array, Array]:
@@ -291,7 +286,13 @@ def _project(matrix: Array, xy: Array) -> Array:
 class _Equidistant(Lens):
     @property
     def native(self) -> tuple[float, ...]:
-        return 3.0, self.valid_radius**2, *self.coefficients, *[0.0] * 10, *np.eye(3).ravel().tolist()
+        return (
+            3.0,
+            self.valid_radius**2,
+            *self.coefficients,
+            *[0.0] * 10,
+            *np.eye(3).ravel().tolist(),
+        )
 
     @cached_property
     def valid_angle(self) -> float:
@@ -343,7 +344,9 @@ class _Equidistant(Lens):
             theta = np.clip(theta + step, 0.0, self.valid_angle)
             if not np.any(np.abs(step) > 1e-3 * tolerance):
                 break
-        return distorted * np.where(seen > 1e-8, np.tan(theta) / np.maximum(seen, 1e-8), 1.0)[:, None]
+        return (
+            distorted * np.where(seen > 1e-8, np.tan(theta) / np.maximum(seen, 1e-8), 1.0)[:, None]
+        )
 
 
 @lru_cache(maxsize=64)
@@ -352,9 +355,7 @@ def lens_of(model: LensModel, coefficients: tuple[float, ...]) -> Lens:
     such that are not finite.
     """
     if model not in get_args(LensModel):
-        raise ValueError(
-            f"unknown lens model {model!r}; known: {', '.join(get_args(LensModel))}"
-        )
+        raise ValueError(f"unknown lens model {model!r}; known: {', '.join(get_args(LensModel))}")
     counts = COEFFICIENTS[model]
     if len(coefficients) not in counts:
         raise ValueError(

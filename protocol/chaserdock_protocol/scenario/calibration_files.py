@@ -90,7 +90,8 @@ def _parsed(path: Path) -> Values:
         if text.startswith("<"):
             values = _from_xml(ElementTree.fromstring(text))
         elif text.startswith("{"):
-            values = json.loads(text)
+            # OpenCV writes comments.
+            values = json.loads(re.sub(r"^\s*//.*$", "", text, flags=re.MULTILINE))
         else:
             values = _from_yaml(text)
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
@@ -114,7 +115,7 @@ def _from_yaml(text: str) -> Any:
     if text.startswith("%YAML"):  # OpenCV's header is not YAML's
         text = text.partition("\n")[2]
     try:
-        return next(iter(yaml.load_all(text, Loader)), None)  # noqa: S506  a SafeLoader
+        return next(iter(yaml.load_all(text, Loader)), None)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from None
 
@@ -220,9 +221,7 @@ def _from_matrix(values: Values) -> Values:
     key, coefficients = (found[0], _numbers(*found)) if found else ("distortion_coefficients", [])
     name, model, counts = _model(values)
     if len(coefficients) not in counts:
-        raise _Bad(
-            f"{key}: {name} takes {one_of(counts)} coefficients, not {len(coefficients)}"
-        )
+        raise _Bad(f"{key}: {name} takes {one_of(counts)} coefficients, not {len(coefficients)}")
     return _intrinsics(width, height, lens, model, coefficients)
 
 

@@ -6,8 +6,8 @@ each side to the centroids of the grey-level gradient across it. Then the grey l
 along a side are fitted by those of a blurred edge; a white border that ends at a known distance is
 fitted with its outer edge. Sides are curves in the distorted image, so the place of each pixel is
 mapped through the lens; where that compresses the image much, as a fisheye does, sides are fitted
-on a plane across the line of sight to the marker (`MarkerFrames`). Pixels are not interpolated: that would bias an edge by its place between
-pixels.
+on a plane across the line of sight to the marker (`MarkerFrames`). Pixels are not interpolated:
+that would bias an edge by its place between pixels.
 
 The arithmetic is in C (native/corners.c): a few markers are too little work to vectorize with
 NumPy.

@@ -22,7 +22,15 @@ from numpy.typing import NDArray
 
 from .json_files import numbers, read_object, write_json
 from .model_files import OBJECT, read_models, write_models
-from .types import DatasetError, LabelledDataset, LabelledImage, PoseLabel, Split, TargetShape
+from .types import (
+    DatasetError,
+    LabelledDataset,
+    LabelledImage,
+    PoseLabel,
+    Split,
+    TargetShape,
+    check_camera,
+)
 from .views import ViewImage
 
 _SCENE = "000000"
@@ -38,7 +46,7 @@ class BopWriter:
     def __init__(
         self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape
     ) -> None:
-        check_camera(camera)
+        check_camera(camera, "bop")
         self._folder, self._camera = folder, camera
         write_models(mesh, shape, folder / "models")
         shutil.copytree(folder / "models", folder / "models_eval")
@@ -83,15 +91,6 @@ class BopWriter:
         for split, files in self._scenes.items():
             for name, rows in files.items():
                 write_json(self._folder / _FOLDERS[split] / _SCENE / f"{name}.json", rows)
-
-
-def check_camera(camera: Camera) -> None:
-    """Raise DatasetError for a camera with lens distortion."""
-    if camera.distorts:
-        raise DatasetError(
-            "camera.intrinsics.distortion: the BOP format has no lens distortion; use --format "
-            "speed+, or a camera without it"
-        )
 
 
 def _info(image: ViewImage) -> dict[str, Any]:

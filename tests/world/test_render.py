@@ -334,7 +334,7 @@ def test_an_image_is_drawn_up_to_where_the_lens_ends(camera):
     )  # fmt: skip
     grid = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1)
     away = np.linalg.norm(camera.normalized(camera.undistort(grid)), axis=-1)
-    assert np.all(image[away < min(0.9 * camera.lens.valid_radius, 3.0)] > 200)
+    assert np.all(image[away < min(0.8 * camera.lens.valid_radius, 3.0)] > 200)
     outside = cv2.erode(np.isnan(away).astype(np.uint8), np.ones((3, 3)), borderValue=1) > 0
     assert outside.any()
     assert np.all(image[outside] == SPACE_LEVEL)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lens: point spread, the extent of the ideal image that a distorted image needs, and the
-mapping between them.
-"""
+"""Simulate the lens: point spread, and the mapping from the ideal image to the distorted one."""
 
 from __future__ import annotations
 
@@ -29,8 +27,8 @@ _OUTSIDE = -1e4
 
 
 def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
-    """Return an image (h, w) after the lens' point spread, a Gaussian with this standard deviation;
-    itself if that is 0.
+    """Return an image (h, w) blurred by a Gaussian with this standard deviation; itself if that is
+    0.
     """
     if sigma_px == 0.0:
         return image
@@ -40,7 +38,7 @@ def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8
 
 
 class Lens:
-    """Maps the ideal image, which renderers draw, to the distorted image of ``camera``.
+    """Map the ideal image, which renderers draw, to the distorted image of ``camera``.
 
     ``point_spread_px``: standard deviation of the lens' Gaussian blur. ``origin_px`` (2,): ideal
     pixel coordinates of the ideal image's first pixel; ``size_px``: its width and height, larger
@@ -117,8 +115,9 @@ class Lens:
         return fine[n:-n, n:-n]
 
     def distort(self, ideal: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the distorted image (h, w) of an ideal image of ``size_px``; without distortion
-        the image itself.
+        """Return the distorted image (h, w) of an ideal image of ``size_px``.
+
+        Without distortion it is the ideal image itself.
         """
         if self._maps is None:
             return ideal

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The covariance (D, D) of the error vector: prediction, and its update by rows. */
+/* Covariance (D, D) of the error vector: prediction, and reduction by measured rows. */
 #include "layout.h"
 
 /* Copy the lower triangle of a (d, d) to its upper one. */
@@ -10,8 +10,8 @@ static void mirror(double *a, int64_t d) {
                 for (int64_t c = c0; c < c0 + 8 && c < r; c++) a[d * c + r] = a[d * r + c];
 }
 
-/* Rows 0 .. 11 of `out` (12 rows of length d) become the first `columns` (at least 12) elements of
- * F x, F' = `f` (k, 12) and x the k rows of `p`. */
+/* Write the first `columns` (at least 12) elements of F x to the rows 0 .. 11 of `out` (rows of
+ * length d). F' = `f` (k, 12); x: the k rows of `p`. */
 static void transform_rows(const double *f, int k, const double *p, int64_t d, int64_t columns,
                            double *out) {
     for (int64_t at = 0; at < columns; at += 4) {
@@ -26,7 +26,7 @@ static void transform_rows(const double *f, int k, const double *p, int64_t d, i
     }
 }
 
-/* out (12) = x F', F' = `f` (k, 12), x (k). */
+/* Write x F' to out (12). F' = `f` (k, 12), x (k). */
 static void transform_row(const double *f, int k, const double *x, double *out) {
     v4 a = splat(0.0), b = a, c = a;
     for (int m = 0; m < k; m++) {
@@ -38,10 +38,10 @@ static void transform_row(const double *f, int k, const double *x, double *out) 
     store(out, a), store(out + 4, b), store(out + 8, c);
 }
 
-/* Lower triangle of `out` becomes that of F P F', for P = `p` (d, d): F is block diagonal, with the
- * transposed `target` (12, 12), and for each chaser rows as `motion_transition` gives them, in
- * `motion` (n, MOTION, COUPLED), and factors `fade` (n, CHASER) of the components from MOTION on;
- * what follows the chasers is constant. `g`: working memory (d, d). */
+/* Write the lower triangle of F P F' to `out`, P = `p` (d, d). F is block diagonal: the
+ * transpose of `target` (12, 12); for each chaser its rows from `motion_transition`, in
+ * `motion` (n, MOTION, COUPLED), and factors `fade` (n, CHASER) of its components from MOTION
+ * on; identity for what follows the chasers. `g`: working memory (d, d). */
 static void propagate(int64_t n, int64_t d, const double *target, const double *motion,
                       const double *fade, const double *p, double *g, double *out) {
     const int64_t end = size_of(n);
@@ -77,8 +77,8 @@ static void add_element(double *p, int64_t d, int64_t first, int r, int c, doubl
     p[d * (first + r) + first + c] += added;
 }
 
-/* Add the process noise of a chaser to the lower triangle. impulse (6), prior (CHASER - 12):
- * variances of additive states. */
+/* Add the process noise of a chaser to the lower triangle of p. impulse (6): of the command.
+ * prior (CHASER - 12): variances of the additive states. */
 static void add_noise(double *p, int64_t d, int64_t first, const double *impulse,
                       const double *fade, const double *prior, int is_latched, const Motion *m) {
     const double force = length3(impulse), dt = m->dt;
@@ -95,7 +95,7 @@ static void add_noise(double *p, int64_t d, int64_t first, const double *impulse
             const double more = m->torque_max * m->unknown_s;
             angular = (torque * torque + arm * arm + more * more) / (m->inertia[k] * m->inertia[k]);
         }
-        /* The impulse acts, on average, in the middle of the interval. */
+        /* On average an impulse acts in the middle of the interval. */
         add_element(p, d, first, VELOCITY + k, VELOCITY + k, linear);
         add_element(p, d, first, POSITION + k, POSITION + k, linear * dt * dt / 3.0);
         add_element(p, d, first, VELOCITY + k, POSITION + k, linear * dt / 2.0);
@@ -116,10 +116,10 @@ EXPORT int64_t NAME(predict_workspace)(int64_t n, int64_t d) {
     return d * d + n * (MOTION * COUPLED + CHASER) + 144 + 4 * 8;
 }
 
-/* Predict the chasers' `mean` in place, and `covariance` (D, D) to `out`. target, target_noise (12,
- * 12): of the target. impulses (n, 6): N s, N m s; orbital (n, 6): wrench of the orbit. fade_view
- * (n,): decay of the view's error. alive, latched (n,): 0 or 1. prior (31): variances of the
- * additive states. */
+/* Predict the chasers' `mean` in place, and write the predicted `covariance` (D, D) to `out`.
+ * target, target_noise (12, 12): transition and process noise of the target. impulses (n, 6): N
+ * s, N m s. orbital (n, 6): wrench of the orbit. fade_view (n,): decay of the view error.
+ * alive, latched (n,): 0 or 1. prior (31): variances of the additive states. */
 EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *target,
                           const double *target_noise, const double *impulses, const double *orbital,
                           const double *fade_view, const double *prior, const int64_t *alive,
@@ -158,8 +158,8 @@ EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *t
     mirror(out, d);
 }
 
-/* Subtract W'W from the lower triangle of p (d, d), W the k rows of `w`, of length `stride` with
- * zeros from d on (stride a multiple of 8, at least d + 3). */
+/* Subtract W'W from the lower triangle of p (d, d). W: the k rows of `w`, of length `stride`,
+ * with zeros from d on (stride: a multiple of 8, at least d + 3). */
 static void subtract_square(const double *w, int k, int64_t stride, double *p, int64_t d) {
     for (int64_t r = 0; r < d; r += 4)
         for (int64_t c = 0; c <= r + 3 && c < d; c += 8) {
@@ -186,8 +186,8 @@ static void subtract_square(const double *w, int k, int64_t stride, double *p, i
         }
 }
 
-/* Make the rotation error at `first` relative to an attitude corrected by `correction` (3), in the
- * lower triangle of p (Sola eq. 287). */
+/* Refer the rotation error at `first` to an attitude that was corrected by `correction` (3):
+ * update the lower triangle of p (Sola eq. 287). */
 static void turn_error(double *p, int64_t d, int64_t first, const double *correction) {
     double reset[9], transposed[9];
     right_jacobian(correction, reset);

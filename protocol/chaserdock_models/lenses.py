@@ -24,6 +24,7 @@ from functools import cached_property, lru_cache
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import Array
 
@@ -58,7 +59,7 @@ class Lens(ABC):
 
     coefficients: tuple[float, ...]
 
-    @property
+    @cached_property
     @abstractmethod
     def valid_radius(self) -> float:
         """Distance from the axis, in ideal coordinates, up to which the model can be inverted;
@@ -148,7 +149,8 @@ class _Perspective(Lens):
         direction = np.linspace(0.0, 2.0 * math.pi, _DIRECTIONS, endpoint=False)
         unit = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
         radii = np.tan(np.linspace(0.0, _STEEPEST_RAD, _ANGLES))
-        bad = ~self._regular(radii[:, None, None] * unit)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bad = ~self._regular(radii[:, None, None] * unit)
         if not bad.any():
             return math.inf
         first = int(np.argmax(bad.any(axis=1)))
@@ -160,12 +162,13 @@ class _Perspective(Lens):
             low, high = np.where(turned, low, middle), np.where(turned, middle, high)
         return float(low.min())
 
-    def _regular(self, ideal: Array) -> Array:
+    def _regular(self, ideal: Array) -> NDArray[np.bool_]:
         """Return where the image neither turns back nor jumps."""
         r2 = _square(ideal)
         k4, k5, k6 = self._k[5:8]
         xx, xy, yx, yy = self._flat_jacobian(ideal[..., 0], ideal[..., 1])
-        return (xx * yy - xy * yx > 0.0) & (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)) > 0.0)
+        turn = xx * yy - xy * yx
+        return (turn > 0.0) & (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)) > 0.0)
 
     def _map(self, ideal: Array) -> Array:
         flat = self._flat(ideal)
@@ -221,7 +224,7 @@ class _Perspective(Lens):
 
     def _invert(self, distorted: Array, tolerance: float) -> Array:
         if self._tilt is not None:
-            distorted = _project(np.linalg.inv(self._tilt), distorted)
+            distorted = _project(np.asarray(np.linalg.inv(self._tilt), float), distorted)
         if len(self.coefficients) > 5 or math.isfinite(self.valid_radius):
             return self._newton(distorted, tolerance)
         ideal = distorted.copy()
@@ -256,8 +259,8 @@ class _Perspective(Lens):
             shrink = np.maximum(np.sqrt(x * x + y * y) / self.valid_radius, 1.0)
             x, y = x / shrink, y / shrink
             ideal[:, active] = x, y
-            open_ = ~((np.abs(dx) <= tolerance) & (np.abs(dy) <= tolerance))
-            active, x, y, u, v = (a[open_] for a in (active, x, y, u, v))
+            on = ~((np.abs(dx) <= tolerance) & (np.abs(dy) <= tolerance))
+            active, x, y, u, v = active[on], x[on], y[on], u[on], v[on]
             if not len(active):
                 break
         return ideal.T.copy()

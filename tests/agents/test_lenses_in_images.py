@@ -38,7 +38,7 @@ TILTED = (
 )
 FISHEYE = (-0.0023, 0.0412, -0.0387, 0.0067)
 LENSES = {
-    "rational": Camera(640, 480, 420.0, 411.0, 322.7, 236.2, RATIONAL),
+    "rational": Camera(640, 480, 480.0, 471.0, 322.7, 236.2, RATIONAL),
     "tilted": Camera(640, 480, 520.0, 508.0, 322.7, 236.2, TILTED),
     "wide angle": Camera(
         640, 360, 319.56, 319.56, 320.0, 180.0, (-0.2535, 0.0924, -6e-4, 7e-4, -0.0191)
@@ -59,6 +59,13 @@ def views(camera, count, low, high, seed=3):
         position = ray / np.linalg.norm(ray) * rng.uniform(0.8, 1.5)
         light = rotations.rotate(rotations.normalize(rng.normal(size=4)), [0.0, 0.0, 1.0])
         yield position, rotations.normalize(rng.normal(size=4)), Light(tuple(light))
+
+
+def corners_px(camera, marker, position, q):
+    """Project the corners of a marker."""
+    known = MODEL.marker(marker)
+    assert known is not None
+    return camera.project(rotations.rotate(q, known.corners_trf_m()) + position)
 
 
 def error_of(solutions, position, q):
@@ -86,8 +93,7 @@ def test_markers_are_where_projection_says_and_poses_as_good_as_stated(camera, p
         found = perception.estimate(effects.apply(exact, 0, number))
         assert found.solutions
         for marker, px in zip(found.marker_ids.tolist(), found.corners_px, strict=True):
-            corners = MODEL.marker(marker).corners_trf_m()
-            corner_errors.append(px - camera.project(rotations.rotate(q, corners) + position))
+            corner_errors.append(px - corners_px(camera, marker, position, q))
         error, covariance = error_of(found.solutions, position, q)
         nees.append(error @ np.linalg.solve(covariance, error))
         far.append(np.linalg.norm(error[:3]))
@@ -99,7 +105,7 @@ def test_markers_are_where_projection_says_and_poses_as_good_as_stated(camera, p
 
 def largest_shape(image):
     """Area and centroid of the largest connected part that is brighter than space."""
-    _, _, stats, centroids = cv2.connectedComponentsWithStats(np.uint8(image > 8))
+    _, _, stats, centroids = cv2.connectedComponentsWithStats((image > 8).astype(np.uint8))
     k = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     return float(stats[k, cv2.CC_STAT_AREA]), centroids[k]
 
@@ -126,10 +132,7 @@ def test_statistical_perception_sees_what_is_in_the_image(camera):
         assert found.solutions
         px = found.corners_px
         assert np.all((px >= 2.0) & (px <= (camera.width_px - 3.0, camera.height_px - 3.0)))
-        truth = [
-            camera.project(rotations.rotate(q, MODEL.marker(int(m)).corners_trf_m()) + position)
-            for m in found.marker_ids
-        ]
+        truth = [corners_px(camera, int(m), position, q) for m in found.marker_ids]
         assert np.abs(px - truth).max() < 1e-6
         ideal = camera.undistort(px)
         beyond += bool(np.any((ideal < 0.0) | (ideal > (camera.width_px, camera.height_px))))

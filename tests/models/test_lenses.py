@@ -17,7 +17,7 @@ FISHEYE = (-0.0023, 0.0412, -0.0387, 0.0067)
 
 
 def camera(coefficients: tuple[float, ...], model: LensModel = "perspective") -> Camera:
-    """A camera in general position: pixels that are not square, a principal point off the middle."""
+    """A camera in general position: pixels not square, the principal point off the middle."""
     fx, fy = (335.1, 329.7) if model == "equidistant" else (512.3, 497.8)
     return Camera(640, 480, fx, fy, 331.7, 228.4, coefficients, lens_model=model)
 

@@ -109,9 +109,11 @@ def _from_yaml(text: str) -> Any:
     class Loader(yaml.SafeLoader):
         """Reads OpenCV's matrices as tables."""
 
-    Loader.add_constructor(
-        "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True)
-    )
+        def construct_matrix(self, node: yaml.MappingNode) -> dict[Any, Any]:
+            """Return the table of a matrix."""
+            return self.construct_mapping(node, deep=True)
+
+    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", Loader.construct_matrix)
     if text.startswith("%YAML"):  # OpenCV's header is not YAML's
         text = text.partition("\n")[2]
     try:

@@ -17,8 +17,8 @@ from .fields import Fraction, NotNegative, Number, Positive, Section, Vector
 
 SidePixels = Annotated[int, Field(ge=64, le=4096)]
 _LEAST_SHARE = 0.5
-"""A lens must be invertible in so much of the image (chosen): published wide-angle calibrations that
-turn back do so at the corners, in a tenth of it."""
+"""A lens must be invertible in so much of the image (chosen): published wide-angle calibrations
+that turn back do so at the corners, in a tenth of it."""
 _NO_FISHEYE = math.tan(math.radians(85.0))
 """A fisheye that ends at a larger angle draws a circle in a black image, as it should."""
 _GRID = 61
@@ -241,8 +241,8 @@ class CameraSection(FlightCamera):
         default=None,
         exclude=True,
         description="Path, relative to the scenario file, of a calibration file to read "
-        "`intrinsics` from: of OpenCV (YAML, JSON or XML), ROS (`camera_info`) or Kalibr (camchain; "
-        "`camchain.yaml#cam1` names one of several cameras).",
+        "`intrinsics` from: of OpenCV (YAML, JSON or XML), ROS (`camera_info`) or Kalibr "
+        "(camchain; `camchain.yaml#cam1` names one of several cameras).",
     )
     sun_direction: Vector = Field(
         default=(-0.4, -0.5, 0.77), description="Direction to the sun (WRF), any length but 0."

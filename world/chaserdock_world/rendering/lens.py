@@ -17,8 +17,8 @@ _CANVAS_MOST = 4.0
 """Largest ideal image, in widths and heights of the image: 77 and 74 degrees from the axis for a
 fisheye of 640 x 480 with 285 px. It bounds memory and time."""
 _WEAK_STRETCH, _STRETCH_STEP_PX = 1.5, 8
-"""A lens is sampled once a pixel where a pixel covers at most so many ideal ones along a side, which
-draws edges within 0.01 px; looked at on a grid of this step."""
+"""A lens is sampled once a pixel where a pixel covers at most so many ideal ones along a side,
+which draws edges within 0.01 px; looked at on a grid of this step."""
 _STRONG_SAMPLES = 3
 """Otherwise so many samples along a pixel: at 60 degrees from a fisheye's axis it covers 4 x 1.7
 ideal pixels."""

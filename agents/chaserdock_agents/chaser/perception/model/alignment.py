@@ -435,8 +435,8 @@ def _match(
     pose, residual, weight = pose_array(prior), np.empty(n), np.empty(n)
     correlation, rows, work = np.empty(n), np.empty((n, 6)), np.empty(2 * n)
     inside = function("align_points", c_int64)(
-        byref(camera), address(image), settings, address(at), address(ahead), address(points.profiles),
-        address(points.border_m),
+        byref(camera), address(image), settings, address(at), address(ahead),
+        address(points.profiles), address(points.border_m),
         c_int64(n), address(pose), address(residual), address(weight), address(correlation),
         address(rows), address(work),
     )  # fmt: skip

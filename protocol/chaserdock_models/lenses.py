@@ -149,8 +149,7 @@ class _Perspective(Lens):
         direction = np.linspace(0.0, 2.0 * math.pi, _DIRECTIONS, endpoint=False)
         unit = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
         radii = np.tan(np.linspace(0.0, _STEEPEST_RAD, _ANGLES))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            bad = ~self._regular(radii[:, None, None] * unit)
+        bad = ~self._regular(radii[:, None, None] * unit)
         if not bad.any():
             return math.inf
         first = int(np.argmax(bad.any(axis=1)))
@@ -166,8 +165,9 @@ class _Perspective(Lens):
         """Return where the image neither turns back nor jumps."""
         r2 = _square(ideal)
         k4, k5, k6 = self._k[5:8]
-        xx, xy, yx, yy = self._flat_jacobian(ideal[..., 0], ideal[..., 1])
-        turn = xx * yy - xy * yx
+        with np.errstate(divide="ignore", invalid="ignore"):  # at a pole
+            xx, xy, yx, yy = self._flat_jacobian(ideal[..., 0], ideal[..., 1])
+            turn = xx * yy - xy * yx
         return (turn > 0.0) & (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)) > 0.0)
 
     def _map(self, ideal: Array) -> Array:

@@ -6,8 +6,9 @@ covariance says.
 import cv2
 import numpy as np
 import pytest
-from chaserdock_agents.chaser.perception import Perception
-from chaserdock_agents.chaser.perception.lens import MarkerFrames
+from chaserdock_agents.chaser.perception import Perception, corners, detect
+from chaserdock_agents.chaser.perception.lens import LEAST_STRETCH, MarkerFrames
+from chaserdock_agents.chaser.perception.pnp import MarkerTable
 from chaserdock_agents.chaser.perception.statistical import StatisticalPerception
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
@@ -156,3 +157,23 @@ def test_frames_keep_corners_and_have_the_scale_of_the_image(camera):
         steps = np.array([[0.5, 0.0, 1.0], [-0.5, 0.0, 1.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]])
         px = camera.project(steps @ frames.to_ray[k].T)
         assert np.allclose([px[0] - px[1], px[2] - px[3]], np.eye(2), atol=1e-3)
+
+
+def test_corners_are_as_uncertain_as_the_lens_stretches_them():
+    camera = LENSES["fisheye"]
+    renderer = Renderer(camera, MODEL, None, Effects().point_spread_px)
+    perception, table = Perception(camera, MODEL), MarkerTable.of(MODEL)
+    position, q, light = next(views(camera, 1, 0.75, 0.8))
+    image = renderer.render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
+    rows = np.searchsorted(table.ids, perception.estimate(image).marker_ids)
+    truth = camera.undistort(
+        np.array([corners_px(camera, int(m), position, q) for m in table.ids[rows]])
+    )
+    cells = detect.dictionary_of(MODEL.dictionary).markerSize + 2
+    found = corners.refine(
+        image, camera, truth, cells, table.margin_share[rows], table.outlined[rows]
+    )
+    stretch = camera.stretch(truth.mean(axis=1))
+    assert stretch.min() > LEAST_STRETCH
+    assert found.good.any()
+    assert np.all(found.relative_sigma >= 0.999 * stretch)

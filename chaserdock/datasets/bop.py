@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.camera import Camera
+from chaserdock_models.camera import Camera, focal_and_centre
 from chaserdock_models.meshes import TriangleMesh
 from numpy.typing import NDArray
 
@@ -31,6 +31,7 @@ from .types import (
     Selection,
     Split,
     TargetShape,
+    check_camera,
     read_pixels,
 )
 from .views import ViewImage
@@ -56,7 +57,7 @@ class BopWriter:
     def __init__(
         self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape
     ) -> None:
-        check_camera(camera)
+        check_camera(camera, "bop")
         self._folder, self._camera = folder, camera
         write_models(mesh, shape, folder / "models")
         shutil.copytree(folder / "models", folder / "models_eval")
@@ -101,15 +102,6 @@ class BopWriter:
         for split, files in self._scenes.items():
             for name, rows in files.items():
                 write_json(self._folder / _FOLDERS[split] / _SCENE / f"{name}.json", rows)
-
-
-def check_camera(camera: Camera) -> None:
-    """Raise DatasetError for a camera with lens distortion."""
-    if camera.distortion:
-        raise DatasetError(
-            "camera.intrinsics.distortion: the BOP format has no lens distortion; use --format "
-            "speed+, or a camera without it"
-        )
 
 
 def _info(image: ViewImage) -> dict[str, Any]:
@@ -223,8 +215,8 @@ def _camera(folder: Path, matrices: dict[Path, Array]) -> Camera:
             "one camera: give --domain, or the images of one camera"
         )
     height, width = read_pixels(path).shape
-    fx, fy, cx, cy = (float(first[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     try:
+        fx, fy, cx, cy = focal_and_centre(first)
         return Camera(width, height, fx, fy, cx, cy)
     except ValueError as error:
         raise DatasetError(f"{path.parents[1] / 'scene_camera.json'}: {error}") from None

@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.camera import Camera
+from chaserdock_models.camera import Camera, focal_and_centre
 from chaserdock_models.meshes import TriangleMesh
 
 from .json_files import numbers, read_list, read_object, write_json
@@ -107,7 +107,7 @@ def _camera_values(camera: Camera) -> dict[str, Any]:
         "ccx": camera.cx_px,
         "ccy": camera.cy_px,
         "cameraMatrix": camera.matrix().tolist(),
-        "distCoeffs": list((*camera.distortion, *[0.0] * 5)[:5]),
+        "distCoeffs": camera.ros_distortion()[1],
     }
 
 
@@ -185,9 +185,9 @@ def _read_camera(file: Path) -> Camera:
     coefficients = (
         numbers(file, values, "distCoeffs", (5,)) if "distCoeffs" in values else np.zeros(5)
     )
-    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     distortion = tuple(coefficients.tolist()) if coefficients.any() else ()
     try:
+        fx, fy, cx, cy = focal_and_centre(matrix)
         return Camera(width, height, fx, fy, cx, cy, distortion)
     except ValueError as error:
         raise DatasetError(f"{file}: {error}") from None

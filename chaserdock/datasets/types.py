@@ -27,6 +27,21 @@ class DatasetError(ChaserdockError):
     """
 
 
+def check_camera(camera: Camera, layout: Layout) -> None:
+    """Raise DatasetError for a lens that a layout cannot state."""
+    key = "camera.intrinsics"
+    if layout == "bop" and camera.distorts:
+        raise DatasetError(
+            f"{key}.distortion: the BOP format has no lens distortion; use --format speed+, or a "
+            "camera without it"
+        )
+    if camera.lens_model != "perspective" or len(camera.distortion) > 5:
+        raise DatasetError(
+            f"{key}.distortion: the SPEED+ format has k1, k2, p1, p2, k3 only; this lens is "
+            f"{camera.lens_model} with {len(camera.distortion)} coefficients"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class PoseLabel:
     """Pose of the target in the camera: position (3,), m, in IRF and rotation (4,), TRF to IRF."""

@@ -14,7 +14,7 @@ from chaserdock_protocol.messages import Level, Odometry, Sighting
 
 from chaserdock_controller.bodies.body_shape import BodyShape
 from chaserdock_controller.bodies.target_body import TargetBody
-from chaserdock_controller.interfaces import RelativePose, TargetState
+from chaserdock_controller.interfaces import AppliedImpulse, RelativePose, TargetState
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,14 +22,14 @@ class MeasuredChaser:
     """What is measured and known of one chaser in a tick.
 
     ``odometry``: measured in this tick. ``outdated``: the newest one where there is none of this
-    tick, with the time of the tick at which it was measured. ``impulse`` (6,): N s and N m s, body
-    axes, that its actuators gave in the last ``EstimatorInputs.covered_s``. ``last_command`` (6,):
+    tick, with the time of the tick at which it was measured. ``impulse``: what its actuators gave
+    in the last ``EstimatorInputs.covered_s``. ``last_command`` (6,):
     N and N m, of a chaser without odometry in this tick, which flies by a plan that the controller
     does not know. ``latched``: its latch holds the target. ``contact``: since the tick before.
     """
 
     chaser: int
-    impulse: Array
+    impulse: AppliedImpulse
     odometry: Odometry | None = None
     outdated: Odometry | None = None
     last_command: Array | None = None

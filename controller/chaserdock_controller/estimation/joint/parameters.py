@@ -149,6 +149,8 @@ class JointParameters:
     """As calibrated."""
     navigation: NavigationErrors
     """Errors of the chasers' sensors."""
+    tick_s: float = 0.1
+    """Time between ticks."""
     force_max_N: float = 1.0
     torque_max_N_m: float = 0.1
 
@@ -208,6 +210,9 @@ class JointParameters:
     again, its error can jump by several sigmas."""
     collective_rejections: int = 3
     """Rejections in a row by most cameras after which the target's rates are widened."""
+    collective_cameras: int = 3
+    """Cameras with a sighting from which on most of them can outvote the estimate of a chaser: with
+    fewer, the error may as well be that of the only chaser that disagrees."""
     iterated_updates: int = 5
     """The first updates after a start of the target are iterated, as they are far from linear."""
     iterations: int = 4
@@ -259,6 +264,7 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
         body=body,
         camera=scenario.camera_model(),
         navigation=scenario.navigation.errors(),
+        tick_s=1.0 / rate_hz,
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
         unexpected_velocity_m_s=body.force_max_N / body.mass_kg / rate_hz / math.sqrt(3.0),

@@ -14,6 +14,7 @@ from chaserdock_models import rotations
 from chaserdock_models.targets import target_model
 from chaserdock_protocol.scenario import (
     ScenarioError,
+    flight_scenario,
     load_scenario,
     parse_scenario,
     scenario_from_json,
@@ -237,6 +238,7 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("controller.horizon_s", 0.04, "controller", "shorter than one step"),
     ("controller.dt_s", 0.001, "controller", "3000 stages; at most 500"),
     ("controller.dt_s", 0.0, "controller.dt_s", "greater than 0"),
+    ("controller.dt_s", 0.05, "controller", "shorter than a tick (time.rate_hz = 15)"),
     ("controller.falloff", 1.5, "controller.falloff", "a number from 0 to 1 (got 1.5)"),
     ("controller.weight_force", 0.0, "controller.weight_force", "greater than 0"),
     ("approach.max_speed_m_s", 0.0, "approach.max_speed_m_s", "greater than 0"),
@@ -327,3 +329,11 @@ def test_rates_are_accepted_exactly_when_they_divide(
     else:
         assert divides
         assert scenario.timing.steps_per_tick * rate_hz == physics_hz
+
+
+@pytest.mark.parametrize(("rate_hz", "dt_s"), [(60, 0.1), (10, 0.1), (8, 0.125), (1, 1.0)])
+def test_the_step_of_the_prediction_is_at_least_a_tick(rate_hz: int, dt_s: float) -> None:
+    values = good() | {"time": {"rate_hz": rate_hz, "image_hz": 1}}
+    scenario = parse_scenario(values, "x")
+    assert scenario.controller.dt_s == dt_s
+    assert flight_scenario(scenario).controller == scenario.controller

@@ -154,7 +154,11 @@ class Controller(ControllerOptions):
         default=3.0,
         description=f"Prediction horizon, s: at least one and at most {MAX_STAGES} steps `dt_s`.",
     )
-    dt_s: Positive = Field(default=0.1, description="Step of the prediction, s.")
+    dt_s: Positive = Field(
+        default=0.1,
+        description="Step of the prediction, s: at least a tick, as long as a command is held. Not "
+        "set: 0.1, or a tick where that is longer.",
+    )
     falloff: Fraction = Field(
         default=0.0,
         description="Linear decrease of the stage weights along the horizon: 0 is constant, 1 "
@@ -195,6 +199,23 @@ class Controller(ControllerOptions):
         if stages > MAX_STAGES:
             raise ValueError(f"horizon_s / dt_s is {stages:.0f} stages; at most {MAX_STAGES}")
         return self
+
+    def at_rate(self, rate_hz: int) -> Controller:
+        """Return the controller for ticks at ``rate_hz``, with the step derived if it is not set.
+
+        Raises ValueError for a step shorter than a tick: its input would be held for longer than
+        planned.
+        """
+        if self.dt_s * rate_hz >= 1.0 - 1e-9:
+            return self
+        if "dt_s" in self.model_fields_set:
+            raise ValueError(
+                f"dt_s ({self.dt_s:g} s) is shorter than a tick (time.rate_hz = {rate_hz}), for "
+                f"which a command is held: at least {1.0 / rate_hz:g} s, or leave it out"
+            )
+        if self.horizon_s < 1.0 / rate_hz:
+            raise ValueError(f"horizon_s ({self.horizon_s:g} s) is shorter than a tick")
+        return self.model_copy(update={"dt_s": 1.0 / rate_hz})
 
 
 class Limits(Section):

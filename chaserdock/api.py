@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions of the Python API, which ``import chaserdock`` exports. Heavy imports wait until a
+"""Functions of the Python API, exported by ``import chaserdock``. Heavy imports wait until a
 function needs them.
 """
 
@@ -32,8 +32,8 @@ class OverrideError(ChaserdockError):
 
 @dataclass(frozen=True)
 class RunResult:
-    """A flown mission: ``summary`` and the folder ``dir`` with its files; ``summary.success`` is
-    the verdict.
+    """A flown mission. ``summary``: its evaluation; ``summary.success`` is the verdict. ``dir``:
+    folder with its files.
     """
 
     summary: Summary
@@ -41,7 +41,7 @@ class RunResult:
 
     @cached_property
     def log(self) -> Log:
-        """The recorded log, open."""
+        """Return the recorded log, open."""
         return open_log(self.dir)
 
 

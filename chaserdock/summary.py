@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a flight as typed values; docs/summary.md describes the fields. SI units and
-radians.
-"""
+"""Typed form of a flight's summary; docs/summary.md describes the fields. SI units and radians."""
 
 from __future__ import annotations
 
@@ -13,16 +11,18 @@ from msgspec import Struct
 
 
 class SteadyErrors(Struct, frozen=True, kw_only=True):
-    """Mean square tracking errors after the settling time; None in flights without such a part."""
+    """Mean square tracking errors after the settling time; None if the flight has no such part."""
 
     position_mse_m2: float | None
     orientation_mse_rad2: float | None
 
 
 class PortLoadPeaks(Struct, frozen=True, kw_only=True):
-    """Largest loads at a chaser's port, over all physics steps; ``closing_impulse_N_s``: largest in
-    a tick, where a latch closed. ``limit_exceeded_s``: end of the first tick with a load beyond the
-    port's limits, or None."""
+    """Largest loads at a chaser's port over all physics steps.
+
+    ``closing_impulse_N_s``: largest impulse in a tick in which a latch closed.
+    ``limit_exceeded_s``: end of the first tick with a load beyond the port's limits, or None.
+    """
 
     peak_force_N: float
     peak_torque_N_m: float
@@ -34,7 +34,7 @@ class PortLoadPeaks(Struct, frozen=True, kw_only=True):
 
 
 class Capture(Struct, frozen=True, kw_only=True):
-    """Docking by contact of one chaser; the figures at contact are None without a latch."""
+    """Docking by contact of one chaser. The figures at contact are None without a latch."""
 
     latched: bool
     verified: bool
@@ -49,8 +49,9 @@ class Capture(Struct, frozen=True, kw_only=True):
 
 
 class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
-    """Smallest margin of the coasts after a loss of thrust, when it occurred, the closest approach
-    of that coast, and the share of the plans that were safe."""
+    """Passive safety of a chaser's plans: smallest margin of the coasts after a loss of thrust,
+    when it occurred, closest approach of that coast, and share of the plans that were safe.
+    """
 
     min_margin_sigmas: float
     min_margin_time_s: float
@@ -59,9 +60,10 @@ class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
 
 
 class RendezvousFigures(Struct, frozen=True, kw_only=True):
-    """What the criteria of a published task judge: least margin to the speed limit, largest angle
-    from the cone's axis, arrival, and the first abort with the least half edge of a cube about the
-    target that the chaser touched since. None: no such part."""
+    """Quantities that the criteria of a published task judge: least margin to the speed limit;
+    largest angle from the cone's axis; arrival; first abort, with the least half edge of a cube
+    about the target that the chaser touched afterwards. None if the flight has no such part.
+    """
 
     speed_margin_m_s: float | None
     cone_angle_rad: float | None
@@ -114,7 +116,7 @@ class TargetEstimateErrors(PoseEstimateErrors, frozen=True, kw_only=True):
 
 
 class StackRest(Struct, frozen=True, kw_only=True):
-    """Rates at the end of the target with the chasers latched to it, and since when they are within
+    """Final rates of the target with its latched chasers, and since when they are within
     ``success.detumbled``.
     """
 
@@ -165,8 +167,8 @@ class MessageCount(Struct, frozen=True, kw_only=True):
 
 
 class PlumeSummary(Struct, frozen=True, kw_only=True):
-    """What the plumes of thrusters gave a body: sums of the magnitudes of the impulses per tick,
-    and the largest force.
+    """Impulses of thruster plumes on a body: sums of their magnitudes per tick, and the largest
+    force.
     """
 
     impulse_N_s: float

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a log says about a flight."""
+"""Evaluation of recorded flights: summary, criteria, figures, report, video."""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Target and chasers with meshes in the outside view, rendered as for the simulated cameras, with
-each chaser in its colour.
+"""Renders target and chasers with meshes for the outside view, as for the simulated cameras but
+with each chaser in its colour.
 """
 
 from __future__ import annotations
@@ -23,14 +23,12 @@ from numpy.typing import NDArray
 from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint
 
 _AMBIENT = 0.45
-"""Share of light from everywhere: more than in the cameras' images, so that the shaded side is
-visible.
-"""
+"""Share of ambient light: more than in the cameras' images, so that the shaded side is visible."""
 _GAMMA = 0.6
 """Exponent of the grey levels for display, as in snapshots."""
 _BRIGHTER = 1.5
-"""Factor of a chaser's colour relative to grey of the same brightness, which its low components
-would darken.
+"""Brightness of a chaser's colour relative to grey of the same grey level; the colour's low
+components would darken it.
 """
 _BLACK = Material("black", diffuse=0.0)
 
@@ -63,9 +61,9 @@ class BodyRenderer:
         chasers: dict[int, BodyPose],
         tint: Callable[[int], Array],
     ) -> RenderedBodies:
-        """Render the bodies at their poses; ``tint`` returns the colour (3,), BGR, of a chaser.
+        """Render the bodies at their poses. ``tint`` returns the colour (3,), BGR, of a chaser.
 
-        A chaser's share of a pixel is what the pixel loses if that chaser is black.
+        A chaser's share of a pixel is how much the pixel darkens if that chaser is black.
         """
         eye, attitude = look.centre_m + look.axes()[2] * look.distance_m, look.attitude()
 

@@ -24,15 +24,16 @@ BodyPose = tuple[Array, Array]
 """Position (3,) WRF and attitude (4,) body to WRF."""
 
 _NEAR_M = 0.02
-"""Least depth (m) of what is drawn, so that no division overflows. Chosen; bodies are farther away.
-"""
+"""Least depth (m) that is drawn; bounds the division by depth. Bodies are farther away."""
 _SHIFT = 4
 """Bits of OpenCV's fixed-point coordinates behind the point: 1/16 px, finer than antialiasing
 shows."""
 _SPACE = (26, 21, 18)
-"""Colour (BGR, 0 to 255) of space without a background. Chosen."""
+"""Colour (BGR, 0 to 255) of space without a background: almost black, so that dark bodies stand
+out.
+"""
 _TARGET_PATH = (150, 150, 150)
-"""Colour (BGR, 0 to 255) of the path of the target. Chosen; grey, as chasers are coloured."""
+"""Colour (BGR, 0 to 255) of the target's path: grey, because chasers are coloured."""
 _PLUME = np.array([255.0, 214.0, 150.0])
 
 
@@ -46,8 +47,10 @@ def tint(chaser: int) -> Array:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera that looks at a point. ``centre_m`` (3,), WRF: that point, in the middle of the
-    image. ``distance_m``, ``azimuth_rad``, ``elevation_rad``: where it is from there, in WRF.
+    """A camera that looks at a point ``centre_m`` (3,), WRF, in the middle of the image.
+
+    ``distance_m``, ``azimuth_rad``, ``elevation_rad``: position of the camera from that point, in
+    WRF.
     """
 
     centre_m: Array
@@ -71,7 +74,7 @@ class Viewpoint:
         return 1.25 * min(self.width_px, 1.35 * self.height_px)
 
     def pinhole(self) -> Camera:
-        """Return the camera without its pose."""
+        """Return the camera's intrinsics."""
         w, h = self.width_px, self.height_px
         return Camera(w, h, self.focal_px, self.focal_px, w / 2.0, h / 2.0)
 
@@ -81,8 +84,8 @@ class Viewpoint:
         return rotations.from_matrix(np.stack([right, -up, -back], axis=1))
 
     def project(self, points_m: Array) -> tuple[Array, Array]:
-        """Return pixels (..., 2) and depths (...) in metres of points (..., 3) WRF; pixels are
-        invalid at depths <= 0.
+        """Return pixels (..., 2) and depths (...), m, of points (..., 3) in WRF. Pixels are invalid
+        at depths <= 0.
         """
         local = (points_m - self.centre_m) @ self.axes().T
         depth = self.distance_m - local[..., 2]

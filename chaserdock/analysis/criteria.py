@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Success criteria of a recorded flight: which can be judged, docking and goals, evaluated on
-ground truth.
+"""Success criteria of a recorded flight, evaluated on ground truth: which can be judged; docking
+and goals.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from chaserdock_protocol.scenario import Scenario
 from .flight import LoadHistory, RecordedFlight
 
 _CONTACT_SLACK_M = 0.02
-"""Distance (m) by which a chaser in contact may be nearer than latched: by its tilt and the spring
-of its probe. Chosen."""
+"""Distance (m) by which a chaser in contact may be closer than a latched one, because it tilts and
+its probe is sprung. Larger: a wrong penetration passes; smaller: contacts fail.
+"""
 _VERIFIED = ("verified", "identify", "detumble", "stack_hold")
-"""Phases of a chaser whose latch has passed the test."""
+"""Phases of a chaser whose latch has passed its test."""
 
 
 def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
-    """Return the capture of a chaser as plain values for JSON; None without a port.
+    """Return the capture of a chaser as plain values for JSON; None for a chaser without a port.
 
-    ``latched``: at the end. ``latch_time_s`` and the contact values are those of the touch that
-    closed the latch.
+    ``latched``: at the end. ``latch_time_s`` and the contact values belong to the touch that closed
+    the latch.
     """
     if flight.scenario.docking.port_of(chaser) is None:
         return None
@@ -48,8 +49,8 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
 
 
 def port_load_of(loads: LoadHistory, s: Scenario, chaser: int) -> dict[str, float | None]:
-    """Return the largest loads at a chaser's port as plain values for JSON, and when a limit was
-    first exceeded.
+    """Return the largest loads at a chaser's port, and when a limit was first exceeded, as plain
+    values for JSON.
     """
     beyond = np.zeros(len(loads.time_s), dtype=bool)
     for quantity, limit, _ in _load_limits(s, chaser):
@@ -94,8 +95,8 @@ def overloads(result: dict[str, Any], s: Scenario) -> list[str]:
 
 
 def nearest_allowed_m(s: Scenario, chaser: int) -> float:
-    """Return the smallest allowed distance of a chaser from the target's centre; smaller for a
-    chaser with a port.
+    """Return the smallest allowed distance of a chaser from the target's centre. With a port it is
+    smaller.
     """
     port, limit = s.docking.port_of(chaser), s.limits.min_distance_target_m
     if port is None:
@@ -140,11 +141,11 @@ def capture_text(capture: dict[str, Any]) -> str:
 
 
 def stack_rest(flight: RecordedFlight) -> dict[str, float | None] | None:
-    """Return the rates at the end of the target with the chasers latched then; None where nothing
-    is judged.
+    """Return the final rates of the target with the chasers latched then; None if the scenario does
+    not judge them.
 
-    ``since_s``: simulated time from which on both were within ``success.detumbled``; None if they
-    are not at the end.
+    ``since_s``: simulated time since which both were within ``success.detumbled``; None if they are
+    not at the end.
     """
     limits = flight.scenario.success.detumbled
     if limits is None or "target" not in flight.truth:
@@ -189,11 +190,11 @@ def rest_failures(result: dict[str, Any], s: Scenario) -> list[str]:
 
 
 def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
-    """Return the simulated time (s) from which on a chaser stays at the goal of its last ``goto``;
+    """Return the simulated time (s) since which a chaser stays at the goal of its last ``goto``;
     None if it does not.
 
-    The goal is the one of the scenario, on the true target. Chasers without a ``goto`` in the time
-    line have none.
+    The goal is the scenario's, placed on the true target. A chaser without a ``goto`` in the
+    timeline has none.
     """
     goal, success = flight.scenario.goal_of(chaser), flight.scenario.success
     if goal is None:
@@ -209,8 +210,8 @@ def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
 
 
 def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[str]:
-    """Return the violations of ``success.reached``, given the time from which on the chaser stayed
-    at its goal.
+    """Return the violations of ``success.reached``. ``time_s``: time since which the chaser stayed
+    at its goal, or None.
     """
     success, goal = scenario.success, scenario.goal_of(chaser)
     if chaser not in success.reached or goal is None:
@@ -230,13 +231,14 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
     """Return the scenario with the success criteria that its duration allows to judge, and a line
     for each other one.
 
-    A scenario that is shortened by an override can end before the part of the flight that a
-    criterion is about: before ``settling_s`` (tracking and estimation errors), or before the time
-    line commands the approach or the ``goto`` of a chaser (``docked``, ``latched``, ``reached``,
+    A scenario shortened by an override can end before the part of the flight that a criterion is
+    about. That part begins at ``settling_s`` (tracking and estimation errors), or when the timeline
+    commands the approach or the ``goto`` of a chaser (``docked``, ``latched``, ``reached``,
     ``arrival``) or the first ``detumble``. Such criteria are neither met nor violated.
     """
     success, changes, skipped = scenario.success, {}, []
     end_s = min(scenario.steady_until_s or scenario.duration_s, scenario.duration_s)
+
     for name, from_s, until_s in (
         ("steady_position_rms_m", scenario.settling_s, end_s),
         ("steady_orientation_rms_deg", scenario.settling_s, end_s),
@@ -248,6 +250,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
             skipped.append(
                 f"success.{name}: the flight ends at {until_s:g} s, settling_s is {from_s:g} s"
             )
+
     for name, command in (("docked", "approach"), ("latched", "approach"), ("reached", "goto")):
         late = {
             i: first_s
@@ -262,6 +265,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
                 f"its {command} is at {first_s:g} s"
                 for i, first_s in late.items()
             ]
+
     if late := _late_arrivals(scenario):
         assert success.arrival is not None
         left = tuple(i for i in success.arrival.chasers if i not in late)
@@ -271,6 +275,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"is at {first_s:g} s"
             for i, first_s in late.items()
         ]
+
     first_s = min((e.at_s for e in scenario.timeline if e.command == "detumble"), default=None)
     if success.detumbled is not None and first_s is not None and first_s >= scenario.duration_s:
         changes["detumbled"] = None
@@ -278,12 +283,13 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"success.detumbled: the flight ends at {scenario.duration_s:g} s, detumble is at "
             f"{first_s:g} s"
         )
+
     return scenario.model_copy(update={"success": success.model_copy(update=changes)}), skipped
 
 
 def _late_arrivals(scenario: Scenario) -> dict[int, float]:
-    """Return the chasers of ``success.arrival`` whose first ``goto`` is not before the end, with
-    its time (s).
+    """Return the chasers of ``success.arrival`` whose first ``goto`` comes after the end, with its
+    time (s).
     """
     arrival = scenario.success.arrival
     first = {i: _first_command_s(scenario, "goto", i) for i in (arrival.chasers if arrival else ())}
@@ -293,7 +299,7 @@ def _late_arrivals(scenario: Scenario) -> dict[int, float]:
 
 
 def _first_command_s(scenario: Scenario, command: str, chaser: int) -> float | None:
-    """Return the time of the first such command of the time line to a chaser, or None."""
+    """Return the time (s) of the first such command to a chaser in the timeline, or None."""
     return min(
         (e.at_s for e in scenario.timeline if e.command == command and chaser in e.chasers),
         default=None,

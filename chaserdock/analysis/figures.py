@@ -72,8 +72,8 @@ def _figure(title: str, caption: str) -> Callable[[Drawing], Drawing]:
 
 
 def flown(flight: RecordedFlight) -> list[int]:
-    """Return the chasers whose motion is in the log. Raise MissingData without any, or without
-    target.
+    """Return the chasers whose motion is in the log. Raise MissingData if there are none or the
+    target is missing.
     """
     if "target" not in flight.truth:
         raise MissingData("the log holds no ground truth of the target")
@@ -84,12 +84,12 @@ def flown(flight: RecordedFlight) -> list[int]:
 
 
 def _span_s(times_s: Array) -> tuple[float, float]:
-    """Return the limits of a time axis, from zero, not empty."""
+    """Return the limits of a time axis, from zero; the interval is not empty."""
     return 0.0, max(float(times_s[-1]), 1e-3)
 
 
 def _path(own: Track, target: Track) -> tuple[Array, Array]:
-    """Return the drawn positions of a chaser, including the last one: WRF, and relative to the
+    """Return the drawn positions of a chaser, up to the last one: in WRF, and relative to the
     target in TRF.
     """
     n = min(len(own.time_s), len(target.time_s))
@@ -140,7 +140,7 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 def _equal_scale(axes: Any, paths: list[Array]) -> None:
-    """Set limits around the paths and the origin of the axes with one scale, the box no larger than
+    """Give the axes one scale and limits around the paths and the origin; the box is no larger than
     the paths need.
     """
     points = np.concatenate([*paths, np.zeros((1, 3))])
@@ -243,8 +243,8 @@ def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float, float]]:
-    """Return begin (s), end (s) and limit of the closing speed (m/s) for the phases of a chaser
-    that have one.
+    """Return begin (s), end (s) and limit (m/s) of each phase of a chaser in which its closing
+    speed is limited.
     """
     s, history = flight.scenario, flight.references.get(chaser)
     if history is None:
@@ -271,8 +271,8 @@ def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float
 
 
 def keep_out(flight: RecordedFlight, chaser: int) -> tuple[Array, Array]:
-    """Return times (K,) s and, from each on, the distance from the target (K,) m that a chaser
-    keeps; NaN: none.
+    """Return times (K,) s, and the distance (K,) m from the target that a chaser keeps from each
+    on; NaN for none.
     """
     end_s = float(flight.truth["target"].time_s[-1])
     history = flight.references.get(chaser)
@@ -327,7 +327,7 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 def _docks_at_distance(flight: RecordedFlight, chaser: int) -> bool:
-    """Return whether a chaser approaches the docking distance, instead of a port."""
+    """Return whether a chaser docks at a distance, not at a port."""
     history = flight.references.get(chaser)
     phases = set() if history is None else {name for _, name in history.phases}
     return flight.scenario.docking.port_of(chaser) is None and not phases.isdisjoint(
@@ -558,10 +558,10 @@ _OUTCOME_COLOURS: dict[ImageOutcome, str] = {
 
 
 def component_errors(flight: RecordedFlight) -> tuple[Array, Array, Array]:
-    """Return times (K,) s, errors (K, 12) truth minus estimate, and their sigmas (K, 12), decimated
-    for drawing.
+    """Return times (K,) s, errors (K, 12) of the estimate (truth minus estimate) and their sigmas
+    (K, 12), decimated for drawing.
 
-    Order and axes follow the covariance: position and velocity WRF, attitude and rate TRF.
+    Order and axes as in the covariance: position and velocity in WRF, attitude and rate in TRF.
     """
     a, b = (rows[decimated(len(rows))] for rows in known_estimates(flight))
     if not len(a):
@@ -618,14 +618,14 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 _TAIL_SHARE = 0.05
-"""Share of values on one side of the band from which on a filter is not called consistent: twice
-the expected one.
+"""Share of values beyond one side of the band above which a filter is not called consistent: twice
+the expected share.
 """
 
 
 def consistency_text(nees: Array, low: float, high: float) -> str:
-    """Judge NEES values (K,) against the band from ``low`` to ``high``, which 2.5 % exceed on
-    either side if consistent.
+    """Judge NEES values (K,) by the band from ``low`` to ``high``; of a consistent filter 2.5 % lie
+    beyond each side.
     """
     above, below = float(np.mean(nees > high)), float(np.mean(nees < low))
     verdict = "consistent"
@@ -666,8 +666,8 @@ def consistency(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 def _bars(axes: Axes, outcomes: ImageOutcomes, row: float, period_s: float) -> None:
-    """Draw one row of the raster: a bar for each interval of images with the same outcome; gaps
-    stay empty.
+    """Draw one row of the raster: a bar per run of images with the same outcome; gaps stay
+    empty.
     """
     spans: dict[ImageOutcome, list[tuple[float, float]]] = {}
     for first_s, last_s, outcome in outcomes.intervals(1.5 * period_s):

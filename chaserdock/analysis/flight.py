@@ -43,7 +43,7 @@ from .columns import Columns
 from .mass_properties import values_of
 from .pose_errors import POSE
 
-# Messages whose number or content depends on the wall clock.
+# Messages whose number or content depends on the wall clock: left out of the digest.
 NOT_IN_DIGEST = (topics.PRESENCE, topics.HEALTH, topics.FAREWELL, topics.ACK, topics.STATE)
 LOAD_QUANTITIES = (
     "peak_force_N",
@@ -78,7 +78,9 @@ class Track:
 
 
 class Tracks(Mapping[str, Track]):
-    """Tracks by name. A long track occupies memory only while it is referenced."""
+    """Tracks by name. A long track is read from its file and occupies memory only while
+    referenced.
+    """
 
     def __init__(self, motions: dict[str, Columns]) -> None:
         self._motions = motions
@@ -97,11 +99,11 @@ class Tracks(Mapping[str, Track]):
 
 @dataclass
 class ReferenceHistory:
-    """What a chaser was to follow. ``offset_m`` (K, 3), TRF: commanded offsets, each from
-    ``time_s`` (K,) on. ``phases``: start (s) and name of each.
+    """Reference of a chaser over time.
 
-    ``keep_out`` (L, 2): times (s), and the distance (m) from the target's centre that the plan
-    keeps from then on; 0 while the chaser is latched, which keeps none.
+    ``offset_m`` (K, 3), TRF: commanded offsets, each valid from ``time_s`` (K,) on. ``phases``:
+    start (s) and name of each. ``keep_out`` (L, 2): times (s), and the distance (m) from the
+    target's centre that the plan keeps from then on; 0 while the chaser is latched.
     """
 
     time_s: Array
@@ -123,8 +125,8 @@ class SightingHistory:
 
 @dataclass
 class SolverHistory:
-    """Solves of the controller: times (K,) s, wall-clock durations (K,) s, whether a status other
-    than ``solved`` occurred.
+    """Solves of the controller: times (K,) s, wall-clock durations (K,) s, and whether any status
+    was not ``solved``.
     """
 
     name: str | None
@@ -136,7 +138,7 @@ class SolverHistory:
 
 @dataclass
 class WorldHistory:
-    """Totals of the world's ground truth. ``latched``: at the end; ``contacts``: number of times
+    """Totals in the world's ground truth. ``latched``: at the end. ``contacts``: number of times
     two bodies touched.
     """
 
@@ -159,8 +161,8 @@ class WorldHistory:
 
 @dataclass
 class LoadHistory:
-    """Loads at a port: times (K,) s, and what ``LOAD_QUANTITIES`` names since the tick before, (K,
-    6).
+    """Loads at a port: times (K,) s, and values (K, 6) since the previous tick, in the order of
+    ``LOAD_QUANTITIES``.
     """
 
     time_s: Array
@@ -177,8 +179,9 @@ class LoadHistory:
 
 @dataclass
 class IdentificationHistory:
-    """Identified mass properties of the target, in the order of ``mass_properties.NAMES``: times
-    (K,) s, values and standard deviations (K, 10), SI units; the ``last`` message."""
+    """Identified mass properties of the target: times (K,) s; values and standard deviations (K,
+    10), SI units, in the order of ``mass_properties.NAMES``; the ``last`` message.
+    """
 
     time_s: Array
     values: Array
@@ -188,8 +191,9 @@ class IdentificationHistory:
 
 @dataclass
 class SafetyHistory:
-    """Certificates of passive safety of a chaser: times (K,) s, margins (K,) in sigmas, distances
-    (K,) m of closest approach, whether the plan was safe (K,)."""
+    """Passive safety of a chaser's plans: times (K,) s, margins (K,) in sigmas, distances (K,) m of
+    closest approach, and whether the plan was safe (K,).
+    """
 
     time_s: Array
     margin_sigmas: Array
@@ -199,9 +203,11 @@ class SafetyHistory:
 
 @dataclass
 class RelativeHistory:
-    """Estimated poses of a chaser relative to the target: times (K,) s, CRF's origin (K, 3) m in
-    TRF, attitudes (K, 4), and covariances (K, 21), upper triangles over position (TRF axes) and
-    attitude (CRF axes)."""
+    """Estimated poses of a chaser relative to the target.
+
+    Times (K,) s; CRF's origin (K, 3) in TRF, m; attitudes (K, 4); covariances (K, 21): upper
+    triangles over position (TRF axes) and attitude (CRF axes).
+    """
 
     time_s: Array
     position_m: Array
@@ -215,8 +221,8 @@ class RelativeHistory:
 
 @dataclass
 class PlumeTotals:
-    """What plumes gave a body: sums of the magnitudes of the impulses per tick, N s and N m s, and
-    the largest force, N.
+    """Impulses of plumes on a body: sums of their magnitudes per tick, N s and N m s, and the
+    largest force, N.
     """
 
     impulse_N_s: float = 0.0
@@ -231,13 +237,13 @@ class PlumeTotals:
 
 @dataclass
 class RecordedFlight:
-    """Content of a log without the images. Mappings by body name or chaser.
+    """Content of a log without the images. Mappings are by body name or chaser.
 
-    ``estimates`` holds the fused estimate as ``target``; ``estimate_known`` (K,): whether the
-    target was tracked or predicted. ``relative``: of the chasers whose pose the estimator
-    publishes, while the target is known. ``identified``: None without identification.
-    ``expected_commands``: number of actuator commands that all ticks expected. ``blas``: linear
-    algebra library of each process, empty where older logs do not state it.
+    ``estimates``: the fused estimate is ``target``. ``estimate_known`` (K,): the target was tracked
+    or predicted. ``relative``: of the chasers whose pose the estimator publishes, while the target
+    is known. ``identified``: None without identification. ``expected_commands``: number of actuator
+    commands that all ticks expected. ``blas``: linear algebra library of each process; empty if an
+    older log does not state it.
     """
 
     scenario: Scenario
@@ -435,13 +441,13 @@ class _Collector:
         self.gaps.update(record.key, message.seq)
         if record.topic not in NOT_IN_DIGEST:
             content = msgspec.msgpack.encode(without_wall_time(message))
-            # A sum, as two controllers publish on the same keys, and their messages arrive in any
-            # order.
+            # A sum does not depend on the order: two controllers publish on the same keys, and
+            # their messages arrive in any order.
             number = int.from_bytes(hashlib.sha256(content).digest(), "big")
             self.hashes[record.key] = (self.hashes.get(record.key, 0) + number) % 2**256
 
     def _add_tick(self, message: Tick, sent_ns: int) -> None:
-        # A later revision of the same tick replaces the number of commands that it expects.
+        # A later revision of a tick replaces its number of expected commands.
         replaced = self.tick_expected if message.tick == self.tick else 0
         self.expected += len(message.chasers) - replaced
         self.tick, self.tick_expected = message.tick, len(message.chasers)
@@ -511,12 +517,15 @@ def load_flight(log: LogSource) -> RecordedFlight:
     c = _Collector()
     for record in read_log(log):
         c.add(record)
+
     digest = hashlib.sha256()
     for key in sorted(c.hashes):
         digest.update(f"{key} {c.hashes[key]:064x}\n".encode())
+
     rejected: Counter[str] = Counter()
     for health in c.health.values():
         rejected.update(health.rejected)
+
     solves = c.solves.table()
     return RecordedFlight(
         scenario=scenario,

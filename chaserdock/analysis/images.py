@@ -16,15 +16,16 @@ from chaserdock_protocol.topics import IMAGE, SIGHTING
 Pair = tuple[Image, Sighting | None]
 
 _MAX_WAITING = 4
-"""Images of a chaser that wait for their sightings. Chosen: it may follow the next image, and one
-that is lost is to delay few."""
+"""Images of a chaser that wait for their sightings. A sighting may follow the next image; larger:
+one lost sighting delays more images.
+"""
 
 
 def pairs(log: Path, chasers: int) -> Iterator[Pair]:
-    """Yield every image with the sighting of the same exposure, or None; the images of one chaser
-    in order of time.
+    """Yield every image with the sighting of the same exposure, or None. Those of one chaser are in
+    order of time.
 
-    A log is ordered by arrival: a sighting may precede its image or follow the next one. Raise
+    A log is in order of arrival: a sighting may precede its image or follow the next one. Raise
     LogError for an unreadable log.
     """
     waiting: dict[int, deque[Image]] = defaultdict(deque)
@@ -50,11 +51,11 @@ def pairs(log: Path, chasers: int) -> Iterator[Pair]:
 def shots(
     log: Path, chasers: int, every_s: float, first_s: float = 0.0
 ) -> Iterator[tuple[float, dict[int, Pair]]]:
-    """Yield the latest image of each chaser at regular times: at ``first_s``, then ``every_s``
-    (simulated time, s), with that time.
+    """Yield simulated times (s) and the latest image of each chaser then: at ``first_s``, then
+    every ``every_s``.
 
     The last item lies at or after the last image; there is none if that precedes ``first_s``. Where
-    the log is not ordered by time, an image may be older by one than necessary.
+    the log is not in order of time, an image may be the one before the latest.
     """
     latest: dict[int, Pair] = {}
     number, time_s = 0, -math.inf
@@ -70,8 +71,8 @@ def shots(
 
 
 def columns_for(number: int, aspect: float, width_px: int, height_px: int) -> tuple[int, int]:
-    """Return the number of columns that maximizes the size of ``number`` images of this aspect
-    ratio, and their width.
+    """Return the number of columns that shows ``number`` images of this aspect ratio largest, and
+    their width (px).
     """
     best = (1, 1)
     for columns in range(1, number + 1):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identified mass properties as shown in report and viewer: beside the scenario's stated values
-and, where recorded, the true ones.
+"""Formats identified mass properties for report and viewer, beside the stated and, if recorded, the
+true values.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ def true_values(drawn: DrawnBody) -> Array:
 
 @dataclass(frozen=True)
 class PropertyRow:
-    """One quantity: value and standard deviation of target and stack, the stated value and, if
-    known, the true one, as text.
+    """One quantity of the table as text: value and standard deviation of target and stack; stated
+    value; true value, if known.
 
-    ``off``: the true error of the target in standard deviations.
+    ``off``: true error of the target's value in standard deviations.
     """
 
     name: str

@@ -63,7 +63,7 @@ _VARIABLES = {
 
 
 MAX_POINTS = 20_000
-"""Longer series are decimated: an undecimated figure of ten hours would have gigabytes."""
+"""Longer series are decimated. Figures of all values would have gigabytes for ten hours."""
 
 
 def decimation(number: int) -> int:

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Criteria of published rendezvous and docking tasks, evaluated on ground truth at every tick:
-``success.speed_limit``, ``approach_cone``, ``arrival``, ``abort_clear_m``. WRF, in an orbit the
-Hill frame; distances between centres."""
+"""Criteria of published rendezvous and docking tasks, evaluated on ground truth at every tick.
+
+They are ``success.speed_limit``, ``approach_cone``, ``arrival`` and ``abort_clear_m``. Motion is in
+WRF, in an orbit the Hill frame; distances are between centres.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,14 @@ RendezvousResult = dict[str, float | None]
 
 
 def rendezvous_of(flight: RecordedFlight, chaser: int) -> RendezvousResult | None:
-    """Return what a chaser's flight has to do with the criteria, as plain values for JSON; None
-    without any of them.
+    """Return what the criteria judge of a chaser's flight, as plain values for JSON; None if the
+    scenario has none of them.
 
-    ``speed_margin_m_s``: least distance from the speed limit; ``cone_angle_rad``: largest angle
-    from the cone's axis; ``arrived_s``, ``arrived_speed_m_s``: at the arrival; ``abort_s``: begin
-    of the first abort; ``abort_clear_m``: from then on, the least half edge of a cube about the
-    target with the chaser's centre on its surface. None where a flight has no such part.
+    ``speed_margin_m_s``: least margin to the speed limit. ``cone_angle_rad``: largest angle from
+    the cone's axis. ``arrived_s``, ``arrived_speed_m_s``: time and speed of the arrival.
+    ``abort_s``: begin of the first abort. ``abort_clear_m``: since then, the least half edge of a
+    cube about the target with the chaser's centre on its surface. A value is None if the flight has
+    no such part.
     """
     success = flight.scenario.success
     if all(
@@ -99,7 +102,7 @@ def _arrival(
 
 
 def rendezvous_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
-    """Yield a message for each of the criteria that a summary violates."""
+    """Yield a message for each of these criteria that a summary violates."""
     for i, c in result["chasers"].items():
         if (found := c.get("rendezvous")) is not None:
             yield from _failures(int(i), found, s)
@@ -143,7 +146,7 @@ def _arrival_failures(i: int, arrived_s: float | None, s: Scenario) -> Iterator[
 
 
 def rendezvous_text(found: RendezvousResult) -> str:
-    """Describe the figures as part of a line."""
+    """Format the values as part of a line."""
     parts = [
         ("least margin to the speed limit {:.3f} m/s", found["speed_margin_m_s"]),
         ("at most {:.2f} deg off the cone's axis", _degrees(found["cone_angle_rad"])),

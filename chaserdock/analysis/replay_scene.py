@@ -30,12 +30,15 @@ from .summary import tracking_errors
 from .time_series import Traces
 
 _MOST_SAMPLES = 1200
-"""Most rows of a body in a report: ten a second of two minutes. Chosen, for the size of the page.
+"""Largest number of rows of a body in a report: ten a second for two minutes. Larger: smoother
+replay, larger page.
 """
 _MOST_SHOTS = 120
-"""Most images of a chaser in a report. Chosen, for the size of the page."""
+"""Largest number of images of a chaser in a report. Larger: images follow the replay more closely,
+larger page.
+"""
 _SHOT_WIDTH_PX = 256
-"""Width (px) of the images in a report. Chosen, for the size of the page."""
+"""Width (px) of the images in a report. Larger: sharper images, larger page."""
 
 
 def _numbers(values: Array, digits: int) -> list[float]:
@@ -61,24 +64,26 @@ def _thinned(track: Track, rows: NDArray[Any]) -> dict[str, Any]:
 
 
 def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) -> dict[str, Any]:
-    """Return plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases,
-    outcomes of images.
+    """Return the replay as plain values for JSON: times (s), flat positions (m, WRF) and attitudes,
+    phases, outcomes of images.
 
-    The rows of the bodies are those of ``times``, at most 1200, evenly spaced; a lost body has
-    fewer.
+    The rows of the bodies belong to ``times``: evenly spaced, at most ``_MOST_SAMPLES``; fewer for
+    a lost body.
     """
     target = flight.truth["target"]
     rows = np.arange(0, len(target.time_s), max(1, -(-len(target.time_s) // _MOST_SAMPLES)))
     if rows[-1] != len(target.time_s) - 1:
         rows = np.append(rows, len(target.time_s) - 1)
+
     chasers, reach_m = [], 0.3
     for i in flight.flown:
         own = flight.truth[f"chaser/{i}"]
         mine = rows[rows < len(own.time_s)]
         _, position, _ = tracking_errors(flight, i)
         distance = np.linalg.norm(own.position_m[mine] - target.position_m[mine], axis=1)
-        # Distant chasers must not reduce the scale for all others.
+        # Distant chasers must not shrink all others.
         reach_m = max(reach_m, min(float(distance.max()), 3.0))
+
         outcomes = traces.image_outcomes.get(i)
         reference = flight.references.get(i)
         chasers.append(
@@ -94,6 +99,7 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
                 "error_mm": [float(f"{1e3 * e:.3g}") for e in position[mine]],
             }
         )
+
     scene = scene_of(flight.scenario)
     return {
         "times": _numbers(target.time_s[rows], 3),
@@ -112,8 +118,8 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
 
 
 def small_images(log: Path, flight: RecordedFlight) -> dict[str, Any]:
-    """Return camera images with detections as data URLs, at most 120 per chaser: ``times`` (s) and
-    ``chasers`` by number.
+    """Return camera images with detections as data URLs, at most ``_MOST_SHOTS`` per chaser:
+    ``times`` (s) and ``chasers`` by number.
 
     A missing or unreadable image is an empty string.
     """

@@ -50,6 +50,7 @@ def report_of(log: Path) -> str:
     result = summary_of(flight)
     every = decimation(flight.world.ticks)
     traces = load_traces(log, range(len(flight.scenario.chasers)), every)
+
     missing: list[str] = []
     figures = []
     for kind, figure in draw_figures(flight, traces):
@@ -62,6 +63,7 @@ def report_of(log: Path) -> str:
             f"<figcaption>{escape(kind.caption)}</figcaption>\n<div "
             f'class="wide">{svg}</div></figure>'
         )
+
     replay, script = "", ""
     if "target" in flight.truth:
         data = replay_data(flight, traces, small_images(log, flight))
@@ -73,6 +75,7 @@ def report_of(log: Path) -> str:
         script = f"{stored}\n<script>\n{code}</script>"
     else:
         missing.insert(0, "3-D replay: the log holds no ground truth of the target.")
+
     body = [
         _head(flight, result),
         _outcome(result),
@@ -207,7 +210,7 @@ def _docked(c: dict[str, Any]) -> str:
 
 
 def _captures(result: dict[str, Any]) -> str:
-    """Return a table of the captures, with the values of the touch that closed the latch."""
+    """Return a table of the captures, with the values at the touch that closed the latch."""
     degree = math.degrees(1.0)
     rows = [
         (
@@ -244,7 +247,7 @@ def _captures(result: dict[str, Any]) -> str:
 
 
 def _rendezvous(result: dict[str, Any]) -> str:
-    """Return a table of what the criteria of a published task judge."""
+    """Return a table of the quantities that the criteria of a published task judge."""
     rows = [
         (
             f"chaser {i}",
@@ -332,8 +335,8 @@ def _identified(flight: RecordedFlight) -> str:
 
 
 def _drawn(flight: RecordedFlight) -> str:
-    """Return a table of the true bodies and sensors beside the nominal values of the flight
-    software.
+    """Return a table of the true bodies and sensors, beside the nominal values that the flight
+    software has.
     """
     stated = {"target": flight.scenario.target.mass_kg} | {
         f"chaser/{i}": flight.scenario.chaser.mass_kg for i in range(len(flight.scenario.chasers))
@@ -365,7 +368,7 @@ def _drawn(flight: RecordedFlight) -> str:
         "focal length, %",
         "gyro bias, deg/s",
     )
-    # One column per body: with one per quantity, even a wide screen would cut the table off.
+    # One column per body: with one per quantity even a wide screen would cut the table off.
     rows = list(zip(quantities, *columns, strict=True))
     head = ("", *(b.body for b in flight.drawn))
     return f'<h2 id="drawn">True bodies and sensors</h2>{table(head, rows)}' if columns else ""
@@ -405,7 +408,8 @@ aria-label="target and chasers in three dimensions"></canvas>{views}</div>
 <thead><tr><th></th><th>phase</th><th>distance to target</th>
 <th>position error</th><th>image</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
-<p class="faint">Drag to rotate, wheel to zoom; or arrow keys, + and −; space starts and stops. Ground truth.
+<p class="faint">Drag to rotate, wheel to zoom; or arrow keys, + and −; space starts and stops. \
+Ground truth.
 A camera frustum is bright while its image is used. Chasers have the colours of the figures.</p>
 </div>"""  # noqa: RUF001
 
@@ -442,7 +446,7 @@ def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
     run = [(k, v) for k, v in sorted(flight.run.items()) if not k.startswith("version.")]
     messages = [(key, str(m["count"]), str(m["lost"])) for key, m in result["messages"].items()]
     refused = [(reason, str(count)) for reason, count in result["rejected"].items()]
-    # The full digest identifies equal flights.
+    # The full digest: it identifies equal flights.
     run.append(("digest", result["digest"]))
     return (
         '<h2 id="scenario">Scenario and data</h2>'

@@ -15,31 +15,38 @@ from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, fac
 from chaserdock_protocol.scenario import FlightScenario
 
 Grey = int
-"""0 black to 255 white, fully lit."""
+"""Grey level when fully lit, 0 black to 255 white."""
 
 _PROBE_WIDTH_M = 0.012
-"""Width (m) of the drawn probe. Chosen."""
+"""Width (m) of the drawn probe; for display only, wide enough to be seen."""
 _LONGEST_PIECE_M = 0.06
-"""Longest piece (m) of the drawn probe: a long thin box is divided, so that ordering faces by the
-depth of their centres is correct."""
+"""Longest piece (m) of the drawn probe. A long thin box is divided, so that the depths of the
+pieces' centres order faces correctly.
+"""
 _LONGEST_EDGE_M = 0.12
-"""Longest edge (m) of a drawn triangle, for the same reason. Chosen."""
+"""Longest edge (m) of a drawn triangle, for the same reason. Smaller: fewer errors of order, more
+triangles to draw.
+"""
 _PLATE_M = 0.03
-"""Thickness (m) below which a part of a mesh counts as a plate. Chosen."""
+"""Thickness (m) below which a part of a mesh counts as a plate: that of solar panels and antennas,
+not of bodies.
+"""
 _LIFT_M = 0.08
-"""Distance (m) by which the broad faces of a plate count as nearer: drawn after what is behind it,
-where depths of centres alone err. Chosen."""
+"""Distance (m) by which the broad faces of a plate count as closer, so that they are drawn after
+what is behind them, where depths of centres alone err. Larger: plates cover what is in front of
+them.
+"""
 _FACET_M = 0.02
 """Largest deviation of the drawn facets of a satellite from its curved surfaces."""
 
 
 @dataclass(frozen=True)
 class Face:
-    """A flat quadrangle ``corners_m`` (4, 3) in body axes with outward ``normal``; ``decals`` are
+    """A flat quadrangle ``corners_m`` (4, 3) in body axes with outward ``normal``. ``decals`` are
     painted on it in order.
 
-    A triangle has its last corner twice. ``lift_m``: by how much nearer than it is the face counts
-    when faces are ordered by depth: a thin part on a larger face must not be hidden by it.
+    A triangle repeats its last corner. ``lift_m``: distance by which the face counts as closer when
+    faces are ordered by depth, so that a thin part on a larger face is not hidden.
     """
 
     corners_m: Array
@@ -62,7 +69,7 @@ class Scene:
 
 
 def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey], ...]:
-    """Return the quadrangles (4, 3) in TRF of a marker: white border, black square, and the white
+    """Return the quadrangles (4, 3), TRF, of a marker: white border, black square, then the white
     cells row by row.
     """
     table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, model.dictionary))
@@ -86,7 +93,7 @@ def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey
 
 
 def box_faces(box: Box, model: TargetModel | None = None) -> list[Face]:
-    """Return the six faces of a box in its parent axes; with a ``model``, including the markers on
+    """Return the six faces of a box in its parent's axes. ``model``: include the markers on
     them.
     """
     out = []
@@ -124,7 +131,8 @@ def _divided(triangles: Array) -> Array:
         edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
         short = edges.max(axis=1) <= _LONGEST_EDGE_M
         done.append(triangles[short])
-        # Turn each of the others so that its longest edge is between its first two corners.
+        # Rotate the corners of each other triangle so that its longest edge lies between the first
+        # two.
         first = edges[~short].argmax(axis=1)[:, None]
         a, b, c = np.moveaxis(
             np.take_along_axis(triangles[~short], ((first + np.arange(3)) % 3)[..., None], axis=1),
@@ -148,7 +156,8 @@ def mesh_faces(mesh: TriangleMesh) -> list[Face]:
         corners = _divided(part.vertices_m[part.triangles])
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         doubled_areas = np.linalg.norm(normals, axis=1)
-        # Dark materials shine: their diffuse part alone would be black on black space.
+        # Dark materials are shiny; with their diffuse part alone they would be black on black
+        # space.
         material = part.material
         grey = round(255 * min(1.0, 0.15 + material.diffuse + 0.3 * material.specular))
         for three, normal, area in zip(corners, normals, doubled_areas, strict=True):
@@ -181,14 +190,17 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         if body.mesh
         else box_faces(Box(body.size_m, shade=0.42))
     )
+
     mesh = scenario.target.nominal_mesh(_FACET_M)
     target = (
         [face for box in model.boxes for face in box_faces(box, model)]
         if mesh is None
         else mesh_faces(mesh)
     )
+
     if body.probe_reach_m > front:
         chaser += _probe(front, body.probe_reach_m)
+
     camera = scenario.camera_model()
     edges = (
         (0, 0),
@@ -196,6 +208,7 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         (camera.width_px, camera.height_px),
         (0, camera.height_px),
     )
+
     rays = [
         [
             (u - camera.cx_px) / camera.fx_px * view_m,
@@ -204,6 +217,7 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         ]
         for u, v in edges
     ]
+
     origin = np.array(camera.position_crf_m)
     corners = rotations.rotate(camera.q_crf_irf_wxyz, np.array(rays)) + origin
     return Scene(

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from .images import Pair, pairs
 
 _MARKER = (90, 220, 90)
-"""Colour (BGR, 0 to 255) of detected markers. Chosen."""
+"""Colour (BGR, 0 to 255) of detected markers: green, which grey images do not have."""
 _TEXT = (235, 235, 235)
-"""Colour (BGR, 0 to 255) of text. Chosen."""
+"""Colour (BGR, 0 to 255) of text: light on dark images."""
 _AXES = ((80, 80, 255), (90, 220, 90), (255, 160, 60))
-"""Colours (BGR, 0 to 255) of the axes x, y, z: red, green, blue, as usual."""
+"""Colours (BGR, 0 to 255) of the axes x, y, z: red, green, blue."""
 
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
@@ -79,7 +79,7 @@ def annotated_image(
             _draw_axes(canvas, scenario, sighting, scale)
     text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen_text(sighting)}"
     (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
-    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # shrink the text on a small image
+    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # fit the text into a small image
     cv2.putText(canvas, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
     return np.asarray(canvas, dtype=np.uint8)
 
@@ -101,8 +101,8 @@ def _draw_axes(
 
 
 def seen_text(sighting: Sighting | None) -> str:
-    """Return by what a sighting found the target, a number of markers or its shape, or that it did
-    not.
+    """Return how a sighting found the target, by a number of markers or by its shape, or that it
+    did not.
     """
     count = len(sighting.marker_ids) if sighting else 0
     if count:

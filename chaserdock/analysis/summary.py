@@ -50,11 +50,11 @@ def summarize(log: Path) -> dict[str, Any]:
 def true_reference(
     flight: RecordedFlight, chaser: int, rows: slice, target: Track
 ) -> tuple[Array, Array]:
-    """Return the reference positions (K, 3) WRF and attitudes (K, 4) of a chaser at these rows of
+    """Return the reference positions (K, 3), WRF, and attitudes (K, 4) of a chaser at these rows of
     the target's truth.
 
-    They are the commanded offset on the *true* target: estimation errors count as tracking errors.
-    Before the first command the offset is the scenario's.
+    The commanded offset is placed on the *true* target, so that estimation errors count as tracking
+    errors. Before the first command it is the scenario's offset.
     """
     c = flight.scenario.chasers[chaser]
     offsets = commanded_offsets(flight, chaser, np.array(c.position_m), target.time_s[rows])
@@ -66,8 +66,8 @@ def true_reference(
 
 
 def commanded_offsets(flight: RecordedFlight, chaser: int, before: Array, time_s: Array) -> Array:
-    """Return the commanded offsets (K, 3) TRF of a chaser at the times (K,); ``before`` (3,) until
-    the first command.
+    """Return the commanded offsets (K, 3), TRF, of a chaser at times (K,). ``before`` (3,): offset
+    before the first command.
     """
     history = flight.references.get(chaser)
     if history is None:
@@ -77,13 +77,13 @@ def commanded_offsets(flight: RecordedFlight, chaser: int, before: Array, time_s
 
 
 def blocks(number: int) -> Iterator[slice]:
-    """Yield ``number`` rows in blocks, which bounds the memory of intermediate arrays."""
+    """Yield ``number`` rows in blocks, which bound the memory of intermediate arrays."""
     return (slice(k, min(k + _BLOCK, number)) for k in range(0, number, _BLOCK))
 
 
 def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, Array]:
-    """Return times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from
-    its true reference.
+    """Return times (K,) s, position errors (K,) m and orientation errors (K,) rad of a chaser
+    relative to its true reference.
     """
     own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
     n = min(len(target.time_s), len(own.time_s))
@@ -98,10 +98,10 @@ def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, 
 def tracking_components(
     flight: RecordedFlight, chaser: int, step: int
 ) -> tuple[Array, Array, Array]:
-    """Return times (K,), position errors (K, 3) m, TRF, and orientation errors (K, 3) rad, CRF, of
-    every ``step``-th tick.
+    """Return times (K,) s, position errors (K, 3) m, TRF, and orientation errors (K, 3) rad, CRF,
+    of every ``step``-th tick.
 
-    Own pose relative to the true reference; the orientation error is a rotation vector.
+    Own pose relative to the true reference. The orientation error is a rotation vector.
     """
     own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
     rows = slice(0, min(len(target.time_s), len(own.time_s)), step)
@@ -112,8 +112,8 @@ def tracking_components(
 
 
 def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows of the estimate (K,) with a known target, and the rows of its truth at the
-    same times.
+    """Return the rows (K,) of the estimate in which the target is known, and the rows of its truth
+    at the same times.
     """
     none = np.zeros(0, dtype=np.intp)
     truth, known = flight.truth.get("target"), np.flatnonzero(flight.estimate_known)
@@ -124,8 +124,8 @@ def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[n
 
 
 def rows_at_equal_times(time_s: Array, other_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows (K,) of ascending times that occur in both, in the first and in the second
-    (not empty).
+    """Return the rows (K,) in the first and in the second array of ascending times (not empty) that
+    hold equal times.
     """
     at_ns, other_ns = nanoseconds(time_s), nanoseconds(other_s)
     row = rows_since(other_ns, at_ns)
@@ -134,8 +134,10 @@ def rows_at_equal_times(time_s: Array, other_s: Array) -> tuple[NDArray[np.intp]
 
 
 def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
-    """Return errors of the fused estimate: ``time_s``, ``position_m``, ``orientation_rad``,
-    ``velocity_m_s``, ``omega_rad_s`` and ``nees`` (over position and attitude), each (K,)."""
+    """Return errors of the fused estimate, each (K,): ``time_s``, ``position_m``,
+    ``orientation_rad``, ``velocity_m_s``, ``omega_rad_s`` and ``nees`` (over position and
+    attitude).
+    """
     a, b = known_estimates(flight)
     truth = flight.truth.get("target", flight.estimate)  # without truth there are no rows
     e = flight.estimate
@@ -154,9 +156,11 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
 
 
 def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
-    """Return errors of a chaser's estimated pose relative to the target: ``time_s``,
-    ``position_m``, ``orientation_rad``, ``nees``, each (K,); no rows without truth, or if the
-    estimator does not publish that pose."""
+    """Return errors of a chaser's estimated pose relative to the target, each (K,): ``time_s``,
+    ``position_m``, ``orientation_rad``, ``nees``.
+
+    There are no rows without truth, or if the estimator does not publish that pose.
+    """
     own, target = flight.truth.get(f"chaser/{chaser}"), flight.truth.get("target")
     history = flight.relative.get(chaser)
     if own is None or target is None or history is None:
@@ -177,8 +181,8 @@ def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
 def _store_pose_errors(
     errors: dict[str, Array], rows: slice, pose: Array, covariance: Array
 ) -> None:
-    """Store what ``_POSE_ERRORS`` names, of pose errors (K, 6) with covariances (K, 6, 6), in these
-    rows.
+    """Store the quantities of ``_POSE_ERRORS`` in these rows, computed from pose errors (K, 6) with
+    covariances (K, 6, 6).
     """
     errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
     errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
@@ -186,7 +190,9 @@ def _store_pose_errors(
 
 
 def _pose_figures(errors: dict[str, Array], from_s: float) -> dict[str, float | None]:
-    """Return RMS, largest value and mean NEES of pose errors from a time on; None without any."""
+    """Return RMS, largest value and mean NEES of pose errors since ``from_s``; None for an empty
+    part.
+    """
     late = errors["time_s"] >= from_s
     position, angle, nees = (errors[name][late] for name in _POSE_ERRORS)
     return {
@@ -222,7 +228,7 @@ def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
 
 
 def dock_time(flight: RecordedFlight, chaser: int) -> float | None:
-    """Return the time (s) from which on a chaser stays within the docking tolerances; None if it is
+    """Return the time (s) since which a chaser stays within the docking tolerances; None if it is
     not docked.
 
     Docked: the reference is at the docking distance, and at the end the chaser has been within the
@@ -255,6 +261,7 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
     s = flight.scenario
     chasers: dict[str, dict[str, Any]] = {}
     until = s.steady_until_s or s.duration_s
+
     for i in flight.flown if "target" in flight.truth else ():
         name = f"chaser/{i}"
         time_s, position, angle = tracking_errors(flight, i)
@@ -277,6 +284,7 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             "thruster_impulse_N_s": flight.thruster_impulse_N_s[name],
             "propellant_kg": flight.propellant_kg[name],
         }
+
         relative = _pose_figures(relative_errors(flight, i), s.settling_s)
         if relative["nees_mean"] is not None:
             chasers[str(i)]["relative_estimate"] = relative
@@ -286,13 +294,16 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             chasers[str(i)]["rendezvous"] = found
         if i in flight.safety:
             chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
+
     between = [
         float(flight.truth[f"chaser/{i}"].distance_to(flight.truth[f"chaser/{j}"]).min())
         for i, j in combinations(flight.flown, 2)
     ]
+
     errors = estimate_errors(flight)
     late = errors["time_s"] >= s.settling_s
     end_s = float(flight.truth["target"].time_s[-1]) if "target" in flight.truth else 0.0
+
     result: dict[str, Any] = {
         "scenario": s.name,
         "seed": s.seed,
@@ -329,10 +340,12 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "rejected": flight.rejected,
         "digest": flight.digest,
     }
+
     if flight.plumes:
         result["plumes"] = {body: asdict(totals) for body, totals in sorted(flight.plumes.items())}
     if (stack := stack_rest(flight)) is not None:
         result["stack"] = stack
+
     judged, result["not_judged"] = judged_criteria(s)
     result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
@@ -373,6 +386,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         out.append(f"ended at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
     if result["collisions"] > s.success.max_collisions:
         out.append(f"{result['collisions']} collisions, at most {s.success.max_collisions} allowed")
+
     nearest = result["min_distance_chasers_m"]
     if (
         s.success.keep_distances
@@ -383,6 +397,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             f"two chasers came within {nearest:.3f} m; the limit is "
             f"{s.limits.min_distance_chasers_m:g} m"
         )
+
     for i, c in result["chasers"].items():
         distance = c["min_distance_target_m"]
         limit = nearest_allowed_m(s, int(i))
@@ -404,6 +419,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             s.success.steady_orientation_rms_deg,
             "deg",
         )
+
     out += capture_failures(result, s)
     out += overloads(result, s)
     out += rest_failures(result, s)
@@ -414,7 +430,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
 def _estimate_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
     """Yield a message for each estimated pose relative to the target that exceeds its limits.
 
-    An estimator that publishes none takes the odometry of the chasers as exact, and is judged by
+    An estimator that publishes none treats the odometry of the chasers as exact, and is judged by
     the target's pose.
     """
     relative = {
@@ -448,7 +464,7 @@ def _degrees(angle_rad: float | None) -> float | None:
 
 
 def _exceeded(what: str, value: float | None, limit: float | None, unit: str) -> Iterator[str]:
-    """Yield a message if there is a limit and the value is beyond it or unknown."""
+    """Yield a message if there is a limit and the value exceeds it or is unknown."""
     if limit is not None and (value is None or value > limit):
         shown = "unknown" if value is None else f"{value:.4g} {unit}"
         yield f"{what}: {shown}, at most {limit:g} {unit} allowed"

@@ -62,8 +62,8 @@ class ActuatorHistory:
 
 @dataclass
 class Traces:
-    """Time series of each chaser, by number. ``latency``: rows of the time of an exposure (s) and
-    the wall-clock time from it to the command of the actuators (s).
+    """Time series of each chaser, by number. ``latency``: rows of exposure time (s) and wall-clock
+    time from the exposure to the actuators' command (s).
     """
 
     inputs: dict[int, ActuatorHistory]
@@ -73,7 +73,9 @@ class Traces:
 
 @dataclass
 class _ActuatorCollector:
-    """Sums impulses over ``every`` ticks per row; the first tick has no interval before it."""
+    """Averages actuator output over ``every`` ticks per row. The first tick has no interval before
+    it.
+    """
 
     every: int
     rows: Columns | None = None

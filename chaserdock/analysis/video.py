@@ -33,15 +33,19 @@ ENDINGS = (".mp4", ".webp", ".gif")
 _CODECS = {".mp4": "libx264", ".webp": "libwebp_anim", ".gif": "gif"}
 _AZIMUTH_RAD, _ELEVATION_RAD = math.radians(-52.0), math.radians(26.0)
 _TRAIL_S = 25.0
-"""Time (s) of the path behind each chaser. Chosen."""
+"""Time (s) of the path drawn behind each chaser. Larger: more of the manoeuvre, more crossing
+lines.
+"""
 _INK = (235, 235, 235)
-"""Colour (BGR, 0 to 255) of text. Chosen."""
+"""Colour (BGR, 0 to 255) of text: light on dark images."""
 _MARGIN_PX = 8
-"""Distance (px) of insets from the edge. Chosen."""
+"""Distance (px) of insets from the edge of the image."""
 _DIM = (120, 120, 120)
-"""Colour (BGR, 0 to 255) of axes. Chosen."""
+"""Colour (BGR, 0 to 255) of axes: darker than curves and text."""
 _PLUME_M = 0.16
-"""Length (m) of the drawn plume of a thruster that is always open. Chosen."""
+"""Length (m) of the drawn plume of a thruster that is always open; for display only, long enough to
+be seen beside a chaser.
+"""
 _TITLE_SHARE = 0.12
 """Share of the video during which the description, and at the end the verdict, is shown."""
 _CLOSE_PHASES = frozenset({"approach", "final", "contact", "latched", "docked"})
@@ -60,10 +64,11 @@ def write_video(
 ) -> int:
     """Write the video of a log (or run folder); return the number of frames.
 
-    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds per second of
-    video; ``part_s``: simulated times of the first and last frame; ``quality``: of .webp, 0 to 100;
-    ``report_progress`` receives the simulated time of each frame. Raise LogError for an unreadable
-    log or one without motion or image, ChaserdockError for an invalid size or file.
+    ``out``: file that ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds
+    per second of video. ``part_s``: simulated times of the first and last frame. ``quality``: of
+    .webp, 0 to 100. ``report_progress``: receives the simulated time of each frame. Raise LogError
+    for an unreadable log or one without motion or image, ChaserdockError for an invalid size or
+    file.
     """
     ending = out.suffix.lower()
     if ending not in _CODECS:
@@ -74,9 +79,11 @@ def write_video(
         )
     if not part_s[0] < part_s[1]:
         raise ChaserdockError(f"a video from {part_s[0]:g} s to {part_s[1]:g} s has no length")
+
     flight = load_flight(log)
     if "target" not in flight.truth:
         raise LogError(f"{log}: holds no motion of the target; nothing to film")
+
     number = 0
     with errors_of_writing(out), av.open(str(out), "w") as container:
         stream: Any = container.add_stream(_CODECS[ending], rate=fps)
@@ -87,6 +94,7 @@ def write_video(
             stream.options = {"crf": "21", "preset": "medium", "movflags": "+faststart"}
         elif ending == ".webp":
             stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
+
         for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
             report_progress(time_s)
             image = av.VideoFrame.from_ndarray(frame, format="bgr24")
@@ -95,6 +103,7 @@ def write_video(
             number += 1
         if number:
             container.mux(stream.encode())
+
     if not number:
         out.unlink(missing_ok=True)
         after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
@@ -111,7 +120,7 @@ def frames(
     part_s: tuple[float, float] = (0.0, math.inf),
 ) -> Iterator[tuple[float, BgrImage]]:
     """Yield simulated time (s) and video frame (height, width, 3), BGR, every ``every_s`` of
-    simulated time in ``part_s``.
+    simulated time within ``part_s``.
     """
     number = len(flight.scenario.chasers)
     camera = flight.scenario.camera
@@ -161,7 +170,7 @@ def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: in
 
 
 class _ExternalView:
-    """Draws the mission from a fixed direction, one image at a time."""
+    """Draws the mission from a fixed direction, frame by frame."""
 
     def __init__(
         self,
@@ -176,15 +185,18 @@ class _ExternalView:
         self.scene = scene_of(flight.scenario)
         sun = np.array(to_sun(flight.scenario))
         self.sun = sun / np.linalg.norm(sun)
+
         self.numbers = flight.flown
         self.target = target = flight.truth["target"]
         self._verdict = "success" if summary_of(flight)["success"] else "not successful"
+
         self._begin_s, self._end_s = part_s[0], min(float(target.time_s[-1]), part_s[1])
         self._span_s = max(self._end_s - self._begin_s, 1e-3)
         self._sky: BgrImage | None = None
         self._mesh = flight.scenario.target.nominal_mesh()
         self._renderers: dict[tuple[int, int], BodyRenderer] = {}
         self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
+
         reach, distances, speeds = 0.3, {}, {}
         for i, own in self.chasers.items():
             away_m = own.distance_to(target)
@@ -195,8 +207,9 @@ class _ExternalView:
             speeds[i] = time_s[inside], closing_m_s[inside] * 1e3
             reach = max(reach, float(away_m[inside].max(initial=0.0)))
         self._graphs = (_graph("distance / m", distances), _graph("closing / mm/s", speeds))
-        # Distant chasers must not reduce the scale for all others.
+        # Distant chasers must not shrink all others.
         self.distance_m = 3.5 * min(reach, 3.0)
+
         self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
         self.phases = {
             i: flight.references[i].phases if i in flight.references else [] for i in self.numbers
@@ -251,8 +264,8 @@ class _ExternalView:
         return self._renderers[size].render(look, at, chasers, tint)
 
     def _plumes_at(self, chaser: int, time_s: float) -> Array:
-        """Return nozzles and plume ends (K, 2, 3), CRF, of the thrusters that are open in the tick
-        at a time.
+        """Return nozzles and plume ends (K, 2, 3), CRF, of a chaser's thrusters that are open at a
+        time.
         """
         history, thrusters = self._plumes[chaser], self.flight.scenario.chaser.thrusters
         row = min(_row(history.edges_s, time_s), len(history.thruster_duty) - 1)
@@ -275,7 +288,7 @@ class _ExternalView:
         seeing: frozenset[int],
         time_s: float,
     ) -> None:
-        """Draw an enlarged view between the target and the chaser that is docking into the upper
+        """Draw an enlarged view of the gap between the target and a docking chaser into the upper
         right corner.
         """
         close = {
@@ -288,7 +301,7 @@ class _ExternalView:
             return
         nearest = min(close, key=lambda i: float(np.linalg.norm(close[i])))
         away = close[nearest]
-        # From the side: the gap between the bodies is visible.
+        # From the side, so that the gap between the bodies is visible.
         across_rad = math.atan2(away[1], away[0]) - math.pi / 2.0
         distance_m = 2.6 * float(np.linalg.norm(away))
         look = Viewpoint(
@@ -309,8 +322,8 @@ class _ExternalView:
         )
 
     def _draw_graph(self, image: BgrImage, time_s: float) -> None:
-        """Draw distances to the target and closing speeds since the begin of the video, lower right
-        corner.
+        """Draw distances to the target and closing speeds since the start of the video into the
+        lower right corner.
         """
         width, height = round(0.38 * self.size[0]), round(0.15 * self.size[1])
         if width < 160 or height < 40:
@@ -367,8 +380,8 @@ class _ExternalView:
 
 
 def wrapped(text: str, width_px: int, size: float) -> list[str]:
-    """Return the text in lines that are at most ``width_px`` wide as cv2.putText writes them; a
-    longer word is not broken.
+    """Return the text in lines of at most ``width_px`` as cv2.putText draws them. Longer words are
+    not broken.
     """
     lines = [""]
     for word in text.split():
@@ -397,8 +410,8 @@ def load_plumes(log: Path, flight: RecordedFlight) -> dict[int, ActuatorHistory]
 
 @dataclass(frozen=True)
 class _Graph:
-    """Values of each chaser over the part of the flight that is shown (``series``: times (K,) s and
-    values (K,)), and their scale.
+    """Values of each chaser over the shown part of the flight, and their scale. ``series``: times
+    (K,) s and values (K,).
     """
 
     label: str
@@ -408,7 +421,7 @@ class _Graph:
 
 
 def _graph(label: str, series: dict[int, tuple[Array, Array]]) -> _Graph:
-    """Return a graph whose scale leaves out the extreme hundredths of the values."""
+    """Return a graph whose scale excludes the extreme hundredths of the values."""
     known = np.concatenate(
         [values for _, values in series.values() if len(values)] or [np.zeros(1)]
     )
@@ -417,7 +430,9 @@ def _graph(label: str, series: dict[int, tuple[Array, Array]]) -> _Graph:
 
 
 def _row(times_s: Array, time_s: float) -> int:
-    """Return the row of the last of the times (K,) up to a time; the first before it."""
+    """Return the row of the last of the times (K,) up to ``time_s``; the first row if there is
+    none.
+    """
     return max(0, int(np.searchsorted(times_s, time_s + 1e-6)) - 1)
 
 

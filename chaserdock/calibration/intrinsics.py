@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration of camera matrix and distortion from images of a board, with OpenCV.
+"""Calibrates camera matrix and distortion from images of a board, with OpenCV.
 
-Outlier images are excluded and named: those with an RMS error above three times the median and
-above half a pixel. This does not compensate for a board that is not flat.
+Outlier images are excluded and named: those whose RMS error exceeds three times the median and half
+a pixel. This does not compensate for a board that is not flat.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 LEAST_IMAGES = 6
-"""Usable images: twice the three that determine a camera matrix (Z. Zhang, 2000), for distortion
-and for outliers."""
+"""Least number of usable images: twice the three that determine a camera matrix (Z. Zhang, 2000),
+to cover distortion and outliers.
+"""
 _LEAST_CORNERS = 8
-"""Corners in an image: twice the four that determine the pose of a plane."""
+"""Least number of corners in an image: twice the four that determine the pose of a plane."""
 _OUTLIER_RATIO, _OUTLIER_PX = 3.0, 0.5
 """RMS error of an outlier: above this multiple of the median, and above this many pixels, which
-sharp corners do not reach."""
+sharp corners do not exceed.
+"""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -39,8 +41,8 @@ class TooFew(Exception):
 
 @dataclass(frozen=True)
 class Board:
-    """A calibration board. ``points_m`` (n, 3): inner corners, in board axes. ``charuco``: OpenCV's
-    board; None for a chessboard, which has ``size`` corners.
+    """A calibration board. ``points_m`` (n, 3): inner corners, board axes. ``charuco``: OpenCV's
+    board. A chessboard has None there and ``size`` corners.
     """
 
     points_m: NDArray[np.float32]
@@ -120,6 +122,7 @@ def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Cali
     views: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
     shapes = [p.shape for p in images.values() if p is not None]
     usual = max(sorted(set(shapes)), key=shapes.count) if shapes else (0, 0)
+
     for name, image in images.items():
         if image is None:
             excluded[name] = "not an image"
@@ -131,22 +134,27 @@ def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Cali
                 excluded[name] = f"{len(px)} corners of the board found, {_LEAST_CORNERS} needed"
             else:
                 views[name] = (points, px)
+
+    # Calibrate without the worst image until none is an outlier.
     while True:
         if len(views) < LEAST_IMAGES:
             reasons = "".join(f"\n{name}: {reason}" for name, reason in excluded.items())
             raise TooFew(f"{len(views)} usable images, at least {LEAST_IMAGES} are needed{reasons}")
+
         points = [v[0] for v in views.values()]
         px = [v[1] for v in views.values()]
         size = (usual[1], usual[0])
         # The type stubs require initial matrices, which OpenCV treats as optional.
         solve: Any = cv2.calibrateCameraExtended
         total, matrix, lens, _, _, sigma, _, each = solve(points, px, size, None, None)
+
         rms = dict(zip(views, np.ravel(each).tolist(), strict=True))
         worst = max(rms, key=lambda name: rms[name])
         if rms[worst] <= max(_OUTLIER_RATIO * float(np.median(list(rms.values()))), _OUTLIER_PX):
             break
         excluded[worst] = f"outlier: RMS error {rms[worst]:.2f} px"
         del views[worst]
+
     return Calibration(
         usual[1],
         usual[0],

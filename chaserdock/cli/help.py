@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Classes of the program and its commands: help by panel that loads nothing but typer, and one
-check that every number is finite.
+"""Classes of the program and its commands: quick help by panel, and rejection of numbers that are
+not finite.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
 
 
 class FiniteCommand(TyperCommand):
-    """A command that rejects NaN and infinity, which pass typer's range checks, in every numeric
-    option.
+    """A command that rejects NaN and infinity in every numeric option; typer's range checks let
+    them pass.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -32,8 +32,8 @@ class FiniteCommand(TyperCommand):
 
 
 class ProgramHelp(TyperGroup):
-    """Print ``COMMAND … --help`` before typer prepares to parse values (which loads pydantic), and
-    list the commands by panel.
+    """The program: lists its commands by panel. Prints ``COMMAND … --help`` before typer prepares
+    to parse values, which would load pydantic.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

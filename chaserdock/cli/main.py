@@ -33,8 +33,9 @@ from .simulate import simulate
 from .target import target
 
 _GC_THRESHOLD = 100_000
-"""Objects between two garbage collections. Imports make several 100,000 objects that stay: with
-Python's default, 700, collecting among them is an eighth of the start of a process."""
+"""Objects allocated between two garbage collections. Imports create several 100,000 objects that
+stay. With Python's default, 700, collecting among them takes an eighth of a process' start.
+"""
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {
     "Fly": (run, simulate, campaign, reproduce),
@@ -93,8 +94,8 @@ def main() -> None:
         sys.exit(FAILED)
     finally:
         _flush_output()
-        # or Python searches all modules for garbage once more before it exits: a fifth of a short
-        # command's time
+        # Otherwise Python searches all modules for garbage once more before it exits, which takes a
+        # fifth of a short command's time.
         gc.freeze()
 
 
@@ -110,7 +111,7 @@ _PLAIN_TEXTS = {
 
 
 def _report_usage_error(error: Any) -> int:
-    """Print typer's error as one line, or the help where that is the error; return the exit
+    """Print typer's error as one line, or the help if that is the error. Returns the exit
     status.
     """
     if type(error).__name__ == "NoArgsIsHelpError":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands share, the network link they describe, and how commands report
+"""Options that several commands share, the network link that they describe, and the output of
 errors and results.
 
 Heavy imports wait until a command needs them, so that ``--help`` is quick.
@@ -137,7 +137,9 @@ ToOpt = Annotated[
 
 
 def fail(text: str) -> typer.Exit:
-    """Print ``text`` on standard error, one line per fault, and return the exit with status 2."""
+    """Print ``text`` on standard error, one line per fault. Returns the exit with status 2, to be
+    raised.
+    """
     for line in text.splitlines():
         print(f"chaserdock: {line}", file=sys.stderr)
     return typer.Exit(BAD_INPUT)
@@ -168,7 +170,7 @@ def show_of(quiet: bool, as_json: bool) -> Show:
 
 @contextmanager
 def errors_as_json(as_json: bool) -> Generator[None]:
-    """Print an error as the last JSON line, too, for a command that prints JSON lines."""
+    """Also print an error as the last JSON line, for a command that prints JSON lines."""
     try:
         yield
     except ChaserdockError as error:
@@ -205,9 +207,7 @@ def check_config(config: Path | None) -> None:
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """The network options of a command, declared by the annotations; ``with_link_options`` adds
-    them to a command.
-    """
+    """Network options of a command. ``with_link_options`` adds these annotated fields to it."""
 
     namespace: Annotated[
         str, typer.Option(help="Zenoh namespace; isolates missions on one network")
@@ -250,7 +250,7 @@ class LinkOptions:
     ] = 60.0
 
     def link(self, process: str = "operator", timeout_s: float | None = None) -> Link:
-        """Return the link of ``process``; with ``keys``, to a router over TLS. The world listens on
+        """Return the link of ``process``: with ``keys`` to a router over TLS. The world listens on
         the default endpoint.
 
         ``timeout_s``: wall time after which a client that no router accepts gives up; unlimited by
@@ -329,10 +329,10 @@ class LinkOptions:
 def with_link_options(
     *without: str, joins_run: bool = False, **defaults: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace a command's parameter ``link`` by the fields of LinkOptions, but ``without`` some, or
-    with other defaults.
+    """Decorate a command: its parameter ``link`` becomes the fields of LinkOptions, except those in
+    ``without``, with other ``defaults``.
 
-    ``joins_run``: with the option ``--run``.
+    ``joins_run``: also add the option ``--run``.
     """
     without = without if joins_run else (*without, "run")
 

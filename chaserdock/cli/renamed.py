@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands of earlier versions, and what does their work now."""
+"""Command names of earlier versions, and their replacements."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RENAMED = {
 
 
 def renamed(arguments: list[str]) -> str | None:
-    """Return one line that names the command of today, or None for one that has its name still."""
+    """Return one line that names the present command; None if the name is not an earlier one."""
     for words in (1, 2):
         old = " ".join(arguments[:words])
         if old in RENAMED:

@@ -85,11 +85,13 @@ def simulate(
         if unused := [option for option, is_given in given.items() if is_given]:
             raise fail(f"{', '.join(unused)}: only with --seeds")
         raise typer.Exit(_fly_one(scenario, out, mode))
+
     begin_s = time.monotonic()
     results: list[SimulationResult] = []
     outcomes: Counter[str] = Counter()
     options = SeedOptions(scenario, images, None if mode is None else mode.value, to_violation=stop)
     stopped = False
+
     try:
         for result in fly_seeds(options, _seed_range(seeds), jobs):
             if isinstance(result, UnflownSeed):
@@ -108,14 +110,17 @@ def simulate(
                 break
     except KeyboardInterrupt:
         stopped = True
+
     elapsed_s = time.monotonic() - begin_s
     failed = sum(bool(r.violations) for r in results) + outcomes["not flown"]
     counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common()) or "none flown"
+
     mean, flights = consistency(results)
     print(
         f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 "
         f"over {flights} flights"
     )
+
     if reason := inconsistency(results):
         print(f"chaserdock: {reason}", file=sys.stderr)
         failed += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test stand: world and partners replayed from a log over Zenoh, for one process under test."""
+"""Test stand for one process: plays the world and its partners from a log over Zenoh."""
 
 from __future__ import annotations
 
@@ -37,18 +37,21 @@ from .rules import Finding, Ledger
 from .ticks import CheckError, RecordedTick, read_turns, with_instance
 
 SILENT_TICKS = 3
-"""Number of unanswered ticks after which the check stops."""
+"""Unanswered ticks after which the check stops."""
 _LEASE_MS = 60_000
-"""Time (ms) after which a silent process counts as lost: chosen, long, so that a slow one is
-not."""
+"""Time (ms) after which a silent process counts as lost. Long, so that a slow process does not; a
+check of a dead one takes as long.
+"""
 _END_S = 5.0
-"""Time (s) that the process has to end. Chosen."""
+"""Time (s) that the process has to end. Larger: a hanging process delays the check; smaller: a slow
+one is reported.
+"""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """Result of a check: ``findings`` is empty if the process conforms; ``ticks`` of the log were
-    played.
+    """Result of a check. ``findings``: empty if the process conforms. ``ticks``: ticks of the log
+    that were played.
     """
 
     findings: list[Finding]
@@ -110,14 +113,14 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 
 class TestStand:
-    """Plays the messages of a log to one process and records its messages. Single-threaded except
+    """Plays the messages of a log to one process and records its messages. Single-threaded, except
     for the callbacks.
     """
 
     def __init__(self, node: Node, ledger: Ledger, scenario_json: str) -> None:
         self._node, self._ledger, self._scenario_json = node, ledger, scenario_json
         self._inbox: BoundedQueue[RawSample | JoinRequest | tuple[str, bool]] = BoundedQueue()
-        # The stand receives its own messages, too; all others come from the process under test.
+        # The stand also receives its own messages; all others come from the process under test.
         self._sent: Counter[tuple[str, str, bytes]] = Counter()
         self._numbers: Counter[str] = Counter()
         self._alive: set[str] = set()
@@ -264,8 +267,8 @@ class TestStand:
     def _wait(
         self, done: Callable[[], bool], child: subprocess.Popen[bytes] | None, seconds: float
     ) -> bool:
-        """Process messages and publish the partners' presence until ``done``; return False if the
-        child ends or on timeout.
+        """Process messages and publish the partners' presence until ``done``. Returns False if the
+        child ends or time runs out.
         """
         deadline = time.monotonic() + seconds
         ended = False
@@ -275,7 +278,7 @@ class TestStand:
             if time.monotonic() - self._presence_sent_s >= self._period_s:
                 self._presence_sent_s = time.monotonic()
                 self._publish_presence()
-            # Process all messages that preceded its end.
+            # First process all messages that preceded its end.
             ended = child is not None and child.poll() is not None
             self._receive(0.3 if ended else 0.02)
         return True

@@ -25,7 +25,7 @@ from chaserdock_protocol.transport import RawSample
 
 from .ticks import RecordedTick, role_of
 
-# Messages whose time is that of the plan's first state, not of the tick.
+# Messages stamped with the time of the plan's first state instead of the tick's.
 _OWN_TIME = (topics.PLAN,)
 
 
@@ -51,7 +51,7 @@ class Finding:
 def duties_of(
     role: Role, chaser: int | None, turn: RecordedTick, thrusters: bool
 ) -> dict[str, Topic]:
-    """Return the required answers of a process to a tick, by key."""
+    """Return the answers that a process owes to a tick, by key."""
     tick = turn.tick
     if role == "controller":
         wrenches = {topics.WRENCH.key_of(i): topics.WRENCH for i in tick.chasers}
@@ -71,7 +71,9 @@ def duties_of(
 
 @dataclass
 class Ledger:
-    """Messages and violations of the process under test. ``instance``: as in its join request."""
+    """Records messages and violations of the process under test. ``instance``: as in its join
+    request.
+    """
 
     process: str
     scenario: Scenario
@@ -133,7 +135,7 @@ class Ledger:
         topic = self._own_topic(raw.key)
         if topic is None:
             return
-        # An invalid answer also counts as the answer: no other one will follow.
+        # An invalid answer counts as the answer, too: no other one will follow.
         if raw.key in self._came:
             self.report(raw.key, "a second answer to one tick")
         if raw.key in self._duties:
@@ -170,7 +172,7 @@ class Ledger:
         return topic
 
     def _number(self, key: str, message: Message, from_zero: bool) -> None:
-        # Messages sent before discovery may be lost; presence is repeated for that reason.
+        # Messages before discovery may be lost; presence is repeated for that reason.
         if key not in self._next and not from_zero:
             self._unheard[key] = message.seq
         due = self._next.get(key, self._unheard.get(key, 0))
@@ -247,7 +249,7 @@ class Ledger:
             self.report(key, "not the term of its leases, its name and its instance", detail)
 
     def miss(self, patience_s: float) -> None:
-        """Report the missing answers of the present tick."""
+        """Report the answers that are missing in the present tick."""
         for key in self.due():
             self.report(key, f"no answer within {patience_s:g} s")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Input of one process from a log, tick by tick."""
+"""Reads the input of one process from a log, tick by tick."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from chaserdock_protocol.scenario import Scenario, flight_scenario_json
 from chaserdock_protocol.topics import Role, Topic
 from chaserdock_protocol.transport import RawSample
 
-# Generous bound on the delay of messages at a recorder in a lock-step flight, in ticks.
+# Bound on the delay of messages at a recorder in a lock-step flight, in ticks; generous.
 _LATE_TICKS = 64
 
 
 class CheckError(ChaserdockError):
-    """A check is impossible with the given arguments."""
+    """The given process, log or command cannot be checked."""
 
 
 @dataclass
 class RecordedTick:
-    """One recorded tick: the world's messages in ``opening``, the answers of the other processes in
-    ``answers``.
+    """One recorded tick. ``opening``: the world's messages. ``answers``: those of the other
+    processes.
 
-    ``exposure_ns``: the time of the process' own image, None without one.
+    ``exposure_ns``: time of the process' own image, None without one.
     """
 
     tick: Tick
@@ -111,6 +111,7 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
             f"{log}: flown in real time; a check needs a lock-step log, in which every tick is "
             "complete"
         )
+
     role, number = role_of(process, len(scenario.chasers))
     inputs = input_topics(role)
     keys = [
@@ -120,6 +121,7 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
             _places(number, len(scenario.chasers)) if "{chaser}" in topic.key else (None,)
         )
     ]
+
     turns: dict[int, RecordedTick] = {}
     waiting: dict[int, list[tuple[int, RawSample, int | None]]] = {}
     for record in read_log(log, keys):
@@ -134,6 +136,7 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
                 turns[message.tick] = RecordedTick(message)
         exposure_ns = message.sim_time_ns if isinstance(message, Image) else None
         waiting.setdefault(message.tick, []).append((inputs.index(record.topic), raw, exposure_ns))
+
     played = []
     for tick in range(most):
         if tick not in turns:
@@ -143,11 +146,13 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
             (turn.opening if inputs[rank].writer == "world" else turn.answers).append(raw)
             turn.exposure_ns = exposure_ns if exposure_ns is not None else turn.exposure_ns
         played.append(turn)
+
     if not played:
         raise CheckError(
             f"{log}: its first tick expects no answer of {process}; give a log that begins at tick "
             "0"
         )
+
     return Recorded(scenario, flight_scenario_json(scenario), played)
 
 

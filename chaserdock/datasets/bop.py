@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layout of BOP datasets (T. Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation",
-2018; docs of bop_toolkit), grey.
+"""Layout of BOP datasets (T. Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", 2018;
+docs of bop_toolkit), grey.
 
-Lengths are in millimetres, rotations row-wise from the model to the camera. A scene per split;
-there are no depth images.
+Lengths are in millimetres; rotations, from the model to the camera, row-wise. Each split is a
+scene. There are no depth images.
 """
 
 from __future__ import annotations
@@ -32,8 +32,11 @@ _IMAGE_FOLDERS = ("gray", "rgb")
 
 class BopWriter:
     """Writes a dataset into ``folder``: ``camera.json``, ``models``, ``models_eval``, ``train`` and
-    ``val``. Raises OSError, and DatasetError for a camera with lens distortion, which the format
-    does not have."""
+    ``val``.
+
+    Raises OSError, and DatasetError for a camera with lens distortion, which the format does not
+    support.
+    """
 
     def __init__(
         self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Score a perception on a dataset, image by image without memory of the one before."""
+"""Scores a perception on a dataset; each image is processed without memory of the previous one."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from .types import DatasetError, LabelledImage, PoseLabel, TargetShape, read_gre
 
 
 def perception_of(name: str | None, flight: FlightScenario, camera: Camera) -> PerceptionMethod:
-    """Return a perception for the camera of a dataset: by its name in a scenario, or a class
+    """Return a perception for the camera of a dataset, by its name in a scenario or a class
     ``MODULE:NAME``.
 
-    None is the perception of the flight scenario. Raises DatasetError for a class that cannot be
-    made, PluginError for an unknown name.
+    None: the perception of the flight scenario. Raises DatasetError for a class that cannot be
+    created, PluginError for an unknown name.
     """
     if name is not None and ":" in name:
         return _of_class(name, flight, camera)
@@ -77,8 +77,8 @@ def score_perception(
     shape: TargetShape | None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> dict[str, float]:
-    """Return the figures of `summarize` and the CPU time per image of the best solution of a
-    perception in every image.
+    """Return the figures of `summarize` for the best solution of a perception in every image, and
+    the CPU time per image.
 
     A perception with memory must have ``reset()``, which is called before each image. Raises
     DatasetError.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export a dataset: images of random views with their labels, and what flight software knows, which
-a perception is made from.
+"""Exports a dataset: images of random views with their labels, and the flight scenario from which a
+perception is created.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .views import ViewLimits, ViewRenderer
 DESCRIPTION = "dataset.json"
 FOLDERS: dict[Layout, str] = {"bop": "bop", "speed+": "speedplus"}
 EXACT_CAMERA = 'navigation.grade="exact"'
-"""Override of a scenario by which its camera has no errors against its calibration."""
+"""Override of a scenario by which the camera matches its calibration exactly."""
 
 
 def export_dataset(
@@ -34,11 +34,11 @@ def export_dataset(
     validation_share: float = 0.2,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Write ``images`` images with labels into a new ``folder``, the last ones, a share of
-    ``validation_share``, for validation.
+    """Write ``images`` labelled images into a new ``folder``. The last ones, a share of
+    ``validation_share``, are for validation.
 
-    Raises DatasetError for a folder that exists and is not empty or cannot be written, and for a
-    camera with errors.
+    Raises DatasetError for a folder that is not empty or cannot be written, and for a camera with
+    errors.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: exists already; give a new folder")

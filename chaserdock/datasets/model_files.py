@@ -14,7 +14,7 @@ from .shapes import diameter_of
 from .types import DatasetError, TargetShape
 
 OBJECT = 1
-"""Number of the target in a dataset of ours."""
+"""Object number of the target in datasets that we write."""
 
 
 def write_models(mesh: TriangleMesh, shape: TargetShape, folder: Path) -> None:

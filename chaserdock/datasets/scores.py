@@ -24,7 +24,9 @@ from .types import PoseLabel, TargetShape
 
 ANGLE_2021_RAD, SHARE_2021 = math.radians(0.169), 2.173e-3
 MISSED = math.pi + 1.0
-"""Score of an image without a pose: the largest error of attitude, and a position at the camera."""
+"""Score of an image without a pose: that of the largest attitude error and a position at the
+camera.
+"""
 ADD_SHARE = 0.1
 """A pose counts as right when ADD is below this share of the diameter."""
 
@@ -54,7 +56,7 @@ class PoseErrors:
 
 
 def pose_errors(estimate: PoseLabel, truth: PoseLabel, shape: TargetShape | None) -> PoseErrors:
-    """Return the errors of a pose; without ``shape`` there is no ADD."""
+    """Return the errors of a pose. ADD needs ``shape``."""
     position_m = float(np.linalg.norm(estimate.position_irf_m - truth.position_irf_m))
     range_m = float(np.linalg.norm(truth.position_irf_m))
     angle = float(rotations.angle_between(estimate.q_irf_trf_wxyz, truth.q_irf_trf_wxyz))
@@ -74,7 +76,7 @@ def add_m(estimate: PoseLabel, truth: PoseLabel, shape: TargetShape) -> float:
 
 
 def summarize(errors: Sequence[PoseErrors | None], shape: TargetShape | None) -> dict[str, float]:
-    """Return the figures of a dataset: scores over all images, where None is an image without a
+    """Return the figures of a dataset: scores over all images, with None for an image without a
     pose, and errors of the poses.
     """
     found = [e for e in errors if e is not None]

@@ -14,14 +14,16 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from .types import TargetShape
 
 _SAME_SHARE = 0.002
-"""Share of the diameter within which vertices count as at one place."""
+"""Distance, as a share of the diameter, within which vertices count as coincident."""
 _MOST_POINTS = 2000
-"""Points of a shape for ADD, spread evenly over its vertices: bounds the cost of an image."""
+"""Points of a shape for ADD, evenly spread over its vertices; bounds the time per image."""
 
 
 def shape_of(mesh: TriangleMesh, symmetric: bool = True) -> TargetShape:
-    """Return the shape of a target. Its candidates for symmetries are the rotations of a cube in
-    TRF; ``symmetric``: False for a target with markers, which has none."""
+    """Return the shape of a target. Candidate symmetries are the rotations of a cube in TRF.
+
+    ``symmetric``: False for a target with markers, which has no symmetry.
+    """
     vertices = np.concatenate([part.vertices_m for part in mesh.parts])
     diameter_m = diameter_of(vertices)
     turns = _symmetries(mesh, _SAME_SHARE * diameter_m) if symmetric else np.zeros((0, 3, 3))
@@ -38,13 +40,13 @@ def diameter_of(points: Array) -> float:
 
 
 def sampled(points: Array) -> Array:
-    """Return at most 2,000 of the points (n, 3), evenly spread over their order."""
+    """Return at most ``_MOST_POINTS`` of the points (n, 3), evenly spread over their order."""
     return points[np.unique(np.linspace(0, len(points) - 1, _MOST_POINTS).astype(np.int64))]
 
 
 def _symmetries(mesh: TriangleMesh, tolerance_m: float) -> Array:
-    """Return the rotations (k, 3, 3) of a cube, other than the identity, that map the vertices of
-    each material onto each other.
+    """Return the rotations (k, 3, 3) of a cube, identity excluded, that map the vertices of each
+    material onto each other.
     """
     by_material: dict[Material, list[Array]] = defaultdict(list)
     for part in mesh.parts:

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layout of SPEED+ (T. H. Park et al., "SPEED+: Next-Generation Dataset for Spacecraft Pose
+"""Layout of SPEED+ (T. H. Park et al., "SPEED+: Next-Generation Dataset for Spacecraft Pose
 Estimation across Domain Gap", 2022).
 
-``camera.json`` has camera matrix and distortion as OpenCV defines them. A label has the name of its
-image, ``q_vbs2tango_true``: rotation of the target's axes to those of the camera (scalar first,
-with which x_camera = R(q) x_target + r), and ``r_Vo2To_vbs_true``: position of the target's origin
-in the camera, m.
+``camera.json`` holds camera matrix and distortion as OpenCV defines them. A label names its image.
+``q_vbs2tango_true``: rotation from the target's axes to the camera's (scalar first), with x_camera
+= R(q) x_target + r. ``r_Vo2To_vbs_true``: the position r of the target's origin in the camera, m.
 """
 
 from __future__ import annotations
@@ -27,16 +26,17 @@ from .views import ViewImage
 
 _DOMAIN = "synthetic"
 _PIXEL_M = 5.86e-6
-"""Pixel pitch stated in ``camera.json``, that of the SPEED+ camera: the focal length in metres has
-no other meaning.
+"""Pixel pitch in ``camera.json``, m: that of the SPEED+ camera. It only gives the focal length in
+metres.
 """
 _Q, _R = "q_vbs2tango_true", "r_Vo2To_vbs_true"
 _SPLITS: tuple[Split, ...] = ("train", "validation")
 
 
 class SpeedPlusWriter:
-    """Writes a dataset into ``folder``: ``camera.json`` and ``synthetic/`` with images, masks and
-    labels; and, what SPEED+ does not have, ``models`` as in BOP, for ADD. Raises OSError."""
+    """Writes a dataset into ``folder``: ``camera.json``, and ``synthetic/`` with images, masks and
+    labels. For ADD it adds ``models`` as in BOP, which SPEED+ does not have. Raises OSError.
+    """
 
     def __init__(
         self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape

@@ -21,7 +21,7 @@ Layout = Literal["speed+", "bop"]
 
 
 class DatasetError(ChaserdockError):
-    """A dataset that cannot be made, read or scored: one line with the file, the fault and what is
+    """A dataset that cannot be written, read or scored. The text is one line: file, fault, what is
     valid.
     """
 
@@ -45,9 +45,11 @@ class LabelledImage:
 
 @dataclass(frozen=True, eq=False)
 class TargetShape:
-    """Vertices (n, 3), m, TRF, of the target as it is in the images, its diameter, m, and the
-    rotations (k, 3, 3) other than the identity that leave it unchanged. ``continuous``: whether it
-    has an axis of symmetry, too."""
+    """Shape of the target as in the images.
+
+    Vertices (n, 3), m, TRF; diameter, m; rotations (k, 3, 3), identity excluded, that leave it
+    unchanged. ``continuous``: it also has an axis of rotational symmetry.
+    """
 
     points_m: Array
     diameter_m: float
@@ -69,7 +71,7 @@ class LabelledDataset:
     shape: TargetShape | None
 
     def of_split(self, split: Split | None) -> tuple[LabelledImage, ...]:
-        """Return the images of a split; all for None."""
+        """Return the images of a split; None for all images."""
         return tuple(i for i in self.images if split in (None, i.split))
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random views of a target, and their images and masks by the world's renderer.
+"""Random views of a target, with images and masks by the world's renderer.
 
-Sun and Earth stay where the scenario has them; the camera's attitude in WRF is drawn, which moves
-both relative to camera and target. A view depends on the seed and its number only, so that a longer
+Sun and Earth stay where the scenario has them. The camera's attitude in WRF is drawn, which moves
+both relative to camera and target. A view depends only on the seed and its number, so that a longer
 dataset begins with the shorter one.
 """
 
@@ -110,7 +110,7 @@ def draw_view(
     across = np.cross(to_camera, np.eye(3)[int(np.argmin(np.abs(to_camera)))])
     across = rotations.rotate(rotations.exp(azimuth * to_camera), across / np.linalg.norm(across))
     to_sun = math.cos(phase) * to_camera + math.sin(phase) * across
-    # Any rotation that turns the drawn direction of the sun to that in WRF, and a drawn roll about
+    # Any rotation that maps the drawn direction of the sun to that in WRF, then a drawn roll about
     # it.
     q_w_irf = rotations.multiply(rotations.exp(roll * to_sun_w), _between(to_sun, to_sun_w))
     return TargetView(PoseLabel(position, q_irf_trf), q_w_irf)
@@ -125,11 +125,11 @@ def _between(a: Array, b: Array) -> Array:
 
 
 class ViewRenderer:
-    """Renders random views of the target of a scenario by the camera of chaser 0, with the
-    scenario's light and effects.
+    """Renders random views of a scenario's target by the camera of chaser 0, with the scenario's
+    light and effects.
 
-    The camera has no errors against its calibration. Raises DatasetError for a scenario whose
-    camera has.
+    The camera has no errors against its calibration. Raises DatasetError for a scenario in which it
+    has.
     """
 
     def __init__(self, scenario: Scenario, limits: ViewLimits) -> None:
@@ -166,7 +166,9 @@ class ViewRenderer:
         return ViewImage(view, pixels, mask, visible, self._wide.of(view.label), self._margin_px)
 
     def _states(self, view: TargetView) -> dict[str, BodyState]:
-        """Return target and chaser 0, the target at WRF's origin with the scenario's rates."""
+        """Return the states of target and chaser 0; the target is at WRF's origin and has the
+        scenario's rates.
+        """
         still, q_w_irf = np.zeros(3), view.q_w_irf_wxyz
         q_w_trf = rotations.multiply(q_w_irf, view.label.q_irf_trf_wxyz)
         q_w_crf = rotations.multiply(
@@ -182,10 +184,10 @@ class ViewRenderer:
 
 
 class _Coverage:
-    """Finds the pixels that a target covers: renders it white, in light from everywhere, before the
-    stars of one attitude of the camera.
+    """Finds the pixels that a target covers: renders it white, under ambient light, before the
+    stars of one camera attitude.
 
-    ``own``: a box in chaser axes that is drawn in black and hides the target.
+    ``own``: a box in chaser axes, drawn black, that hides the target.
     """
 
     def __init__(self, camera: Camera, mesh: TriangleMesh, own: Box | None = None) -> None:
@@ -220,8 +222,8 @@ def target_mesh(scenario: Scenario) -> TriangleMesh:
 
 
 def _padded(camera: Camera, margin_px: tuple[int, int]) -> Camera:
-    """Return the camera without distortion whose image reaches ``margin_px`` columns and rows
-    further on every side.
+    """Return the camera, without distortion, whose image extends by ``margin_px`` columns and rows
+    on every side.
     """
     x, y = margin_px
     return replace(

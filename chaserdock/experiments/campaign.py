@@ -20,10 +20,11 @@ from .worker import ExperimentProgress, Workers, fly, fly_plan
 
 
 def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | None) -> int:
-    """Fly the campaign of ``file``; return the exit status: 0 when every flight has ended, whatever
-    its outcome. ``only``: fly this one.
+    """Fly the campaign of ``file``. Returns the exit status: 0 when every flight has ended,
+    whatever its outcome.
 
-    Raise ScenarioError for an invalid file, ExperimentError when the campaign cannot continue.
+    ``only``: index of the one flight to fly. Raise ScenarioError for an invalid file,
+    ExperimentError when the campaign cannot continue.
     """
     plan = load_campaign(file)
     folder = (out or Path("campaigns") / plan.name).absolute()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Campaign file and the plan it defines.
+"""Campaign file, and the plan that it defines.
 
-A campaign is a scenario, values shared by all runs, and varied parameters: a grid (every
+A campaign is a scenario, overrides shared by all runs, and varied parameters: a grid (every
 combination of ``values``) or a random sample (each parameter drawn from its distribution).
 """
 
@@ -23,7 +23,7 @@ from chaserdock.toml_text import toml_value
 from .plan import Alone, ExperimentPlan, PlannedFlight, plan_flight
 
 MAX_RUNS = 100_000
-"""Runs of a campaign: all are checked before the first one flies, 10 ms each."""
+"""Largest number of runs of a campaign. All are checked before the first one flies, 10 ms each."""
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly the controller alone: in this process, with perfect knowledge of the target's motion.
+"""Flies the controller alone, in this process, with perfect knowledge of the target's motion.
 
-``python -m chaserdock.experiments.controller_flight FOLDER`` reads a flight as JSON on standard
+``python -m chaserdock.experiments.controller_flight FOLDER`` reads a flight as JSON from standard
 input and writes ``FOLDER/summary.json``, as ``chaserdock run`` does for whole missions.
 """
 
@@ -27,8 +27,8 @@ from .perfect_knowledge import PerfectEstimator
 from .plan import Alone, PlannedFlight
 
 _FLOOR_S = 15.0
-"""The lower bound covers this time, s, and is zero after it: twice what 2 N need to bring 30 kg
-over the paper's 0.85 m to rest, 2 sqrt(0.85 m / (2 N / 30 kg)) = 7.1 s.
+"""Time, s, that the lower bound covers; it counts as zero afterwards. Twice what 2 N need to bring
+30 kg over the paper's 0.85 m to rest, 2 sqrt(0.85 m / (2 N / 30 kg)) = 7.1 s.
 """
 
 
@@ -47,8 +47,8 @@ def main() -> int:
 
 
 def fly_alone(scenario: Scenario, alone: Alone | None = None) -> Mapping[str, Any]:
-    """Fly a scenario; return the part of a summary (docs/summary.md) that a controller can be
-    judged by, with ``floor_m2_s``, the lower bound, if it is asked for.
+    """Fly a scenario. Returns the part of a summary (docs/summary.md) that judges a controller,
+    with the lower bound ``floor_m2_s`` on request.
     """
     alone = alone or Alone()
     delay_s = alone.delay_s
@@ -82,8 +82,8 @@ def fly_alone(scenario: Scenario, alone: Alone | None = None) -> Mapping[str, An
 
 
 def position_error_floor(scenario: Scenario, flight: FlightRecord) -> float:
-    """Return the least integral (m^2 s) of chaser 0's squared position error, with the attitudes of
-    ``flight``.
+    """Return a lower bound (m^2 s) on the integral of chaser 0's squared position error, given the
+    attitudes of ``flight``.
     """
     step_s = 1.0 / scenario.time.rate_hz
     steps = min(len(flight.time_s) - 1, round(_FLOOR_S / step_s))

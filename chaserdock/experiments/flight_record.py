@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole in-process mission as arrays: states, tracking errors, commands, and what the actuators
-delivered.
+"""Records a whole in-process mission as arrays: states, tracking errors, commands, actuator
+output.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def record_flight(
 
 
 def failed_solves(outputs: TickOutputs) -> int:
-    """Return the number of chasers whose problem was not solved; 1 when there was no solution at
+    """Return the number of chasers whose problem was not solved; 1 if there was no solution at
     all.
     """
     if outputs.solver is None or not outputs.solver.status:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mission in one process: physics, sensors and actuators of the world, and the cores of chasers
-and controller.
+"""Flies a mission in one process: physics, sensors and actuators of the world with the cores of
+chasers and controller.
 
 They are called in the order and with the latencies of a lock-step mission, so that the bodies of a
 scenario move exactly as with ``chaserdock run`` (tests/missions/test_in_process.py). All sensor and
 actuator errors of the scenario apply. Left out is what a network and separate processes add:
-injected message faults, process failures, access control.
+message faults, process failures, access control.
 """
 
 from __future__ import annotations
@@ -57,12 +57,11 @@ from .perfect_knowledge import PerfectEstimator
 
 @dataclass(frozen=True)
 class TickRecord:
-    """One tick: true states at its begin, what was sensed, decided and commanded, and what the
-    actuators delivered.
+    """One tick: true states at its beginning, sightings, decisions, commands, actuator output.
 
-    ``outputs`` is None while a delayed controller is busy. ``tracking_errors``: distance (m) and
+    ``outputs``: None while a delayed controller is busy. ``tracking_errors``: distance (m) and
     angle (rad) of each chaser from its reference pose on the true target. ``loads``: at each port,
-    since the tick before.
+    since the previous tick.
     """
 
     tick: int
@@ -84,14 +83,14 @@ class TickRecord:
 class InProcessMission:
     """A mission in flight, one ``step`` per tick.
 
-    ``perception`` maps the true states to a sighting; None gives the controller perfect knowledge
-    of the target's motion, which must be prescribed. ``actuator_gain``: delivered over commanded
-    wrench. ``solve_delay_s`` maps the wall-clock seconds of a solve to the time from a tick to its
-    command's effect, in place of the scenario's latency; the controller does not know of it and
-    skips the ticks that pass meanwhile. Both need ideal actuation, else ValueError.
+    ``perception`` maps the true states to a sighting; with None the controller knows the target's
+    motion, which must be prescribed, perfectly. ``actuator_gain``: delivered over commanded wrench.
+    ``solve_delay_s`` maps the wall-clock seconds of a solve to the time from a tick to its
+    command's effect, in place of the scenario's latency. The controller does not know of it and
+    skips the ticks meanwhile. Both require ideal actuation, else ValueError.
 
-    ``contacts``: pairs of bodies that touched so far, except a probe's tip on the target;
-    ``touches``: those of the tips; ``events`` of the controller: (time in s, level, text);
+    ``contacts``: pairs of bodies that have touched, without a probe's tip on the target;
+    ``touches``: those of the tips. ``events`` of the controller: (time in s, level, text).
     ``thruster_events`` of the chasers: (time in s, chaser, text).
     """
 
@@ -106,12 +105,15 @@ class InProcessMission:
         ideal = scenario.chaser.actuation == "ideal"
         if not ideal and (actuator_gain != 1.0 or solve_delay_s is not None):
             raise ValueError('actuator_gain and solve_delay_s need chaser.actuation = "ideal"')
+
         self.scenario = scenario
         self.perception = perception
         self.chasers = range(len(scenario.chasers))
+
         estimator = PerfectEstimator(scenario.target) if perception is None else None
         flight = flight_scenario(scenario)
         self.controller = ControllerCore(flight, time.perf_counter, estimator)
+
         self.physics = Physics(scenario)
         self.actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in self.chasers}
         rendered = perception.visions if isinstance(perception, RenderedImages) else None
@@ -124,19 +126,21 @@ class InProcessMission:
             )
             for i in self.chasers
         ]
+
         self.tick = 0
         self.contacts: set[tuple[str, str]] = set()
         self.touches: list[ProbeTouch] = []
         self.events: list[tuple[float, str, str]] = []
         self.thruster_events: list[tuple[float, int, str]] = []
         self.propellant_kg = 0.0
+
         self._gain, self._solve_delay_s = actuator_gain, solve_delay_s
         self._busy_until_ns = 0
         self._odometry_sensor = OdometrySensor(scenario)
         self._validations = tuple(OdometryValidation(flight) for _ in flight.chasers)
 
     def retreats(self, chaser: int) -> list[str]:
-        """Return why a chaser retreated, in order: phase and reason."""
+        """Return the retreats of a chaser in order: phase and reason."""
         begin = f"chaser {chaser}: retreat ("
         return [
             text.removeprefix(begin).rstrip(")")
@@ -175,6 +179,7 @@ class InProcessMission:
         """Fly one tick, with these operator commands."""
         timing, states = self.scenario.timing, self.states()
         time_ns = timing.tick_time_ns(self.tick)
+
         docking = {
             x.chaser: docking_status(x, self.tick, time_ns) for x in self.physics.latches.values()
         }
@@ -184,14 +189,17 @@ class InProcessMission:
             x.chaser: self.physics.port_loads[name].take()
             for name, x in self.physics.latches.items()
         }
+
         odometry = {i: self.measure(i, time_ns, states) for i in self.chasers}
         reports = {}
         for i in self.chasers:
             if (report := self._sense(odometry[i], docking.get(i))) is not None:
                 reports[i] = report
+
         sightings = ()
         if self.perception is not None and timing.has_images(self.tick):
             sightings = tuple(self.perception(i, self.tick, time_ns, states) for i in self.chasers)
+
         outputs = None
         if time_ns >= self._busy_until_ns:
             received = tuple(
@@ -201,8 +209,10 @@ class InProcessMission:
                 for i, o in odometry.items()
             )
             outputs = self._control(TickInputs(self.tick, time_ns, received, sightings, commands))
+
         errors = {i: self.tracking_error(i, states, outputs) for i in self.chasers}
         actuator_commands, delivered = self._act(outputs, odometry, time_ns)
+
         record = TickRecord(
             self.tick,
             time_ns,
@@ -234,7 +244,7 @@ class InProcessMission:
         return self.cores[chaser].step(ReceivedMessage(topic, str(chaser), message, 0))
 
     def _sense(self, odometry: Odometry, docking: DockingStatus | None) -> ThrusterReport | None:
-        """Begin a chaser's tick with what its sensors state; return the report of its thrusters, if
+        """Start a chaser's tick with its sensors' output. Returns the report of its thrusters, if
         it has any.
         """
         chaser, time_ns, report = odometry.chaser, odometry.sim_time_ns, None
@@ -265,7 +275,7 @@ class InProcessMission:
     def _act(
         self, outputs: TickOutputs | None, odometry: Mapping[int, Odometry], time_ns: int
     ) -> tuple[dict[int, ActuatorCommand], dict[int, ActuatorOutput]]:
-        """Deliver the commands when a lock-step mission does, and move the bodies to the next
+        """Deliver the commands when a lock-step mission does, and advance the bodies to the next
         tick.
         """
         timing = self.scenario.timing
@@ -287,8 +297,8 @@ class InProcessMission:
     def uncommanded(
         self, odometry: Mapping[int, Odometry], time_ns: int
     ) -> dict[int, ActuatorCommand]:
-        """Return what the chasers do without a controller's commands; to be overridden where it is
-        silent.
+        """Return what the chasers do without commands of a controller. Override it for chasers that
+        are silent.
         """
         return {}
 
@@ -311,7 +321,9 @@ class InProcessMission:
         return {i: msgspec.structs.replace(command, **late) for i, command in commands.items()}
 
     def _executed(self, wrench: WrenchCommand, outputs: TickOutputs) -> ActuatorCommand:
-        """Return what a chaser makes of its command. Raises RuntimeError if it refuses it."""
+        """Return the actuator command that a chaser derives from its wrench. Raises RuntimeError if
+        it refuses the wrench.
+        """
         i = wrench.chaser
         lease = self.cores[i].gate.leases
         head = {"term": lease.term, "commander": lease.holder, "instance": lease.instance}
@@ -341,11 +353,11 @@ class InProcessMission:
     def tracking_error(
         self, chaser: int, states: States, outputs: TickOutputs | None = None
     ) -> tuple[float, float]:
-        """Return distance (m) and angle (rad) of a chaser from its reference pose on the true
-        target now.
+        """Return distance (m) and angle (rad) of a chaser from its reference pose, placed on the
+        true target.
 
-        The reference is the one of ``outputs`` or, where there is none, the guidance's with the
-        nominal attitude.
+        The reference is that of ``outputs``; without one it is the guidance's, with the nominal
+        attitude.
         """
         reference = outputs.references.get(chaser) if outputs is not None else None
         if outputs is not None and reference is not None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lower bound of the transient tracking error: the optimum under the actuators' limits, for any
-controller.
+"""Lower bound of the transient tracking error for any controller: the optimum under the actuators'
+limits.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.rotations import rotate
 
-# Three-point Gauss: exact for the fourth-degree square of a parabola.
+# Three-point Gauss quadrature is exact for the fourth-degree square of a parabola.
 _GAUSS = ((0.5 - np.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(0.15), 5 / 18))
 
 
@@ -35,21 +35,27 @@ def least_square_integral(
         raise ValueError(
             f"references_m must have shape {(3 * steps + 1, 3)}, not {references_m.shape}"
         )
+
     p, v = ca.MX.sym("p", 3, steps + 1), ca.MX.sym("v", 3, steps + 1)
     u = ca.MX.sym("u", 3, steps)  # in body axes
     axes = [np.array(rotate(q_wxyz, np.tile(e, (steps, 1)))).T for e in np.eye(3)]
     a = sum((axes[i] * ca.repmat(u[i, :], 3, 1) for i in range(3)), ca.MX.zeros(3, steps))
+
+    # The integral by Gauss quadrature over each step.
     total: ca.MX | int = 0
     for k, (at, weight) in enumerate(_GAUSS):
         t = at * step_s
         position = p[:, :-1] + t * v[:, :-1] + t * t / 2 * a
         total += weight * step_s * ca.sumsqr(position - references_m[k:-1:3].T)
+
+    # Exact motion of a point mass under constant acceleration, and the initial state.
     motion = ca.horzcat(
         p[:, 1:] - p[:, :-1] - step_s * v[:, :-1] - step_s**2 / 2 * a,
         v[:, 1:] - v[:, :-1] - step_s * a,
         p[:, 0] - position_m,
         v[:, 0] - velocity_m_s,
     )
+
     variables = ca.vertcat(ca.vec(p), ca.vec(v), ca.vec(u))
     options = {
         "print_time": False,
@@ -58,6 +64,7 @@ def least_square_integral(
         "ipopt.hessian_constant": "yes",
     }
     solver = ca.nlpsol("floor", "ipopt", {"x": variables, "f": total, "g": ca.vec(motion)}, options)
+
     bound = np.full(variables.shape[0], np.inf)
     bound[-3 * steps :] = acceleration_max_m_s2
     solution = solver(lbx=-bound, ubx=bound, lbg=0, ubg=0)

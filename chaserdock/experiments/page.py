@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of an experiment: sections as Markdown, or as one self-contained HTML file."""
+"""Page of an experiment: sections, written as Markdown or as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from chaserdock.html_page import Markup, html_page, table
 
 @dataclass(frozen=True)
 class Table:
-    """A table. The first column is text; the others are numbers, or ``text``. Raise ValueError for
-    a row of another length.
+    """A table whose first column is text. The others are numbers, or text if ``text``. Raise
+    ValueError for a row of another length.
     """
 
     header: tuple[str, ...]
@@ -31,8 +31,8 @@ class Table:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A heading (none: ""), followed by paragraphs (text, with code in backticks), tables, and HTML
-    (``Markup``), which Markdown leaves out.
+    """A heading ("" for none), followed by paragraphs (text, with code in backticks), tables, and
+    HTML (``Markup``), which Markdown omits.
     """
 
     title: str

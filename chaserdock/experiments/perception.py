@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the chasers see of the target in an in-process mission."""
+"""Perception of the chasers in an in-process mission."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ PerceptionModel = Callable[[int, int, int, States], Sighting]
 
 
 class RenderedImages:
-    """Render each chaser's image, with the scenario's camera errors and effects, and run its
+    """Renders each chaser's image, with the scenario's camera errors and effects, and runs its
     perception on it.
 
-    With statistical perception no image is rendered. ``on_image`` sees every image, and returns the
-    one that perception gets. ``visions``: of the chasers, which commands inform.
+    With statistical perception no image is rendered. ``on_image``: receives every image and returns
+    the one that perception gets. ``visions``: perceptions of the chasers, which commands inform.
     """
 
     def __init__(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An estimator that knows a prescribed target exactly, so that the errors that remain are the
+"""Estimator that knows a prescribed target exactly, so that the remaining errors are the
 controller's.
 """
 
@@ -12,7 +12,7 @@ from chaserdock_controller.interfaces import TargetState
 from chaserdock_protocol.scenario.bodies import Target
 
 _VARIANCE = 1e-12
-"""Variance of every number (SI units): nothing, but positive, as a covariance must be."""
+"""Variance of every component (SI units): negligible, but positive, as a covariance requires."""
 
 
 class PerfectEstimator(Estimator):
@@ -31,7 +31,7 @@ class PerfectEstimator(Estimator):
         self._omega = np.array(target.omega_rad_s) if moves else still
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """Return the state at any time, with a variance of 1e-12 (SI units) of every number."""
+        """Return the state at any time, with ``_VARIANCE`` for every component."""
         position, q = self._start
         positions, attitudes = predict_target(
             position, self._velocity, q, self._omega, [time_ns / 1e9]
@@ -50,5 +50,5 @@ class PerfectEstimator(Estimator):
         )
 
     def update(self, inputs: EstimatorInputs) -> Estimate:
-        """Return the state now. Pushes and latched chasers do not move a prescribed target."""
+        """Return the present state. Pushes and latched chasers do not move a prescribed target."""
         return Estimate(self.estimate_at(inputs.time_ns))

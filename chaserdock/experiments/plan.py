@@ -20,10 +20,11 @@ class ExperimentError(ChaserdockError):
 
 
 class Alone(Struct, frozen=True):
-    """Fly the controller alone: in one process, with perfect knowledge of the target's motion.
+    """Settings of a flight of the controller alone: in one process, with perfect knowledge of the
+    target's motion.
 
-    ``delay_s``: time from a tick to its command's effect. The controller does not know of it, and
-    skips the ticks meanwhile. ``floor``: compute the least squared position error, too, of any
+    ``delay_s``: time from a tick to its command's effect. The controller does not know of it and
+    skips the ticks meanwhile. ``floor``: also compute the least squared position error of any
     controller that turns the chaser as this one did.
     """
 
@@ -34,8 +35,8 @@ class Alone(Struct, frozen=True):
 class PlannedFlight(Struct, frozen=True, kw_only=True):
     """One flight: all processes of a mission, recorded and judged, or the controller ``alone``.
 
-    ``name``: a digest of all that is flown. ``label``: what the experiment calls the flight.
-    ``scenario``: path of its file. ``varied``: the values in which flights of the plan differ.
+    ``name``: digest of all that determines the flight. ``label``: its name within the experiment.
+    ``scenario``: path of its file. ``varied``: values in which flights of the plan differ.
     """
 
     name: str
@@ -48,7 +49,7 @@ class PlannedFlight(Struct, frozen=True, kw_only=True):
 
 
 class ExperimentPlan(Struct, frozen=True):
-    """All flights of an experiment, and the names of what varies."""
+    """All flights of an experiment, and the names of the varied parameters."""
 
     name: str
     flights: tuple[PlannedFlight, ...]
@@ -64,7 +65,7 @@ def plan_flight(
     alone: Alone | None = None,
     salt: str = "",
 ) -> PlannedFlight:
-    """Return a flight, named by the resolved scenario, ``alone`` and ``salt``. Raise
+    """Return a flight, named by a digest of the resolved scenario, ``alone`` and ``salt``. Raise
     ScenarioError.
     """
     resolved = load_scenario(scenario, overrides)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of a plan as a table, and the statistics of the table."""
+"""Table of a plan's results, and its statistics."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ _OF_CHASERS: tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]], 
     ("min_distance_target_m", ("min_distance_target_m",), min),
     ("impulse_N_s", ("impulse_N_s",), sum),
 )
-"""Columns of results by chaser: name, place in a chaser's summary, and how chasers are combined."""
+"""Columns of results by chaser: name, key path in a chaser's summary, and how the values of chasers
+are combined.
+"""
 
 
 def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultRow:
-    """Return a flight as a row of plain values: varied values (``vary.NAME``), outcome, and results
-    in SI units.
+    """Return a flight as a row of plain values: varied values (``vary.NAME``), outcome, results in
+    SI units.
 
     No value depends on the speed of the machine: equal plans give equal tables.
     """
@@ -40,6 +42,7 @@ def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultR
     failures = list(s.get("failures", [])) or (
         [outcome.last_words or "ended without output"] if outcome.status else []
     )
+
     row: ResultRow = {
         "run": flight.name,
         "index": index,
@@ -50,17 +53,21 @@ def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultR
         "digest": s.get("digest", ""),
         "log": outcome.log or "",
     }
+
     row |= {
         f"vary.{k}": v if isinstance(v, int | float | str | bool) else json.dumps(v)
         for k, v in flight.varied.items()
     }
+
     chasers = s.get("chasers", {}).values()
     for name, path, combine in _OF_CHASERS:
         values = [v for c in chasers if (v := _value_at(c, path)) is not None]
         row[name] = float(combine(values)) if values else math.nan
     row["docked"] = sum(bool(c.get("docked")) for c in chasers)
+
     row["collisions"] = int(s.get("collisions", 0))
     row["min_distance_chasers_m"] = _number(s.get("min_distance_chasers_m"))
+
     for key, value in s.get("target_estimate", {}).items():
         row[f"estimate_{key}"] = _number(value)
     if flight.alone is not None and flight.alone.floor:
@@ -86,7 +93,9 @@ def cause_of(failure: str) -> str:
 
 
 def rows_of(plan: ExperimentPlan, outcomes: Mapping[str, FlightOutcome]) -> list[ResultRow]:
-    """Return the table in the plan's order, as far as flown; all rows have the same columns."""
+    """Return the table of the flights flown so far, in the plan's order. All rows have the same
+    columns.
+    """
     rows = [
         row_of(index, flight, outcomes[flight.name])
         for index, flight in enumerate(plan.flights)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a plan: one process per flight, on this machine or on the workers of a Dask cluster.
+"""Flies a plan: one process per flight, on this machine or on the workers of a Dask cluster.
 
-A flight that has ended leaves ``runs/NAME/result.json``, written atomically. A later call skips the
-flights that have one. A flight that crashed leaves none, and is flown again.
+A flight that has ended leaves ``runs/NAME/result.json``, written atomically. Later calls skip it. A
+flight that crashed leaves none and is flown again.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Keep = Literal["failures", "all", "none"]
 
 
 class FlightOutcome(Struct, frozen=True):
-    """Outcome of a flight: exit status, summary (None after a crash), last line of output, and the
-    path of a log that was kept.
+    """Outcome of a flight: exit status, summary (None after a crash), last line of output, and path
+    of a kept log.
     """
 
     name: str
@@ -52,7 +52,7 @@ ReportProgress = Callable[[int, int, PlannedFlight, FlightOutcome], None]
 @dataclass(frozen=True)
 class Workers:
     """Where flights are flown: ``jobs`` at a time on this machine, or on the Dask scheduler at
-    ``cluster``. ``keep``: flights whose logs are kept.
+    ``cluster``. ``keep``: whose logs are kept.
     """
 
     jobs: int = 1
@@ -67,8 +67,8 @@ def fly_plan(
     report: ReportProgress,
     stop: threading.Event,
 ) -> dict[str, FlightOutcome]:
-    """Fly what has no result in ``folder`` yet, until ``stop``; return the outcomes by flight name,
-    in the plan's order.
+    """Fly what has no result in ``folder`` yet, until ``stop``. Returns the outcomes by flight
+    name, in the plan's order.
 
     Raise ExperimentError, and MissingPackageError for a cluster without Dask.
     """
@@ -110,7 +110,7 @@ def read_result(folder: Path, name: str) -> FlightOutcome | None:
 
 
 def write_result(folder: Path, outcome: FlightOutcome) -> None:
-    """Write a result atomically; of a flight that crashed, none."""
+    """Write a result atomically; a flight that crashed gets none."""
     if outcome.summary is None:
         return
     path = result_path(folder, outcome.name)
@@ -124,16 +124,16 @@ def write_result(folder: Path, outcome: FlightOutcome) -> None:
 
 
 def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
-    """Fly one flight in a temporary folder; move its log to ``logs`` if ``keep`` says so.
+    """Fly one flight in a temporary folder. Move its log to ``logs`` if ``keep`` asks for it.
 
-    Also runs on Dask workers, so that arguments and result are plain values. Where ``logs`` is not
+    Also runs on Dask workers, therefore arguments and result are plain values. If ``logs`` is not
     writable (no shared disk), a kept log stays on the worker's machine and the result names host
     and path.
     """
     folder = Path(tempfile.mkdtemp(prefix=f"chaserdock-{flight.name}-"))
     try:
         out = folder / "run"
-        # A session of its own: Ctrl-C in the terminal reaches this process only, which lets the
+        # In a session of its own Ctrl-C in the terminal reaches this process only, which lets the
         # flight finish.
         done = subprocess.run(
             [sys.executable, "-m", *_program(flight, out)],
@@ -211,7 +211,7 @@ def _fly_on_cluster(
         by_key = {}
         for flight in flights:
             # pure=False: Dask must not reuse a result. retries=1: the flight of a lost worker is
-            # flown again.
+            # repeated.
             future = client.submit(
                 fly, flight, workers.keep, logs, key=flight.name, pure=False, retries=1
             )

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start, watch and judge missions; operator commands, status, keys."""
+"""Starts, watches and judges missions; sends operator commands, shows status, makes keys."""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docker Compose file of a mission: a service per process, and a volume of keys that only this
-process mounts.
+"""Docker Compose file of a mission: one service per process, each with a volume for its own keys
+only.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 from chaserdock_protocol.transport.access_control import identities
 
 MAX_CHASERS = 16
-"""The image has key folders for so many."""
+"""Largest number of chasers: the image has key folders for so many."""
 _SHIPPED = {1: "single", 2: "two-chaser-tracking", 4: "four-chaser-docking", 16: "sixteen-chasers"}
-"""Scenario of a file without SCENARIO, by number of chasers."""
+"""Scenario that a file flies unless SCENARIO is set, by number of chasers."""
 
 _HEAD = """\
 # SPDX-License-Identifier: Apache-2.0
@@ -172,13 +172,13 @@ _CHASER = """
 
 
 def default_scenario(chasers: int) -> str:
-    """Return the shipped scenario that so many chaser services fly without SCENARIO."""
+    """Return the shipped scenario that so many chaser services fly unless SCENARIO is set."""
     return _SHIPPED[max(n for n in _SHIPPED if n <= chasers)]
 
 
 def compose_file(chasers: int, *, standby: bool = False, view: bool = False) -> str:
-    """Return compose.yaml for up to ``chasers`` chasers, with a standby controller and the viewer
-    (profile ``view``) on request.
+    """Return compose.yaml for up to ``chasers`` chasers, optionally with a standby controller and
+    the viewer (profile ``view``).
 
     Raises ValueError for a number of chasers outside 1 to ``MAX_CHASERS``.
     """

@@ -23,9 +23,9 @@ from collections.abc import Callable
 import psutil
 
 ROUTER_TIMEOUT_S = 60.0
-"""A process that has lost its connection to the router for this long considers the mission over."""
+"""Time, s, without a connection to the router after which a process considers the mission over."""
 _NOT_IN_SCENARIO = 10
-"""Exit status of ``--check`` for a chaser that the scenario does not have."""
+"""Exit status of ``--check`` if the scenario does not have this chaser."""
 
 
 def is_linked(port: int) -> bool:
@@ -47,7 +47,7 @@ def is_listening(host: str, port: int) -> bool:
 
 
 def with_overrides(arguments: list[str], overrides: str) -> list[str]:
-    """Return the arguments of ``chaserdock``, for a world with the scenario overrides."""
+    """Return the arguments of ``chaserdock``; those of a world get the scenario overrides."""
     if arguments[:1] != ["world"]:
         return arguments
     return [
@@ -65,7 +65,7 @@ def count_chasers(scenario: str, overrides: str) -> int:
 
 
 def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None:
-    """Return why a scenario cannot fly with so many chaser services, or None."""
+    """Return why a scenario cannot fly with ``services`` chaser services; None if it can."""
     needed = count_chasers(scenario, overrides)
     if needed <= services:
         return None
@@ -76,8 +76,8 @@ def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None
 
 
 def run(arguments: list[str], host: str, port: int) -> int:
-    """Run the program to its end, forward signals; return its status, or 0 when the router has gone
-    for good.
+    """Run the program to its end and forward signals to it. Returns its status, or 0 when the
+    router is gone for good.
     """
     process: subprocess.Popen[bytes] | None = None
     stopping: int | None = None
@@ -88,7 +88,7 @@ def run(arguments: list[str], host: str, port: int) -> int:
         if process is not None:
             process.send_signal(number)
 
-    # Before the start, so that no signal is lost: it would leave the program behind.
+    # Install before the start: a lost signal would leave the program behind.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, forward)
     process = subprocess.Popen([sys.executable, "-m", "chaserdock", *arguments])
@@ -136,8 +136,8 @@ def main() -> int:
     host, _, port = environment.get("ROUTER", "router:7447").rpartition(":")
     scenario, overrides = environment.get("SCENARIO", ""), environment.get("SET", "")
     if arguments[:1] in (["chaser"], ["judge"]):
-        # In a process of its own, because loading the scenario keeps tens of megabytes for the
-        # whole flight.
+        # In a process of its own: loading the scenario would keep tens of megabytes for the whole
+        # flight.
         check = subprocess.run(
             [sys.executable, "-m", "chaserdock.launch.container", "--check", *arguments]
         )

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State of a running mission, from its messages: notices for the operator, and progress. No I/O;
-wall time is passed in.
+"""State of a running mission, derived from its messages: notices for the operator, and progress. No
+I/O; wall time is an argument.
 """
 
 from __future__ import annotations
@@ -28,15 +28,17 @@ from chaserdock_protocol.scenario import Scenario
 from .json_events import ChaserProgress, CommandNotice, EventNotice, Progress
 
 _SPEED_WINDOW_S = 5.0
-"""Wall time over which the present speed is measured."""
+"""Wall time, s, over which the present speed is averaged."""
 _KEPT_TICKS = 50
-"""Ticks for which odometry waits for an estimate of the same tick: 5 s at 10 Hz. Chosen."""
+"""Ticks for which odometry waits for an estimate of the same tick: 5 s at 10 Hz. Larger: more
+memory; smaller: no errors are shown if estimates are late.
+"""
 _SOLVED = ("solved", "iteration_limit")
 
 
 @dataclass
 class FlightState:
-    """Track a mission from its messages, in order of arrival."""
+    """Tracks a mission by its messages, in order of arrival."""
 
     scenario: Scenario
     flying: bool = False
@@ -89,7 +91,7 @@ class FlightState:
         return []
 
     def waiting_for(self) -> list[str]:
-        """Return the processes of the scenario that have not published their presence."""
+        """Return the scenario's processes whose presence has not been received."""
         names = [
             "world",
             "controller",
@@ -100,8 +102,8 @@ class FlightState:
         return [name for name in names if name not in self.present]
 
     def errors(self, chaser: int) -> tuple[float, float] | None:
-        """Return position (m) and orientation (rad) error of a chaser relative to its reference,
-        from its odometry.
+        """Return position (m) and orientation (rad) error of a chaser relative to its reference, by
+        its odometry; None if unknown.
         """
         reference = self.references.get(chaser)
         odometry = self._odometry.get((chaser, reference.tick)) if reference is not None else None
@@ -127,7 +129,7 @@ class FlightState:
         )
 
     def remaining_s(self, progress: Progress) -> float | None:
-        """Return the wall time to the end at the present speed, or None when it is unknown."""
+        """Return the wall time to the end at the present speed; None if unknown."""
         simulated_s = self.scenario.duration_s - progress.sim_time_s
         return (
             simulated_s / progress.speed_now if self.flying and progress.speed_now > 1e-6 else None
@@ -161,7 +163,7 @@ class FlightState:
         )
 
     def _health(self, health: Health) -> list[EventNotice | CommandNotice]:
-        """Report messages that a process rejected or missed, when the count grows."""
+        """Report rejected or missed messages of a process when their count grows."""
         notices: list[EventNotice | CommandNotice] = []
         rejected = sum(health.rejected.values())
         if rejected > self._rejected.get(health.process, 0):
@@ -173,12 +175,12 @@ class FlightState:
             notices.append(
                 self._warning(health.process, f"{health.lost} messages missing", "gaps in seq")
             )
-        # A restarted process counts from zero.
+        # A restarted process counts from zero again.
         self._rejected[health.process], self._missing[health.process] = rejected, health.lost
         return notices
 
     def _solver(self, status: SolverStatus) -> list[EventNotice | CommandNotice]:
-        """Report chasers without a plan, or whose plan enters a keep-out zone, when that begins."""
+        """Report chasers when they begin to have no plan, or a plan that enters a keep-out zone."""
         failed = {
             c: s for c, s in zip(status.chasers, status.status, strict=False) if s not in _SOLVED
         }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON lines that ``--json`` prints while a mission flies: one object per line, distinguished by
+"""JSON lines that ``--json`` prints while a mission flies: one object per line, told apart by
 ``type``.
 
 SI units and radians. docs/cli.md is generated from these types (``docs/make_cli.py``).

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watch a mission that other machines or containers fly, wait for its log, and judge it."""
+"""Watches a mission that other machines or containers fly, waits for its log, and judges it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .mission_address import MissionAddress
 from .progress import ProgressReporter, Show
 
 LOG_CLOSED_S = 60.0
-"""Wall time after the end of the mission within which the recorder must close its log."""
+"""Wall time, s, after the end of the mission within which the recorder must close its log."""
 _MCAP_END = b"\x89MCAP0\r\n"
 
 
@@ -35,12 +35,11 @@ class JudgeError(ChaserdockError):
 def judge_mission(
     out: Path, link: Link, timeout_s: float | None, world_timeout_s: float, show: Show
 ) -> int:
-    """Watch the mission on ``link`` to its end, judge the log in ``out/SCENARIO-RUN``, write
-    report.html beside it.
+    """Watch the mission on ``link`` to its end, judge its log in ``out/SCENARIO-RUN`` and write
+    report.html beside the log.
 
     Returns the exit status. ``world_timeout_s``: wall time after which an absent world counts as
-    lost. Raises JoinRefused when there is no mission within ``timeout_s``, JudgeError when it left
-    no log.
+    lost. Raises JoinRefused without a mission within ``timeout_s``, JudgeError if it left no log.
     """
     node = Node("operator", "operator", link)
     try:
@@ -48,22 +47,26 @@ def judge_mission(
         mission = join(node, node.host.unique_id(), stop, timeout_s)
         if mission is None:
             return STOPPED
+
         folder = out / run_name(mission)
         full = request_scenario(node, mission, stop)
         if full is None:
             return STOPPED
         scenario = scenario_from_json(full, "the world's scenario")
+
         reporter = ProgressReporter(scenario, show)
         # Keys differ between the parties of a mission on several hosts: each has its own folder.
         address = MissionAddress(namespace=link.namespace, endpoint=",".join(link.connect))
         reporter.report(start_line(scenario, mission.mode, folder, address))
         ignore_foreign_publishers(node, mission.source, reporter.report_foreign)
+
         try:
             failure = _watch(node, reporter, stop, world_timeout_s)
         finally:
             reporter.close()
         if stop():
             return STOPPED
+
         log = folder / LOG_NAME
         if not log.exists():
             raise JudgeError(
@@ -74,18 +77,19 @@ def judge_mission(
                 failure
                 or f"the recorder did not close its log within {LOG_CLOSED_S:g} s after the end"
             )
+
         outcome = judge(Fleet(), folder, failure, reporter)
         print_outcome(outcome, show)
         _write_page(log)
         return outcome.status
     finally:
-        node.close()  # last, because the router may exit when this node leaves
+        node.close()  # last, because the router may exit once this node has left
 
 
 def _watch(
     node: Node, reporter: ProgressReporter, stop: StopSignal, world_timeout_s: float
 ) -> str | None:
-    """Show the flight until it ends; return why it failed, or None."""
+    """Show the flight until it ends. Returns why it failed, or None."""
     world_seen_s = time.monotonic()
 
     def changed(process: str, alive: bool) -> None:
@@ -120,8 +124,8 @@ def _write_page(log: Path) -> None:
 
 
 def _wait_for_end(log: Path) -> bool:
-    """Wait until a log has its footer, which the recorder writes last; return False when it does
-    not appear.
+    """Wait until a log has its footer, which the recorder writes last. Returns False if it does not
+    appear.
     """
     deadline = time.monotonic() + LOG_CLOSED_S
     while time.monotonic() < deadline:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keys of a mission: its own certificate authority, and a key and a certificate per process.
+"""Keys of a mission: a certificate authority of its own, and a key and a certificate per process.
 
-Elliptic curve P-256. The authority's private key is never written: no process can be added later, a
-new mission needs new keys. ``FOLDER/NAME/`` holds ``ca.pem``, ``cert.pem`` and ``key.pem``, all
-that the process NAME needs.
+Elliptic curve P-256. The authority's private key is never written. No process can therefore be
+added later: a new mission needs new keys. ``FOLDER/NAME/`` holds all that the process NAME needs:
+``ca.pem``, ``cert.pem`` and ``key.pem``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class KeysError(ChaserdockError):
 
 
 def names(chasers: int) -> list[str]:
-    """Return the names of all that get keys: the router and the processes that may connect."""
+    """Return the names of all key holders: the router, and the processes that may connect."""
     return [ROUTER, *(identity.common_name for identity in identities(chasers))]
 
 
@@ -42,12 +42,11 @@ def init_keys(
     *,
     shared: bool = False,
 ) -> None:
-    """Make all keys of a mission in ``folder``; ``hosts`` are the names and addresses of its
-    router.
+    """Make all keys of a mission in ``folder``. ``hosts``: names and addresses of its router.
 
-    ``now``: UTC; certificates are valid from an hour before (clocks of hosts differ) for ``days``.
-    Private keys are readable by their owner only, or by every user when ``shared`` (a volume that
-    only one process mounts). Raises KeysError when the folder contains keys, or cannot be written.
+    ``now``: UTC. Certificates are valid for ``days`` from an hour before (clocks of hosts differ).
+    Private keys are readable by their owner only, or by every user if ``shared`` (for a volume that
+    one process mounts). Raises KeysError if the folder contains keys or cannot be written.
     """
     existing = [
         name for name in names(chasers) if any((folder / name / f).exists() for f in _FILES)
@@ -72,15 +71,15 @@ def init_keys(
             (folder / name).mkdir(parents=True, exist_ok=True)
             _write(folder / name / "key.pem", _private(key), 0o644 if shared else 0o600)
             _write(folder / name / "ca.pem", authority.public_bytes(public), 0o644)
-            # Last: its presence means that the other files are complete.
+            # Written last: it shows that the other files are complete.
             _write(folder / name / "cert.pem", certificate.public_bytes(public), 0o644)
     except OSError as error:
         raise KeysError(f"{folder}: keys cannot be written: {error.strerror or error}") from None
 
 
 def why_not_usable(folder: Path, chasers: int, now: datetime) -> str | None:
-    """Return None when ``folder`` holds the keys of all processes, valid for an hour at least; else
-    the reason.
+    """Return why ``folder`` does not hold keys of all processes that are valid for another hour;
+    None if it does.
     """
     complete = [
         name for name in names(chasers) if all((folder / name / f).is_file() for f in _FILES)
@@ -99,7 +98,7 @@ def why_not_usable(folder: Path, chasers: int, now: datetime) -> str | None:
 
 
 def remove_keys(folder: Path, chasers: int) -> None:
-    """Remove a mission's keys; the folders stay, because they may be mounts."""
+    """Remove a mission's keys. The folders stay, because they may be mounts."""
     for name in names(chasers):
         for file in _FILES:
             (folder / name / file).unlink(missing_ok=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a mission on this machine: start every process, watch them, stop them, judge the log."""
+"""Flies a mission on this machine: starts every process, watches and stops them, judges the log."""
 
 from __future__ import annotations
 
@@ -43,13 +43,15 @@ from .progress import ProgressReporter, Show, print_json_line
 from .signals import deferred_signals
 
 _START_TIMEOUT_S = 120
-"""Time (s) that processes have to start and to find each other. Chosen, for busy
-machines."""
+"""Time (s) that processes have to start and find each other. Larger: a failed start is noticed
+later; smaller: missions fail on busy machines.
+"""
 _END_TIMEOUT_S = 30.0
-"""Time (s) that processes have to end after the mission; the recorder closes its log in it. Chosen.
+"""Time (s) that processes have to end after the mission; in it the recorder closes its log. Larger:
+a hanging process delays the verdict; smaller: a long log may be cut off.
 """
 _WORLD_ENDS_S = 15.0
-"""Time (s) that the world has for ending a stalled mission itself."""
+"""Time (s) that the world has to end a stalled mission itself."""
 STOPPED_BY_OPERATOR = "stopped by the operator"
 
 
@@ -59,7 +61,7 @@ class RunError(ChaserdockError):
 
 @dataclass(frozen=True)
 class MissionOutcome:
-    """How a mission ended. ``summary`` is None when there is no readable log; ``failure`` then says
+    """Outcome of a mission. ``summary``: None without a readable log; ``failure`` then states
     why.
     """
 
@@ -71,7 +73,7 @@ class MissionOutcome:
 
 @dataclass
 class Child:
-    """A process of the mission and the file of its output."""
+    """A process of the mission, and the file of its output."""
 
     name: str
     process: subprocess.Popen[bytes]
@@ -89,9 +91,9 @@ class Child:
         )
 
 
-# Of Zenoh's two receiving threads the second mostly wakes up without work: with one, seven
-# processes on two cores need two thirds of the time per tick (benchmarks/transport.py). Not for a
-# router, where one slow reader would block all others.
+# Zenoh starts two receiving threads, of which the second mostly wakes up without work. With one,
+# seven processes on two cores need two thirds of the time per tick (benchmarks/transport.py). Not
+# for a router, where one slow reader would block all others.
 _ZENOH_THREADS = "(rx: (worker_threads: 1))"
 
 
@@ -104,8 +106,8 @@ class Fleet:
     cpu_s: dict[str, float] = field(default_factory=dict[str, float])
 
     def start(self, name: str, arguments: list[str], folder: Path) -> None:
-        """Start a process; it exits when this process ends for any reason (its standard input
-        closes).
+        """Start a process. It exits when this process ends for any reason, as its standard input
+        closes.
         """
         output = folder / f"{name.replace('/', '-')}.txt"
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
@@ -121,8 +123,8 @@ class Fleet:
                 # one to wake up would wait longest.
                 process_group=0,
             )
-            # Before a signal handler can raise an exception, after which ``end`` ends the processes
-            # of the list.
+            # Append now: a signal handler may raise an exception, after which ``end`` ends the
+            # listed processes.
             self.children.append(Child(name, process, output))
 
     def running(self) -> list[Child]:
@@ -130,12 +132,12 @@ class Fleet:
         return [c for c in self.children if c.process.poll() is None]
 
     def is_replaced(self, child: Child) -> bool:
-        """Return whether it is a controller, and another controller flew to the end."""
+        """Return whether it is a controller while another controller flew to the end."""
         others = [c for c in self.children if c.name in topics.CONTROLLERS and c is not child]
         return child.name in topics.CONTROLLERS and any(c.process.poll() == 0 for c in others)
 
     def measure(self) -> None:
-        """Measure the CPU time of each process and their total memory (proportional set size where
+        """Measure each process' CPU time, and their total memory (proportional set size where
         available).
         """
         total = 0
@@ -182,7 +184,7 @@ def open_hub(
     role: Role = "operator",
     port: int | None = None,
 ) -> tuple[Node, str]:
-    """Open the launcher's node, which the processes connect to, on ``port`` or a free one; return
+    """Open the launcher's node, to which the processes connect, on ``port`` or a free one. Returns
     it and its endpoint.
 
     Raises TransportError.
@@ -198,9 +200,9 @@ def open_hub(
 
 
 def check_port(port: int) -> None:
-    """Raise RunError when the port is not available."""
+    """Raise RunError if the port is not available."""
     with socket.socket() as probe:
-        # As in Zenoh: a port with connections in TIME_WAIT is available.
+        # As in Zenoh, a port with connections in TIME_WAIT is available.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("127.0.0.1", port))
@@ -209,7 +211,7 @@ def check_port(port: int) -> None:
 
 
 def check_keys(keys: Path, chasers: int) -> None:
-    """Raise RunError unless a mission's keys exist for so many chasers and are valid."""
+    """Raise RunError unless valid keys of a mission exist for so many chasers."""
     from .keys import why_not_usable  # imports cryptography, which is slow
 
     if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
@@ -275,21 +277,22 @@ def fly_mission(
     port: int | None = None,
     namespace: str | None = None,
 ) -> MissionOutcome:
-    """Fly a scenario; write log, summary and the processes' output to ``folder``, by default a new
+    """Fly a scenario. Writes log, summary and the processes' output to ``folder``, by default a new
     one in ``runs/``.
 
     ``scenario_name``: a file, or the name of a shipped scenario. ``viewer_port``: serve the live
     viewer there until the end of the flight. ``keys``: connect through a router, over TLS, with
-    access rights. ``stall_s``: longest time (s) without progress. ``port`` and ``namespace``: where
-    other processes reach the mission, by default a free port and a unique name; ``network.json`` in
-    the folder contains them while the mission flies. ``stop_requested`` is polled. Installs no
+    access rights. ``stall_s``: longest time (s) without progress. ``port``, ``namespace``: where
+    other processes reach the mission, by default a free port and a unique name; while the mission
+    flies, ``network.json`` in the folder states them. ``stop_requested``: polled. Installs no
     signal handler; an exception ends all processes. Raises RunError, ScenarioError,
-    MissingPackageError or TransportError when the mission cannot start.
+    MissingPackageError or TransportError if the mission cannot start.
     """
     path = find_scenario(str(scenario_name))
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
     require_packages(scenario)
+
     folder = folder or _new_folder(path.stem)
     output = folder / "processes"
     if keys is not None:
@@ -300,16 +303,20 @@ def fly_mission(
         raise RunError(
             f"{folder} contains a mission.mcap; a log is never overwritten, choose another --out"
         )
+
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{folder}: cannot be created: {error.strerror or error}") from None
+
     namespace = namespace or f"run-{uuid.uuid4().hex[:12]}"
-    # After the lease a silent peer counts as lost; in lock-step the mission waits for a stopped
+    # After the lease a silent peer counts as lost. In lock-step the mission waits for a stopped
     # process instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
+
     fleet, observers, hub = Fleet(), Fleet(), None
     reporter = ProgressReporter(scenario, show, emit)
+
     try:
         if keys is not None:
             keys = keys.resolve()
@@ -318,15 +325,18 @@ def fly_mission(
             )
         else:
             hub, endpoint = open_hub(namespace, lease_ms, port=port)
+
         address = MissionAddress(
             namespace=namespace, endpoint=endpoint, keys=None if keys is None else str(keys)
         )
         write_address(folder, address)
         reporter.report(start_line(scenario, mode, folder, address))
         reporter.refresh()
+
         network = network_options(namespace, endpoint, lease_ms, keys)
         if viewer_port is not None:
             observers.start("viewer", ["view", "--port", str(viewer_port), *network], output)
+
         stall = ["--stall-s", f"{stall_s:g}"]
         start_all(fleet, scenario, path, folder, mode, overrides, [*network, *stall])
         failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
@@ -357,7 +367,7 @@ def _new_folder(name: str) -> Path:
 
 
 def start_line(scenario: Scenario, mode: Mode, folder: Path, address: MissionAddress) -> Start:
-    """Return the first line about a mission."""
+    """Return the first JSON line of a mission."""
     return Start(
         scenario=scenario.name,
         seed=scenario.seed,
@@ -401,22 +411,25 @@ def watch(
     stop_requested: Callable[[], bool],
     silent_s: float,
 ) -> str | None:
-    """Show the flight until it ends; return why it failed, or None.
+    """Show the flight until it ends. Returns why it failed, or None.
 
     A flight without a tick for ``silent_s`` has failed: the world hangs.
     """
     hub.subscribe(topics.END)
     reporter.subscribe(hub)
+
     stopping = False
     measured_s = 0.0
     silence = StallTimer(time.monotonic)
     end: MissionEnd | None = None
     world: str | None = None
+
     while end is None:
         if world is None and (world := find_world(hub)) is not None:
             ignore_foreign_publishers(hub, world, reporter.report_foreign)
         if world is None:
-            time.sleep(0.1)  # messages wait: whether they are the world's is not known
+            time.sleep(0.1)  # messages wait: it is unknown whether the world sent them
+
         received = None if world is None else hub.receive(0.1)
         if not reporter.flying or (received is not None and received.topic is topics.TICK):
             silence.reset()
@@ -424,27 +437,30 @@ def watch(
             reporter.update(received.message)
             if isinstance(received.message, MissionEnd):
                 end = received.message
+
         reporter.refresh()
+
         if time.monotonic() - measured_s > 2.0:
             measured_s = time.monotonic()
             fleet.measure()
+
         if stop_requested() and not stopping:
             stopping = True
             reporter.print_text("stopping: the log is being closed")
             fleet.children[0].process.send_signal(signal.SIGTERM)
+
         failure = None if end is not None else _premature_end(fleet, reporter, stopping)
         if silence.update() > silent_s and end is None:
             failure = f"world: hangs; no tick for {silence.waited_s:.0f} s"
         if failure is not None:
             return failure
+
     fleet.wait(_END_TIMEOUT_S)
     return STOPPED_BY_OPERATOR if stopping else _failure_at_end(fleet, end)
 
 
 def _premature_end(fleet: Fleet, reporter: ProgressReporter, stopping: bool) -> str | None:
-    """Return why the flight cannot continue, or None; report processes that it can continue
-    without.
-    """
+    """Return why the flight cannot continue, or None. Reports processes without which it can."""
     dead = [c for c in fleet.children if c.process.poll() not in (None, 0)]
     if dead and (dead[0].name == "world" or stopping or not reporter.flying):
         return STOPPED_BY_OPERATOR if stopping else dead[0].last_line()
@@ -466,7 +482,7 @@ def _failure_at_end(fleet: Fleet, end: MissionEnd) -> str | None:
 def judge(
     fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter
 ) -> MissionOutcome:
-    """Write summary.json from the log in ``folder``; return and report the outcome."""
+    """Write summary.json from the log in ``folder``. Returns and reports the outcome."""
     from chaserdock.analysis.summary import summarize
 
     stopped = failure == STOPPED_BY_OPERATOR
@@ -492,8 +508,8 @@ def judge(
 
 
 def print_outcome(outcome: MissionOutcome, show: Show) -> None:
-    """Print the verdict: text on standard output unless that carries JSON lines, a failure on
-    standard error.
+    """Print the verdict: on standard output unless that carries JSON lines; a failure on standard
+    error.
     """
     from chaserdock.analysis.summary import text_of
 

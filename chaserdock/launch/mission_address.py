@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Network address of a mission that ``chaserdock run`` flies, in a file of its folder while the
-mission flies.
+"""Network address of a mission of ``chaserdock run``, in a file of its folder while the mission
+flies.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class AddressError(ChaserdockError):
 
 class MissionAddress(Struct, frozen=True, kw_only=True):
     """Where other processes reach a mission: Zenoh endpoint and namespace, and the folder of its
-    keys, if it has keys.
+    keys, if any.
     """
 
     namespace: str
@@ -28,7 +28,7 @@ class MissionAddress(Struct, frozen=True, kw_only=True):
     keys: str | None = None
 
     def options(self) -> str:
-        """Return the command-line options with which an operator's command or the viewer joins the
+        """Return the command-line options with which operator commands and the viewer join the
         mission.
         """
         keys = [] if self.keys is None else ["--keys", self.keys]

@@ -31,10 +31,10 @@ def send_command(
     operator: str = "",
     before_s: float | None = None,
 ) -> CommandReply:
-    """Send a command to the controller and return its reply; the controller refuses it after
-    simulated time ``before_s``.
+    """Send a command to the controller and return its reply.
 
-    Raises OperatorError when there is no reply in time, TransportError.
+    ``before_s``: simulated time after which the controller refuses it. Raises OperatorError without
+    a reply within ``timeout_s``, TransportError.
     """
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z: required by goto, and by no other command")

@@ -23,11 +23,13 @@ from .flight_state import FlightState
 from .json_events import CommandNotice, EventNotice, JsonLine, Progress, Start, encode_line
 
 _LIVE_EVERY_S = 0.25
-"""Time (s) between two updates of the table on a terminal. Chosen, to be read."""
+"""Time (s) between two updates of the table on a terminal: figures can still be read."""
 _LINE_EVERY_S = 5.0
-"""Time (s) between two lines where output is no terminal. Chosen, for short logs."""
+"""Time (s) between two lines where output is not a terminal. Smaller: longer logs."""
 _JSON_EVERY_S = 1.0
-"""Time (s) between two JSON lines of progress. Chosen."""
+"""Time (s) between two JSON lines of progress. Larger: programs see progress later; smaller: more
+lines.
+"""
 _STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 _SUBSCRIBED = (
     topics.TICK,
@@ -45,7 +47,7 @@ _SUBSCRIBED = (
 class Show(StrEnum):
     """How progress is shown.
 
-    ``text``: a live table on a terminal, otherwise a line every few seconds, on standard error.
+    ``text``: on standard error, as a live table on a terminal, otherwise a line every few seconds.
     ``none``: not at all. ``json``: JSON lines, on standard output by default.
     """
 
@@ -60,7 +62,7 @@ def print_json_line(line: JsonLine) -> None:
 
 
 class ProgressReporter:
-    """Show the progress of a mission; with ``Show.json``, every line goes to ``emit``."""
+    """Shows the progress of a mission. With ``Show.json`` every line goes to ``emit``."""
 
     def __init__(
         self, scenario: Scenario, show: Show, emit: Callable[[JsonLine], None] = print_json_line
@@ -143,7 +145,7 @@ class ProgressReporter:
             )
 
     def report_foreign(self, detail: str, newest: Message | None) -> None:
-        """Report a session that publishes on the world's keys; see `ignore_foreign_publishers`."""
+        """Report a session that publishes on the world's keys (`ignore_foreign_publishers`)."""
         time_s = self.state.time_ns / 1e9
         self.report(
             EventNotice(

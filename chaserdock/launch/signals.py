@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stop by a signal: work in progress ends first."""
+"""Stops by signals that let work in progress end first."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def stop_on_signals(notice: str = "") -> Generator[threading.Event]:
 
 @contextmanager
 def deferred_signals() -> Generator[None]:
-    """Call Python's handlers of SIGINT and SIGTERM, which may raise exceptions, only after the
+    """Defer Python's handlers of SIGINT and SIGTERM, which may raise exceptions, to the end of the
     block.
 
-    Other threads than the main one receive no signals.
+    Only the main thread receives signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

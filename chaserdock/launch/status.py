@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observe a running mission: processes, tick, speed, phases."""
+"""Observes a running mission: processes, tick, speed, phases."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class StatusError(ChaserdockError):
 
 @dataclass
 class MissionStatus:
-    """Messages received while observing; processes by name."""
+    """What was received while observing; processes by name."""
 
     alive: set[str] = field(default_factory=set[str])
     presence: dict[str, Presence] = field(default_factory=dict[str, Presence])
@@ -61,7 +61,7 @@ class MissionStatus:
     @property
     def speed(self) -> float | None:
         """Return simulated over wall time between the first and the last tick; None with fewer than
-        two.
+        two ticks.
         """
         if len(self.ticks) < 2 or self.received_s[-1] <= self.received_s[0]:
             return None
@@ -69,7 +69,7 @@ class MissionStatus:
         return simulated_s / (self.received_s[-1] - self.received_s[0])
 
     def as_dict(self) -> dict[str, object]:
-        """Return plain values for JSON. ``expected``: whether the open tick waits for it."""
+        """Return plain values for JSON. ``expected`` of a process: the open tick waits for it."""
         tick = self.ticks[-1] if self.ticks else None
         return {
             "tick": tick.tick if tick else None,
@@ -90,8 +90,8 @@ class MissionStatus:
 
 
 def expected(name: str, tick: Tick | None) -> bool | None:
-    """Return whether a tick waits for this process; None where no tick ever does, or without a
-    tick.
+    """Return whether a tick waits for this process; None without a tick, and for a process for
+    which none ever does.
     """
     if tick is None:
         return None

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write tables of a log as Parquet or CSV files while reading it: memory does not grow with its
-length.
-"""
+"""Writes tables of a log as Parquet or CSV files while reading it, so that memory is bounded."""
 
 from __future__ import annotations
 
@@ -21,13 +19,14 @@ from .tables import TopicTable
 
 TableFormat = Literal["parquet", "csv"]
 _ROWS, _IMAGE_ROWS = 4096, 64
-"""Rows of a table, without and with the bytes of images, that are held in memory before they are
-written. Chosen; 64 grey images of 640 x 480 px are 20 MB."""
+"""Rows of a table that are held in memory before they are written, without and with the bytes of
+images. Larger: more memory; smaller: larger files. 64 grey images of 640 x 480 px are 20 MB.
+"""
 
 
 class _CsvFile:
-    """A CSV file with the interface of ``ParquetWriter``. Lists become JSON text, missing values
-    empty cells.
+    """A CSV file with the interface of ``ParquetWriter``. Lists are written as JSON text, missing
+    values as empty cells.
     """
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
@@ -60,10 +59,10 @@ def _cell(value: Any) -> Any:
 def export(
     log: LogSource, folder: Path, format: TableFormat, images: bool = False
 ) -> dict[str, int]:
-    """Write every topic of a log into ``folder``, which is created; return the number of rows by
+    """Write every topic of a log into ``folder``, which is created. Returns the number of rows by
     file name.
 
-    ``images``: include the bytes of the images. Raises LogError when the log or the files cannot be
+    ``images``: include the bytes of the images. Raises LogError if the log or the files cannot be
     used.
     """
     tables: dict[str, TopicTable] = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Describe a log and check that it is complete."""
+"""Describes a log, and checks that it is complete."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from chaserdock_protocol.recording.schema_migrations import decode_logged
 
 
 class FileInfo(msgspec.Struct):
-    """A file of a log. ``closed`` and ``cut_bytes``: as in ``recording.scan.FileState``."""
+    """A file of a log. ``closed``, ``cut_bytes``: as in ``recording.scan.FileState``."""
 
     path: str
     bytes: int
@@ -26,7 +26,7 @@ class FileInfo(msgspec.Struct):
 
 
 class KeyInfo(msgspec.Struct):
-    """What a log holds of a key: number and bytes of its messages, first and last simulated time
+    """Content of a log for one key: number and bytes of messages, first and last simulated time
     (s). ``lost``: gaps in their sequence numbers.
     """
 
@@ -39,8 +39,8 @@ class KeyInfo(msgspec.Struct):
 
 
 class LogInfo(msgspec.Struct):
-    """A log. ``rejected``: invalid messages by key and reason. ``viewer``: messages of the viewer
-    layer.
+    """Content of a log. ``rejected``: number of invalid messages by key and reason. ``viewer``:
+    messages of the viewer layer.
     """
 
     scenario: str
@@ -55,7 +55,7 @@ class LogInfo(msgspec.Struct):
 
     @property
     def whole(self) -> bool:
-        """Whether every file was closed, no message is missing and every message is valid."""
+        """Return whether every file is closed and no message is missing or invalid."""
         lost = any(k.lost for k in self.keys)
         return (
             all(f.closed and not f.recovered for f in self.files) and not lost and not self.rejected
@@ -63,19 +63,23 @@ class LogInfo(msgspec.Struct):
 
 
 def info_of(log: LogSource) -> LogInfo:
-    """Read all of a log, check every checksum and message. Raises LogError where it is damaged."""
+    """Read a whole log and check every checksum and message. Raises LogError where it is
+    damaged.
+    """
     scenario, run = logged_scenario(log)
     keys: dict[str, KeyInfo] = {}
     gaps = SequenceGaps()
     rejected: Counter[str] = Counter()
     files: list[FileInfo] = []
     viewer, sent = 0, [0, 0]
+
     for path in log_files(log):
         state = FileState()
         for channel, stored in stored_messages(path, state):
             if channel.topic.startswith(VIEWER_PREFIX):
                 viewer += 1
                 continue
+
             key = keys.get(channel.topic)
             time_s = stored.log_time / 1e9
             if key is None:
@@ -87,14 +91,17 @@ def info_of(log: LogSource) -> LogInfo:
                 min(sent[0] or stored.publish_time, stored.publish_time),
                 max(sent[1], stored.publish_time),
             ]
+
             seq = _seq_of(
                 channel.topic, stored.data, channel.metadata.get("zenoh_encoding", ""), rejected
             )
             if seq is not None:
                 gaps.update(channel.topic, seq)
                 key.lost = gaps.lost[channel.topic]
+
         size = path.stat().st_size
         files.append(FileInfo(str(path), size, state.closed, state.cut_bytes, state.recovered))
+
     return LogInfo(
         scenario=scenario.name,
         seed=scenario.seed,

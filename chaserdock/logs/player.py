@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish a log again, byte for byte, in place of the world: to recorders, viewers and other
+"""Publishes a log again, byte for byte, in place of the world: for recorders, viewers and other
 subscribers.
 """
 
@@ -28,8 +28,8 @@ class PlayError(ChaserdockError):
 
 
 def stored_samples(log: LogSource) -> Iterator[tuple[int, RawSample]]:
-    """Iterate over simulated time (ns) and content of all messages but the recorder's and the
-    viewers', in file order.
+    """Yield simulated time (ns) and content of all messages, in file order, without those of
+    recorder and viewers.
     """
     for path in log_files(log):
         for channel, stored in stored_messages(path):
@@ -49,11 +49,11 @@ def play(
     on_sent: Callable[[RawSample], None] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> int:
-    """Wait for a recorder, then publish all of a log; return the number of messages.
+    """Wait for a recorder, then publish a whole log. Returns the number of messages.
 
-    ``speed``: simulated over wall time, None for as fast as possible. ``on_sent`` is called with
-    each message that was published. Raises LogError, TransportError, or PlayError when no recorder
-    joins within ``timeout_s``.
+    ``speed``: simulated over wall time; None for as fast as possible. ``on_sent``: called with each
+    published message. Raises LogError, TransportError, or PlayError if no recorder joins within
+    ``timeout_s``.
     """
     text, run = read_scenario(log)
     scenario = scenario_from_json(text, f"{log}: scenario")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open a log: typed messages, and tables by topic.
+"""Opens a log: typed messages, and tables by topic.
 
 >>> from chaserdock.logs import open_log  # doctest: +SKIP
 >>> log = open_log("runs/main")
@@ -47,8 +47,8 @@ def open_log(source: str | Path | Sequence[str | Path]) -> Log:
 
 
 class Log:
-    """A log: its ``scenario``, its ``run`` data (run_id, mode, versions), its messages. Reads the
-    files on each call.
+    """A log: its ``scenario``, its ``run`` data (run_id, mode, versions) and its messages. Files
+    are read on each call.
     """
 
     def __init__(self, source: LogSource, scenario: Scenario, run: dict[str, str]) -> None:
@@ -74,7 +74,7 @@ class Log:
     @overload
     def messages(self, *names: str | Topic) -> Iterator[Any]: ...
     def messages(self, *names: Any) -> Iterator[Any]:
-        """Iterate over messages of a type (``messages.TargetEstimate``), or by names as in
+        """Iterate over messages of a type (``messages.TargetEstimate``) or, by name, as
         ``records``.
         """
         if len(names) == 1 and isinstance(names[0], type):
@@ -84,8 +84,8 @@ class Log:
         return (record.message for record in self.records(*names))
 
     def table(self, name: str | Topic) -> pyarrow.Table:
-        """Return a topic as one table, all chasers together; columns as in
-        ``chaserdock.logs.tables``. Raises LogError.
+        """Return a topic as one table of all chasers. Columns: ``chaserdock.logs.tables``. Raises
+        LogError.
         """
         from .tables import TopicTable
 
@@ -112,8 +112,8 @@ class Log:
 
 
 def topic_named(name: str | Topic) -> Topic:
-    """Return a topic by itself, by its key in the topics table, or by a concrete key. Raises
-    LogError.
+    """Return the topic of this name: a topic itself, its key in the topics table, or a concrete
+    key. Raises LogError.
     """
     if isinstance(name, Topic):
         return name

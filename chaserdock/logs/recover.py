@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recover the readable messages of a log that is cut off or damaged into a new log."""
+"""Copies the readable messages of a damaged or cut off log into a new one."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from mcap.records import Message as McapMessage
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 _HEAD = struct.Struct("<BQ")
-# A chunk's head: opcode and length, then 28 bytes of times, size and checksum, then the name of its
+# Head of a chunk: opcode and length, 28 bytes of times, size and checksum, then the name of its
 # compression.
 _CHUNK_MARK, _MARK_OFFSET = b"\x04\x00\x00\x00zstd", _HEAD.size + 28
 
 
 class Recovered(msgspec.Struct):
-    """What was recovered from a damaged log: messages and chunks. What was lost: records with a
-    wrong checksum or format, and bytes that were skipped.
+    """Result of a recovery: copied messages and chunks; records with a wrong checksum or format;
+    bytes that were skipped.
     """
 
     messages: int = 0
@@ -76,9 +76,7 @@ def recover(log: Path, out: Path) -> Recovered:
 
 
 def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and content of each record; after a broken one, continue with the next
-    chunk.
-    """
+    """Yield opcode and content of each record. After a broken one, continue with the next chunk."""
     place = len(MCAP0_MAGIC)
     while place + _HEAD.size <= len(data):
         opcode, length = _HEAD.unpack_from(data, place)
@@ -92,7 +90,7 @@ def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[int, bytes]]:
                 place += _HEAD.size + length
                 continue
         following = _next_chunk(data, place + 1)
-        # A partial last record is normal after a kill; only damage before the end counts.
+        # After a kill the last record is partial. Only damage before the end counts.
         found.broken_records += following < len(data)
         found.skipped_bytes += following - place
         place = following
@@ -107,7 +105,7 @@ def _is_valid(chunk: bytes) -> bool:
 
 
 def _next_chunk(data: mmap.mmap, place: int) -> int:
-    """Return where the next whole chunk begins; the end of the data if there is none."""
+    """Return the position of the next whole chunk, or the end of the data."""
     mark = data.find(_CHUNK_MARK, place)
     while mark >= 0:
         begin = mark - _MARK_OFFSET
@@ -121,8 +119,8 @@ def _next_chunk(data: mmap.mmap, place: int) -> int:
 
 
 def _summary_declarations(data: mmap.mmap) -> tuple[dict[int, Channel], dict[int, Schema]]:
-    """Return channels and schemas that a closed log repeats in its summary: the chunk that declares
-    them may be lost.
+    """Return the channels and schemas that a closed log repeats in its summary; the chunk that
+    declares them may be lost.
     """
     channels: dict[int, Channel] = {}
     schemas: dict[int, Schema] = {}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a log as a bag of ROS 2 (rosbag2 with MCAP storage): schemas and CDR of ROS 2,
+"""Writes a log as a ROS 2 bag (rosbag2 with MCAP storage): ROS 2 schemas and CDR,
 ``metadata.yaml``.
 
-Topics are those of the bridge, and the true states of the bodies under ``/truth/``. Needs the extra
-``chaserdock[ros2]``.
+Topics are those of the bridge, plus the true states of the bodies under ``/truth/``. Requires the
+extra ``chaserdock[ros2]``.
 """
 
 from __future__ import annotations
@@ -18,18 +18,16 @@ from chaserdock_protocol.recording.log import LogError, LogSource
 from .reader import open_log
 
 BAG_VERSION = 9
-"""Format of the metadata: that of ROS 2 Jazzy and later."""
+"""Version of the metadata format: that of ROS 2 Jazzy and later."""
 
 
 def export_bag(log: LogSource, folder: Path, images: bool = False) -> dict[str, int]:
-    """Write a log as the bag ``folder``, which must not exist, and return the number of messages by
+    """Write a log as the bag ``folder``, which must not exist. Returns the number of messages by
     topic.
 
-    ``images``: include images (decoded) and camera calibrations.
-
-    A message's time in the bag is its simulated time, that of an image its exposure; a bag is in
-    order of arrival, as the log is. Raises LogError when the log or the bag cannot be used,
-    MissingPackageError without rosbags.
+    ``images``: include images (decoded) and camera calibrations. The time of a message is its
+    simulated time, of an image its exposure. Like the log, the bag is in order of arrival. Raises
+    LogError if the log or the bag cannot be used, MissingPackageError without rosbags.
     """
     require_extra("rosbags", "ros2")
     from chaserdock_agents.ros2.conversion import Converter, InvalidImage

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as tables: one row per message, nested fields flattened, the unit of every column in its
+"""Messages as tables: one row per message, nested fields as columns, units in the columns'
 metadata.
 
 Columns: ``key``, ``sent_ns`` (the sender's wall clock), ``time_s`` (simulated), then the message's
-fields. Vectors become ``position_m_x`` …, quaternions ``q_w`` …; lists of numbers stay lists;
-dictionaries become JSON text. Lists of structures (the solutions of a sighting) become a table of
+fields. Vectors become ``position_m_x`` …, quaternions ``q_w`` …; dictionaries become JSON text;
+lists of numbers stay lists. Lists of structures (the solutions of a sighting) become a table of
 their own, with ``key``, ``seq``, ``tick``, ``time_s`` and ``index``. The bytes of images are left
 out by default (``data_bytes`` is their number).
 """
@@ -66,7 +66,7 @@ def _item(name: str, k: int) -> Reader:
 
 
 def _part(name: str, read: Reader) -> Reader:
-    """Return a reader of a column of the structure in a field, which may be None."""
+    """Return a reader of one column of a nested structure, which may be None."""
     return lambda message: None if getattr(message, name) is None else read(getattr(message, name))
 
 
@@ -75,7 +75,7 @@ def _json(name: str) -> Reader:
 
 
 def _plain(kind: inspect.Type) -> pa.DataType | None:
-    """Return Arrow's type of a plain value or a list of such, None for another type."""
+    """Return Arrow's type of a plain value or a list of plain values; None for any other type."""
     match kind:
         case inspect.BoolType():
             return pa.bool_()
@@ -97,9 +97,7 @@ def _plain(kind: inspect.Type) -> pa.DataType | None:
 
 
 def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], list[str]]:
-    """Return the columns of a structure, and the names of its fields that become tables of their
-    own.
-    """
+    """Return the columns of a structure, and its fields that become tables of their own."""
     columns: list[Column] = []
     children: list[str] = []
     info: Any = inspect.type_info(kind)
@@ -136,7 +134,7 @@ def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], li
 
 
 def _element(kind: type[msgspec.Struct], field: str) -> type[msgspec.Struct]:
-    """Return the structure in a field that holds a tuple of them."""
+    """Return the type of the structures in a field that holds a tuple of them."""
     hint = get_type_hints(kind)[field]
     while get_origin(hint) is not tuple:
         hint = get_args(hint)[0]
@@ -150,7 +148,7 @@ def _field(name: str, type_: pa.DataType) -> pa.Field:
 
 
 class TableRows:
-    """Rows of one table, collected until they are taken."""
+    """Collects rows of one table until they are taken."""
 
     def __init__(self, columns: list[Column]) -> None:
         self.schema = pa.schema([_field(name, type_) for name, type_, _ in columns])
@@ -159,13 +157,13 @@ class TableRows:
         self.number = 0
 
     def add(self, row: Any) -> None:
-        """Add a row with the values that the columns read."""
+        """Add a row: the values that the columns' readers return."""
         for values, reader in zip(self._values, self._readers, strict=True):
             values.append(reader(row))
         self.number += 1
 
     def take(self) -> pa.Table:
-        """Return the rows since the last call."""
+        """Return the rows since the last call and drop them."""
         arrays = [pa.array(v, f.type) for v, f in zip(self._values, self.schema, strict=True)]
         self._values = [[] for _ in self._values]
         self.number = 0
@@ -183,7 +181,7 @@ def table_name(topic: Topic) -> str:
 
 
 class TopicTable:
-    """The table of a topic and those of its lists of structures (``children``, by field)."""
+    """The table of a topic, and tables of its lists of structures (``children``, by field)."""
 
     def __init__(self, topic: Topic, images: bool = False) -> None:
         columns, children = _columns(topic.kind, images)
@@ -210,7 +208,7 @@ class TopicTable:
 
     @property
     def number(self) -> int:
-        """Rows collected and not yet taken, of the greatest table."""
+        """Return the number of rows of the longest table that are not yet taken."""
         return max(self._rows.number, *(c.number for c in self.children.values()), 0)
 
     def add(self, record: Record) -> None:
@@ -221,7 +219,7 @@ class TopicTable:
                 rows.add((record, index, item))
 
     def take(self) -> pa.Table:
-        """The topic's own rows so far."""
+        """Return the topic's own rows since the last call."""
         return self._rows.take()
 
     def take_all(self) -> Iterator[tuple[str, pa.Table]]:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write trajectories of a log as TUM files: ``time_s x y z qx qy qz qw`` per line, in WRF; evo and
-others read them.
+"""Writes trajectories of a log as TUM files, which evo and others read: lines ``time_s x y z qx qy
+qz qw``, in WRF.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .reader import open_log
 
 
 def _track_of(record: Record) -> str | None:
-    """Return the name of the track that a message is a point of, or None."""
+    """Return the name of the trajectory to which a message belongs, or None."""
     message: Any = record.message
     match record.topic:
         case topics.TRUTH_BODY:
@@ -34,10 +34,9 @@ def _track_of(record: Record) -> str | None:
 def write_tracks(
     log: LogSource, folder: Path, from_s: float = 0.0, to_s: float = math.inf
 ) -> dict[str, int]:
-    """Write truth of all bodies, target estimate, odometry and references from ``from_s`` to
-    ``to_s``.
+    """Write true states, target estimate, odometry and references from ``from_s`` to ``to_s``.
 
-    Returns the number of points by file name. Raises LogError when the log or the files cannot be
+    Returns the number of points by file name. Raises LogError if the log or the files cannot be
     used.
     """
     opened = open_log(log)

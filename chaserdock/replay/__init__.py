@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of recorded inputs through current code, and comparison of messages field by field."""
+"""Replays recorded inputs through the present code; compares messages field by field."""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of two recorded flights: summaries, digests, first different message, deviations of
-the bodies.
+"""Compares two recorded flights: summaries, digests, first different message, deviations of the
+bodies.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from chaserdock.analysis.summary import summary_of
 
 from .difference import Comparison, TopicDifference, difference_lines, first_difference
 
-# Prefixes of values that depend on the machine: shown, but not a difference between flights.
+# Prefixes of values that depend on the machine. They are shown, but are no difference between
+# flights.
 _WALL = (
     "wall_time_s",
     "latency_s.",
@@ -41,12 +42,12 @@ class Deviation(msgspec.Struct):
 
 
 class RunComparison(msgspec.Struct):
-    """What differs between two recorded flights. ``summary``: both values of each key of the
-    summaries that differs. ``deviations``: of the motion of each body; ``target estimate`` is the
-    fused one.
+    """Differences of two recorded flights.
 
-    ``blas``: both linear algebra libraries (recording.provenance.blas_in_use) of each process for
-    which they are known and differ.
+    ``summary``: both values of each key that differs between the summaries. ``deviations``: of the
+    motion of each body; ``target estimate`` is the fused one. ``blas``: both linear algebra
+    libraries (recording.provenance.blas_in_use) of each process for which they are known and
+    differ.
     """
 
     digests: tuple[str, str]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of messages field by field: first and largest differences of two runs, or of a log and
-current code.
+"""Compares messages field by field: first and largest differences of two runs, or of a log and the
+present code.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ Side = int
 
 
 class FieldDifference(msgspec.Struct):
-    """Differences of one field. ``largest``: largest absolute difference of numbers, else None."""
+    """Differences of one field. ``largest``: largest absolute difference if it is a number, else
+    None.
+    """
 
     name: str
     unequal: int = 0
@@ -29,7 +31,7 @@ class FieldDifference(msgspec.Struct):
 
 
 class TopicDifference(msgspec.Struct):
-    """Differences of one key. ``alone``: numbers of messages that only one side has;
+    """Differences of one key. ``alone``: number of messages that only one side has, for each side.
     ``alone_time_s``: time of the first one.
     """
 
@@ -56,10 +58,10 @@ class TopicDifference(msgspec.Struct):
 def field_differences(
     a: Any, b: Any, name: str = ""
 ) -> Iterator[tuple[str, Any, Any, float | None]]:
-    """Yield different fields: name (shared by the items of a list), both values, and the difference
-    of numbers.
+    """Yield the fields that differ: name (shared by the items of a list), both values, and the
+    difference of numbers.
 
-    Transport and wall-clock fields (``seq``, ``wall_...``) are not compared.
+    Transport and wall-clock fields (``seq``, ``wall_...``) are ignored.
     """
     if isinstance(a, msgspec.Struct) and type(a) is type(b):
         for field in a.__struct_fields__:
@@ -89,12 +91,13 @@ def _is_number(x: Any) -> TypeGuard[int | float]:
     return isinstance(x, int | float) and not isinstance(x, bool)
 
 
-# Beyond this number of waiting messages, those this many ticks behind both sides count as unpaired.
+# When more messages than the first number wait, those more than the second number of ticks behind
+# both sides count as unpaired.
 _MANY_WAITING, _BEHIND_TICKS = 20_000, 300
 
 
 class Comparison:
-    """Pairs the messages of two sides by key, tick and order within it, and collects their
+    """Pairs the messages of two sides by key, tick and order within the tick, and collects their
     differences.
 
     Numbers that differ by at most ``tolerance`` count as equal. Memory is bounded.
@@ -181,7 +184,7 @@ def first_difference(topics: list[TopicDifference]) -> str | None:
 
 
 def difference_lines(topics: list[TopicDifference], sides: tuple[str, str]) -> Iterator[str]:
-    """Format the differences by topic. Equal topics share one line."""
+    """Format the differences by topic; equal topics share a line."""
     equal = [t for t in topics if t.equal]
     yield f"equal: {len(equal)} topics, {sum(t.compared for t in equal)} messages"
     for t in topics:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of a log through one stage of the current code, compared with the recorded output."""
+"""Replays a log through one stage of the present code and compares with the recorded output."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .difference import Comparison, TopicDifference
 
 
 class ReplayError(ChaserdockError):
-    """A replay is impossible with the given arguments."""
+    """A replay with the given arguments is impossible."""
 
 
 class Replay(msgspec.Struct):

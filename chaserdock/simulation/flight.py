@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a case and check the invariants meanwhile."""
+"""Flies a case and checks the invariants on the way."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from .swarm import Case
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """A simulated flight and its verdict. ``outcome``: the first violated invariant, or the least
-    final state of the chasers that are to dock. ``fingerprint``: of all messages and their times,
-    equal in equal flights.
+    """A simulated flight and its verdict.
 
+    ``outcome``: the first violated invariant, or else the worst final state of the chasers that are
+    to dock. ``fingerprint``: digest of all messages and their times, equal for equal flights.
     ``nees``: normalized squared errors of the estimate, one a second. ``honest``: no sensor lies
-    and the plant is as stated, so that they should be consistent.
+    and the plant is as stated, so that the estimate should be consistent.
     """
 
     seed: int
@@ -56,7 +56,7 @@ def fly_case(
         try:
             checks, fingerprint = FlightChecks(load_scenario(path)), 0
         except ScenarioError as error:
-            # The text is not to name a file that is deleted now.
+            # The text must not name the temporary file.
             raise ScenarioError(str(error).replace(f"{scratch / path.name}: ", "")) from None
 
         def tap(sender: str, raw: RawSample) -> None:
@@ -85,5 +85,5 @@ def fly_case(
 
 
 def memory_folder() -> str | None:
-    """Return a folder in memory for logs that are not kept, if this system has one."""
+    """Return a folder in memory for logs that are not kept; None if this system has none."""
     return "/dev/shm" if Path("/dev/shm").is_dir() else None

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Links between the processes of a simulated mission: when a message arrives, and how often.
+"""Links between the processes of a simulated mission: when, and how often, a message arrives.
 
-They behave as Zenoh over TCP: messages of one priority arrive in order, and after the declarations
-that were sent before them. A link that is cut or congested holds back what must not be lost and
-drops the rest.
+They behave as Zenoh over TCP. Messages of one priority arrive in order, after the declarations sent
+before them. A link that is cut or congested holds back what must not be lost and drops the rest.
 """
 
 from __future__ import annotations
@@ -19,20 +18,23 @@ from chaserdock_protocol.scenario.simulation import SimulationSection
 from .scheduler import NEVER, Due, Scheduler, VirtualQueue
 
 LINK_BYTES = 1 << 20
-"""A link drops droppable messages while so many bytes are on it, as Zenoh with the options of
-``transport.config`` does.
+"""Bytes on a link above which it drops droppable messages, as Zenoh does with the options of
+``transport.config``.
 """
 _RETRY_S = 0.2
-"""Time (s) after which a lost message that must not be lost is sent again: as TCP does in Linux
-(TCP_RTO_MIN)."""
+"""Time (s) after which a lost message that must not be lost is sent again, as TCP does in Linux
+(TCP_RTO_MIN).
+"""
 _LATE_DELAYS = 4.0
-"""Additional delay of a message that later ones overtake, in mean delays of a message. Chosen."""
+"""Additional delay of a message that later ones overtake, in mean delays of a message. Larger: more
+messages overtake it; smaller: fewer reorderings.
+"""
 
 
 @dataclass
 class Traffic:
     """What the network has carried and lost. ``recorded``: messages that arrived at the recorder,
-    by key. ``queues``: of the readers, by a name that begins with the process.
+    by key. ``queues``: of the readers; their names begin with the process.
     """
 
     sent: int = 0
@@ -44,7 +46,9 @@ class Traffic:
 
 @dataclass
 class MessageLink:
-    """One direction between two processes: bytes on the way, and the last arrival by priority."""
+    """One direction between two processes: bytes in flight, and the last arrival time of each
+    priority.
+    """
 
     sender: str
     receiver: str
@@ -53,11 +57,11 @@ class MessageLink:
 
 
 class Links:
-    """All links of a mission, under its conditions. ``first_tick_s``: virtual time (s) from which
+    """All links of a mission under its conditions. ``first_tick_s``: virtual time (s) from which
     the conditions apply, None before.
 
-    ``lockstep``: nothing is lost, duplicated or reordered on one link, as TCP guarantees;
-    conditions only delay.
+    ``lockstep``: as TCP guarantees, nothing is lost, duplicated or reordered on a link; conditions
+    only delay.
     """
 
     def __init__(
@@ -79,7 +83,7 @@ class Links:
 
     @property
     def mission_s(self) -> float:
-        """Time since the first tick (s), which conditions refer to; negative before."""
+        """Return the time since the first tick (s), to which conditions refer; negative before."""
         return -1.0 if self.first_tick_s is None else self._scheduler.now_s - self.first_tick_s
 
     def between(self, sender: str, receiver: str) -> MessageLink:
@@ -98,8 +102,11 @@ class Links:
         arrive: Callable[..., None],
         args: tuple[Any, ...],
     ) -> None:
-        """Put a message of so many bytes on a link; ``arrive(*args)`` takes each copy that arrives,
-        and its bytes, off it. ``blocking``: it must not be lost."""
+        """Send a message of ``size`` bytes over a link. ``blocking``: it must not be lost.
+
+        ``arrive(*args)`` is called for each copy that arrives; it removes the copy and its bytes
+        from the link.
+        """
         copies, late_s, due_s = 1, 0.0, self._scheduler.now_s + self._latency_s
         if not self.lockstep:
             copies, late_s = self._draw_faults(link, size, not blocking)
@@ -114,14 +121,16 @@ class Links:
     def deliver(
         self, sender: str, receiver: str, call: Callable[[], None], qos: str = "control"
     ) -> None:
-        """Call ``call()`` when a message arrives that is sent now: after all earlier ones of its
-        priority, and after all declarations."""
+        """Call ``call()`` when a message sent now arrives: after all earlier ones of its priority,
+        and after all declarations.
+        """
         link = self.between(sender, receiver)
         self._call_in_order(link, self._due_s(link, 0.0), call, qos, 0.0, ())
 
     def _draw_faults(self, link: MessageLink, size: int, droppable: bool) -> tuple[int, float]:
-        """Return how many copies of a message arrive in real time, and the additional delay (s);
-        negative: later messages overtake it."""
+        """Return how many copies of a message arrive in real time, and their additional delay (s).
+        If it is negative, later messages overtake this one.
+        """
         c, late_s = self.conditions, 0.0
         if droppable and (link.bytes + size > LINK_BYTES or self._cut_until_s(link) > 0.0):
             self.traffic.lost += 1
@@ -137,7 +146,7 @@ class Links:
         return copies, late_s
 
     def _due_s(self, link: MessageLink, late_s: float) -> float:
-        """Return when a message arrives that is sent now, but for those before it."""
+        """Return when a message sent now arrives, regardless of those before it."""
         delay_s = self._latency_s
         if late_s > 0.0:
             delay_s += late_s
@@ -167,7 +176,7 @@ class Links:
         )
 
     def _cut_until_s(self, link: MessageLink) -> float:
-        """Return when the partition across a link ends (virtual time, s), 0 without one."""
+        """Return when the partition across a link ends (virtual time, s); 0 without one."""
         now_s, end_s = self.mission_s, 0.0
         if now_s < 0.0:
             return 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly one scenario in this process: all processes of the mission, unchanged, on a simulated
+"""Flies one scenario in this process: all processes of the mission, unchanged, over a simulated
 network.
 """
 
@@ -28,17 +28,17 @@ from .scheduler import Scheduler, Task
 Tap = Callable[[str, RawSample], None]
 
 _START_S, _END_S = 30.0, 60.0
-"""Longest virtual time from the start of the processes to the first tick, and from the mission's
-end to theirs (s).
+"""Longest virtual time (s) from the start of the processes to the first tick, and from the end of
+the mission to the end of all processes.
 """
 
 
 @dataclass(frozen=True)
 class SimulatedFlight:
-    """A simulated flight. ``statuses``: exit status by process; None of one that was killed.
+    """A simulated flight. ``statuses``: exit status by process; None for one that was killed.
 
-    ``crashes``: traceback by process. ``stalled``: processes that had not ended when the time was
-    over. ``output``: what the processes printed. ``time_s``: virtual time at the end.
+    ``crashes``: traceback by process. ``stalled``: processes that had not ended when time was up.
+    ``output``: text that the processes printed. ``time_s``: virtual time at the end.
     """
 
     folder: Path
@@ -60,8 +60,8 @@ def simulate(
     """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes
     to ``folder``.
 
-    ``tap`` sees every message when it is published: the sender's name, the sample. The flight is
-    broken off when ``over`` holds. Raises ScenarioError and MissingPackageError.
+    ``tap``: called with sender and sample of every message when it is published. ``over``: the
+    flight is broken off once it returns True. Raises ScenarioError and MissingPackageError.
     """
     scenario = load_scenario(path, overrides)
     require_packages(scenario)
@@ -69,6 +69,7 @@ def simulate(
     conditions = scenario.simulation
     lockstep = conditions.mode == "lockstep"
     network = SimulatedNetwork(scheduler, conditions, scenario.seed, lockstep, tap)
+
     options = ProcessOptions(
         link=Link(network=network),
         scenario=path,
@@ -79,6 +80,7 @@ def simulate(
         compressed_log=False,  # it is read once, if at all
         signals=False,
     )
+
     printed = io.StringIO()
     collecting = gc.isenabled()
     gc.disable()
@@ -92,6 +94,7 @@ def simulate(
     finally:
         if collecting:
             gc.enable()
+
     return SimulatedFlight(
         folder=folder,
         statuses={t.name: None if t.killed else t.result for t in tasks if t.name not in stalled},

@@ -2,8 +2,8 @@
 """Simulated network: carries the messages of all nodes in virtual time, with the faults of
 ``Conditions``.
 
-Declarations and messages travel the same links (`links.py`). Deliveries run within the scheduler,
-so that publishing never waits.
+Declarations and messages travel over the same links (`links.py`). Deliveries run within the
+scheduler, so that publishing never waits.
 """
 
 from __future__ import annotations
@@ -28,21 +28,23 @@ from .scheduler import Killed, Scheduler, VirtualQueue
 LEASE_S = 2.0
 """Time (s) after which a silent process counts as lost in real time, as under `chaserdock run`."""
 EPOCH_NS = 1_800_000_000 * 10**9
-"""Wall-clock time (ns) at the begin of a simulation. Chosen: in January 2027."""
+"""Wall-clock time (ns) at the start of a simulation, in January 2027; fixed, so that flights are
+repeatable.
+"""
 
 
 @lru_cache(maxsize=128)
 def decode_once(kind: type[T], payload: bytes, encoding: str) -> T:
-    """Decode as ``codec.decode``; the receivers of a message share the result, which cannot be
-    changed.
+    """Decode as ``codec.decode``. The receivers of a message share the result, which is
+    immutable.
     """
     return codec.decode(kind, payload, encoding)
 
 
 @lru_cache(maxsize=4096)
 def matches(expression: str, key: str) -> bool:
-    """Return whether a key expression includes a key: ``*`` stands for one chunk, ``**`` for any
-    number.
+    """Return whether a key expression includes a key. ``*`` stands for one chunk, ``**`` for any
+    number of chunks.
     """
     pattern = re.escape(expression).replace(r"\*\*/", "(.*/)?").replace(r"\*\*", ".*")
     return re.fullmatch(pattern.replace(r"\*", "[^/]*"), key) is not None
@@ -61,8 +63,8 @@ class _Subscription:
 
 
 class SimulatedNetwork:
-    """The ``Network`` of one simulated mission. ``tap`` sees every message when it is published:
-    sender, sample. ``lockstep``: see ``Links``.
+    """The ``Network`` of one simulated mission. ``tap``: called with sender and sample of every
+    message when it is published. ``lockstep``: see ``Links``.
     """
 
     def __init__(
@@ -83,7 +85,7 @@ class SimulatedNetwork:
         self._routes: dict[str, list[_Subscription]] = {}
 
     def open(self, name: str) -> tuple[Connection, Host]:
-        """Connect a process. A process that is started again replaces itself."""
+        """Connect a process. One that is started again replaces its earlier connection."""
         host = SimulatedHost(name, self)
         self._connections[name] = SimulatedConnection(self, name, host)
         for subscription in self._subscriptions:
@@ -91,7 +93,7 @@ class SimulatedNetwork:
         return self._connections[name], host
 
     def seeded(self, *parts: object) -> random.Random:
-        """Return a random stream of this network's seed."""
+        """Return a random stream that depends on this network's seed and ``parts``."""
         return random.Random(f"{self._seed} {parts}")
 
     # -- messages ----------------------------------------------------------------------------------
@@ -99,7 +101,7 @@ class SimulatedNetwork:
     def publish(
         self, sender: SimulatedConnection, raw: RawSample, qos: str, blocking: bool
     ) -> None:
-        """Send a sample to all who have subscribed to its key, as far as the sender knows."""
+        """Send a sample to all subscribers of its key that the sender knows of."""
         if sender.closed:
             return
         if raw.key == topics.TICK.key:
@@ -138,7 +140,7 @@ class SimulatedNetwork:
         self.links.send(link, size, qos, blocking, self._arrive, (link, to, raw))
 
     def _arrive(self, link: MessageLink, to: _Subscription, raw: RawSample) -> None:
-        """Hand a sample that has crossed a link to the subscriber."""
+        """Hand a sample that has crossed a link to its subscriber."""
         link.bytes -= len(raw.payload)
         if to.owner.closed:
             return
@@ -149,7 +151,7 @@ class SimulatedNetwork:
     # -- partitions and liveliness -----------------------------------------------------------------
 
     def _schedule_partitions(self) -> None:
-        """Let processes lose sight of each other when a partition outlasts the lease."""
+        """Let processes lose sight of each other during partitions that outlast the lease."""
         if self.lockstep:
             return
         begin_s = self.links.first_tick_s or 0.0
@@ -170,7 +172,7 @@ class SimulatedNetwork:
                     other.review(name)
 
     def is_alive(self, name: str, seen_from: str) -> bool:
-        """Return whether a process counts as alive for another one."""
+        """Return whether one process counts as alive for another."""
         connection, host = self._connections.get(name), self.host_of(name)
         if connection is None or connection.closed or not connection.token:
             return False
@@ -195,9 +197,7 @@ class SimulatedNetwork:
         self._connections[name].close()
 
     def announce(self, name: str) -> None:
-        """Let all others review whether a process is alive, after the time that the news takes to
-        them.
-        """
+        """Let all others check whether a process is alive, once the news has reached them."""
         for other in list(self._connections.values()):
             if other.name != name:
                 self.links.deliver(name, other.name, lambda other=other: other.review(name))
@@ -207,7 +207,7 @@ class SimulatedNetwork:
     def subscribe(
         self, owner: SimulatedConnection, expression: str, arrived: Callable[[RawSample], None]
     ) -> None:
-        """Add a subscription, which each publisher learns of when the declaration arrives there."""
+        """Add a subscription. Each publisher learns of it when the declaration arrives there."""
         added = _Subscription(owner, expression, arrived)
         for name in self._connections:
             if name != owner.name:
@@ -216,7 +216,7 @@ class SimulatedNetwork:
         self._routes.clear()
 
     def _declare(self, subscription: _Subscription, publisher: str) -> None:
-        """Let a publisher know a subscription when the declaration arrives there."""
+        """Make a subscription known to a publisher when the declaration arrives there."""
         self.links.deliver(
             subscription.owner.name, publisher, lambda: subscription.known_to.add(publisher)
         )
@@ -229,7 +229,7 @@ class SimulatedNetwork:
         encoding: str,
         replied: Callable[[Reply], None],
     ) -> None:
-        """Carry a query to the process that serves its key, if any, and the reply back."""
+        """Carry a query to the process that serves its key, if any, and carry the reply back."""
         for server in list(self._connections.values()):
             handle = server.queryables.get(key)
             if handle is None or server.closed:
@@ -308,7 +308,7 @@ class SimulatedConnection:
         return undeclare
 
     def serve(self, key: str, query: Query) -> None:
-        """Hand a query that has arrived to the process, if it still serves the key."""
+        """Hand an arrived query to the process if it still serves the key."""
         if not self.closed and key in self.queryables:
             self.queryables[key](query)
 
@@ -352,8 +352,8 @@ class SimulatedConnection:
 
 
 class SimulatedHost:
-    """The ``Host`` of a process in virtual time. Its clock differs from the scheduler's by an
-    offset and a drift.
+    """The ``Host`` of a process in virtual time. Its clock has an offset and a drift from the
+    scheduler's.
     """
 
     def __init__(self, name: str, network: SimulatedNetwork) -> None:
@@ -380,7 +380,9 @@ class SimulatedHost:
         return EPOCH_NS + round(self.now_s() * 1e9)
 
     def pause(self, timeout_s: float | None, over: Callable[[], bool] = lambda: False) -> None:
-        """Wait until ``over``, after which the task is woken, or for a time of the host's clock."""
+        """Wait for a time of the host's clock or until ``over``, which is tested whenever the task
+        is woken.
+        """
         end_s = None if timeout_s is None else self._scheduler.now_s + timeout_s / self._rate
         while not over() and (end_s is None or self._scheduler.now_s < end_s):
             self._scheduler.pause(None if end_s is None else end_s - self._scheduler.now_s)
@@ -394,7 +396,7 @@ class SimulatedHost:
         return queue
 
     def _read_slowly(self) -> None:
-        """Take as long as a slow reader does before it reads a message."""
+        """Pause before reading a message for as long as a slow reader does."""
         now_s = self._network.links.mission_s
         for slow in self._slow:
             if slow.at_s <= now_s < slow.at_s + slow.duration_s:
@@ -404,7 +406,7 @@ class SimulatedHost:
         return f"{self._ids.getrandbits(48):012x}"
 
     def repeat(self, call: Callable[[], float]) -> Undo:
-        """Call ``call`` within the scheduler; a frozen or dead host does not."""
+        """Call ``call`` repeatedly within the scheduler, unless the host is frozen or dead."""
         ended = False
 
         def run() -> None:
@@ -431,14 +433,14 @@ class SimulatedHost:
         """Do nothing: tasks have no priority."""
 
     def kill(self) -> None:
-        """End the process' task. Nothing that it does on the way out reaches the network."""
+        """End the process' task. Nothing that it does while unwinding reaches the network."""
         self._dead = True
         self._network.disconnect(self.name)
         raise Killed
 
     @property
     def frozen_for_s(self) -> float:
-        """How long the process has been frozen (s)."""
+        """Return for how long the process has been frozen (s)."""
         now_s = self._scheduler.now_s
         return now_s - self._frozen_since_s if now_s < self.frozen_until_s else 0.0
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cooperative scheduler in virtual time: tasks that run one at a time and hand over only where they
+"""Cooperative scheduler in virtual time: tasks run one at a time and hand over only where they
 wait.
 
-A task is a greenlet. It runs until it waits for a time or an item; the scheduler then advances
-virtual time to the next event and continues the task that it wakes. Events at equal times come in
-an order drawn from the seed, so that a seed repeats a run exactly and seeds differ in their
+A task is a greenlet. It runs until it waits for a time or an item. The scheduler then advances
+virtual time to the next event and continues the task that this wakes. Events at equal times come in
+an order drawn from the seed. A seed therefore repeats a run exactly, and seeds differ in their
 interleavings.
 """
 
@@ -28,21 +28,22 @@ class Killed(BaseException):
 
 
 Due = tuple[float, float]
-"""Virtual time (s) of an event, and its place among those of the same time."""
+"""Virtual time (s) of an event, and its rank among those of the same time."""
 NEVER: Due = (0.0, 0.0)
 """A time before all events."""
 SPREAD, WAKE_SPREAD = 32.0, 128.0
-"""How many later events of the same time may come before an event, and before a task that is woken
-continues.
+"""How many later events of the same time may precede an event, and precede the continuation of a
+woken task.
 """
 MOST_EVENTS = 1_000_000
-"""Most events at one virtual time without progress: a tick has a few hundred, with a flood 100,000.
+"""Most events at one virtual time without progress. A tick has a few hundred, with a flood
+100,000.
 """
 
 
 class Task:
-    """One task. ``result`` is its return value; ``error`` the traceback of the exception that ended
-    it, empty if none did.
+    """One task. ``result``: its return value. ``error``: traceback of the exception that ended it,
+    or empty.
 
     ``until_s``: virtual time (s) at which a pause ends, None without a limit. ``timer_s``: time of
     its pending timer.
@@ -91,8 +92,8 @@ class Scheduler:
         after: Due = NEVER,
         args: tuple[Any, ...] = (),
     ) -> Due:
-        """Schedule ``call(*args)`` at a virtual time (s), at once if it has passed, and not before
-        the event ``after``. Return when it comes. The call must not wait.
+        """Schedule ``call(*args)`` at a virtual time (s), or at once if that has passed, but not
+        before the event ``after``. Returns when it comes. The call must not wait.
         """
         self._count += 1
         now_s = self.now_s
@@ -111,11 +112,11 @@ class Scheduler:
         return task
 
     def run(self, limit_s: float, over: Callable[[], bool] | None = None) -> bool:
-        """Run until all tasks have ended; return False if they have not by ``limit_s``, or when
+        """Run until all tasks have ended. Returns False if they have not by ``limit_s`` or when
         ``over`` holds.
 
-        Also returns False after ``MOST_EVENTS`` events at one time without ``note_progress``: they
-        would go on forever.
+        It also returns False after ``MOST_EVENTS`` events at one time without ``note_progress``,
+        which would go on forever.
         """
         self._hub = getcurrent()
         self.note_progress()
@@ -133,8 +134,8 @@ class Scheduler:
         return True
 
     def note_progress(self) -> None:
-        """Note that events at the present time lead somewhere: without latency, a flight in
-        lock-step has a single time.
+        """Record that events at the present time make progress. Without latency, a lock-step flight
+        has a single time.
         """
         self._last_event = self._count + MOST_EVENTS
 
@@ -157,11 +158,11 @@ class Scheduler:
         else:
             until_s = self.now_s + timeout_s
             if until_s == self.now_s and timeout_s > 0.0:
-                # Below the resolution of virtual time: a reader that waits for its own, finer clock
+                # Below the resolution of virtual time: a reader that waits by its own, finer clock
                 # would wait forever.
                 until_s = math.nextafter(until_s, math.inf)
             task.until_s = until_s
-            # One timer per task: a pause that outlasts the pending one sets no other.
+            # One timer per task: a pause that ends after the pending timer sets no other.
             if until_s < task.timer_s:
                 self._set_timer(task, until_s)
         self._hub.switch()
@@ -171,7 +172,9 @@ class Scheduler:
         self.call_at(time_s, self._on_timer, args=(task,))
 
     def _on_timer(self, task: Task) -> None:
-        """Continue a task whose pause has ended, or wait for the end of its present pause."""
+        """Continue a task whose pause has ended, or set the timer for the end of its present
+        pause.
+        """
         if task.timer_s <= self.now_s:
             task.timer_s = math.inf
         until_s = task.until_s
@@ -183,10 +186,9 @@ class Scheduler:
             self._set_timer(task, until_s)
 
     def wake(self, task: Task) -> None:
-        """Continue a task that pauses, at the present time.
+        """Continue a pausing task at the present time.
 
-        Other events of this time are likelier to come first, so that a reader often finds several
-        messages.
+        Other events of this time tend to come first, so that a reader often finds several messages.
         """
         self._count += 1
         place = self._count + WAKE_SPREAD * self._draw()
@@ -200,12 +202,12 @@ class Scheduler:
 
     @property
     def running(self) -> Task | None:
-        """The task that runs now; None within a timed call."""
+        """Return the task that runs now; None within a timed call."""
         return self._running
 
     def _continue(self, task: Task, stamp: int) -> None:
         if task.done or task.waits != stamp:
-            return  # it was continued before
+            return  # it was already continued
         task.waits += 1
         task.until_s = None
         self._running = task
@@ -219,8 +221,8 @@ class Scheduler:
 class VirtualQueue(BoundedQueue[Any]):
     """A ``BoundedQueue`` whose reader waits in virtual time, by a clock of this rate.
 
-    ``before_take``, if any, runs in the reader's task before it takes an item. ``most``: most items
-    that have been in it.
+    ``before_take``: if given, runs in the reader's task before it takes an item. ``most``: largest
+    number of items so far.
     """
 
     def __init__(

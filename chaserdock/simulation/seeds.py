@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly many seeds, on several processes if asked to; shrink what fails, and check consistency over
-all of them.
+"""Flies many seeds, optionally on several processes. Shrinks cases that fail, and checks
+consistency over all seeds.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from .shrinking import shrink
 from .swarm import Case, draw_case
 
 _NOT_DOCKED = "ends in phase "
-"""Begin of the text on a chaser that should have docked, or should be safe."""
+"""Start of the text about a chaser that should have docked or be safe."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class SeedOptions:
 
 @dataclass(frozen=True)
 class UnflownSeed:
-    """A seed that could not be flown, and why."""
+    """A seed that could not be flown, and the reason."""
 
     seed: int
     reason: str
 
 
 def _load(options: SeedOptions) -> tuple[str, Scenario]:
-    """Return what cases extend, and the scenario. Raises ScenarioError if no seed can fly it."""
+    """Return what cases extend, and the scenario. Raises ScenarioError if it can fly no seed."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path)
     if not (options.images or scenario.target_model().markers):
@@ -90,10 +90,9 @@ def _fly(options: SeedOptions, seed: int) -> SimulationResult | UnflownSeed:
 def fly_seeds(
     options: SeedOptions, seeds: Iterable[int], jobs: int = 1
 ) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds, in their order. Raises ScenarioError at once if no seed can
-    be flown.
+    """Yield the results of the seeds in order. Raises ScenarioError at once if none can be flown.
 
-    With several ``jobs``, these processes end at once when the generator does.
+    The processes (``jobs``) end at once when the generator does.
     """
     _load(options)
     if jobs == 1:
@@ -113,7 +112,7 @@ def fly_seeds(
 
 
 class _Worker:
-    """A process that flies one seed after the other. ``turn``: the place of its ``seed`` in the
+    """A process that flies one seed after the other. ``turn``: position of its ``seed`` in the
     order of all.
     """
 
@@ -129,7 +128,7 @@ class _Worker:
         theirs.close()
 
     def answer(self) -> SimulationResult | UnflownSeed | ChaserdockError:
-        """Return what the process has sent; start another one if it has died."""
+        """Return what the process has sent. If it has died, start another one."""
         try:
             return self.connection.recv()
         except (EOFError, OSError):
@@ -148,7 +147,7 @@ class _Worker:
 
 
 def _work(options: SeedOptions, connection: Connection) -> None:
-    """Fly the seeds that arrive until the connection closes, and send back results, or errors that
+    """Fly the seeds that arrive until the connection closes. Sends back results, or errors that
     concern all seeds.
     """
     signal.signal(
@@ -166,7 +165,7 @@ def _work(options: SeedOptions, connection: Connection) -> None:
 def _fly_on(
     workers: Sequence[_Worker], seeds: Iterator[int]
 ) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds in their order; a worker that is free flies the next one."""
+    """Yield the results of the seeds in order; a free worker flies the next seed."""
     flying: dict[Connection, _Worker] = {}
     flown: dict[int, SimulationResult | UnflownSeed] = {}
     turns, turn = itertools.count(), 0
@@ -194,15 +193,15 @@ def _fly_on(
 
 
 def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
-    """Reduce the case of a result: yield flights of simpler and simpler cases with its first
-    violation, in other numbers.
+    """Reduce the case of a result: yield flights of ever simpler cases that have its first
+    violation, numbers aside.
     """
     first, flown = result.violations[0], result
     judges_docking = _NOT_DOCKED in first.text
 
     def violation_s(case: Case) -> float | None:
         nonlocal flown
-        # Without its command to approach, no chaser docks.
+        # Without a command to approach no chaser docks.
         if judges_docking and _approaches(case) != _approaches(result.case):
             return None
         try:
@@ -220,14 +219,14 @@ def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[Sim
 
 
 def _approaches(case: Case) -> int:
-    """Return the number of commands to approach."""
+    """Return the number of approach commands."""
     return sum(entry["command"] == "approach" for entry in case.get("timeline", ()))
 
 
 def _without_numbers(violation: Violation) -> tuple[str, str, str]:
-    """Return what violations of one defect share: invariant, subject and the words of the text.
+    """Return what violations of one defect share: invariant, subject, and text without numbers.
 
-    Of a chaser that has not docked, the phase and the reason may differ.
+    For a chaser that has not docked, phase and reason may differ.
     """
     subject, _, text = violation.text.partition(": ")
     if text.startswith(_NOT_DOCKED):
@@ -236,8 +235,8 @@ def _without_numbers(violation: Violation) -> tuple[str, str, str]:
 
 
 def write_case(result: SimulationResult, folder: Path) -> Path:
-    """Write a case that fails as a scenario file, with what it violates in its first lines; return
-    its path.
+    """Write a failing case as a scenario file whose first lines state what it violates. Returns its
+    path.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{Path(result.case['extends']).stem}-seed-{result.seed}.toml"
@@ -247,16 +246,16 @@ def write_case(result: SimulationResult, folder: Path) -> Path:
 
 
 def consistency(results: Iterable[SimulationResult]) -> tuple[float, int]:
-    """Return the mean NEES over the flights without lying sensors, each weighted equally, and their
-    number.
+    """Return the mean NEES over the flights without lying sensors, each weighted equally, and the
+    number of these flights.
     """
     means = [float(np.mean(r.nees)) for r in results if r.honest and r.nees]
     return (float(np.mean(means)) if means else float("nan")), len(means)
 
 
 def inconsistency(results: Iterable[SimulationResult]) -> str | None:
-    """Return why the estimate's covariance is inconsistent over an ensemble, None if it is not or
-    the ensemble is small.
+    """Return why the estimate's covariance is inconsistent over an ensemble; None if it is
+    consistent or the ensemble is small.
     """
     mean, number = consistency(results)
     if number < LEAST_FLIGHTS or LEAST_MEAN_NEES <= mean <= MOST_MEAN_NEES:

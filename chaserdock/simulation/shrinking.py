@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reduce a failing case: fewest faults, shortest duration, simplest values with the same violation.
+"""Reduces a failing case to fewest faults, shortest duration and simplest values with the same
+violation.
 
 Greedy delta debugging (A. Zeller, R. Hildebrandt, 2002): each pass proposes simpler cases, coarse
-ones first, and keeps one whenever it still fails, until a whole pass changes nothing.
+ones first, and keeps those that still fail, until a whole pass changes nothing.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ _SECTIONS = ("truth", "simulation", "controller")
 def shrink(
     case: Case, violation_s: Judge, violated_s: float, duration_s: float, attempts: int = 200
 ) -> Iterator[Case]:
-    """Yield simpler and simpler cases with the violation of ``case``, which is at ``violated_s`` of
+    """Yield ever simpler cases with the violation of ``case``, which occurs at ``violated_s`` of
     ``duration_s``.
 
-    ``violation_s`` returns the mission time of the violation in a case, None without it; it is
-    called ``attempts`` times at most.
+    ``violation_s`` returns the mission time of the violation in a case, None without it. It is
+    called at most ``attempts`` times.
     """
 
     def shorter(case: Case) -> Iterator[Case]:
@@ -69,9 +70,7 @@ def shrink(
 
 
 def _changed(case: Case, path: tuple[Any, ...], value: Any) -> Case:
-    """Return a copy with another value at a path; without the key, and without sections left empty,
-    for None.
-    """
+    """Return a copy with another value at a path. None removes the key, and sections left empty."""
     changed = copy.deepcopy(case)
     at: Any = changed
     for key in path[:-1]:
@@ -93,7 +92,7 @@ def _at(case: Case, path: tuple[str, ...]) -> Any:
 
 
 def _shorter(case: Case, violated_s: float, duration_s: float) -> Iterator[Case]:
-    """Yield the case cut soon after the violation; whether chasers dock is not judged in it."""
+    """Yield the case cut soon after the violation. It does not judge whether chasers dock."""
     for extra_s in (0.5, 2.0):
         end_s = math.ceil(2.0 * (violated_s + extra_s)) / 2.0
         if end_s < case.get("duration_s", duration_s):
@@ -124,8 +123,8 @@ def _without_items(case: Case) -> Iterator[Case]:
 
 
 def _without_keys(case: Case) -> Iterator[Case]:
-    """Yield the case without whole sections, then without single keys of them and of rows, and with
-    seed 0.
+    """Yield the case without whole sections, then without single keys of them and of rows, then
+    with seed 0.
     """
     for section in _SECTIONS:
         if section in case:
@@ -146,7 +145,7 @@ def _without_keys(case: Case) -> Iterator[Case]:
 
 
 def _earlier(case: Case) -> Iterator[Case]:
-    """Yield the case with one row at half the time."""
+    """Yield the case with one row moved to half its time."""
     for path in _LISTS:
         for k, row in enumerate(_at(case, path)):
             if (half_s := round(row.get("at_s", 0.0) / 2.0, 2)) >= 0.1:

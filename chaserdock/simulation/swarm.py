@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random flights: each seed draws a subset of the kinds of faults, and from these its faults,
-network and operator commands.
+"""Random flights: each seed draws a subset of the fault kinds, then its faults, network and
+operator commands.
 
-Leaving out most kinds in each flight finds more than mixing all of them always (A. Groce et al.,
-"Swarm testing", 2012). A flight is a ``Case``: the keys of a scenario file that extends a shipped
+Leaving out most kinds in each flight finds more than always mixing all (A. Groce et al., "Swarm
+testing", 2012). A flight is a ``Case``: the keys of a scenario file that extends a shipped
 scenario.
 """
 
@@ -28,7 +28,7 @@ RECEIVED = {
     "chaser": ["image", "odometry", "wrench"],
 }
 MESSAGE_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt")
-"""Kinds of faults of what a process receives."""
+"""Kinds of faults of received messages."""
 PUBLISHED = {
     "world": ["image", "odometry"],
     "controller": ["wrench"],
@@ -36,8 +36,8 @@ PUBLISHED = {
 }
 
 LONG_EVERY, RECOVERY_S = 4, 10.0
-"""One seed in so many flies on until docking can be judged: so long (s) after the last disturbance,
-and as long as an approach.
+"""One seed in LONG_EVERY flies on until docking can be judged: RECOVERY_S (s) after the last
+disturbance plus the time of an approach.
 """
 
 Case = dict[str, Any]
@@ -49,7 +49,7 @@ def draw_fault(
 ) -> dict[str, Any]:
     """Return a random fault of a kind, as in a scenario file, that begins before ``latest_s``.
 
-    ``ports``: chasers that have one; a fault of a latch needs one.
+    ``ports``: chasers with a port; latch faults need one.
     """
     names = [f"chaser/{i}" for i in range(chasers)]
     fault: dict[str, Any] = {"kind": kind, "at_s": round(draw.uniform(0.5, latest_s), 2)}
@@ -100,19 +100,21 @@ def _draw_severity(kind: str, draw: random.Random) -> dict[str, Any]:
 def draw_case(
     name: str, seed: int, scenario: Scenario, *, images: bool = False, mode: str | None = None
 ) -> Case:
-    """Return the flight of a seed: a variant of scenario ``name``, which is ``scenario`` when
-    loaded.
+    """Return the flight of a seed: a variant of scenario ``name``, of which ``scenario`` is the
+    loaded form.
     """
     draw, chasers, end_s = (
         random.Random(f"swarm {seed}"),
         len(scenario.chasers),
         scenario.duration_s,
     )
+
     case: Case = {"extends": name, "name": f"seed-{seed}", "seed": seed % 2**32}
     if not images:
         case["perception"] = {"name": "statistical"}
     standby = scenario.controller.standby or draw.random() < 0.5
     case["controller"] = {"standby": standby}
+
     kinds = [kind for kind in KINDS if draw.random() < 0.25]
     ports = [i for i in range(chasers) if scenario.docking.port_of(i) is not None]
     kinds += [kind for kind in LATCH_KINDS if ports and draw.random() < 0.25]
@@ -124,6 +126,7 @@ def draw_case(
         if standby and fault["process"] == "controller" and draw.random() < 0.3:
             fault["process"] = "standby"
     case["fault"] = faults
+
     case["simulation"] = _draw_network(draw, chasers, end_s, standby)
     if mode is not None:
         case["simulation"]["mode"] = mode
@@ -131,21 +134,22 @@ def draw_case(
         case["truth"] = truth
     if commands := _draw_commands(draw, scenario):
         case["timeline"] = commands
+
     devices = random.Random(f"devices {seed}")
     faults += _draw_device_faults(devices, scenario)
     if failures := _draw_thruster_failures(devices, scenario):
         case["thruster_failure"] = failures
-    # A stream of its own, so that seeds without such a fault fly as before it was drawn.
+
+    # A stream of its own, so that other seeds fly as they did before this fault existed.
     faults += _draw_other_faults(random.Random(f"others {seed}"), scenario, standby)
+
     if seed % LONG_EVERY == 0:
         case["duration_s"] = _long_enough_s(case, scenario)
     return case
 
 
 def _long_enough_s(case: Case, scenario: Scenario) -> float:
-    """Return the duration (s) of a flight in which the chasers have the time to dock after the last
-    disturbance.
-    """
+    """Return the duration (s) that leaves the chasers time to dock after the last disturbance."""
     rows = (
         [e.model_dump() for e in scenario.timeline] if "timeline" not in case else case["timeline"]
     )
@@ -160,8 +164,8 @@ def _long_enough_s(case: Case, scenario: Scenario) -> float:
 
 
 def _draw_device_faults(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:
-    """Return at most one fault of the messages of thrusters or docking sensors, where a scenario
-    has them.
+    """Return at most one fault of thruster or docking sensor messages, if the scenario has these
+    devices.
     """
     readers = [("controller", "thrusters")] if scenario.chaser.actuation == "thrusters" else []
     if scenario.docking.kind == "capture":
@@ -176,7 +180,8 @@ def _draw_other_faults(
     draw: random.Random, scenario: Scenario, standby: bool
 ) -> list[dict[str, Any]]:
     """Return at most one fault: of the leases that a controller receives, a controller that is cut
-    off, or a flood of leases or of a device's messages."""
+    off, or a flood of leases or of a device's messages.
+    """
     if draw.random() > 0.15:
         return []
     controllers = ["controller", *(["standby"] if standby else [])]
@@ -202,14 +207,16 @@ def _draw_other_faults(
 def _draw_message_fault(
     kind: str, draw: random.Random, scenario: Scenario, choices: Sequence[tuple[str, str]]
 ) -> dict[str, Any]:
-    """Return a fault of one of the ``choices``, process and topic."""
+    """Return a fault for one of the ``choices`` of process and topic."""
     fault = draw_fault(kind, draw, len(scenario.chasers), 0.8 * scenario.duration_s)
     fault["process"], fault["topic"] = draw.choice(choices)
     return fault
 
 
 def _draw_thruster_failures(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:
-    """Return the scenario's thruster failures and one more; mostly, and without thrusters, none."""
+    """Return the scenario's thruster failures, sometimes with one more; usually, and without
+    thrusters, none.
+    """
     if scenario.chaser.actuation != "thrusters" or draw.random() > 0.3:
         return []
     failures = [f.model_dump(exclude_none=True) for f in scenario.thruster_failure]
@@ -248,6 +255,7 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
 
     section: dict[str, Any] = {"mode": draw.choice(["lockstep", "realtime", "realtime"])}
     section["latency_s"] = draw.choice([0.0, 0.0005, 0.002, 0.01])
+
     for key, values in (
         ("jitter_s", [0.0005, 0.002, 0.01]),
         ("loss", [0.001, 0.01, 0.05]),
@@ -256,17 +264,20 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
     ):
         if draw.random() < 0.3:
             section[key] = draw.choice(values)
+
     if draw.random() < 0.3:
         section["partition"] = [
-            # All others are on the side of the world.
+            # All others are on the world's side.
             {**window(), "processes": sorted(draw.sample(names[1:], draw.choice([1, 1, 2])))}
             for _ in range(draw.choice([1, 1, 2]))
         ]
+
     if draw.random() < 0.25:
         reader = draw.choice([*names, "recorder"])
         section["slow"] = [
             {**window(), "process": reader, "each_s": draw.choice([0.001, 0.005, 0.02])}
         ]
+
     if draw.random() < 0.3:
         wrong = draw.sample(names, draw.choice([1, 2]))
         section["clock"] = [
@@ -279,11 +290,12 @@ def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool
         ]
         for clock in section["clock"]:
             clock["drift"] = max(-0.05, min(0.05, clock["drift"]))
+
     return section
 
 
 def _draw_truth(draw: random.Random) -> dict[str, Any]:
-    """Return a section ``[truth]``: mostly none."""
+    """Return a section ``[truth]``, usually empty."""
     if draw.random() > 0.3:
         return {}
     chaser = {
@@ -298,7 +310,7 @@ def _draw_truth(draw: random.Random) -> dict[str, Any]:
 
 
 def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:
-    """Return a timeline: that of the scenario and random operator commands; empty without any."""
+    """Return a timeline: the scenario's, with random operator commands; may be empty."""
     if draw.random() > 0.3:
         return []
     timeline = [e.model_dump(exclude_none=True) for e in scenario.timeline]
@@ -309,7 +321,7 @@ def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, An
         entry["chasers"] = [chaser]
         if command == "goto":
             position_m = scenario.chasers[chaser].position_m
-            # The farthest reference less 0.1 %, for what rounding adds.
+            # The farthest allowed reference, less 0.1 % for rounding.
             farthest_m = 0.999 * scenario.limits.max_reference_distance_m
             share = min(1.3, farthest_m / (math.hypot(*position_m) or 1.0))
             entry["offset_m"] = [round(share * x, 3) for x in position_m]

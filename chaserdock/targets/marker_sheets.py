@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 
 SHEETS_MM = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 _EDGE_MM, _GAP_MM, _TEXT_MM, _MARK_MM, _LINE_MM = 12.0, 8.0, 3.0, 3.0, 0.1
-"""Margin, which printers leave blank; between markers, for scissors; height of text; length of
-cutting marks; width of lines."""
-# Footer of a sheet: a ruler to check the scale, and the sheet's name.
+"""Lengths, mm: margin, which printers leave blank; gap between markers, for scissors; height of
+text; length of cutting marks; width of lines.
+"""
+# Footer of a sheet, mm: a ruler to check the scale, and the sheet's name.
 _FOOT_MM = 14.0
 _MM_PER_INCH = 25.4  # exact
 _POINTS_PER_MM = 72.0 / _MM_PER_INCH
@@ -36,8 +37,8 @@ _STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fontty
 
 @dataclass
 class Sheet:
-    """What is printed on one sheet, mm: black ``rectangles`` (x, y, width, height), ``lines`` (x0,
-    y0, x1, y1) and ``texts`` (x, y of the baseline, text).
+    """Content of one sheet, mm: black ``rectangles`` (x, y, width, height), ``lines`` (x0, y0, x1,
+    y1), ``texts`` (x, y of the baseline, text).
     """
 
     size_mm: tuple[float, float]
@@ -49,7 +50,7 @@ class Sheet:
 def write_sheets(
     model: TargetModel, out: Path, size_mm: tuple[float, float]
 ) -> tuple[int, list[Path]]:
-    """Write one PDF, or one SVG per sheet (numbered if several); return the number of sheets and
+    """Write one PDF, or one SVG per sheet (numbered if several). Returns the number of sheets, and
     the files.
 
     Raise ValueError for a marker that does not fit on a sheet or is not in its dictionary.
@@ -70,8 +71,11 @@ def write_sheets(
 
 
 def lay_out(model: TargetModel, size_mm: tuple[float, float]) -> list[Sheet]:
-    """Place all markers in rows, large ones first, each with its white border up to the next marker
-    or the edge of its face. Raise ValueError as ``write_sheets`` does."""
+    """Place all markers in rows, large ones first. Each has its white border up to the next marker
+    or the edge of its face.
+
+    Raise ValueError as ``write_sheets``.
+    """
     width, height = size_mm
     sheets: list[Sheet] = []
     x = y = row = 0.0
@@ -105,7 +109,7 @@ def lay_out(model: TargetModel, size_mm: tuple[float, float]) -> list[Sheet]:
 def _place(
     sheet: Sheet, dictionary: str, marker: Marker, at: tuple[float, float], margin: float
 ) -> None:
-    """Add a marker with a white ``margin`` ``at`` (x, y), crop marks at its corners, and its id
+    """Add a marker ``at`` (x, y) with a white ``margin``, crop marks at its corners, and its id
     below.
     """
     cells = marker_bits(dictionary, marker.id)
@@ -140,7 +144,7 @@ def marker_bits(dictionary: str, marker_id: int) -> NDArray[np.int64]:
 
 
 def _figure_of(sheet: Sheet) -> Figure:
-    """Return the sheet as a matplotlib figure of its size: one unit of the transform is one
+    """Return the sheet as a matplotlib figure of its size; one unit of the transform is a
     millimetre of paper.
     """
     width, height = (length / _MM_PER_INCH for length in sheet.size_mm)
@@ -151,7 +155,7 @@ def _figure_of(sheet: Sheet) -> Figure:
     cells = [
         unit.transformed(Affine2D().scale(a, b).translate(x, y)) for x, y, a, b in sheet.rectangles
     ]
-    # One path for all cells: a renderer leaves no seams between adjacent parts of one path.
+    # One path for all cells: within a path, renderers leave no seams between adjacent parts.
     squares = PathPatch(
         MplPath.make_compound_path(*cells), facecolor="black", linewidth=0.0, antialiased=False
     )

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Address of the viewer's page and admission of connections. Imports no viser: the launcher uses
-it, too.
+"""Address of the viewer's page, and admission of connections. Imports no viser, since the launcher
+uses it.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from chaserdock_protocol.errors import ChaserdockError
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
-"""First TCP port that is tried: the usual one of a local page."""
+"""First TCP port that is tried: the usual one of local pages."""
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _TRIES = 20
-"""Ports that are tried. Chosen."""
+"""Number of ports that are tried. Larger: more viewers can run at once."""
 TOKEN_VARIABLE = "CHASERDOCK_VIEWER_TOKEN"
-"""Environment variable with the token of the page: unlike an argument, other users cannot read it.
+"""Environment variable with the token of the page. Other users cannot read it, unlike an
+argument.
 """
 
 
@@ -54,7 +55,7 @@ def free_port(host: str, port: int | None) -> int:
 
 
 def page_token() -> str:
-    """Return the token of the page: that of the environment, otherwise a random one. Raise
+    """Return the token of the page: that of the environment, or else a random one. Raise
     ViewError.
     """
     token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
@@ -72,9 +73,7 @@ def url_of(host: str, port: int, token: str) -> str:
 
 
 def path_below_token(path: str, token: str) -> str | None:
-    """Return the path and query of a request without the token in front, or None if it has no valid
-    token.
-    """
+    """Return path and query of a request without the token in front; None without a valid token."""
     found = re.fullmatch(r"/?([^/?]*)(.*)", path, re.DOTALL)
     assert found is not None  # all parts are optional
     first, rest = found.groups()
@@ -87,8 +86,8 @@ def is_own_origin(origins: Sequence[str], requested_hosts: Sequence[str], host: 
     """Return whether a web socket is opened by the viewer's page (``Origin`` equals ``Host``) or by
     a program (no ``Origin``).
 
-    ``origins``, ``requested_hosts``: values of these headers, of which a request states at most one
-    and exactly one. On a loopback address ``Host`` must be a loopback name, which prevents DNS
+    ``origins``, ``requested_hosts``: values of these headers; a valid request has at most one and
+    exactly one. On a loopback address ``Host`` must be a loopback name, which prevents DNS
     rebinding.
     """
     if len(origins) > 1 or len(requested_hosts) != 1:

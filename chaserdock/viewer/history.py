@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""History of a mission: series over simulated time, trails and event lines, bounded in memory."""
+"""History of a mission, bounded in memory: series over simulated time, trails, event lines."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ from chaserdock.analysis.mass_properties import values_of
 from .snapshot import TARGET, keep_newest
 
 MOST_POINTS = 40_000
-"""Most points of a curve: an hour at 10 Hz, and thinned beyond that. Chosen, for memory."""
+"""Most points of a curve: an hour at 10 Hz; longer ones are thinned. Larger: more memory."""
 _MOST_LINES = 500
-"""Most lines of the event list, and an eighth of the most points of a trail. Chosen, for memory.
+"""Most lines of the event list. Larger: more memory. A trail has at most eight times as many
+points.
 """
 
 ChartQuantity = Literal[
@@ -56,7 +57,7 @@ ChartQuantity = Literal[
 
 
 class Series:
-    """Values in order of time; beyond the maximum length every second one is dropped."""
+    """Values in order of time. Beyond the largest length every second one is dropped."""
 
     def __init__(self, most: int = MOST_POINTS) -> None:
         self._most = most
@@ -119,8 +120,8 @@ class Trail:
 
 
 class History:
-    """What the page shows of the past: ``series`` by quantity and chaser (None: of the mission),
-    ``trails`` by chaser, and ``lines`` of events.
+    """Past of a mission as the page shows it: ``series`` by quantity and chaser (None: of the
+    mission), ``trails`` by chaser, ``lines`` of events.
     """
 
     def __init__(self, chasers: int) -> None:
@@ -134,11 +135,11 @@ class History:
         self._target: TargetEstimate | None = None
 
     def add_exposure(self, chaser: int, tick: int, sent_ns: int) -> None:
-        """Add the wall-clock time at which an image was sent."""
+        """Record the wall-clock time at which an image was sent."""
         keep_newest(self._exposed[chaser], tick, sent_ns)
 
     def update(self, topic: Topic, message: Any, sent_ns: int) -> None:
-        """Add a message and the sender's wall-clock time."""
+        """Add a message. ``sent_ns``: the sender's wall-clock time."""
         if topic is topics.IMAGE:
             self.add_exposure(message.chaser, message.tick, sent_ns)
         elif topic is topics.ACTUATORS:
@@ -174,8 +175,9 @@ class History:
                 self.rejected[message.process] = sum(message.rejected.values()) + message.lost
 
     def _add_identification(self, message: StackEstimate) -> None:
-        """Add the standard deviations of the target: of the mass, of the centre of mass per axis at
-        the worst, and of the worst element of the inertia as a share of the largest moment."""
+        """Add standard deviations of the target: of its mass; of its centre of mass, worst axis; of
+        its inertia, worst element as a share of the largest moment.
+        """
         time_s, (values, sigmas) = message.sim_time_ns / 1e9, values_of(message.target)
         self.series["mass_sigma_percent", None].add(time_s, 100.0 * float(sigmas[0] / values[0]))
         self.series["centre_sigma_mm", None].add(time_s, 1e3 * float(sigmas[1:4].max()))
@@ -219,7 +221,8 @@ class History:
         target = self._target
         if target is None or odometry.chaser >= len(self.trails):
             return
-        # The estimate is about one tick older than the odometry: extrapolate it to the same time.
+        # The estimate is about one tick older than the odometry, so it is extrapolated to the same
+        # time.
         later_s = (odometry.sim_time_ns - target.sim_time_ns) / 1e9
         position = np.add(target.position_m, np.multiply(target.velocity_m_s, later_s))
         attitude = rotations.integrate(target.q_wxyz, target.omega_rad_s, later_s)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Viewer of a running mission: receives messages, draws, sends commands. A process of its own.
+"""Viewer of a running mission: receives messages, draws, sends commands. Runs as a process of its
+own.
 
-It keeps only the newest messages of each topic, the rest is dropped inside Zenoh: a blocked browser
+It keeps only the newest messages of each topic; Zenoh drops the rest. A blocked browser therefore
 never delays the mission. After the end of a mission it waits for the next one.
 """
 
@@ -36,18 +37,25 @@ from .snapshot import OF_CHASERS, MissionState
 PERIOD_S = 0.1
 """Time (s) between two drawings: as long as a tick of 10 Hz."""
 _STATES, _EVENTS = 16, 256
-"""Messages of a state and of events that may wait for a drawing. Chosen; 16 states last
-1.6 s at 10 Hz."""
+"""Messages of a state, and of events, that may wait for drawing: 16 states are 1.6 s at 10 Hz.
+Larger: after a pause old states are shown first; smaller: messages of a slow drawing are lost.
+"""
 _REPLY_TIMEOUT_S = 5.0
-"""Time (s) that a controller has to answer a command of the page. Chosen."""
+"""Time (s) that a controller has to answer a command of the page. Larger: a missing answer is
+reported later; smaller: answers of busy machines are missed.
+"""
 _SILENCE_S = 3.0
-"""Time (s) without messages after which a new mission is looked for. Chosen."""
+"""Time (s) without messages after which a new mission is searched. Smaller: pauses of a mission
+pass for its end.
+"""
 _JOIN_PERIOD_S = 2.0
-"""Time (s) between two attempts to find it. Chosen."""
+"""Time (s) between two attempts to find a mission. Larger: it is shown later; smaller: more
+requests.
+"""
 _RECONNECT_S = 10.0
-"""Time (s) without an answer after which the session is opened again. Chosen."""
+"""Time (s) without an answer after which the session is opened again: several attempts."""
 _DRAWING_NICE = 10
-"""Priority (nice) of drawing: below that of missions on the same machine, half of the range."""
+"""Priority (nice) of drawing: half of the range below that of missions on the same machine."""
 _ATTEMPT_S = 2.0
 """Longest time (s) of one attempt to connect to a router."""
 _WAITING = "no mission is running"
@@ -55,7 +63,7 @@ _WAITING = "no mission is running"
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Address and content of the page. ``truth``: subscribe to ground truth, if access rights allow
+    """Address and content of the page. ``truth``: subscribe to ground truth if access rights allow
     it.
     """
 
@@ -73,8 +81,8 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
     with ThreadPoolExecutor(1, "session") as opener:
         opener.submit(int).result()
         # Only drawing has a low priority. Zenoh's threads inherit the priority of the thread that
-        # opens the session (nice(2) applies to a thread), and an unread link would delay its
-        # publishers.
+        # opens the session (nice(2) applies to a thread), and a link that is read too slowly would
+        # delay its publishers.
         os.nice(_DRAWING_NICE)
 
         def connect() -> Node:
@@ -103,9 +111,9 @@ class _Stopped(Exception):
 
 
 class _Patience:
-    """Opens a node as soon as a router accepts the connection; says once that none does.
+    """Opens a node as soon as a router accepts the connection; reports once that none does.
 
-    Each attempt takes ``_ATTEMPT_S`` at most, in native code, where no signal is handled. Raises
+    An attempt takes at most ``_ATTEMPT_S``, in native code, where no signal is handled. Raises
     _Stopped.
     """
 
@@ -123,7 +131,7 @@ class _Patience:
         raise _Stopped
 
 
-# One instance for all join requests: the world treats another instance as a replacement.
+# One instance for all join requests: the world would treat another one as a replacement.
 _INSTANCE = unique_id()
 
 
@@ -136,8 +144,8 @@ def _join(node: Node) -> JoinReply | None:
 def _next_mission(
     connect: Callable[[], Node], server: viser.ViserServer, past: str, stop: StopSignal
 ) -> JoinReply | None:
-    """Wait for a mission other than ``past``; return None when stopped. The page shows the
-    status.
+    """Wait for a mission other than ``past`` and show the status on the page. Returns None when
+    stopped.
     """
     shown = None
     notice = server.gui.add_markdown("") if not past else None
@@ -158,7 +166,7 @@ def _next_mission(
 
 @dataclass
 class _Feed:
-    """Subscriptions of a mission, ordered so that no message precedes its cause."""
+    """Subscriptions of a mission, ordered so that no message comes before its cause."""
 
     subscriptions: list[Callable[[], list[ReceivedMessage]]] = field(default_factory=list)
 
@@ -191,7 +199,7 @@ class _Feed:
 
 
 class _MissionView:
-    """Shows one mission, until another one starts."""
+    """Shows one mission until another one starts."""
 
     def __init__(
         self,
@@ -220,7 +228,7 @@ class _MissionView:
         )
 
     def run(self, stop: StopSignal) -> None:
-        """Receive and draw at most ten times per second, with a duty cycle of at most one half."""
+        """Receive and draw at most ten times per second, for at most half of the time."""
         operator = threading.Thread(target=self._operate, name="operator", daemon=True)
         operator.start()
         joined_s = connected_s = time.monotonic()
@@ -243,7 +251,7 @@ class _MissionView:
                     ):
                         return
                     if reply is None and begun_s - connected_s > _RECONNECT_S:
-                        # Between peers, Zenoh does not reopen a link that was closed because it was
+                        # Between peers Zenoh does not reopen a link that it closed because it was
                         # not read.
                         connected_s = begun_s
                         self._node.close()
@@ -276,7 +284,7 @@ class _MissionView:
             self._paces.append((self._received_s, self._state.time_s()))
 
     def _speed(self) -> float | None:
-        """Return simulated time over wall time during the last seconds."""
+        """Return simulated over wall time during the last seconds; None if unknown."""
         if len(self._paces) < 2:
             return None
         (begin, first), (end, last) = self._paces[0], self._paces[-1]

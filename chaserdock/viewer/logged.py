@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random access to a log for the viewer: indexed in one pass, images stay in the file."""
+"""Random access to a log for the viewer: one pass builds an index, images stay in the file."""
 
 from __future__ import annotations
 
@@ -46,9 +46,10 @@ _DECODED = (
     topics.TICK,
     *_EVENT_TOPICS,
 )
-"""Topics of the plots and of the event list, decoded while the log is indexed."""
+"""Topics of the plots and the event list; they are decoded while the log is indexed."""
 _CHUNKS_KEPT = 24
-"""Decoded chunks of a log that are kept. Chosen, for memory.
+"""Decoded chunks of a log that are kept. Larger: more memory; smaller: moving back and forth
+decodes again.
 """
 
 
@@ -63,7 +64,7 @@ _exposure = msgspec.msgpack.Decoder(_Exposure)
 
 
 class LoggedMission:
-    """A recorded mission: ``history`` covers all of it, ``at`` returns the state at any time.
+    """A recorded mission. ``history``: covers all of it. ``at``: returns the state at any time.
     Raises LogError.
     """
 
@@ -75,8 +76,8 @@ class LoggedMission:
         self.truth = False
         self._chunks: list[tuple[Path, int]] = []
         self._channels: dict[Path, dict[int, Channel]] = {}
-        # By key: for each chunk with messages of that key, the time of the first one and the
-        # chunk's number. One entry per message would take 0.5 GB for ten hours.
+        # By key: for each chunk with messages of that key, the time of the first one and the number
+        # of the chunk. One entry per message would take 0.5 GB for ten hours.
         self._index: dict[str, tuple[array[int], array[int]]] = defaultdict(
             lambda: (array("q"), array("l"))
         )
@@ -113,7 +114,8 @@ class LoggedMission:
         topic = found[0]
         if key in self._shown:
             times, chunks = self._index[key]
-            # A log is ordered by arrival; within a key by time, except for late messages.
+            # A log is in order of arrival; within a key that is the order of time, except for late
+            # messages.
             self._latest[key] = max(stored.log_time, self._latest[key])
             if not chunks or chunks[-1] != chunk:
                 times.append(self._latest[key])
@@ -151,7 +153,7 @@ class LoggedMission:
         return out
 
     def at(self, time_s: float) -> MissionState:
-        """Return the state at a simulated time: the latest message of every key up to then. Raise
+        """Return the state at a simulated time: the latest message of every key until then. Raise
         LogError.
         """
         state, until = MissionState.empty(self.chasers), round(time_s * 1e9) + 1
@@ -160,8 +162,8 @@ class LoggedMission:
             last = bisect_right(times, until) - 1
             if last < 0:
                 continue
-            # The first message of the chunk counts whatever its own time: an earlier one had a
-            # later time.
+            # The first message of the chunk counts whatever its own time, since an earlier one had
+            # a later time.
             first, *more = self._chunk(chunks[last])[key]
             channel, stored = first
             for later in more:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Panels of the page: state, commands, images, plots, events, and the time line of a log."""
+"""Panels of the page: state, commands, images, plots, events, and the timeline of a log."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from .snapshot import MissionState
 
 COMMANDS = ("approach", "hold", "retreat")
 ABORT = "abort"
-"""The command that needs a confirmation."""
+"""The command that must be confirmed."""
 SendCommand = Callable[[str, int], None]
 
 _IMAGE_PX = 400
-"""Width (px) of each camera's image. Chosen."""
+"""Width (px) of each camera's image. Larger: more load of the browser."""
 _ALL = "all cameras"
 _ENLARGED_PX = 800
-"""Width (px) of one camera's image: as wide as two tiles."""
+"""Width (px) when one camera is shown: that of two tiles."""
 _SLOW_S = 0.5
-"""Time (s) between two updates of text and plots. Chosen; faster ones cannot be read."""
+"""Time (s) between two updates of text and plots. Smaller: they change too fast to be read."""
 _IMAGES_S = 0.25
-"""Time (s) between two updates of images. Chosen, for the load of the browser."""
+"""Time (s) between two updates of images. Smaller: smoother images, more load of the browser."""
 _GRID = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
 
 
 @dataclass
 class Timeline:
-    """Playback position of a log: written by the controls, read by the player."""
+    """Playback position of a log, written by the controls and read by the player."""
 
     end_s: float
     at_s: float = 0.0
@@ -54,7 +54,7 @@ class Timeline:
 
 
 def _confirm_abort(gui: Any, chaser: int, command: SendCommand) -> None:
-    """Ask whether a chaser is to abort, and send the command if so."""
+    """Ask for confirmation of an abort, then send the command."""
     dialog = gui.add_modal(f"Abort chaser {chaser}?")
     with dialog:
         gui.add_markdown(f"Chaser {chaser} leaves its task and flies away from the target.")
@@ -75,8 +75,8 @@ SPEEDS = ("0.25", "0.5", "1", "2", "5", "10", "20")
 
 
 class Page:
-    """The page of one mission, shared by all tabs. ``command`` is called on viser's threads; None:
-    no buttons.
+    """The page of one mission, shared by all tabs. ``command``: called on viser's threads; None for
+    a page without buttons.
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class Page:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected."""
+        """Return whether a browser is connected."""
         return bool(self._server.get_clients())
 
     def show_reply(self, text: str) -> None:
@@ -272,7 +272,7 @@ class Page:
     def draw(
         self, state: MissionState, history: History, mode: str, speed: float | None, lost: set[str]
     ) -> None:
-        """Draw the scene and one chaser's image; twice per second also text and plots."""
+        """Draw the scene and the images; text and plots twice per second only."""
         slow = time.monotonic() - self._drawn_s >= _SLOW_S
         with self._server.atomic():
             self._scene_view.draw(state, history, slow)
@@ -306,7 +306,9 @@ class Page:
                 chart.data = points_of(plot, history, 0.0, state.time_s())
 
     def _draw_image(self, state: MissionState) -> None:
-        """Draw the images that have changed, all at once: the tiles show the same moment."""
+        """Draw the images that have changed, all at once, so that the tiles show the same
+        moment.
+        """
         if time.monotonic() - self._images_s < _IMAGES_S:
             return
         enlarged, changed = self._enlarged, False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Viewer of a log: the page with a time line."""
+"""Viewer of a log: the page with a timeline."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def view_log(
 
 
 def advance(line: Timeline, wall_s: float) -> None:
-    """Advance a playing time line by ``wall_s`` of wall time; it stops at its end."""
+    """Advance a playing timeline by ``wall_s`` of wall time; it stops at its end."""
     if line.moved:  # the slider has just been moved
         line.moved = False
         return

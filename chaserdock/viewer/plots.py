@@ -14,11 +14,11 @@ from chaserdock.analysis.plots import SERIES
 from .history import ChartQuantity, History
 
 POINTS = 240
-"""Maximum number of points of a curve: about one per pixel."""
+"""Largest number of points of a curve: about one per pixel."""
 
 COLOURS = SERIES
-"""Colours of the chasers, those of the figures and the film; beyond the last they repeat, with
-dashed curves.
+"""Colours of the chasers, as in figures and video. Beyond the last one they repeat with dashed
+curves.
 """
 ESTIMATE_COLOUR = "#e0a800"
 
@@ -38,9 +38,11 @@ class Plot:
 def plots_of(
     chasers: int, truth: bool, ports: Sequence[int] = (), identified: bool = False
 ) -> tuple[Plot, ...]:
-    """Return the plots of the page; the estimation error and the loads at the ports of the chasers
-    ``ports`` only with ground truth; the uncertainty of the target's mass properties only if they
-    are ``identified``."""
+    """Return the plots of the page.
+
+    ``truth``: with estimation error and loads at the ports of the chasers ``ports``.
+    ``identified``: with uncertainty of the target's mass properties.
+    """
 
     def each(quantity: ChartQuantity, numbers: Iterable[int] = range(chasers)) -> tuple[Curve, ...]:
         return tuple((f"chaser {i}", COLOURS[i % len(COLOURS)], quantity, i) for i in numbers)
@@ -70,8 +72,8 @@ def points_of(plot: Plot, history: History, begin_s: float, until_s: float) -> t
     """Return times (K,) and the values (K,) of each curve, 2 <= K <= ``POINTS``; zeros without
     data.
 
-    Each value is the maximum of an equal time bin, so that no peak is lost. A curve without a value
-    in a bin of another curve keeps its previous value.
+    Each value is the maximum of an equal time bin, so that peaks stay visible. A curve without a
+    value in a bin of another curve keeps its previous value.
     """
     series = [
         history.series[quantity, chaser].until(until_s) for _, _, quantity, chaser in plot.curves

@@ -24,12 +24,16 @@ from .snapshot import MissionState, Pose, pose_of
 
 ViewFrom = Literal["beside the target", "on the target", "the world"]
 VIEWS: tuple[ViewFrom, ...] = get_args(ViewFrom)
-"""Frame fixed on the screen: world axes at the target's position; target frame; world frame."""
+"""Frames that can be fixed on the screen: world axes at the target's position; target frame; world
+frame.
+"""
 
 TRAIL_S = 60.0
-"""Time (s) of the path behind each chaser. Chosen."""
+"""Time (s) of the path drawn behind each chaser. Larger: more of the manoeuvre, more crossing
+lines.
+"""
 _VIEW_M = 0.22
-"""Length (m) of the drawn field of view of a camera. Chosen."""
+"""Length (m) of the drawn camera frustum; for display only, about the size of a chaser."""
 _STARS_M = 100.0
 """Distance of the stars, m: far outside the scene."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -40,7 +44,7 @@ def _rgb(colour: str) -> tuple[int, int, int]:
 
 
 class SceneView:
-    """Scene of one mission. The pose of the root node ``/scene`` realizes the fixed frame."""
+    """Scene of one mission. The pose of the root node ``/scene`` keeps the chosen frame fixed."""
 
     def __init__(self, server: viser.ViserServer, scenario: FlightScenario) -> None:
         self._scenario = scenario
@@ -48,6 +52,7 @@ class SceneView:
         scene.configure_default_lights(cast_shadow=False)
         self._root = scene.add_frame("/scene", show_axes=False)
         self._add_space()
+
         bodies = scene_of(scenario)
         self._target = self._body("/scene/target", shapes.mesh_of(bodies.target))
         self._estimate = scene.add_frame("/scene/estimate", axes_length=0.25, axes_radius=0.003)
@@ -55,17 +60,20 @@ class SceneView:
         self._lines(
             "/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0
         )
+
         self._keep_out_m = scenario.limits.min_distance_target_m
         self._keep_out = self._lines(
             "/scene/estimate/keep_out", shapes.sphere(self._keep_out_m), (176, 118, 128), 1.0
         )
         self._keep_out.visible = False
+
         self._chasers: list[Any] = []
         self._plans: list[Any] = []
         self._references: list[Any] = []
         self._trails: list[Any] = []
         self._corridors: list[Any] = []
         self._frustums: list[Any] = []
+
         camera = scenario.camera_model()
         for i in range(len(scenario.chasers)):
             colour = _rgb(COLOURS[i % len(COLOURS)])
@@ -74,6 +82,7 @@ class SceneView:
             scene.add_label(
                 f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2])
             )
+
             self._frustums.append(
                 scene.add_camera_frustum(
                     f"{name}/camera",
@@ -88,6 +97,7 @@ class SceneView:
                     cast_shadow=False,
                 )
             )
+
             self._plans.append(
                 self._lines(f"/scene/plan_{i}", shapes.polyline(np.zeros((0, 3))), colour, 3.0)
             )
@@ -96,22 +106,25 @@ class SceneView:
                     f"/scene/reference_{i}", axes_length=0.08, axes_radius=0.0025, visible=False
                 )
             )
+
             trail = self._lines(
                 f"/scene/estimate/trail_{i}", shapes.polyline(np.zeros((0, 3))), colour, 1.0
             )
             self._trails.append(trail)
+
             corridor = shapes.corridor_of(scenario, i)
             if corridor is not None:
                 self._corridors.append(
                     self._lines(f"/scene/estimate/corridor_{i}", corridor, colour, 1.0)
                 )
+
         self.view: ViewFrom = VIEWS[0]
         far = 2.0 * max(math.hypot(*c.position_m) for c in scenario.chasers)
         server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
 
     def _add_space(self) -> None:
-        """Add the stars of the simulated images on black, whatever the theme of the page."""
+        """Add the stars of the simulated images, on black whatever the theme of the page."""
         self._scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
         directions, levels = star_field()
         self._scene.add_point_cloud(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Web server of the page: viser's, bound to one address, without public sharing, closed to pages of
-other origins and to programs without the page's token."""
+"""Web server of the page: viser's, bound to one address, without public sharing. It rejects pages
+of other origins and programs without the page's token.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +26,10 @@ _RequestHandler = Callable[[ServerConnection, Request], Response | None]
 
 @contextlib.contextmanager
 def page_server(host: str, port: int | None, token: str) -> Iterator[viser.ViserServer]:
-    """Run a page server on ``host``; without a ``port``, on the first free one from 8080 on. Raise
-    ViewError.
+    """Run a page server on ``host``, on ``port`` or the first free one from ``DEFAULT_PORT`` on.
+    Raise ViewError.
 
-    ``token``: first segment of the path of the page and of its web socket, which is rejected
-    without it.
+    ``token``: first path segment of the page and of its web socket, which is rejected without it.
     """
     server = _open(host, port, token)
     try:
@@ -41,7 +41,7 @@ def page_server(host: str, port: int | None, token: str) -> Iterator[viser.Viser
 
 def _open(host: str, port: int | None, token: str) -> viser.ViserServer:
     chosen = free_port(host, port)
-    # Requests other than a browser's are not errors of this process.
+    # Requests of other programs than a browser are not errors of this process.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     # Suppress viser's message on standard output.
     with contextlib.redirect_stdout(io.StringIO()), _checked_requests(host, token):
@@ -67,8 +67,8 @@ def _checked_requests(host: str, token: str) -> Iterator[None]:
     """Make a viser server that starts meanwhile check every request before it accepts a web socket.
 
     A browser lets any web site open a socket to this machine, which could then send commands. viser
-    has no option for this check, and its callback for a new client comes after the handshake, when
-    frames may already be buffered. So this replaces the function that starts its server;
+    has no option for this check; its callback for a new client comes after the handshake, when
+    frames may already be buffered. This therefore replaces the function that starts its server;
     tests/chaserdock/test_viewer.py checks the effect.
     """
 

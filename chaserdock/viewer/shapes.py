@@ -16,17 +16,19 @@ from numpy.typing import NDArray
 from chaserdock.analysis.scene import Face
 
 _LAYER_M = 0.0004
-"""Offset (m) of each painted layer above its face, so that the depth buffer separates them. Chosen.
+"""Offset (m) of each painted layer above its face. Larger: layers visibly float; smaller: the depth
+buffer does not separate them.
 """
 _SIDES = 24
-"""Sides of a polygon that stands for a circle. Chosen; deviates by 1 - cos(pi / 24) = 0.9 % of the
-radius."""
+"""Sides of a polygon that stands for a circle; it deviates by 1 - cos(pi / 24) = 0.9 % of the
+radius.
+"""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Coloured triangles to draw. ``vertices_m`` (V, 3); ``triangles`` (F, 3): indices of their
-    corners; ``colours`` (V, 3): of the vertices, 0 to 255.
+    """Coloured triangles. ``vertices_m`` (V, 3). ``triangles`` (F, 3): indices of their corners.
+    ``colours`` (V, 3): of the vertices, 0 to 255.
     """
 
     vertices_m: Array
@@ -35,8 +37,8 @@ class Mesh:
 
 
 def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> Mesh:
-    """Return faces with their decals as a mesh in body axes; ``tint`` colours the faces, not the
-    decals.
+    """Return faces with their decals as a mesh in body axes. ``tint``: colour of the faces, not of
+    the decals.
     """
     corners: list[Array] = []
     normals: list[Array] = []
@@ -49,11 +51,11 @@ def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> 
         normals += [face.normal] * (1 + len(face.decals))
         colours.append(np.tile(colour, (4, 1)))
         for layer, (painted, grey) in enumerate(face.decals):
-            # Three layers: border, black square, white cells.
+            # Layers of a marker: border, black square, white cells.
             corners.append(painted + face.normal * _LAYER_M * (1 + min(layer, 2)))
             colours.append(np.full((4, 3), float(grey)))
-    # Vertices are not shared, so that each quadrangle has flat shading; corners are
-    # counterclockwise seen from outside.
+    # Vertices are not shared, so that each quadrangle is flat shaded. Corners are counterclockwise
+    # seen from outside.
     quads = np.array([_counterclockwise(c, n) for c, n in zip(corners, normals, strict=True)])
     halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     triangles = (4 * np.arange(len(quads), dtype=np.int32)[:, None, None] + halves).reshape(-1, 3)
@@ -67,7 +69,7 @@ def _counterclockwise(corners: Array, normal: Array) -> Array:
 
 
 def polyline(points: Array) -> NDArray[np.float32]:
-    """Convert points (K, 3) to segments (K - 1, 2, 3); one of zero length for fewer than two
+    """Return points (K, 3) as segments (K - 1, 2, 3); one of zero length for fewer than two
     points.
     """
     if len(points) < 2:
@@ -112,11 +114,11 @@ def sphere(radius_m: float) -> NDArray[np.float32]:
 
 
 def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | None:
-    """Return a chaser's approach corridor in TRF as segments (K, 2, 3), or None.
+    """Return a chaser's approach corridor, TRF, as segments (K, 2, 3); None without one.
 
-    With capture: the region allowed for its centre from the corridor entry to the port, narrower in
-    the final approach. Otherwise: the line from its station to the docking distance, with the
-    radius of the docking tolerance.
+    With capture: the region allowed for its centre from the corridor's entry to the port, narrower
+    in the final approach. Otherwise: the line from its nominal place to the docking distance, with
+    the radius of the docking tolerance.
     """
     docking, port = scenario.docking, scenario.docking.port_of(chaser)
     if docking.kind == "capture":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State of a mission at one time: the latest message of each kind, and derived values."""
+"""State of a mission at one time: the latest message of each kind, and derived quantities."""
 
 from __future__ import annotations
 
@@ -47,14 +47,22 @@ OF_CHASERS = (
     topics.SAFETY,
 )
 OF_ALL = (topics.TICK, topics.TARGET, topics.STACK, topics.SOLVER, topics.END)
-"""Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
+"""Topics of the state: of each chaser (OF_CHASERS), of the mission (OF_ALL). Within a tick their
+order is causal.
+"""
 
 _KEPT = 64
-"""Messages that are kept to be matched with later ones: 6 s at 10 Hz. Chosen."""
+"""Messages kept to be matched with later ones: 6 s at 10 Hz. Larger: more memory; smaller: late
+matches are missed.
+"""
 _IMAGES_KEPT = 4
-"""Images of a chaser that are kept, to show all cameras at one moment. Chosen, for memory."""
+"""Images of a chaser that are kept, to show all cameras at one moment. Larger: more memory;
+smaller: late cameras are missed.
+"""
 _RECENT_NS = 2_000_000_000
-"""Age (ns) from which on the images of a chaser count as stopped. Chosen."""
+"""Age (ns) after which a chaser's images count as stopped. Larger: the others wait longer for
+it.
+"""
 _FIELDS = {
     Odometry: "odometry",
     Reference: "reference",
@@ -67,7 +75,7 @@ _FIELDS = {
     ActuatorCommand: "actuators",
     ThrusterReport: "thrusters",
 }
-"""Fields of ``ChaserState`` by the type of their message."""
+"""Fields of ``ChaserState`` by the type of the message that they hold."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +93,7 @@ def pose_of(message: Odometry | BodyTruth | TargetEstimate | Reference) -> Pose:
 
 @dataclass
 class ChaserState:
-    """Latest messages of one chaser; None before the first."""
+    """Latest messages of one chaser; None before the first one."""
 
     odometry: Odometry | None = None
     reference: Reference | None = None
@@ -100,7 +108,7 @@ class ChaserState:
     _odometries: OrderedDict[int, Odometry] = field(default_factory=OrderedDict)
     _sightings: OrderedDict[int, Sighting] = field(default_factory=OrderedDict)
     images: OrderedDict[int, Image] = field(default_factory=OrderedDict)
-    """The last images by the time of their exposure, ns."""
+    """The last images by time of exposure, ns."""
 
     def update(self, message: Any) -> None:
         """Store a message of this chaser."""
@@ -135,8 +143,11 @@ def keep_newest(store: OrderedDict[int, Any], key: int, message: Any, kept: int 
 
 @dataclass
 class MissionState:
-    """Latest messages of the mission; ``truth`` by body (``target``, ``chaser/0``), empty without
-    access to it. ``true_body``: the target's true mass properties, with access to ground truth."""
+    """Latest messages of the mission.
+
+    ``truth``: true states by body (``target``, ``chaser/0``), empty without access to ground truth.
+    ``true_body``: true mass properties of the target, likewise.
+    """
 
     chasers: list[ChaserState]
     tick: Tick | None = None
@@ -173,10 +184,11 @@ class MissionState:
                 self.chasers[message.chaser].update(message)
 
     def images_of_one_moment(self) -> list[Image | None]:
-        """Return an image of each chaser: of the newest exposure of which all images, and if
-        possible all sightings, have arrived.
+        """Return an image of each chaser from the same exposure: the newest of which all images
+        and, if possible, all sightings have arrived.
 
-        Without such an exposure, and for a chaser whose images have stopped, it is the latest.
+        Without such an exposure, and for a chaser whose images have stopped, it is the latest
+        image.
         """
         images = [c.image for c in self.chasers]
         newest_ns = max((image.sim_time_ns for image in images if image is not None), default=0)
@@ -205,24 +217,26 @@ class MissionState:
         )
 
     def true_target(self) -> Pose | None:
-        """Return the true pose of the target, with access to ground truth."""
+        """Return the true pose of the target; None without access to ground truth."""
         return pose_of(self.truth[TARGET]) if TARGET in self.truth else None
 
     def chaser(self, i: int) -> Pose | None:
-        """Return the pose of a chaser: ground truth if available, else odometry."""
+        """Return the pose of a chaser: ground truth if available, or else odometry."""
         body, odometry = self.truth.get(f"chaser/{i}"), self.chasers[i].odometry
         known = body if body is not None else odometry
         return pose_of(known) if known is not None else None
 
     def distance_m(self, i: int) -> float | None:
-        """Return the distance between the centres of chaser and estimated target."""
+        """Return the distance (m) between the centres of a chaser and the estimated target."""
         target, odometry = self.estimate(), self.chasers[i].odometry
         if target is None or odometry is None:
             return None
         return float(np.linalg.norm(np.subtract(odometry.position_m, target.position_m)))
 
     def keep_out_m(self, default: float) -> float:
-        """Return the largest minimum distance to the target that applies to a chaser."""
+        """Return the largest distance from the target that any chaser has to keep now, ``default``
+        if unknown.
+        """
         limits = [
             c.reference.min_distance_target_m for c in self.chasers if c.reference is not None
         ]

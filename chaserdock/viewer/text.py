@@ -15,7 +15,7 @@ from .snapshot import ChaserState, MissionState
 
 _MARKS = {"info": "", "warning": "⚠ ", "error": "⛔ "}
 _FRESH_S = 2.0
-"""Age (s) up to which a latency is shown. Chosen."""
+"""Age (s) up to which a latency is shown: that of stopped images is out of date."""
 _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
 
 
@@ -66,7 +66,7 @@ def chasers(state: MissionState, history: History) -> str:
 
 
 def mass_properties(scenario: FlightScenario, state: MissionState) -> str:
-    """Return a table of the identified mass properties of target and stack beside the stated and,
+    """Return a table of the identified mass properties of target and stack, beside the stated and,
     if known, the true ones.
     """
     if state.stack is None:
@@ -96,7 +96,7 @@ def visibility(chaser: ChaserState) -> str:
 
 
 def faults(state: MissionState, history: History, lost: set[str]) -> str:
-    """Return the present faults; ``lost``: processes that have disappeared."""
+    """Return the present faults. ``lost``: processes that have disappeared."""
     out = [f"**{name}** has disappeared" for name in sorted(lost)]
     if state.target is not None and state.target.status == "lost":
         out.append("the target is lost")
@@ -137,12 +137,12 @@ def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
 
 
 def events(lines: list[Line], most: int = 99) -> str:
-    """Return at most so many event lines, newest first; lines that differ in numbers only are one,
-    with their count.
+    """Return at most ``most`` event lines, newest first. Lines that differ in numbers only are
+    merged and counted.
     """
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
-        # Events differ by the number of a chaser or thruster, not by measured values.
+        # Chasers and thrusters are told apart by their numbers; measured values are not.
         pattern = re.sub(r"(?<!chaser )(?<!chaser/)(?<!thruster )\b\d+(\.\d+)?", "#", line.text)
         groups.setdefault((line.level, pattern), []).append(line)
     out = []

@@ -21,12 +21,12 @@ from .parameters import nmpc_parameters
 
 
 class ControllerCore:
-    """The controller's stages, which keep its state from tick to tick. ``inspecting``: the chasers
-    that guidance let inspect the target in the last tick.
+    """Runs the controller's stages in turn; their state lasts from tick to tick.
 
-    ``now_s`` is a wall clock that only measures solve times; in ``realtime`` the scenario's solve
-    budget follows from them. ``estimator`` replaces the scenario's. Raises PluginError for an
-    installed solver that cannot be held to a budget.
+    ``inspecting``: chasers that guidance let inspect the target in the last tick. ``now_s``: a wall
+    clock that only measures solve times; with ``realtime`` the scenario's solve budget follows from
+    them. ``estimator``: replaces the scenario's. Raises PluginError for an installed solver that
+    cannot be held to a budget.
     """
 
     def __init__(
@@ -55,12 +55,12 @@ class ControllerCore:
         return self.output.run(observation, estimation, guidance, plan)
 
     def estimate(self, inputs: TickInputs) -> TargetEstimate:
-        """Run ingest and estimation only, in place of ``step``."""
+        """Run ingest and estimation only; call it in place of ``step``."""
         observation = self.ingest.run(inputs, self.output.sent)
         return target_message(observation, self.estimation.run(observation))
 
     def doubts(self, chaser: int) -> bool:
-        """Return whether the odometry of a chaser may be wrong, after the last tick."""
+        """Return whether the odometry of a chaser may be wrong, judged by the last tick."""
         consistency = self.estimation.consistency
         return chaser < len(consistency) and consistency[chaser].doubtful
 

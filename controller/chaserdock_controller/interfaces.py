@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs and outputs of a controller tick, and the results that its stages hand to each other.
+"""Inputs and outputs of a controller tick, and the results that its stages pass on.
 
-``Observation``, ``TargetEstimation``, ``GuidanceResult`` and ``PlanResult`` each describe a chaser
-by one object. The first two have one for every chaser of the mission, so that ``chasers[i]`` is
-chaser i; what is not known of it is None.
+``Observation``, ``TargetEstimation``, ``GuidanceResult`` and ``PlanResult`` hold one object per
+chaser. The first two hold one for every chaser of the mission, so that ``chasers[i]`` is chaser i;
+what is unknown of it is None.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search", "detu
 class ChaserInputs:
     """Messages of one chaser for a tick.
 
-    ``odometry``: of the tick; a lost one is extrapolated for a while. ``outdated``: the newest one,
-    where it is of an earlier tick. ``thrusters``: the newest report. ``docking``: of the tick.
+    ``odometry``: of the tick; extrapolated for a while if lost. ``outdated``: the newest one, if it
+    belongs to an earlier tick. ``thrusters``: the newest report. ``docking``: of the tick.
     """
 
     chaser: int
@@ -116,19 +116,19 @@ class AppliedImpulse(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ChaserObservation:
-    """What is known of one chaser in a tick before anything is estimated.
+    """What is known of one chaser in a tick before estimation.
 
-    ``odometry``: its valid state, None without one; ``invalid``: why it is not used, or empty.
-    ``outdated``: valid odometry of an earlier tick, with the time of that, where there is no newer;
-    an ``odometry`` beside it is extrapolated. ``lost``: its last odometry, while it is an obstacle
-    to the others. ``interrupted``: without odometry for a while before this tick, as it sent none
-    or this controller received none.
+    ``odometry``: its valid state, else None; ``invalid``: why it is not used, or empty.
+    ``outdated``: valid odometry of an earlier tick, with that tick's time, if there is no newer
+    one; an ``odometry`` beside it is extrapolated. ``lost``: its last odometry, while it is an
+    obstacle to others. ``interrupted``: it had no odometry for a while before this tick, because it
+    sent none or this controller received none.
 
-    ``impulse``: on a chaser with ``odometry``. ``last_command``: to one without, (6,); what it
-    flies now is not known. ``ahead``: what acts on it until ``Observation.effective_ns``, as
-    durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
-    ``thruster_impulses`` (n,): of its thrusters since the tick before, N s, if it reports them.
-    ``isolated``: thrusters that it reports as closed.
+    Wrenches are N and N m in body axes. ``impulse``: on a chaser with ``odometry``.
+    ``last_command`` (6,): to a chaser without; what it flies now is unknown. ``ahead``: wrenches
+    that act on it until ``Observation.effective_ns``, as durations (s) and wrenches (6,).
+    ``input_limits``: (6,). ``thruster_impulses`` (n,): of its thrusters since the previous tick, N
+    s, if reported. ``isolated``: thrusters that it reports as closed.
     """
 
     chaser: int
@@ -147,22 +147,22 @@ class ChaserObservation:
 
     @property
     def measured(self) -> Odometry | None:
-        """Return the odometry of this tick, None for an extrapolated state, which leaves out the
+        """Return the odometry of this tick. None if it is extrapolated: that state ignores the
         thrust.
         """
         return self.odometry if self.outdated is None else None
 
     @property
     def touches(self) -> bool:
-        """Return whether its tip touches the target while its latch is open."""
+        """Return whether its probe tip touches the target while its latch is open."""
         return self.docking is not None and self.docking.contact and not self.docking.latched
 
 
 @dataclass(frozen=True)
 class Observation:
-    """Result of ingest: checked inputs and what follows from them about each of the ``chasers``.
+    """Result of ingest: checked inputs, and what follows from them for each of the ``chasers``.
 
-    ``effective_ns``: when this tick's commands take effect.
+    ``effective_ns``: time at which this tick's commands take effect.
     """
 
     tick: int
@@ -188,9 +188,9 @@ class TargetState:
 
     position_m, velocity_m_s: (3,) WRF. q_wxyz: (4,) TRF to WRF. omega_rad_s: (3,) TRF axes.
     covariance: (12, 12), order (position WRF, velocity WRF, dtheta TRF, omega TRF).
-    status: "none" (no measurement yet: pose and rates are zero, the covariance is 1e6 times identity),
-        "tracking" (a measurement was accepted recently), "predicting" (motion model only), "lost" (too
-        uncertain to use).
+    status: "none" (no measurement yet: pose and rates are zero, the covariance is 1e6 times
+        identity), "tracking" (a measurement was accepted recently), "predicting" (motion model
+        only), "lost" (too uncertain to use).
     sightings: number of chasers whose measurements were accepted at the newest exposure.
     rejected: chasers whose measurements were gated out at the newest exposure.
     """
@@ -223,8 +223,8 @@ class RelativePose:
 class OwnMotion:
     """Estimated motion of a chaser with valid odometry.
 
-    ``state``: now. ``at_effect``: at ``Observation.effective_ns``, (13,): p, v (WRF), q_wxyz, omega
-    (body). ``disturbance``: estimated force and torque (6,) on it, body axes.
+    ``state``: now. ``at_effect`` (13,): at ``Observation.effective_ns``; p, v (WRF), q_wxyz, omega
+    (body). ``disturbance`` (6,): estimated force and torque, body axes.
     """
 
     state: Odometry
@@ -236,11 +236,11 @@ class OwnMotion:
 class ChaserEstimate:
     """What is estimated of one chaser.
 
-    ``own``: None without valid odometry. ``motion_covariance``: (6, 6) of its position and velocity
-    relative to the target, WRF, unless passive safety is off; ``relative``: its pose relative to
-    the target; both if estimated, with ``own``. ``camera``: the errors of its camera, once they are
-    estimated. ``visible``: it has a sighting of the target in this tick. ``latched``: its latch
-    holds the target. ``doubtful``: its odometry may be wrong.
+    ``own``: its motion, None without valid odometry. ``relative``: its pose relative to the target.
+    ``motion_covariance`` (6, 6): of its position and velocity relative to the target, WRF; None
+    while passive safety is off. Both only with ``own`` and if the estimator provides them.
+    ``camera``: errors of its camera, once estimated. ``visible``: it sees the target in this tick.
+    ``latched``: its latch holds the target. ``doubtful``: its odometry may be wrong.
     """
 
     chaser: int
@@ -255,8 +255,8 @@ class ChaserEstimate:
 
 @dataclass(frozen=True, eq=False)
 class StackChaser:
-    """A chaser that is part of the stack: where it is fixed, and estimated over stated thrust (n,)
-    of its thrusters.
+    """A chaser that is part of the stack: its mounting, and the ratios (n,) of estimated to stated
+    thrust of its thrusters.
     """
 
     chaser: int
@@ -266,11 +266,11 @@ class StackChaser:
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedStack:
-    """Mass properties of the stack and of the target alone, as identified until now.
+    """Mass properties of the stack and of the target alone, as identified so far.
 
     ``motion``: of the centre of mass (WRF) and the target's axes. ``failed``: thrusters found
-    stuck, as (chaser, number). ``informative`` returns the thrusters (chaser, number) whose pulses
-    would tell most about the mass properties, the best first.
+    stuck, as (chaser, number). ``informative``: function that returns the thrusters (chaser,
+    number) in the order of the information of their pulses on the mass properties, best first.
     """
 
     stack: MassProperties
@@ -287,9 +287,12 @@ class IdentifiedStack:
 
 @dataclass(frozen=True, eq=False)
 class EstimatedShape:
-    """Errors of the target's known geometry: ``parameters``, their estimated values (k,) and
-    covariance (k, k), both in the parameters' standard deviations; number of ``views``, the share
-    of directions that they cover, and whether this tick brought one (``changed``)."""
+    """Errors of the target's known geometry.
+
+    ``parameters`` and their covariance (k, k), values (k,): in units of the parameters' standard
+    deviations. ``views``: number of views; ``coverage``: share of directions that they cover.
+    ``changed``: this tick brought a view.
+    """
 
     parameters: tuple[GeometryParameter, ...]
     values: Array
@@ -301,11 +304,11 @@ class EstimatedShape:
 
 @dataclass(frozen=True)
 class TargetEstimation:
-    """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose
-    is known.
+    """Result of estimation.
 
-    ``body``: the target and the latched chasers as one rigid body. ``stack``: their mass properties
-    as identified, if they are. ``shape``: errors of the known geometry, once they are estimated.
+    ``at_effect``: the target at ``Observation.effective_ns``, None while its pose is unknown.
+    ``body``: the target and the latched chasers as one rigid body. ``stack``: their identified mass
+    properties, if identified. ``shape``: errors of the known geometry, once estimated.
     """
 
     target: TargetState
@@ -339,8 +342,11 @@ class ReferencePose:
 
 @dataclass(frozen=True)
 class DirectCommand:
-    """Force and torque (6,), body axes, of a chaser that is not flown by the NMPC; ``thrusts_N``
-    (n,), if not None: those of its thrusters, which give that wrench."""
+    """Wrench of a chaser that the NMPC does not fly: force and torque (6,), body axes.
+
+    ``thrusts_N`` (n,): thrusts of its thrusters that give this wrench; None to leave the allocation
+    to the chaser.
+    """
 
     mode: ControlMode
     wrench: Array
@@ -349,10 +355,12 @@ class DirectCommand:
 
 @dataclass(frozen=True)
 class Directive:
-    """Guidance of one chaser. ``phase``: its name. ``isolated`` and ``trusted``: thrusters, by
-    operator command. ``reference`` is None while the target or the chaser's own state is unknown.
-    ``inspects``: it flies around the target to view it. ``abort_margin``: of its best abort, in
-    sigmas, while its passive safety is enforced.
+    """What guidance wants of one chaser.
+
+    ``phase``: name of its phase. ``isolated``, ``trusted``: thrusters, by operator command.
+    ``reference``: None while the target or the chaser's own state is unknown. ``inspects``: it
+    flies around the target to view it. ``abort_margin``: margin of its best abort, in sigmas, while
+    passive safety is enforced.
     """
 
     chaser: int
@@ -370,10 +378,10 @@ class Directive:
 
 @dataclass(frozen=True)
 class HorizonReference:
-    """References of N ``chasers`` over D stages: the guidance part of an ``NmpcInput`` (shapes
-    there).
+    """References of N ``chasers`` over D stages: the part of an ``NmpcInput`` that guidance
+    provides (shapes there).
 
-    ``attached``: chasers whose latch holds the target; they are obstacles and follow its motion.
+    ``attached``: chasers whose latch holds the target. They are obstacles that follow its motion.
     """
 
     chasers: tuple[int, ...]
@@ -390,7 +398,7 @@ class HorizonReference:
 @dataclass(frozen=True)
 class GuidanceResult:
     """Result of guidance. ``directives``: one for every chaser of the mission, in order.
-    ``horizon`` is None when no chaser is planned for.
+    ``horizon``: None if no chaser is planned for.
     """
 
     directives: tuple[Directive, ...]
@@ -413,15 +421,15 @@ class ChaserPlan:
     inputs: Array
 
     def input_at(self, time_ns: int, step_s: float) -> Array | None:
-        """Return the input (6,) at a time, None after the plan's end."""
+        """Return the input (6,) at a time; None after the plan's end."""
         stage = int((time_ns - self.time_ns) / 1e9 / step_s + 1e-9)
         return self.inputs[stage] if 0 <= stage < len(self.inputs) else None
 
 
 @dataclass(frozen=True)
 class PlanningFailure:
-    """Planning has failed for a chaser for so long that it has to retreat: there is no usable plan
-    (``without_plan``), or plans are degraded. ``text``: the reason.
+    """Reason why a chaser has to retreat: planning has failed for too long. ``without_plan``: there
+    is no usable plan; otherwise plans are degraded.
     """
 
     without_plan: bool
@@ -429,23 +437,21 @@ class PlanningFailure:
 
 
 class PlanningHistory(Protocol):
-    """What guidance learns about the plans of earlier ticks."""
+    """What guidance needs to know about the plans of earlier ticks."""
 
     def failure(self, chaser: int, time_ns: int) -> PlanningFailure | None:
-        """Return why a chaser has to retreat at ``time_ns`` because planning has failed."""
+        """Return why a chaser has to retreat at ``time_ns``, or None if planning has not failed."""
         ...
 
     def unsafe(self, chaser: int, time_ns: int) -> str:
-        """Return why the plans of a chaser are not passively safe at ``time_ns``, or an empty
-        string.
-        """
+        """Return why a chaser's plans are not passively safe at ``time_ns``; empty if they are."""
         ...
 
 
 @dataclass(frozen=True)
 class PlanCertificate:
-    """Passive safety of a chaser's newest plan: the worst coast, and the time (s) from the plan's
-    beginning to its loss of thrust.
+    """Passive safety of a chaser's newest plan: the worst coast, and the time (s) from the start of
+    the plan to its loss of thrust.
     """
 
     coast: CoastCertificate
@@ -466,9 +472,9 @@ class SolveStatus(NamedTuple):
 class ChaserPlanning:
     """Result of planning for one chaser.
 
-    ``solve``: of this tick, None without one. ``flyable``: the plan that may be flown, an earlier
-    one for a while after a failed solve. ``certificate``: passive safety of its newest plan, where
-    it is monitored.
+    ``solve``: result of this tick's solve, None without one. ``flyable``: plan that may be flown;
+    after a failed solve for a while an earlier one. ``certificate``: passive safety of its newest
+    plan, where monitored.
     """
 
     chaser: int
@@ -480,7 +486,7 @@ class ChaserPlanning:
 @dataclass(frozen=True)
 class PlanResult:
     """Result of planning. ``chasers``: one for every chaser of the mission, in order. ``wall_s``:
-    time of the solve.
+    duration of the solve.
     """
 
     chasers: tuple[ChaserPlanning, ...]

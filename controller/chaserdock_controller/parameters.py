@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the NMPC from the scenario."""
+"""Derives the parameters of the NMPC from the scenario."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .nmpc.problem import terms_of
 
 
 def nmpc_parameters(scenario: FlightScenario) -> NmpcParameters:
-    """Return the NMPC's parameters, which the scenario has validated."""
+    """Return the NMPC's parameters. The scenario has validated them."""
     body = scenario.chaser
     ix, iy, iz = body.inertia
     return NmpcParameters(
@@ -27,8 +27,10 @@ def nmpc_parameters(scenario: FlightScenario) -> NmpcParameters:
 
 
 def nmpc_settings(controller: Controller, limits: Limits) -> dict[str, Any]:
-    """Return the parameters of the NMPC that do not depend on the body: every key of ``controller``
-    that is not among `ControllerOptions`. Raises ValueError for one that nothing reads.
+    """Return the NMPC's parameters that do not depend on the body: every key of ``controller`` that
+    is not among `ControllerOptions`.
+
+    Raises ValueError for a key that nothing reads.
     """
     keys = type(controller).model_fields.keys() - ControllerOptions.model_fields.keys()
     own = keys & {f.name for f in fields(NmpcParameters)}

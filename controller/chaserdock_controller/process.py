@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller process: receives the messages of a tick, has it processed, and publishes the
-outputs.
-"""
+"""The controller process: receive the messages of a tick, process it, publish the outputs."""
 
 from __future__ import annotations
 
@@ -45,11 +43,11 @@ from .redundancy.operator_requests import OperatorRequests
 from .redundancy.standby import HotStandby
 
 _IDLE_RECEIVES = 5
-"""In lock-step, messages are no longer expected after this many receives without one."""
+"""In lock-step, number of receives without a message after which none is expected any more."""
 _PATIENCE_TICKS = 0.5
-"""In real time a tick waits for its sightings for this share of its period."""
+"""In real time, share of a tick's period for which the tick waits for its sightings."""
 _RECEIVE_TIMEOUT_S = 0.2
-"""Longest wait, s, for a message before the process looks whether it is to stop."""
+"""Longest wait for a message, s, before the process checks whether it has to stop."""
 
 
 def main(options: ProcessOptions) -> int:
@@ -83,10 +81,10 @@ def main(options: ProcessOptions) -> int:
 
 
 class ControllerProcess:
-    """Barrier and I/O: a tick is processed once every message that it needs has arrived or is lost.
+    """Barrier and I/O: processes a tick once every message that it needs has arrived or is lost.
 
     In real time a tick is processed with what has arrived when its patience is over, by ``now_s``,
-    or when the first odometry of the next one arrives. A standby processes the same ticks without
+    or when the first odometry of the next tick arrives. A standby processes the same ticks without
     publishing. ``replaying``: this process leads in every tick.
     """
 
@@ -170,8 +168,8 @@ class ControllerProcess:
             self._process(tick)
 
     def _missing_keys(self) -> tuple[str, ...]:
-        """Return the keys of the messages that the open tick waits for, or that the next one begins
-        with.
+        """Return the keys of the messages for which the open tick waits, or with which the next one
+        begins.
         """
         tick = self.tick
         if tick is None or tick.tick <= self.done_tick:
@@ -180,7 +178,7 @@ class ControllerProcess:
         return self.inputs.missing_keys(tick) + leases or (topics.STATE.key_of(),)
 
     def _open_tick(self) -> Tick | None:
-        """Return the tick that waits for its deadline, in real time."""
+        """Return the tick that waits for its deadline; only in real time."""
         tick = self.tick
         is_open = (
             self.realtime and not self.replaying and tick is not None and tick.tick > self.done_tick
@@ -271,8 +269,8 @@ class ControllerProcess:
     ) -> None:
         node = self.node
         if self.standby.others:
-            # Before the wrenches: once a tick is answered, the standby knows the commands that it
-            # was answered with.
+            # State before wrenches: once a tick is answered, the standby must know the commands
+            # that were processed with it.
             self._publish_state(tick, operated=operated)
         node.publish(topics.TARGET, out.target)
         if out.stack is not None:
@@ -320,7 +318,7 @@ class ControllerProcess:
         self.node.publish(topics.EVENT, event, self.name)
 
     def _report_role(self, text: str, at: Tick) -> None:
-        """Publish, and print, that this controller takes or leaves the command."""
+        """Publish, and print, that this controller starts or stops to command."""
         if self._on_network:
             print_status(self.name, f"{at.sim_time_ns / 1e9:.2f} s: {text}")
         self._publish_event("info", text, at)
@@ -328,8 +326,8 @@ class ControllerProcess:
     # -- leader and standby ------------------------------------------------------------------------
 
     def _dispatch_leadership(self, received: ReceivedMessage) -> bool:
-        """Apply what a message says about the leader, ahead of held messages; return whether that
-        is all it says.
+        """Apply what a message says about the leader, ahead of held messages. Returns whether it
+        says nothing else.
         """
         match received.message:
             case ControllerState() as state:
@@ -361,7 +359,7 @@ class ControllerProcess:
         return False
 
     def _decide(self, processed: Tick | None = None) -> None:
-        """Determine who commands, and take or leave the command; ``processed``: see
+        """Determine who commands, and start or stop to command. ``processed``: see
         ``HotStandby.decide``.
         """
         standby = self.standby
@@ -378,7 +376,7 @@ class ControllerProcess:
             self._leave_unused_leases(newest)
 
     def _leave_unused_leases(self, tick: Tick) -> None:
-        """Let the chasers wait that have granted their lease to this controller, which lacks a
+        """Let chasers wait that have granted their lease to this controller while it lacks a
         majority.
         """
         stamp = (tick.tick, tick.revision)
@@ -404,8 +402,8 @@ class ControllerProcess:
             self._report_role(f"commands in term {term}" if leads else "stands by", tick)
         result = self._last_result
         if leads and result is not None and result[0].tick == tick.tick:
-            # Processed already as a standby, for a leader that cannot publish its own result any
-            # more.
+            # It was processed already, as a standby, for a leader that can no longer publish its
+            # own result.
             self._publish(tick, result[1], result[2], ())
 
     def _refuse_requests(self, tick: Tick) -> None:

@@ -21,7 +21,7 @@ from .process import ControllerProcess
 
 
 class _EstimationOnly:
-    """Processes ticks by ingest and estimation only."""
+    """Processes ticks by ingest and estimation alone."""
 
     def __init__(self, core: ControllerCore) -> None:
         self._core = core
@@ -38,7 +38,7 @@ class _EstimationOnly:
         return self._core.doubts(chaser)
 
     def add_command(self, command: WrenchCommand) -> None:
-        """Add a recorded command, which the estimator needs to know."""
+        """Add a recorded command, which the estimator takes into account."""
         wrench = np.array([*command.force_N, *command.torque_N_m])
         self._core.output.sent[command.chaser].add(command.effective_time_ns, wrench)
 
@@ -50,7 +50,7 @@ def _core_of(scenario: FlightScenario) -> ControllerCore:
 def _with_leader(
     recorded: Iterable[ReceivedMessage],
 ) -> Iterator[tuple[Commander | None, list[ReceivedMessage]]]:
-    """Return the messages of each tick with the last controller that commanded it, None if none
+    """Return the messages of each tick with the controller that commanded it last; None if none
     did.
     """
     for _, group in groupby(recorded, key=lambda r: r.message.tick):
@@ -67,8 +67,8 @@ def _with_leader(
 def _play(
     scenario: FlightScenario, recorded: Iterable[ReceivedMessage], core_of: Callable[[], Any]
 ) -> Iterator[Published]:
-    """Return the outputs of the leader. A new leader keeps the state of the one before; a restarted
-    process does not.
+    """Return the outputs of the leader. A new leader inherits the state of the previous one; a
+    restarted process does not.
     """
     node, controller, last_seq = ReplayNode("controller"), None, -1
     last_leader = authority = Commander("controller", "", 0)

@@ -17,14 +17,13 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 
 def length(vector: Array) -> float:
-    """Return the length of a vector (n,): the bits of ``numpy.linalg.norm`` in a fifth of its
-    time.
+    """Return the Euclidean length of a vector (n,).
+
+    Bit-identical to ``numpy.linalg.norm``, in a fifth of its time.
     """
     return math.sqrt(vector.dot(vector))
 
 
 def limited(values: Array, limits: Array) -> Array:
-    """Return values (n,) within plus and minus ``limits`` (n,), as ``numpy.clip`` does in three
-    times the time.
-    """
+    """Clip values (n,) to plus and minus ``limits`` (n,), in a third of the time of ``numpy.clip``."""
     return np.minimum(np.maximum(values, -limits), limits)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reference attitudes that keep a chaser facing the target when its offset differs from the nominal
-one.
-"""
+"""Compute reference attitudes that keep a chaser facing the target at any offset from it."""
 
 from __future__ import annotations
 

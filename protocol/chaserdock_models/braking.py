@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Safe fallback command: brake to rest within the actuator limits."""
+"""Bring a body to rest within its actuator limits: the safe fallback command."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from . import rotations
 from .arrays import Array
 
 BRAKE_TIME_S = 3.0
-"""Time constant of the decay of velocity and angular rate while the limits allow it."""
+"""Time constant (s) with which velocity and angular rate decay while the limits allow it."""
 
 
 class MovingBody(Protocol):
-    """Velocity (3,) in WRF, attitude (4,) body to WRF, and angular rate (3,) in body axes."""
+    """Describe a body's motion: velocity (3,) in WRF, attitude (4,) body to WRF, rate (3,) in body
+    axes.
+    """
 
     @property
     def velocity_m_s(self) -> ArrayLike: ...
@@ -27,7 +29,9 @@ class MovingBody(Protocol):
 
 
 class ActuatedBody(Protocol):
-    """Mass, principal moments of inertia (3,), and the limits per axis of an actuated body."""
+    """Describe a body that can be actuated: mass, principal moments of inertia (3,), limits per
+    axis.
+    """
 
     @property
     def mass_kg(self) -> float: ...
@@ -42,8 +46,10 @@ class ActuatedBody(Protocol):
 def brake_wrench(
     odometry: MovingBody, body: ActuatedBody, velocity_m_s: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """Return the force and torque (6,), body axes, that stop a chaser's rotation and its motion
-    relative to ``velocity_m_s`` (3,), WRF."""
+    """Return the wrench (6,), force and torque in body axes, that brings a chaser to rest.
+
+    It stops the rotation, and the motion relative to ``velocity_m_s`` (3,), WRF.
+    """
     relative = np.asarray(odometry.velocity_m_s) - np.asarray(velocity_m_s)
     velocity = rotations.rotate_inverse(odometry.q_wxyz, relative)
     force = np.clip(-body.mass_kg / BRAKE_TIME_S * velocity, -body.force_max_N, body.force_max_N)

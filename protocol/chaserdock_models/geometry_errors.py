@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of a known mesh as independent parameters, each with its standard deviation and the
-displacement of every vertex by it.
+"""Describe the errors of a known mesh by independent parameters, for trackers and for the
+controller.
 
-The parameters: a turn of each joint about each body axis, the scale of what is not on a joint, and
-the visible border of solar panels, whose grid of cells a known mesh does not have. Trackers
-estimate them with the pose, the controller fuses them.
+Each parameter has a standard deviation, and displaces every vertex by a known vector per standard
+deviation. There is a rotation of each joint about each body axis, the scale of what is not on a
+joint, and the visible border of solar panels, whose grid of cells a known mesh does not have.
+Trackers estimate the parameters with the pose; the controller fuses them.
 """
 
 from __future__ import annotations
@@ -20,13 +21,18 @@ from .meshes import MeshPart, TriangleMesh, with_geometry_errors
 from .targets import box_around
 
 _RIM_SIGMA_M = 0.001
-"""Standard deviation of where the visible border of solar panels lies."""
+"""Standard deviation (m) of where the visible border of solar panels lies. The grid of cells, which
+the mesh does not have, displaces it by tenths of a millimetre; 1 mm lets images estimate that.
+"""
 
 
 @dataclass(frozen=True)
 class GeometryParameter:
-    """An error of the geometry: ``name``, such as ``panel_left x``, ``scale`` or ``rim``;
-    ``sigma``: standard deviation, rad, as a share, or m."""
+    """One parameter of a mesh's errors.
+
+    ``name``: such as ``panel_left x`` (a joint and an axis), ``scale`` or ``rim``. ``sigma``: its
+    prior standard deviation; rad for a joint, relative for the scale, m for the rim.
+    """
 
     name: str
     sigma: float
@@ -35,8 +41,9 @@ class GeometryParameter:
 def geometry_parameters(
     mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float
 ) -> tuple[GeometryParameter, ...]:
-    """Return the parameters of a mesh, in the order of `error_modes`; none without a standard
-    deviation.
+    """Return the parameters of a mesh, in the order of `error_modes`.
+
+    Leaves out those whose standard deviation is zero; the rim alone is no parameter.
     """
     turns = (
         [f"{joint} {axis}" for joint in mesh.joints for axis in "xyz"]
@@ -52,8 +59,8 @@ def geometry_parameters(
 
 
 def error_modes(mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float) -> Array:
-    """Return the displacements (k, n, 3), m, of the vertices of all parts by one standard deviation
-    of each parameter.
+    """Return the displacements (k, n, 3), m, of all vertices by one standard deviation of each
+    parameter.
     """
     known = _vertices(mesh.parts)
     modes = []

@@ -78,8 +78,10 @@ class TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class TriangleSoup:
-    """All triangles of a mesh: ``corners_m`` (m, 3, 3) and ``normals`` (m, 3, 3) by triangle and
-    corner, ``part`` (m,).
+    """All m triangles of a mesh.
+
+    ``corners_m``, ``normals`` (m, 3, 3): by triangle and corner. ``part`` (m,): index of the part
+    that a triangle belongs to.
     """
 
     corners_m: Array
@@ -104,8 +106,9 @@ def triangle_soup(mesh: TriangleMesh) -> TriangleSoup:
 
 
 def _corner_normals(part: MeshPart) -> Array:
-    """Return unit normals (m, 3, 3) at the corners: sums, weighted by angle, over neighbours on the
-    same side of creases.
+    """Return unit normals (m, 3, 3) at the corners of m triangles.
+
+    Each is the sum, weighted by angle, over neighbours on the same side of creases.
     """
     corners = part.vertices_m[part.triangles]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -197,8 +200,9 @@ def open_edges(part: MeshPart) -> int:
 
 
 def hole_m(part: MeshPart) -> Array | None:
-    """Return the middle (3,), body axes, of the first edge that is not shared by two triangles of
-    opposite direction.
+    """Return a point (3,), body axes, of the first hole, or None: the middle of an open edge.
+
+    An edge is open unless two triangles of opposite direction share it.
     """
     edges, balance = _edge_balance(part)
     open_ones = edges[balance != 0]
@@ -206,8 +210,10 @@ def hole_m(part: MeshPart) -> Array | None:
 
 
 def _edge_balance(part: MeshPart) -> tuple[IntArray, IntArray]:
-    """Return the edges (n, 2), lower vertex first, and how many more triangles (n,) use each
-    upwards than downwards.
+    """Return the edges (n, 2), lower vertex index first, and the balance (n,) of their directions.
+
+    Balance: number of triangles that run along an edge upwards, less those that run downwards. It
+    is 0 where two triangles of opposite direction share the edge.
     """
     ends = np.concatenate(
         [part.triangles[:, [0, 1]], part.triangles[:, [1, 2]], part.triangles[:, [2, 0]]]

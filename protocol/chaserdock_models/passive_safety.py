@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passive safety: how far the coast after a total loss of thrust stays from a keep-out sphere
-around the target.
+"""Certify passive safety: how far a coast after a total loss of thrust stays from the target.
 
-The coast is free motion, or Clohessy-Wiltshire motion in an orbit (relative_motion.py). Definition:
-Fehse, Automated Rendezvous and Docking of Spacecraft, section 4.4 (passive trajectory protection).
+The target is surrounded by a keep-out sphere. The coast is free motion, or Clohessy-Wiltshire
+motion in an orbit (relative_motion.py). Definition: Fehse, Automated Rendezvous and Docking of
+Spacecraft, section 4.4 (passive trajectory protection).
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _SAGITTA_SHARE = 1.02 / 8.0
 class CoastCertificate:
     """Closest approach of the coasts from the states of a plan.
 
-    ``margin_sigmas``: smallest distance from the keep-out sphere over the standard deviation along
-    the line from the target; negative inside. ``distance_m``: a lower bound on the distance from
-    the target there. ``time_s``: time of it after the loss of thrust. ``loss``: index of the state
-    at which thrust is lost.
+    ``margin_sigmas``: smallest distance from the keep-out sphere, in standard deviations along the
+    line from the target; negative inside. ``distance_m``: lower bound on the distance from the
+    target at that moment. ``time_s``: the moment, counted from the loss of thrust. ``loss``: index
+    of the state at which thrust is lost.
     """
 
     margin_sigmas: float
@@ -43,8 +43,10 @@ class CoastCertificate:
 
 @dataclass(frozen=True)
 class ClosestApproaches:
-    """Closest approach of the coast from each of M states: ``margin_sigmas``, ``distance_m`` and
-    ``time_s`` (M,), as in ``CoastCertificate``."""
+    """Closest approach of the coast from each of M states.
+
+    ``margin_sigmas``, ``distance_m`` and ``time_s`` (M,), as in ``CoastCertificate``.
+    """
 
     margin_sigmas: Array
     distance_m: Array
@@ -52,11 +54,10 @@ class ClosestApproaches:
 
 
 class CoastModel:
-    """Transition matrices of a coast of ``duration_s`` on an orbit with this mean motion; without
-    one, of free motion.
+    """Predict coasts of ``duration_s`` by transition matrices, on an orbit with this mean motion.
 
-    The coast is sampled every ``step_s``. A longer step is faster, and its lower bound on the
-    distance lower.
+    A mean motion of 0 stands for free motion. The coast is sampled every ``step_s``; a longer step
+    is faster, and its lower bound on the distance smaller.
     """
 
     def __init__(self, mean_motion_rad_s: float, duration_s: float, step_s: float = STEP_S) -> None:
@@ -88,20 +89,22 @@ class CoastModel:
         )
 
     def closest(self, states: Array, covariance: Array, keep_out_m: float) -> ClosestApproaches:
-        """Return the approach with the smallest margin of the coast from each of the states (M, 6);
-        arguments as in ``certify``.
+        """Return the approach of smallest margin of the coast from each of the states (M, 6).
+
+        Arguments as in ``certify``.
         """
         return self._closest_in(np.arange(len(self._times_s) - 1), states, covariance, keep_out_m)
 
     def tangent_planes(
         self, states: Array, covariance: Array, keep_out_m: float, sigmas: float, count: int
     ) -> Array:
-        """Return half-spaces (M, count, 7) at the closest approaches of the coast from each of M
-        states; arguments as in ``certify``.
+        """Return half-spaces (M, count, 7) that keep the coasts from M states out of the keep-out
+        sphere.
 
-        [c (6), d]: at its moment, c' x >= d suffices for a state x (6,) to keep ``sigmas`` standard
-        deviations from the keep-out; c is zero where a coast has fewer approaches. Those with the
-        smallest margins are returned.
+        Each is tangent at one of a coast's closest approaches, those with the smallest margins. For
+        a row [c (6), d], c' x >= d suffices for a state x (6,) to keep ``sigmas`` standard
+        deviations from the keep-out at that moment. c is zero where a coast has fewer approaches.
+        Other arguments as in ``certify``.
         """
         coasts = (self._by_axis @ states.T).transpose(2, 1, 0)
         distances = np.sqrt(np.square(coasts).sum(axis=2))
@@ -126,8 +129,8 @@ class CoastModel:
     def _planes_in(
         self, steps: IntArray, states: Array, covariance: Array, keep_out_m: float, sigmas: float
     ) -> tuple[Array, Array]:
-        """Return half-spaces (M, C, 7) of the closest approach within ``steps`` (M, C) of the
-        coasts, and its margins (M, C).
+        """Return half-spaces (M, C, 7) of the closest approach within ``steps`` (M, C), and margins
+        (M, C).
         """
         parts = self._transitions[steps], self._transitions[steps + 1]
         begin, end = (np.einsum("mcij,mj->mci", part, states) for part in parts)
@@ -152,11 +155,10 @@ class CoastModel:
         return np.concatenate([normal, bound[..., None]], axis=2), margin
 
     def _candidates(self, states: Array, covariance: Array, keep_out_m: float) -> IntArray:
-        """Return the steps of the coasts that can contain the smallest margin of all states;
-        arguments as in ``certify``.
+        """Return the steps that can contain the smallest margin of the coasts from all states.
 
-        The distance is bounded as in ``_room``, the standard deviation by the root of the trace of
-        the covariance.
+        Bounds the distance as in ``_room``, and the standard deviation by the root of the trace of
+        the covariance. Arguments as in ``certify``.
         """
         room_m = self._room(states) - keep_out_m
         trace = self._squares @ covariance.ravel()
@@ -167,8 +169,9 @@ class CoastModel:
         return np.flatnonzero(bound <= least + 1e-9 * abs(least))
 
     def _room(self, states: Array) -> Array:
-        """Return lower bounds (T,) on the distance of the coasts of all states (M, 6) in each step
-        (native/coast.c).
+        """Return lower bounds (T,) on the distance from the target, m, in each step of the coasts.
+
+        ``states`` (M, 6); computed by native/coast.c.
         """
         columns, room = _columns(states), np.empty(len(self._times_s) - 1)
         work = scratch(columns.size)
@@ -209,8 +212,9 @@ class CoastModel:
 
 
 def _columns(states: Array) -> Array:
-    """Return states (M, 6) as columns (6, P) for the kernels: P is the next multiple of four, and
-    the last state is repeated.
+    """Return states (M, 6) as columns (6, P) for the kernels.
+
+    P is the next multiple of four; the last state is repeated.
     """
     count = -(-len(states) // 4) * 4
     columns = np.empty((6, count))
@@ -219,8 +223,9 @@ def _columns(states: Array) -> Array:
 
 
 def _across(step: Array) -> Array:
-    """Return vectors (..., 3) across the given ones, for coasts through the target's centre, which
-    have no line from it.
+    """Return vectors (..., 3) perpendicular to ``step`` (..., 3).
+
+    They stand in for the line from the target where a coast leads through its centre.
     """
     least = np.eye(3)[np.argmin(np.abs(step), axis=-1)]
     side = np.cross(step, least)

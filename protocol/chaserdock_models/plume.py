@@ -34,11 +34,11 @@ _EDGES = np.array(
 
 
 def angle_to_box(nozzle_m: Array, axis: Array, box: Box) -> float:
-    """Return the smallest angle between ``axis`` (3,), of unit length, and the direction from the
-    nozzle (3,) to a point of a box.
+    """Return the smallest angle (rad) between ``axis`` and the directions from a nozzle to a box.
 
-    0 if the nozzle is in the box or the axis meets it. Otherwise the smallest angle is at an edge:
-    within a plane that the axis does not meet, the angle has no minimum.
+    ``axis`` (3,): unit vector. 0 if the nozzle is in the box or the axis meets it. Otherwise the
+    smallest angle is at an edge: within a plane that the axis does not meet, the angle has no
+    minimum.
     """
     local = rotations.rotate_inverse(box.q_wxyz, nozzle_m - np.asarray(box.position_m))
     direction = rotations.rotate_inverse(box.q_wxyz, axis)
@@ -79,8 +79,8 @@ def _meets(origin: Array, direction: Array, half: Array) -> bool:
 
 
 def angle_to_point(nozzle_m: Array, axis: Array, point_m: Array) -> float:
-    """Return the angle between ``axis`` (3,), of unit length, and the direction from the nozzle
-    (3,) to a point (3,).
+    """Return the angle (rad) between ``axis`` (3,), a unit vector, and the direction from a nozzle
+    to a point.
     """
     off = np.asarray(point_m) - nozzle_m
     distance = float(np.linalg.norm(off))
@@ -94,8 +94,10 @@ def plume_hits(
     boxes: Sequence[Box],
     points_m: Sequence[Array] = (),
 ) -> bool:
-    """Return whether the plume of a thruster at ``nozzle_m`` (3,) hits a box or a point; ``force``
-    (3,): its unit direction.
+    """Return whether the plume of a thruster hits a box or a point.
+
+    ``nozzle_m`` (3,). ``force`` (3,): unit direction of the thruster's force; the plume goes the
+    opposite way.
     """
     axis = -np.asarray(force, dtype=float)
     return any(angle_to_box(nozzle_m, axis, box) < half_angle_rad for box in boxes) or any(
@@ -139,8 +141,9 @@ def panels_of(boxes: Sequence[Box], parts: int = 6) -> Panels:
 
 @dataclass(frozen=True)
 class PlumeFlux:
-    """Momentum flux of a plume per newton of thrust: ``limit_rad`` (below pi / 2) and ``exponent``
-    as in the module's docstring.
+    """Momentum flux of a plume per newton of thrust.
+
+    ``limit_rad`` (below pi / 2) and ``exponent``: theta_limit and m of the module's docstring.
     """
 
     limit_rad: float
@@ -176,12 +179,12 @@ def plume_wrench(
     thrusts_N: Array,
     reach_m: float,
 ) -> Array:
-    """Return force and torque (6,) about the origin, in the axes of the panels, that the plumes of
-    thrusters exert on them.
+    """Return force and torque (6,) that the plumes of thrusters exert on panels.
 
-    ``nozzles_m``, ``forces`` (n, 3): nozzles and unit directions of the thrusters' forces; the
-    plumes go the opposite way. Each panel that faces a nozzle within ``reach_m`` takes up the whole
-    momentum of the flux through it; panels do not shade others.
+    Torque is about the origin; axes are those of the panels. ``nozzles_m``, ``forces`` (n, 3):
+    nozzles and unit directions of the thrusters' forces; the plumes go the opposite way. Each panel
+    that faces a nozzle within ``reach_m`` takes up the whole momentum of the flux through it;
+    panels do not shade others.
     """
     firing = thrusts_N > 0.0
     if not firing.any():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NumPy's random generators of many short sequences."""
+"""Create NumPy random generators faster than NumPy, for many short sequences."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 
 
 def generator(words: Sequence[int]) -> np.random.Generator:
-    """Return the generator that ``numpy.random.default_rng(words)`` returns, for numbers below 2^32
-    in half its time.
+    """Return the generator of ``numpy.random.default_rng(words)``, in half its time.
+
+    Every word must be below 2^32.
     """
     small = (
         len(words) > 0 and min(words) >= 0 and max(words) < 2**32

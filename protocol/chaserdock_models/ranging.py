@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Range of a far target, the attitude that it sends, and, without images, its bearing: the model of
-``[ranging]``.
+"""Model the measurements of ``[ranging]``: the range of a far target, the attitude that it sends,
+and its bearing where there are no images.
 """
 
 from __future__ import annotations
@@ -17,8 +17,11 @@ from .camera import Camera
 
 @dataclass(frozen=True)
 class RangingErrors:
-    """Standard deviations of the white errors: range (m) and, in addition, as a share of it;
-    bearing and attitude per axis (rad). ``reach_m``: greatest range."""
+    """Standard deviations of the white errors of ``[ranging]``.
+
+    Range: an absolute part (m) and a share of the range. Bearing and attitude: per axis, rad.
+    ``reach_m``: greatest range that is measured.
+    """
 
     range_m: float
     range_share: float
@@ -33,8 +36,11 @@ class RangingErrors:
 
 @dataclass(frozen=True, eq=False)
 class RangedPose:
-    """A measured pose: position (3,) m in IRF, rotation (4,) TRF to IRF, covariance (6, 6) over
-    position (IRF axes) and rotation (TRF axes), and the bearing's standard deviation in pixels."""
+    """Measured pose of the target.
+
+    Position (3,), m, in IRF; rotation (4,) TRF to IRF. Covariance (6, 6) over position (IRF axes)
+    and rotation (TRF axes). Standard deviation of the bearing in pixels.
+    """
 
     position_m: Array
     q_wxyz: Array
@@ -44,8 +50,10 @@ class RangedPose:
 
 @dataclass(frozen=True, eq=False)
 class RangeReading:
-    """Distance (m) of TRF's origin from the optical centre with its standard deviation, and the
-    sent attitude, TRF to IRF (4,).
+    """Measured range of the target, and the attitude that it sends.
+
+    Range: distance (m) of TRF's origin from the optical centre, with standard deviation. Attitude:
+    TRF to IRF (4,).
     """
 
     range_m: float
@@ -64,10 +72,10 @@ def _in_view(errors: RangingErrors, camera: Camera, position_m: Array) -> bool:
 def range_reading(
     errors: RangingErrors, camera: Camera, position_m: Array, q_wxyz: Array, white: Array
 ) -> RangeReading | None:
-    """Return range and attitude of a true pose (position (3,) in IRF, rotation (4,) TRF to IRF);
-    None out of the image or of reach.
+    """Return measured range and attitude of a true pose; None out of the image or of reach.
 
-    ``white`` (4,): standard normal numbers, from which the errors follow.
+    ``position_m`` (3,): in IRF. ``q_wxyz`` (4,): TRF to IRF. ``white`` (4,): standard normal
+    numbers that the errors are scaled from.
     """
     if not _in_view(errors, camera, position_m):
         return None
@@ -80,10 +88,10 @@ def range_reading(
 def ranged_pose(
     errors: RangingErrors, camera: Camera, position_m: Array, q_wxyz: Array, white: Array
 ) -> RangedPose | None:
-    """Return the measurement of a true pose (position (3,) in IRF, rotation (4,) TRF to IRF); None
-    out of the image or of reach.
+    """Return the measurement of a true pose; None out of the image or of reach.
 
-    ``white`` (6,): standard normal numbers, from which the errors follow.
+    ``position_m`` (3,): in IRF. ``q_wxyz`` (4,): TRF to IRF. ``white`` (6,): standard normal
+    numbers that the errors are scaled from.
     """
     if not _in_view(errors, camera, position_m):
         return None

@@ -33,8 +33,8 @@ from .scalar_rotations import rotated_components
 def relative_acceleration(
     frame: HillFrame, position_m: Scalars3, velocity_m_s: Scalars3
 ) -> Scalars3:
-    """Return the acceleration (3,) in the Hill frame of a free body at a position (3,) and velocity
-    (3,) in it.
+    """Return the acceleration (3,) of a free body in the Hill frame, at this position and velocity
+    (3,).
 
     In scalars, since the simulator calls it for every body in every physics step.
     """
@@ -83,13 +83,13 @@ def _j2_difference(frame: HillFrame, x: float, y: float, z: float, q: float) -> 
 def relative_torque(
     frame: HillFrame, q_wxyz: Sequence[float], omega_rad_s: Scalars3, moments: Scalars3
 ) -> Scalars3:
-    """Return the torque (3,), body axes, by which a body's rotation against the Hill frame differs
-    from a free rotation.
+    """Return the torque (3,), body axes, to add to a free rotation so that it is one in the Hill
+    frame.
 
-    ``q_wxyz`` (4,): principal axes to Hill frame; ``omega_rad_s`` (3,): rate against the Hill
-    frame, body axes. It is the gravity gradient 3 mu / r^3 u x I u (u: away from the Earth) and the
-    effect of the turning frame with rate W: with w = omega + W, I omega' = torque - w x I w + I
-    (omega x W) - I W'.
+    ``q_wxyz`` (4,): principal axes to Hill frame. ``omega_rad_s`` (3,): rate against the Hill
+    frame, body axes. The torque is the gravity gradient 3 mu / r^3 u x I u (u: away from the Earth)
+    and the effect of the frame's rate W: with w = omega + W, I omega' = torque - w x I w + I (omega
+    x W) - I W'.
     """
     w, x, y, z = q_wxyz
     ua, ub, uc = rotated_components(w, -x, -y, -z, 1.0, 0.0, 0.0)
@@ -159,11 +159,10 @@ def cw_matrix(mean_motion_rad_s: float) -> Array:
 
 
 def cw_transition(mean_motion_rad_s: float, time_s: ArrayLike) -> Array:
-    """Return the transition matrices (..., 6, 6) of Clohessy-Wiltshire over ``time_s`` (...);
-    without rate, of free motion.
+    """Return the Clohessy-Wiltshire transition matrices (..., 6, 6) over ``time_s`` (...).
 
-    The closed form of Clohessy and Wiltshire; differences of nearly equal numbers are written
-    without cancellation.
+    A mean motion of 0 gives free motion. The closed form of Clohessy and Wiltshire; differences of
+    nearly equal numbers are written without cancellation.
     """
     n, t = mean_motion_rad_s, np.asarray(time_s, dtype=float)
     phi = np.zeros((*t.shape, 6, 6))
@@ -192,11 +191,11 @@ def cw_transition(mean_motion_rad_s: float, time_s: ArrayLike) -> Array:
 
 
 def cw_wrench(mean_motion_rad_s: float, state: Array, mass_kg: float, moments: Scalars3) -> Array:
-    """Return force and torque (6,), body axes, that move a body in free space as a circular orbit
-    moves it in its Hill frame.
+    """Return the wrench (6,) that moves a body in free space as a circular orbit moves it in Hill
+    axes.
 
-    ``state`` (13,): position, velocity, attitude, rate as in ``rigid_body``; ``moments``:
-    principal, along the body's axes.
+    Force and torque in body axes. ``state`` (13,): position, velocity, attitude, rate as in
+    ``rigid_body``. ``moments``: principal, along the body's axes.
     """
     n = mean_motion_rad_s
     frame = HillFrame(

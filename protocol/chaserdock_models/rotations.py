@@ -60,8 +60,9 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def _by_rows(kernel: str, a: Array, b: Array) -> Array:
-    """Return a kernel's result (..., n) for operands (..., m) and (..., n), which it repeats along
-    leading axes.
+    """Call a kernel that works row by row, and return its result (..., n).
+
+    Operands (..., m) and (..., n) are repeated along leading axes.
     """
     lead_a, lead_b = a.shape[:-1], b.shape[:-1]
     if not lead_b or lead_a[-len(lead_b) :] == lead_b:
@@ -84,7 +85,7 @@ def _by_rows(kernel: str, a: Array, b: Array) -> Array:
 
 
 def _repeatable(operand: Array, lead: tuple[int, ...]) -> Array:
-    """Return rows whose repetition is ``operand`` with the leading axes ``lead``."""
+    """Return the rows that, repeated, give ``operand`` with the leading axes ``lead``."""
     own = operand.shape[:-1]
     if own != lead[len(lead) - len(own) :]:
         operand = np.broadcast_to(operand, (*lead, operand.shape[-1]))
@@ -92,7 +93,7 @@ def _repeatable(operand: Array, lead: tuple[int, ...]) -> Array:
 
 
 def _operand(array: Array) -> Any:
-    """Return an array, which may be read-only, as an argument of a kernel."""
+    """Pass an array, which may be read-only, to a kernel."""
     array = np.ascontiguousarray(array)
     try:
         return address(array)
@@ -158,8 +159,9 @@ def log(q: ArrayLike) -> Array:
 
 
 def _log_components(w: float, x: float, y: float, z: float) -> list[float]:
-    """Return ``log`` of one quaternion with the bits of the array branch: NumPy's arctan2 differs
-    from math's.
+    """Return ``log`` of one quaternion, with the bits of the array branch.
+
+    Uses NumPy's arctan2, whose last bits differ from those of ``math``.
     """
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z

@@ -173,8 +173,9 @@ def _dish(radius_m: float, depth_m: float, wall_m: float) -> list[tuple[float, f
 def _wings(
     bus_half_m: float, panel_m: Vector3, boom_m: float, tilt_rad: float, tolerance_m: float
 ) -> list[MeshPart]:
-    """Return two solar panels on booms along +Y ("north") and -Y ("south"), turned about the boom
-    by ``tilt_rad``.
+    """Return two solar panels on booms along +Y ("north") and -Y ("south").
+
+    ``tilt_rad``: rotation of the panels about the boom.
     """
     parts = []
     for label, side in (("north", 1.0), ("south", -1.0)):
@@ -381,11 +382,11 @@ def satellite_names() -> tuple[str, ...]:
 
 @lru_cache
 def satellite(name: str, tolerance_m: float = FINE_M) -> TriangleMesh:
-    """Return a shipped satellite; the origin is its centre of mass, to 0.1 mm, but that of the
-    cuboid for `chaser_body`.
+    """Return a shipped satellite.
 
-    Raises ValueError, listing the known names, for an unknown one, and for a tolerance that is not
-    positive.
+    The origin is its centre of mass, to 0.1 mm; that of ``chaser_body`` is the centre of the
+    cuboid. Raises ValueError for an unknown name, listing the known ones, and for a tolerance that
+    is not positive.
     """
     if name not in _SATELLITES:
         raise ValueError(f"unknown satellite {name!r}; known: {', '.join(satellite_names())}")

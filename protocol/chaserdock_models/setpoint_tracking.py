@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Track a setpoint by a second-order control law: the safe command where there is no plan."""
+"""Track a setpoint by a second-order control law: the safe command without a plan."""
 
 from __future__ import annotations
 
@@ -27,8 +27,11 @@ class PlacedBody(MovingBody, Protocol):
 
 @dataclass(frozen=True)
 class Setpoint:
-    """Reference of the control law: position and velocity (3,) WRF, attitude (4,) body to WRF, rate
-    (3,) body axes, and feed-forward ``wrench`` (6,) in body axes."""
+    """Reference of the control law.
+
+    Position and velocity (3,) in WRF, attitude (4,) body to WRF, rate (3,) in body axes, and the
+    feed-forward ``wrench`` (6,) in body axes.
+    """
 
     position_m: Array
     velocity_m_s: Array

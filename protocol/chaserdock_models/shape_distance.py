@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signed distance from the cuboids of a body, with its gradient, and distances between bodies of
-cuboids. Pure functions.
+"""Compute signed distances from the cuboids of a body, and distances between bodies of cuboids.
 
-The distance from a cuboid is that from its nearest point; inside it is negative, to the nearest
-face (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.4). Between bodies the distance
-is that of two planes that separate them: the gap along one direction, which is at most the
-distance. The NMPC's kernel computes the same (nmpc/native/planes.c).
+Pure functions. The distance from a cuboid is that from its nearest point; inside it is negative, to
+the nearest face (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.4). Between two
+bodies it is the gap between planes that separate them along one direction, which never exceeds the
+true distance. The NMPC's kernel computes the same (nmpc/native/planes.c).
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ def chaser_boxes(
 
 
 def box_table(boxes: Sequence[Box]) -> Array:
-    """Return centres (3), rotations box to body (9, row-major) and half edges (3) of cuboids, (C,
-    15).
+    """Return a table (C, 15) of cuboids: centre (3), rotation box to body (9, row-major), half
+    edges (3).
     """
     rows = [
         np.concatenate(
@@ -52,8 +51,10 @@ def box_table(boxes: Sequence[Box]) -> Array:
 
 
 def moved(table: Array, positions_m: ArrayLike, q_wxyz: ArrayLike) -> Array:
-    """Return a table (C, 15) for poses of the body (K, 3), (K, 4): (K, C, 15), in the frame of the
+    """Return the table (K, C, 15) of a body's cuboids (C, 15) at K poses, in the frame of the
     poses.
+
+    Poses: positions (K, 3) and attitudes (K, 4).
     """
     turns = rotations.to_matrix(np.asarray(q_wxyz, dtype=float))
     out = np.empty((len(turns), len(table), 15))
@@ -65,10 +66,9 @@ def moved(table: Array, positions_m: ArrayLike, q_wxyz: ArrayLike) -> Array:
 
 
 def signed_distance(table: Array, point_m: ArrayLike) -> tuple[float, Array]:
-    """Return the least signed distance (m) of a point (3,) from the cuboids of a table (C, 15), and
-    its gradient (3,).
+    """Return the least signed distance (m) of a point (3,) from cuboids, and its gradient (3,).
 
-    Infinity without cuboids.
+    ``table`` (C, 15); without cuboids the distance is infinite.
     """
     best, gradient = np.inf, np.zeros(3)
     for row in table:
@@ -102,8 +102,10 @@ def reach_along(table: Array, direction: ArrayLike, q_wxyz: ArrayLike) -> float:
 def distance_from_cuboids(
     table: Array, body: Array, position_m: ArrayLike, q_wxyz: ArrayLike
 ) -> float:
-    """Return the least gap (m) between cuboids (C, 15) and a ``body`` (S, 15) in a pose (3,), (4,),
-    along the gradients of the signed distances of its origin."""
+    """Return the least gap (m) between cuboids (C, 15) and a ``body`` (S, 15) at a pose (3,), (4,).
+
+    The gap is measured along the gradient of each cuboid's signed distance at the body's origin.
+    """
     gaps = []
     for row in table:
         distance_m, normal = signed_distance(row[None], position_m)
@@ -114,8 +116,10 @@ def distance_from_cuboids(
 def distance_between(
     body: Array, pose: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]
 ) -> float:
-    """Return the gap (m) between two bodies of equal shape (S, 15) in poses (3,), (4,), along the
-    line between their origins.
+    """Return the gap (m) between two bodies of equal shape (S, 15), along the line of their
+    origins.
+
+    Each pose: position (3,) and attitude (4,).
     """
     line = np.asarray(pose[0], dtype=float) - np.asarray(other[0], dtype=float)
     apart_m = float(np.linalg.norm(line))

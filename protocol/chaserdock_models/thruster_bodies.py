@@ -12,10 +12,10 @@ _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))  # about x, y a
 
 
 def _tetra12() -> dict[str, Any]:
-    """Return a cube with three 1.5 N thrusters on each of four corners: one thruster under the 12
-    tetrahedral rotations.
+    """Return a cube with three 1.5 N thrusters on each of four corners.
 
-    With any one thruster stuck off or stuck on, all six degrees of freedom stay controllable.
+    They are one thruster under the 12 tetrahedral rotations. With any one stuck off or stuck on,
+    all six degrees of freedom stay controllable.
     """
     arm_m, direction = 0.163, (-0.525, -0.525, 0.669)
     length = math.hypot(*direction)
@@ -41,10 +41,10 @@ def _tetra12() -> dict[str, Any]:
 
 
 def _slider() -> dict[str, Any]:
-    """Return the paper's body with four 2.3 N thrusters on each corner of its plate: two in the
-    plane, one up, one down.
+    """Return the paper's body with four 2.3 N thrusters on each corner of its plate.
 
-    The paper's 2 N and 0.05 N m on all axes at once stay available with any one thruster lost.
+    Two act in the plane, one up, one down. The paper's 2 N and 0.05 N m on all axes at once stay
+    available with any one thruster lost.
     """
     arm_m = 0.125
     thrusters = [

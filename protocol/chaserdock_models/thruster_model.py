@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Impulse of thrusters from the opening times of their valves; used by the simulator and by a
-chaser's own model.
+"""Compute the impulse of thrusters from the opening times of their valves.
 
-Times are integer nanoseconds of simulated time. A valve is open where a pulse or a failure opens it
-and its shut-off valve is not closed. Thrust rises linearly within ``rise_s`` of the opening and
-falls linearly within ``fall_s`` of the closing. A gap no longer than the fall time does not close
-the valve, and a pulse shorter than the minimum on-time does not open it. Impulses between two times
-are exact, so they do not depend on the step size.
+Simulator and chaser use the same model. Times are integer nanoseconds of simulated time. A valve is
+open where a pulse or a failure opens it and its shut-off valve is not closed. Thrust rises linearly
+within ``rise_s`` of the opening and falls linearly within ``fall_s`` of the closing. A gap no
+longer than the fall time does not close the valve, and a pulse shorter than the minimum on-time
+does not open it. Impulses between two times are exact, so they do not depend on the step size.
 """
 
 from __future__ import annotations

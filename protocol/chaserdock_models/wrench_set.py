@@ -44,8 +44,10 @@ def wrench_matrix(thrusters: Sequence[ThrusterMount]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class WrenchSet:
-    """``matrix`` (6, n) from ``wrench_matrix``; ``normals`` (K, 6) of all facets, independent of
-    the thrust limits.
+    """The wrenches that a thruster layout can produce.
+
+    ``matrix`` (6, n): from ``wrench_matrix``. ``normals`` (K, 6): of all facets, independent of the
+    thrust limits.
     """
 
     matrix: Array

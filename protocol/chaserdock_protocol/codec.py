@@ -67,8 +67,11 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
 
 
 def check_numbers(message: Struct) -> None:
-    """Raise Rejected unless every float is finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of
-    unit length and no variance negative."""
+    """Raise Rejected for an invalid number in a message.
+
+    Every float must be finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of unit length, no
+    variance negative.
+    """
     if not _passes_fast_check(message):
         _check_fields(message)
 
@@ -85,10 +88,10 @@ class _FieldGetters(NamedTuple):
 
 
 def _passes_fast_check(message: Struct) -> bool:
-    """Return True only if all numbers of a message are valid, by a few calls into C.
+    """Check all numbers of a message by a few calls into C; return True only if they are valid.
 
-    False requires the detailed check. ``hypot`` propagates NaN and infinity, and is at least as
-    large as each component.
+    False means that the detailed check must decide. ``hypot`` propagates NaN and infinity, and is
+    at least as large as each component.
     """
     getters = _field_getters(type(message))
     if getters is None:
@@ -124,7 +127,10 @@ def _parts_pass_fast_check(message: Struct, getters: _FieldGetters) -> bool:
 
 @cache
 def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
-    """Return None for a type with other fields that hold floats, such as optional numbers."""
+    """Return the getters of a message type for the fast check.
+
+    None for a type with floats in other kinds of fields, such as optional numbers.
+    """
     numbers: list[str] = []
     rows: list[str] = []
     quaternions: list[str] = []
@@ -153,7 +159,7 @@ def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
 
 
 def _is_row(kind: inspect.TupleType | inspect.VarTupleType) -> bool:
-    """Return whether it is a tuple of floats only."""
+    """Return whether a type is a tuple of floats only."""
     items = kind.item_types if isinstance(kind, inspect.TupleType) else (kind.item_type,)
     return all(isinstance(item, inspect.FloatType) for item in items)
 
@@ -249,11 +255,10 @@ _LATER_FIELDS = frozenset({"given_thrusters_N_s", "geometry", "ranging", "expect
 
 
 def without_wall_time(message: Message) -> dict[str, Any]:
-    """Return the fields that are equal in two equal flights: all but wall-clock times and process
-    instances.
+    """Return the fields of a message that are equal in two equal flights.
 
-    Fields that came later are left out while they are empty, so that flights without them keep
-    their digest.
+    Leaves out wall-clock times and process instances. Fields that came later are left out while
+    they are empty, so that flights without them keep their digest.
     """
     return {
         name: value

@@ -163,14 +163,17 @@ class FaultLayer:
         """
         if message.tick >= 0:
             self.apply_process_faults(message.tick)
+
         key = topic.key_of(place)
         out = self._release_delayed(key, message.tick)
+
         for k, fault in self._receipt:
             if not self._affects(k, fault, topic, place, message):
                 continue
             self._count(fault, None)
             sender = sender_of(topic, place, self.name, message)
             lost = [LostMessage(message.tick, message.sim_time_ns, sender)] if self.lockstep else []
+
             if fault.kind == "duplicate":
                 return [*out, message, message, *self._release_overtaken(key)]
             if fault.kind == "delay":
@@ -238,6 +241,8 @@ class FaultLayer:
             damaged: Any = codec.decode(topic.kind, bytes(data))
         except Rejected:
             return None
+        # A message of another tick, chaser or sender does not count as this one. In lock-step the
+        # reader would wait for this one without end, so that damage to these fields is a loss.
         # Not accepted for this one: in lock-step the reader would wait on.
         same = all(
             getattr(damaged, name, None) == getattr(message, name, None)

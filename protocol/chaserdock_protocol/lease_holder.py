@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leases that chasers have granted, as a controller knows them: who commands a tick. No I/O; ticks
-are the only clock.
+"""Decide from the chasers' leases which controller commands a tick.
 
-A controller commands a tick while a majority of the chasers that take part in it have promised it
-to that controller. Any two majorities share a chaser, and a chaser promises a tick to one
-controller only. A chaser that is lost in a tick still counts in it: a majority of the others need
-not share a chaser with one that included it.
+No I/O; ticks are the only clock. A controller commands a tick while a majority of the chasers that
+take part in it have promised it to that controller. Any two majorities share a chaser, and a chaser
+promises a tick to one controller only. A chaser that is lost in a tick still counts in it: a
+majority of the others need not share a chaser with one that included it.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from .leases import is_majority, next_term
 from .messages import Lease, Tick
 
 PATIENCE_TICKS = 3
-"""A controller gives a lease back after it had no majority for so many ticks; after one if the
-other commands meanwhile.
+"""Ticks without a majority after which a controller gives a lease back. One tick is enough while
+the other controller commands.
 """
 _MOST_KNOWN = 8
 """Ticks whose first message is kept: half a second at 15 Hz, longer than `PATIENCE_TICKS`."""
@@ -38,12 +37,12 @@ class Commander:
 
 @dataclass
 class LeaseHolder:
-    """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this
-    controller.
+    """Keep the newest lease that each chaser has stated.
 
-    ``_renewed``: tick in which a chaser has last stated a longer lease of the same holder, and so
-    has executed a command. ``_first``: the first revisions of the last ticks. ``_claimed``,
-    ``_ceded``: newest ticks that this controller, and another one, was found to command.
+    ``name``, ``instance`` and ``term``: of this controller. ``_renewed``: by chaser, the tick in
+    which it last stated a longer lease of the same holder, and so has executed a command.
+    ``_first``: the first revisions of the last ticks. ``_claimed``, ``_ceded``: newest ticks that
+    this controller, and another one, was found to command.
     """
 
     name: str
@@ -106,9 +105,10 @@ class LeaseHolder:
         return granted
 
     def _with_lost_chasers(self, tick: Tick) -> Tick:
-        """Return a tick with the chasers that it began with, none if these are not known.
+        """Return a tick with the chasers that it began with, which also count if they are lost.
 
-        With one controller only, the chasers that are lost do not count.
+        With one controller only, lost chasers do not count. If the tick's first revision is not
+        known, it has no chasers, and so no majority.
         """
         if tick.revision == 0 or len(tick.controllers) < 2:
             return tick
@@ -128,13 +128,13 @@ class LeaseHolder:
         return None
 
     def claim(self, tick: Tick) -> bool:
-        """Return whether this controller commands a tick; ``term`` is then the number to command
-        with.
+        """Return whether this controller commands a tick, and update ``term``, the number to
+        command with.
 
-        With a new grant, or after the other has commanded, it is no smaller than any that chasers
-        have stated up to that tick, so that the newest commander has the highest. Otherwise it
-        stays: the other controller may hold a higher term in a minority, or in later ticks, whose
-        leases a controller that was frozen may have read before it finishes its own.
+        After a new grant, and after the other controller has commanded, the term becomes no smaller
+        than any that chasers have stated up to that tick: the newest commander has the highest.
+        Otherwise it stays: the other controller may hold a higher term in a minority, or in later
+        ticks, whose leases a controller that was frozen may have read before it finishes its own.
         """
         found = self.commander_of(tick)
         if found is None:
@@ -152,8 +152,10 @@ class LeaseHolder:
         return True
 
     def _is_commanded_since(self, since: int, tick: Tick) -> bool:
-        """Return whether another controller holds a majority at a tick, all of which has executed
-        its commands since a tick.
+        """Return whether another controller holds a majority at ``tick`` and commands those
+        chasers.
+
+        Each of them must have executed a command of it in tick ``since`` or later.
         """
         granted = [
             lease
@@ -166,11 +168,10 @@ class LeaseHolder:
         )
 
     def take_idle(self, tick: Tick) -> dict[int, tuple[int, bool]]:
-        """Return the chasers that may wait for a command of this controller, which does not command
-        the tick.
+        """Return the chasers that may wait for this controller in a tick that it does not command.
 
-        Those are the chasers whose lease it holds, and those whose lease of this tick was lost:
-        term, and whether the lease is given back now.
+        These are the chasers whose lease it holds, and those whose lease of this tick was lost. The
+        value is the term, and whether the controller gives the lease back now.
         """
         held = {lease.chaser: lease.term for lease in self._granted(self.name, tick)}
         self._idle_since = {i: self._idle_since.get(i, tick.tick) for i in held}

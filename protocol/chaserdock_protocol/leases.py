@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leases of command authority: rules that the chasers, which grant them, and all others share. Pure
-functions.
+"""Define the leases of command authority: rules for the chasers, which grant them, and for all
+others.
 
-A lease covers a range of the world's ticks, not a span of a clock: no delay of a message and no
-error of a clock lets two controllers hold one chaser's lease of the same tick.
+Pure functions. A lease covers a range of the world's ticks, not a span of a clock: no delay of a
+message and no error of a clock lets two controllers hold one chaser's lease of the same tick.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from .messages import Lease, Tick, WrenchCommand
 from .topics import CONTROLLERS
 
 LEASE_S, LEASE_MAX_S = 0.18, 2.0
-"""Shortest and longest lease; each covers at least two ticks."""
+"""Shortest and longest lease, s; every lease covers at least two ticks. Shorter: a standby takes
+over sooner; longer: a slow machine changes its commander less often.
+"""
 
 
 def lease_ticks(rate_hz: float) -> int:
@@ -29,7 +31,7 @@ def longest_lease_ticks(rate_hz: float) -> int:
 
 
 def defect_of(lease: Lease, rate_hz: float) -> str:
-    """Return why no chaser can have stated a lease, empty if it is sound."""
+    """Return why no chaser can have stated a lease; empty if it is sound."""
     if not lease.holder:
         return ""
     if commander_of(lease.term) != lease.holder:
@@ -45,8 +47,8 @@ def defect_of(lease: Lease, rate_hz: float) -> str:
 
 
 def next_term(term: int, controller: str) -> int:
-    """Return the smallest number above ``term`` that belongs to a controller: no two controllers
-    share a term.
+    """Return the smallest term above ``term`` that belongs to a controller; no two controllers
+    share one.
     """
     number = term + 1
     while commander_of(number) != controller:
@@ -60,8 +62,9 @@ def commander_of(term: int) -> str:
 
 
 def is_majority(granted: Collection[int], live: Collection[int]) -> bool:
-    """Return whether chasers ``granted`` are a majority of those that are ``live``: of an even
-    number, half with the first.
+    """Return whether the chasers ``granted`` are a majority of the ``live`` ones.
+
+    Half of an even number is a majority if it includes the first chaser.
     """
     if not live or not granted:
         return False
@@ -69,9 +72,7 @@ def is_majority(granted: Collection[int], live: Collection[int]) -> bool:
 
 
 def no_command(chaser: int, tick: Tick) -> WrenchCommand:
-    """Return the message for a chaser that waits for the command of a tick for which there is
-    none.
-    """
+    """Return the message that tells a waiting chaser that nobody commands a tick."""
     zero = (0.0, 0.0, 0.0)
     return WrenchCommand(
         tick=tick.tick,

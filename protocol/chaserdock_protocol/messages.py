@@ -76,8 +76,8 @@ PhaseName = Literal[
 ]
 """Phase of a chaser. Those from ``wait`` on occur only if docking ends by capture."""
 Latch = Literal["keep", "arm", "release"]
-"""Command of a probe's latch: no change; close at a valid touch and stay closed; open and stay
-open.
+"""Command to a probe's latch: ``keep`` changes nothing, ``arm`` lets it close at a valid touch and
+stay closed, ``release`` opens it until it is armed again.
 """
 
 
@@ -113,8 +113,9 @@ SquareOfParameters = Annotated[tuple[float, ...], Meta(max_length=64 * 64)]
 
 
 class ExpectedPose(Struct, frozen=True, kw_only=True):
-    """Pose of the target in the camera of a chaser that is expected at ``sim_time_ns``; in the
-    frames of ``PoseSolution``.
+    """Pose of the target that is expected in a chaser's camera at ``sim_time_ns``.
+
+    Frames as in ``PoseSolution``.
     """
 
     sim_time_ns: Count
@@ -123,13 +124,14 @@ class ExpectedPose(Struct, frozen=True, kw_only=True):
 
 
 class GeometryMeasurement(Struct, frozen=True, kw_only=True):
-    """Information of one image on the k errors of the target's known geometry.
+    """Measurement, in one image, of the k errors of the target's known geometry.
 
-    ``information``: row-major (k, k), for any pose of the target; ``vector``: it times the estimate
-    (k,); both empty for an image for which no view was rendered. ``position_m``: of the target in
-    IRF as the image shows it if the geometry has no errors; ``position_by_errors``: its change by
-    the errors, row-major (3, k); ``position_covariance_m2``: for known errors. In units of the
-    errors' prior standard deviations, in the order of ``GeometryEstimate.names``.
+    Errors are in units of their prior standard deviations, in the order of
+    ``GeometryEstimate.names``. ``information``: row-major (k, k), for an unknown pose of the
+    target. ``vector`` (k,): information times estimate. Both are empty for an image for which no
+    view was rendered. ``position_m``: position of the target in IRF that the image shows if all
+    errors are 0. ``position_by_errors``: its derivative by the errors, row-major (3, k).
+    ``position_covariance_m2``: row-major (3, 3), its covariance if the errors are known.
     """
 
     information: SquareOfParameters = ()
@@ -140,12 +142,12 @@ class GeometryMeasurement(Struct, frozen=True, kw_only=True):
 
 
 class GeometryEstimate(Struct, frozen=True, kw_only=True):
-    """Errors of the target's known geometry as estimated from ``views`` images, which cover a share
-    of all directions.
+    """Estimated errors of the target's known geometry.
 
-    ``names``: of the k errors: a joint and a body axis about which it is turned (rad), ``scale``
-    (share) or ``rim`` (m). ``sigmas``: prior standard deviations. ``values`` and row-major
-    ``covariance`` (k, k): of the estimate, in the same units.
+    ``names``: of the k errors: a joint and the body axis about which it is turned (rad), ``scale``
+    (relative) or ``rim`` (m). ``sigmas``: prior standard deviations. ``values`` and row-major
+    ``covariance`` (k, k): the estimate, in the same units. ``views``: number of images it is based
+    on. ``coverage``: share of all viewing directions that these cover.
     """
 
     names: Annotated[tuple[Text, ...], Meta(max_length=64)]
@@ -174,12 +176,12 @@ class CameraCalibration(Struct, frozen=True, kw_only=True):
 
 
 class RelativeEstimate(Struct, frozen=True, kw_only=True):
-    """Estimated pose of chaser ``chaser`` relative to the target, and the disturbance that acts on
-    the chaser.
+    """Estimated pose of chaser ``chaser`` relative to the target, and the disturbance on the
+    chaser.
 
     ``position_m`` is CRF's origin in TRF, ``q_wxyz`` takes CRF to TRF. ``covariance`` is row-major
     (6, 6) over (position in TRF axes, dtheta in CRF axes) with q_true = q (x) exp(dtheta).
-    ``force_N`` and ``torque_N_m``: body axes.
+    ``force_N`` and ``torque_N_m``: disturbance, body axes.
     """
 
     chaser: ChaserId
@@ -191,10 +193,10 @@ class RelativeEstimate(Struct, frozen=True, kw_only=True):
 
 
 class ProbeTouch(Struct, frozen=True, kw_only=True):
-    """First contact of a probe's tip with the target at ``sim_time_ns``: position and velocity
-    relative to its port.
+    """First contact of a probe's tip with the target at ``sim_time_ns``.
 
-    ``latched``: whether the latch closed. ``refused``: the reason if it did not.
+    Positions and velocities are relative to the probe's port. ``latched``: whether the latch
+    closed. ``refused``: the reason if it did not.
     """
 
     chaser: ChaserId
@@ -450,9 +452,9 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
 
 
 class MassEstimate(Struct, frozen=True, kw_only=True):
-    """Estimated mass properties of a body: centre of mass and inertia about it in TRF axes, the
-    latter as xx, yy, zz, xy, xz, yz.
+    """Estimated mass properties of a body.
 
+    Centre of mass, and inertia about it, in TRF axes; inertia as xx, yy, zz, xy, xz, yz.
     ``covariance`` is row-major (10, 10) over (mass, centre of mass, inertia).
     """
 
@@ -463,12 +465,12 @@ class MassEstimate(Struct, frozen=True, kw_only=True):
 
 
 class StackEstimate(Message, frozen=True, kw_only=True):
-    """Identified mass properties at ``sim_time_ns``: of the ``stack`` of the target and
-    ``chasers``, and of the ``target`` alone.
+    """Mass properties identified in flight, at ``sim_time_ns``.
 
-    ``thrust_factors``: estimated over stated thrust of every thruster, chaser after chaser.
-    ``failed``: for each chaser the thrusters that the motion of the stack shows to be stuck.
-    Without chasers both bodies are the freely tumbling target.
+    ``stack``: of the target with ``chasers``. ``target``: of the target alone. ``thrust_factors``:
+    estimated over stated thrust of every thruster, chaser after chaser. ``failed``: for each chaser
+    the thrusters that the motion of the stack shows to be stuck. Without chasers both bodies are
+    the freely tumbling target.
     """
 
     chasers: ChaserIds
@@ -494,22 +496,26 @@ class Reference(Message, frozen=True, kw_only=True):
 
 
 class WrenchCommand(Message, frozen=True, kw_only=True):
-    """Commanded force and torque of a chaser, in body axes, from ``effective_time_ns`` to
+    """Commanded force and torque of a chaser, body axes, from ``effective_time_ns`` to
     ``expires_ns``.
 
-    ``tick`` is that of the odometry that it is based on. ``mode`` is its origin: the NMPC's plan, a
-    safe command (``track`` the reference without a plan, ``brake`` to rest, ``coast`` without
-    force), the ``search`` for a target that no chaser sees, the ``pull`` that verifies a latch, the
-    ``detumble`` of a stack, or ``none``: no command, as the chaser's state is unknown.
+    ``tick``: of the odometry that the command is based on. ``mode``: its origin. ``nmpc`` is the
+    plan. ``track`` (the reference without a plan), ``brake`` (to rest) and ``coast`` (without
+    force) are safe commands. ``search`` looks for a target that no chaser sees, ``pull`` verifies a
+    latch, ``detumble`` stops a stack. ``none``: no command, as the chaser's state is unknown.
+    ``wait`` and ``yield``: the controller has no majority of leases and commands nothing; with
+    ``yield`` it gives the lease back.
+
     ``thrusts_N``, with ``detumble`` only: thrust of every thruster, in place of an allocation by
-    the chaser; force and torque are then those of the thrusts. Without a majority of leases a
-    controller commands nothing: it lets the chaser ``wait``, or gives its lease back (``yield``).
-    ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an
-    operator declared healthy, which overrides the chaser's fault detection. ``free``: no contact or
-    latch, so that the motion identifies thruster faults. ``geometry``: newest estimate of the
-    target's geometry, by which the chaser corrects what it knows; when it has changed, and once a
-    second. ``expected``: to a chaser that does not see a target without markers, where it will be
-    in the next tick. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
+    the chaser; force and torque are then those of the thrusts. ``isolated``: thrusters whose
+    shut-off valve an operator closed. ``trusted``: thrusters that an operator declared healthy,
+    which overrides the chaser's fault detection. ``free``: neither contact nor latch, so that the
+    motion identifies thruster faults.
+
+    ``geometry``: newest estimate of the target's geometry, by which the chaser corrects its mesh;
+    sent when it has changed, and once a second. ``expected``: pose of the target in the next tick;
+    sent to a chaser that does not see a target without markers. ``term``, ``commander`` (the
+    sender) and its ``instance``: see ``Lease``.
     """
 
     chaser: ChaserId
@@ -533,11 +539,11 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
 
 
 class Plan(Message, frozen=True, kw_only=True):
-    """The NMPC's plan for one chaser: ``stages`` + 1 states, ``stages`` inputs, ``step_s`` apart
-    from ``sim_time_ns``.
+    """Plan of the NMPC for one chaser: ``stages`` + 1 states and ``stages`` inputs.
 
-    ``positions_m`` (3 numbers a state), ``q_wxyz`` (4 a state) and ``inputs`` (force, torque: 6 a
-    stage), flattened.
+    The first state is at ``sim_time_ns``; states are ``step_s`` apart. Arrays are flattened:
+    ``positions_m`` has 3 numbers a state, ``quaternions_wxyz`` 4 a state, ``inputs`` (force,
+    torque) 6 a stage.
     """
 
     chaser: ChaserId
@@ -548,15 +554,15 @@ class Plan(Message, frozen=True, kw_only=True):
 
 
 class PassiveSafety(Message, frozen=True, kw_only=True):
-    """Certificate of one chaser: the coasts after a loss of all thrust at any state of its newest
-    plan (``limits.passive_safety``).
+    """Certificate of passive safety of one chaser's newest plan (``limits.passive_safety``).
 
-    ``margin_sigmas``: smallest distance of a coast from the keep-out over its standard deviation;
-    negative inside. ``distance_m``: a lower bound on the distance from the target there,
-    ``closest_s`` after the loss of thrust, which is ``loss_s`` after the plan's beginning.
-    ``safe``: the margin is at least ``limits.estimate_margin_sigmas``. ``enforced``: the chaser
-    aborts while it is not. ``abort_margin_sigmas``: the same margin of the best abort from here;
-    None where none is sought.
+    It holds for the coasts after a loss of all thrust at any state of the plan. ``margin_sigmas``:
+    smallest distance of a coast from the keep-out, in standard deviations; negative inside.
+    ``distance_m``: lower bound on the distance from the target at that moment, ``closest_s`` after
+    the loss of thrust. ``loss_s``: time of the loss after the plan's beginning. ``safe``: whether
+    the margin is at least ``limits.estimate_margin_sigmas``. ``enforced``: whether the chaser
+    aborts otherwise. ``abort_margin_sigmas``: the same margin of the best abort from here; None
+    where none is sought.
     """
 
     chaser: ChaserId
@@ -583,14 +589,14 @@ class SolverStatus(Message, frozen=True, kw_only=True):
 
 
 class ActuatorCommand(Message, frozen=True, kw_only=True):
-    """A chaser's command to its actuators, body axes, from ``effective_time_ns`` on.
+    """Command of a chaser to its actuators, body axes, from ``effective_time_ns`` on.
 
     ``source``: ``command`` for the command of the controller that holds its lease, in ``term``.
-    Without one it flies its last ``plan`` to its end, comes to rest (``brake``) and then keeps
-    clear of the target (``hold``). With thrusters, ``pulses`` are those of the carrier periods that
-    begin while this command acts, ``isolated`` the thrusters whose shut-off valves are closed from
-    ``effective_time_ns`` on, and force and torque the demand. ``instance``: that of the chaser's
-    process.
+    Without one the chaser flies its last ``plan`` to its end, comes to rest (``brake``) and then
+    keeps clear of the target (``hold``). With thrusters, force and torque are the demand,
+    ``pulses`` are those of the carrier periods that begin while this command acts, and ``isolated``
+    are the thrusters whose shut-off valves are closed from ``effective_time_ns`` on. ``instance``:
+    of the chaser's process.
     """
 
     chaser: ChaserId
@@ -606,12 +612,12 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
 
 
 class Lease(Message, frozen=True, kw_only=True):
-    """Command authority over chaser ``chaser``, granted by it to the controller ``holder``; empty:
-    to none.
+    """Command authority over chaser ``chaser``, which it has granted to the controller ``holder``.
 
-    Its ticks are those from ``from_tick`` (in revision ``from_revision`` on) to ``until_tick``. The
-    chaser executes commands of that controller's ``instance`` only, and of no term before ``term``.
-    ``tick`` and ``revision`` are those of the newest ``Tick`` that the chaser has received.
+    An empty holder: to none. The lease covers the ticks from ``from_tick`` (from its revision
+    ``from_revision`` on) to ``until_tick``. The chaser executes commands of that controller's
+    ``instance`` only, and of no term before ``term``. ``tick`` and ``revision`` are those of the
+    newest ``Tick`` that the chaser has received.
     """
 
     chaser: ChaserId
@@ -625,8 +631,8 @@ class Lease(Message, frozen=True, kw_only=True):
 
 
 class ThrusterReport(Message, frozen=True, kw_only=True):
-    """Capability of a chaser's thrusters, by its own estimate, at the time of the odometry of the
-    same tick.
+    """Capability of a chaser's thrusters as it estimates it, at the time of the same tick's
+    odometry.
 
     ``force_max_N`` and ``torque_max_N_m`` can be reached on all body axes at once. ``coming_*``:
     remaining impulse (body axes) of commanded pulses, without the part that belongs to the next
@@ -662,11 +668,11 @@ class Event(Message, frozen=True, kw_only=True):
 
 
 class Health(Message, frozen=True, kw_only=True):
-    """Message counters of a process: rejected (by reason), lost (gaps in ``seq``), discarded as
-    stale.
+    """Message counters of a process.
 
-    ``blas``: the linear algebra library in use, whose kernels differ in the last bits; empty if not
-    known.
+    ``rejected``: invalid messages by reason. ``lost``: gaps in ``seq``. ``stale``: messages
+    discarded as too late. ``blas``: linear algebra library in use, whose kernels differ in the last
+    bits; empty if unknown.
     """
 
     process: Text
@@ -678,7 +684,7 @@ class Health(Message, frozen=True, kw_only=True):
 
 
 class RecorderAck(Message, frozen=True, kw_only=True):
-    """The recorder has all expected messages up to ``tick``."""
+    """Acknowledge that the recorder has all expected messages up to ``tick``."""
 
 
 class OperatorCommand(Message, frozen=True, kw_only=True):
@@ -714,11 +720,11 @@ class CommandReply(Message, frozen=True, kw_only=True):
 
 
 class ControllerState(Message, frozen=True, kw_only=True):
-    """The commanding controller's report to standbys: the tick is complete; ``operated``: its
-    operator commands.
+    """Report of the commanding controller to standbys that it has completed the tick.
 
-    ``state``, at intervals: serialized controller state after the tick, for standbys that joined
-    late; else empty. ``process``, ``instance`` and ``term``: of the sender; see ``Lease``.
+    ``operated``: operator commands of the tick. ``state``: serialized controller state after the
+    tick, for standbys that joined late; sent at intervals, else empty. ``process``, ``instance``
+    and ``term``: of the sender; see ``Lease``.
     """
 
     process: Text
@@ -772,11 +778,11 @@ class JoinRequest(Struct, frozen=True, kw_only=True):
 
 
 class JoinReply(Struct, frozen=True, kw_only=True):
-    """The world's reply: the flight scenario as JSON, or the reason of a rejection.
+    """Reply of the world to a request to join: the flight scenario as JSON, or why it refuses.
 
-    ``faults``: JSON of what the test bed injects at this process. For the code around the flight
-    software only. ``source``: identity of the world's session, which stamps its messages; others on
-    its keys are ignored. Empty: unknown.
+    ``faults``: JSON of what the test bed injects at this process; for the code around the flight
+    software only. ``source``: identity of the world's session, which stamps its messages; messages
+    of other sessions on its keys are ignored. Empty: unknown.
     """
 
     accepted: bool

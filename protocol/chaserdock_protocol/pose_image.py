@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose images for the perception ``statistical``: one row of pixels that are the bytes of nine
-numbers.
+"""Encode a pose as an image, for the perception ``statistical``.
 
-They are the pose of the target in the camera and what the perception draws its errors from. World
-and chaser exchange them as ``mono8`` images, so that everything but rendering and detection stays
-as it is.
+One row of pixels holds the bytes of nine numbers: the pose of the target in the camera, and the
+seed of the perception's errors. World and chaser exchange it as a ``mono8`` image, so that
+everything but rendering and detection stays as it is.
 """
 
 from __future__ import annotations

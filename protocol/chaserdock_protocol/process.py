@@ -40,9 +40,9 @@ class Rotation:
 
 @dataclass(frozen=True)
 class RosLink:
-    """How a bridge reaches ROS 2: endpoints to connect to, or to ``listen`` on as the router;
-    ``domain``: ROS_DOMAIN_ID.
+    """Describe how a bridge reaches ROS 2.
 
+    Endpoints to connect to, or to ``listen`` on as the router. ``domain``: ROS_DOMAIN_ID.
     ``control``: take the controller's place, with wrenches of ROS 2, instead of showing the
     mission.
     """
@@ -92,7 +92,9 @@ class ProcessOptions:
 
 
 class StopSignal:
-    """Set by SIGINT, SIGTERM and, with ``watch_parent``, the end of standard input (the parent has
+    """Record that this process is to stop.
+
+    Set by SIGINT, SIGTERM and, with ``watch_parent``, the end of standard input (the parent has
     ended).
     """
 

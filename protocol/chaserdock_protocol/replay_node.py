@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stand-ins for a process' network node and heartbeat, which replay a log through today's code."""
+"""Replace a process' network node and heartbeat, to replay a log through today's code."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ Published = tuple[Topic, int | str | None, Message]
 
 
 class ReplayNode:
-    """Stands in for a ``Node``: delivers the messages that were put in, and collects published
-    ones.
-    """
+    """Stand in for a ``Node``: deliver the messages that were put in, and collect published ones."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -50,7 +48,7 @@ class ReplayNode:
 
 
 class SilentHeartbeat:
-    """Stands in for a ``Heartbeat``: publishes and records nothing."""
+    """Stand in for a ``Heartbeat``: publish and record nothing."""
 
     def __init__(self) -> None:
         self.in_flight = threading.Event()
@@ -59,7 +57,7 @@ class SilentHeartbeat:
         """Ignore a presence."""
 
     def is_replaced(self, listed: Any) -> bool:
-        """Take a recorded process for the one that the world lists."""
+        """Return False: a recorded process is the one that the world lists."""
         return False
 
     def report_waiting(self, received: Any, missing_keys: Any) -> None:

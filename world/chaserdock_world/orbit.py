@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The target's orbit over a mission: its Hill frame, which is WRF, and sun and Earth seen in it. A
-function of time only.
+"""Propagate the target's orbit over a mission: its Hill frame, which is WRF, with sun and Earth in
+it.
+
+A function of time only.
 """
 
 from __future__ import annotations
@@ -24,26 +26,25 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.orbit import Orbit
 
 _GRID_S = 10.0
-"""Interval of the stored states, s (chosen). A state follows from the last stored one, whatever was
-asked before, so that it depends only on its time.
+"""Interval of the stored states, s. A state follows from the last stored one, whatever was asked
+before, so that it depends only on its time. Longer: less memory, and more steps from a stored state
+to the asked one.
 """
 
 
 class TargetOrbit:
-    """States of an orbit at any time from the begin of the mission on, integrated on a fixed
-    grid.
-    """
+    """Propagate an orbit from the beginning of the mission, on a fixed grid of time."""
 
     def __init__(self, section: Orbit) -> None:
         self._section, self.j2 = section, section.zonal_coefficient
         self._grid = [state_of(section.elements)]
-        # Asked several times for one moment: by bodies, light and drag.
+        # Cached, as bodies, light and drag ask for the same moment.
         self.state_at = lru_cache(maxsize=4)(self._state_at)
         self.frame_at = lru_cache(maxsize=4)(self._frame_at)
 
     def _state_at(self, time_s: float) -> OrbitState:
-        """Return the state at a time of the mission. The same at every call, in any order of
-        calls.
+        """Return the state at a time of the mission; equal at every call, whatever was asked
+        before.
         """
         index = int(time_s / _GRID_S)
         while len(self._grid) <= index:
@@ -81,8 +82,9 @@ class TargetOrbit:
 
 
 def to_sun(scenario: Scenario, time_s: float = 0.0) -> tuple[float, float, float]:
-    """Return the direction (3,) to the sun, WRF, any length: of the orbit, or the camera
-    section's.
+    """Return the direction (3,) to the sun, WRF, of any length.
+
+    By the orbit, or as the camera section states it.
     """
     if scenario.orbit is None:
         return scenario.camera.sun_direction
@@ -91,8 +93,9 @@ def to_sun(scenario: Scenario, time_s: float = 0.0) -> tuple[float, float, float
 
 
 def earth_disc(scenario: Scenario) -> tuple[tuple[float, float, float], float] | None:
-    """Return the direction (3,) to the Earth's centre, WRF, and its angular radius (rad); None
-    without an Earth in images.
+    """Return the Earth's disc: direction (3,) to its centre, WRF, and angular radius (rad).
+
+    None without an Earth in images.
     """
     if scenario.orbit is not None:
         return (-1.0, 0.0, 0.0), TargetOrbit(scenario.orbit).earth_radius_rad(0.0)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""True bodies and actuators: the nominal ones of the flight software with the errors of
-``[truth]``.
+"""Draw true bodies and actuators: nominal ones with the errors of ``[truth]``.
 
 Everything is drawn from the scenario's seed and the chaser's number. Without ``[truth]`` a plant is
 the nominal body.
@@ -23,15 +22,17 @@ from .random_draws import TARGET_KEY, Stream, generator
 
 Moments = tuple[float, float, float]
 _LARGEST_SIGMA = 3.0
-"""Draws are limited to so many standard deviations, so that shares stay positive; 0.3 % of a normal
+"""Largest draw, in standard deviations, so that shares stay positive; 0.3 % of a normal
 distribution lie beyond.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class PrincipalFrame:
-    """Principal axes at the centre of mass, in which an engine integrates: ``q_wxyz`` (4,)
-    principal to body axes, and the centre of mass ``offset_m`` (3,) in body axes."""
+    """Principal axes at the centre of mass, in which an engine integrates.
+
+    ``q_wxyz`` (4,): principal to body axes. ``offset_m`` (3,): centre of mass in body axes.
+    """
 
     q_wxyz: Array
     offset_m: Array
@@ -77,10 +78,10 @@ class PrincipalFrame:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """True mass properties of a body and its constant disturbance (6,), N and N m, at its origin in
-    body axes.
+    """True mass properties of a body, and its constant disturbance.
 
-    ``frame``: None if the principal axes at the centre of mass are the body's frame.
+    Disturbance (6,): N and N m, at the body's origin in its axes. ``frame``: None if the principal
+    axes at the centre of mass are the body's frame.
     """
 
     mass_kg: float
@@ -140,8 +141,9 @@ class ActuationErrors:
         return not (any(figures) or self.thrust_share.any() or self.thrust_turn_rad.any())
 
     def delay(self, step: int) -> float:
-        """Return the time, s, after which a command for this physics step acts; negative if the
-        clock is ahead.
+        """Return the time, s, after which a command for this physics step acts.
+
+        Negative if the chaser's clock is ahead.
         """
         jitter = 0.0
         if self.delay_jitter_s:
@@ -150,8 +152,9 @@ class ActuationErrors:
         return max(0.0, self.delay_s + jitter) - self.clock_offset_s
 
     def scatter(self, key: int, time: int, count: int) -> Array:
-        """Return factors (count,) that scatter around 1. ``key``: of the thruster; ``time``: of the
-        pulse or command.
+        """Return factors (count,) that scatter around 1, drawn for a pulse or command.
+
+        ``key``: of the thruster. ``time``: of the pulse or command.
         """
         draw = generator(self.seed, Stream.SCATTER, self.chaser, key, time).standard_normal(count)
         return 1.0 + self.scatter_share * np.clip(draw, -_LARGEST_SIGMA, _LARGEST_SIGMA)
@@ -163,11 +166,10 @@ def _normal(seed: int, stream: Stream, key: int, count: int) -> Array:
 
 
 def draw_moments(nominal: Moments, share: float, rng: np.random.Generator) -> Moments:
-    """Return principal moments with relative errors of standard deviation ``share`` that a rigid
-    body can have.
+    """Return principal moments with relative errors of standard deviation ``share``.
 
-    What violates the triangle inequality is drawn again, each time with a slightly smaller
-    deviation, which ends for every nominal body.
+    A rigid body must be able to have them: what violates the triangle inequality is drawn again,
+    each time with a slightly smaller deviation, which ends for every nominal body.
     """
     while share:
         draw = np.clip(rng.standard_normal(3), -_LARGEST_SIGMA, _LARGEST_SIGMA)
@@ -179,8 +181,8 @@ def draw_moments(nominal: Moments, share: float, rng: np.random.Generator) -> Mo
 
 
 def _principal(inertia: Array) -> tuple[Moments, Array]:
-    """Return the principal moments of an inertia tensor (3, 3), and the rotation (4,) from
-    principal to body axes.
+    """Return principal moments of an inertia tensor (3, 3), and rotation (4,) principal to body
+    axes.
     """
     values, axes = np.linalg.eigh(inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -233,9 +235,7 @@ def chaser_plant(scenario: Scenario, chaser: int) -> Plant:
 
 
 def target_plant(scenario: Scenario) -> Plant:
-    """Return the true body of the target. A prescribed motion needs none: then it is the stated
-    one.
-    """
+    """Return the true body of the target; the stated one for a prescribed motion."""
     target = scenario.target
     if target.motion != "torque_free":
         return Plant(target.mass_kg, target.moments)
@@ -273,7 +273,7 @@ def actuation_errors(scenario: Scenario, chaser: int) -> ActuationErrors:
 
 
 def true_target(scenario: Scenario) -> TargetModel:
-    """Return the target as it is: its markers displaced in their planes."""
+    """Return the true target, whose markers are displaced in their planes."""
     model, sigma = scenario.target_model(), scenario.truth.mismatch("target").marker_m
     if not sigma:
         return model
@@ -285,18 +285,18 @@ def true_target(scenario: Scenario) -> TargetModel:
 
 
 def true_mesh(scenario: Scenario) -> TriangleMesh | None:
-    """Return the target's mesh as it is: finer than the known one, its size and the angles of its
-    joints in error.
+    """Return the true mesh of the target, or None without a mesh.
 
-    None for a target without a mesh.
+    It is finer than the known one, and its size and the angles of its joints are in error.
     """
     mesh = scenario.target.nominal_mesh()
     return None if mesh is None else with_geometry_errors(mesh, *true_geometry_errors(scenario))
 
 
 def true_geometry_errors(scenario: Scenario) -> tuple[float, dict[str, Array]]:
-    """Return the errors of the known mesh that a seed draws: of the scale, a share, and the turn
-    (3,) of each joint, rad.
+    """Return the errors of the known mesh that a seed draws.
+
+    Relative error of the scale, and the rotation vector (3,) of each joint, rad.
     """
     mesh, knowledge = scenario.target.nominal_mesh(), scenario.target.knowledge
     joints = () if mesh is None else tuple(mesh.joints)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The world process: owns simulated time, simulates the bodies, renders the images and publishes
-the ground truth.
+"""Run the world: own simulated time, simulate the bodies, render images, publish ground truth.
 
 Lock-step: a tick ends when all expected replies have arrived; nothing depends on the order of
 arrival or on the wall clock. Real time: the wall clock ends a tick.
@@ -54,8 +53,8 @@ from chaserdock_world.sensors.publish import (
 )
 
 _REALTIME_SLICES_HZ = 240
-"""Rate at which physics follows the wall clock: a command acts within 4 ms of its arrival, and a
-slice is still several steps of physics.
+"""Rate, Hz, at which physics follows the wall clock: a command acts within 4 ms of its arrival, and
+a slice is still several steps of physics.
 """
 
 
@@ -102,8 +101,9 @@ def refuse_second_world(node: Node) -> None:
 
 
 class World:
-    """One mission: simulation, sensors, actuators and the barrier of its ticks. Processes can join
-    once it is made.
+    """Run one mission: simulation, sensors, actuators and the barrier of its ticks.
+
+    Processes can join once it is made.
     """
 
     def __init__(self, scenario: Scenario, options: ProcessOptions, node: Node) -> None:
@@ -136,6 +136,7 @@ class World:
             source=node.source,
             now_s=node.host.now_s,
         )
+
         node.blocking = not self._realtime
         node.subscribe(topics.ACTUATORS)
         node.subscribe(topics.ACK)
@@ -145,6 +146,7 @@ class World:
         node.declare_queryable(
             topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request))
         )
+
         for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD, topics.TRUTH_DRAWN):
             node.advertise(topic)
         for i in range(len(scenario.chasers)):
@@ -156,9 +158,12 @@ class World:
         if self._physics.plumes is not None:
             for name in self._physics.plumes.bodies:
                 node.advertise(topics.TRUTH_PLUME, name)
+
+        # After all other subscriptions, see ``Heartbeat``.
         heartbeat = Heartbeat(node, membership.instance)
         node.declare_liveliness()
         node.declare_queryable(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
+
         commands = CommandIntake(
             self._timing,
             self._actuators,
@@ -229,8 +234,9 @@ class World:
         return f"not connected within {patience_s:g} s: {missing_names()}" if missing else ""
 
     def _publish_state(self, tick: int) -> States:
-        """Publish odometry, docking sensors and ground truth at the beginning of a tick; return the
-        bodies' states.
+        """Publish odometry, docking sensors and ground truth at the beginning of a tick.
+
+        Return the bodies' states.
         """
         node, physics, timing = self._node, self._physics, self._timing
         states = {name: physics.state(name) for name in physics.bodies}
@@ -265,15 +271,15 @@ class World:
             self._node.publish(topics.IMAGE, image, image.chaser)
 
     def _await_replies_and_step(self, tick: int, stop: StopSignal) -> str:
-        """Lock-step: step the physics to the end of the tick, waiting for all replies before they
+        """Step the physics to the end of a lock-step tick, and wait for all replies before they
         take effect.
 
-        Returns why the tick cannot end, empty if it does.
+        Return why the tick cannot end, empty if it does.
         """
         timing, barrier = self._timing, self._barrier
         end = timing.step_of_tick(tick + 1)
         self._contacts = set()
-        # No reply takes effect before the latency has passed: simulate that far while the others
+        # No reply takes effect before the latency has passed: simulate until then while chasers
         # compute.
         self._step_to(min(end, timing.step_of_tick(tick) + timing.latency_steps))
         stalled = barrier.await_replies(stop, self._options.stall_s)
@@ -282,8 +288,8 @@ class World:
         return stalled
 
     def _step_realtime(self, tick: int) -> None:
-        """Real time: step the physics with the wall clock, in slices, so that a command acts as
-        soon as it arrives.
+        """Step the physics with the wall clock, in slices, so that a command acts as soon as it
+        arrives.
         """
         timing = self._timing
         self._contacts = set()

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random numbers that depend on the scenario's seed and a key only, not on the order in which they
-are drawn.
+"""Draw random numbers that depend on the scenario's seed and a key only, not on the order of
+drawing.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from chaserdock_models.arrays import Array
 
 
 class Stream(IntEnum):
-    """Separates the random streams from each other and from that of the image noise."""
+    """Separate the random streams from each other and from that of the image noise."""
 
     CALIBRATION = 101
     BIAS = 102
@@ -32,7 +32,7 @@ class Stream(IntEnum):
 
 
 TARGET_KEY = 10_000
-"""Stands for the target where a key has the number of a chaser."""
+"""Key of the target where others have the number of a chaser."""
 
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
@@ -59,8 +59,9 @@ class GaussMarkov:
         return generator(self._seed, self._stream, self._key, tick).standard_normal(len(self._kept))
 
     def at(self, tick: int) -> Array:
-        """Return the values (n,) at a tick; cheap for the next one, otherwise computed from the
-        first.
+        """Return the values (n,) at a tick.
+
+        Cheap for the next tick, otherwise computed from the first.
         """
         if tick < self._tick:
             self._tick, self._value = 0, self._drawn(0)

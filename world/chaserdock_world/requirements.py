@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packages that only some scenarios need of the world, and what to do without them."""
+"""Check for packages that only some scenarios need of the world, and state what to do without them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ def require_packages(scenario: Scenario) -> None:
 
 def require_pybullet(
     what: str = "the world",
-    instead: str = "elsewhere, pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\" (--set world.engine=mujoco)",
+    instead: str = (
+        "elsewhere, pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\" "
+        "(--set world.engine=mujoco)"
+    ),
 ) -> None:
     """Raise MissingPackageError if PyBullet, which ``what`` needs, is not installed; ``instead``:
     what else helps.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which wrench commands a chaser executes, and construction of actuator commands. No I/O."""
+"""Decide which wrench commands a chaser executes, and construct its actuator commands. No I/O."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from .outbox import Outbox
 
 
 class Decision(NamedTuple):
-    """What follows from a wrench command. ``execute``: the command to fly.
+    """What follows from a wrench command.
 
-    ``uncommanded_tick``: lock-step: the tick for which its sender gives no valid command.
+    ``execute``: the command to fly, None for a refused one. ``uncommanded_tick``: tick for which
+    its sender gives no valid command; in lock-step only.
     """
 
     execute: WrenchCommand | None = None
@@ -33,7 +34,7 @@ class Decision(NamedTuple):
 
 
 class CommandGate:
-    """Accepts the commands of the controller that holds the chaser's lease, and refuses others.
+    """Accept the commands of the controller that holds the chaser's lease, and refuse others.
 
     ``leases``: to whom this chaser has promised which ticks. ``executed_tick``: tick of the last
     actuator command that answers its tick; older commands are refused.
@@ -52,14 +53,15 @@ class CommandGate:
         self._reported_stale = self._reported_refusal = False
 
     def begin_tick(self, tick: Tick) -> None:
-        """Keep the lease, or grant it to the next controller, and state it."""
+        """Keep the lease or grant it to the next controller, and publish it."""
         if (lease := self.leases.update(tick)) is not None:
             self._outbox.publish(topics.LEASE, lease)
 
     def decide(self, command: WrenchCommand, tick: Tick | None, now_ns: int) -> Decision:
         """Decide on a command. ``tick``: the newest; ``now_ns``: the simulated time."""
         newest = -1 if tick is None else tick.tick
-        # It would count as newer than all commands to come, and extend the lease.
+        # A command of a far tick would count as newer than all that follow, and would extend the
+        # lease.
         early = command.tick > newest + longest_lease_ticks(self._scenario.time.rate_hz)
         stale = (
             f"for tick {command.tick}, the newest is {newest}"
@@ -82,7 +84,8 @@ class CommandGate:
             return self._refuse(command, reason, now_ns)
         self._renew_lease(command, tick)
         self._accept(command)
-        # Ticks are the clock that all share: that of the controller may be wrong.
+        # The tick states when a command takes effect, as all processes share it; the controller's
+        # clock may be wrong.
         return Decision(execute=msgspec.structs.replace(command, effective_time_ns=due_ns))
 
     def _refuse_stale(
@@ -106,7 +109,7 @@ class CommandGate:
         return Decision(uncommanded_tick=command.tick)
 
     def _without_command(self, command: WrenchCommand, tick: Tick | None) -> Decision:
-        """Go on without a command of the lease's holder, which sends none in this tick."""
+        """Continue without a command of the lease's holder, which sends none in this tick."""
         if command.mode == "yield":
             self.leases.give_back(command)
         elif command.mode == "none":

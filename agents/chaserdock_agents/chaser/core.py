@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One chaser without I/O: images to sightings, wrench commands to actuator commands. It has no
-access to ground truth.
+"""Run one chaser without I/O: images to sightings, wrench commands to actuator commands.
+
+It has no access to ground truth.
 """
 
 from __future__ import annotations
@@ -40,12 +41,12 @@ from .vision import Vision
 
 
 class ChaserCore:
-    """The parts of one chaser, which keep its state from message to message.
+    """Handle the messages of one chaser, and keep its state between them.
 
     ``realtime``: the world waits for no reply, and a command stays valid for its lifetime.
-    ``instance``: identity of the process, which its actuator commands state. ``failures``: those
-    that the test bed reports in place of the thrusters' hardware. ``vision`` replaces the
-    scenario's perception.
+    ``instance``: identity of the process, which its actuator commands state. ``failures``: thruster
+    failures that the test bed reports in place of the hardware. ``vision`` replaces the scenario's
+    perception.
     """
 
     def __init__(
@@ -71,9 +72,10 @@ class ChaserCore:
         self._observed_tick = self._uncommanded_tick = -1
 
     def step(self, received: ReceivedMessage, now_s: float = 0.0) -> ChaserOutputs:
-        """Handle one message. ``now_s``: the clock of ``received.arrived_s``, for real time.
+        """Handle one message and return what to publish.
 
-        In lock-step, a ``LostMessage`` stands for one that will not arrive.
+        ``now_s``: the clock of ``received.arrived_s``, for real time. In lock-step, a
+        ``LostMessage`` stands for a message that will not arrive.
         """
         inbox, message = self.inbox, received.message
         match message:
@@ -129,14 +131,14 @@ class ChaserCore:
         self._reply_without_command()
 
     def _continue_tick(self, odometry: Odometry) -> None:
-        """Do what waits for the chaser's own state."""
+        """Do what had to wait for the chaser's own state of this tick."""
         self._observe_thrusters()
         self._reply_without_command()
         if self.realtime:
             self._check_command_timeout(odometry)
 
     def _replace_lost(self, topic: Topic, lost: LostMessage) -> None:
-        """Lock-step: handle the loss of a message, so that the tick is still replied to."""
+        """Handle the loss of a message in lock-step, so that the chaser still replies to the tick."""
         inbox = self.inbox
         if topic is topics.IMAGE:
             no_image = Sighting(
@@ -200,10 +202,11 @@ class ChaserCore:
             self._mark_uncommanded(decision.uncommanded_tick)
 
     def _execute(self, command: WrenchCommand) -> None:
-        # The estimate of the command before: that of this one may arrive later.
+        # Only the estimate that came with the previous command is certain to have arrived.
         known = self.fallback.last.target
         self.fallback.end(command)
-        # Before the reply, so that the next image is seen with it in lock-step.
+        # Before the reply: in lock-step the next image follows it, and is to be seen with this
+        # geometry.
         if (refused := self.vision.inform(command)) is not None:
             self.outbox.warn("geometry refused", refused, command.tick, command.sim_time_ns)
         if self.thrusters is not None:
@@ -219,9 +222,7 @@ class ChaserCore:
         self._reply_without_command()
 
     def _reply_without_command(self) -> None:
-        """Reply to the open tick with a fallback command if there is no controller or no command
-        for the tick.
-        """
+        """Reply to the open tick by a fallback command, if no controller commands it."""
         tick, odometry = self.inbox.tick, self.inbox.odometry
         if tick is None or odometry is None or odometry.tick != tick.tick:
             return

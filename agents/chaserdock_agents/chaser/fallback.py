@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fallback of a chaser that receives no commands. Pure functions; SI units; WRF unless stated
-otherwise.
+"""Fly a chaser that receives no commands.
 
-Three modes in this order, recorded as events: fly the last plan to the end of its horizon
-(``plan``), come to rest relative to the target (``brake``), hold a position relative to it outside
-of the approach corridor (``hold``). The inputs are the plan and the target estimate of the last
-executed command; the target is extrapolated with constant velocity. Where the target was unknown,
-rest and position are those in WRF.
+Pure functions; SI units; WRF unless stated otherwise. Three modes in this order, recorded as
+events: fly the last plan to the end of its horizon (``plan``), come to rest relative to the target
+(``brake``), hold a position relative to it outside of the approach corridor (``hold``). The inputs
+are the plan and the target estimate of the last executed command; the target is extrapolated with
+constant velocity. Where the target was unknown, rest and position are those in WRF.
 """
 
 from __future__ import annotations
@@ -30,17 +29,21 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 FallbackMode = Literal["plan", "brake", "hold"]
 
 REST_M_S, REST_RAD_S = 0.004, math.radians(0.3)
-"""A chaser below these rates, relative to the target's velocity and in WRF, is at rest."""
+"""A chaser slower than this (m/s relative to the target, rad/s in WRF) is at rest. Smaller: noise
+keeps it from rest; larger: it holds a position while it still drifts.
+"""
 BRAKE_LIMIT_S = 5 * BRAKE_TIME_S
-"""Longest time of ``brake``: a constant disturbance, which the braking law only balances, may keep
-a chaser from rest.
+"""Longest time of ``brake``, s. The braking law does not reject a constant disturbance, which may
+keep a chaser from rest.
 """
 REST_PULSES = 2.0
-"""A chaser with thrusters is at rest below the rates that so many shortest pulses of its strongest
-thruster change.
+"""A chaser with thrusters is at rest below the rates that this many shortest pulses of its
+strongest thruster change.
 """
 CLEARANCE_MARGIN_M = 0.05
-"""Distance of the hold position beyond the entry of the corridor (chosen; docs/redundancy.md)."""
+"""Distance (m) of the hold position beyond the entry of the corridor (docs/redundancy.md). Larger:
+more room for a chaser in the corridor; smaller: a shorter way out of it.
+"""
 _KNOWN = ("tracking", "predicting")
 
 
@@ -53,8 +56,10 @@ class LastCommand:
 
 
 class FallbackLimits(NamedTuple):
-    """Least distance of the hold position from the target (m); speed (m/s) and rate (rad/s) below
-    which a chaser is at rest.
+    """Limits of the fallback.
+
+    ``clearance_m``: least distance of the hold position from the target. ``rest_m_s``,
+    ``rest_rad_s``: speed and rate below which a chaser is at rest.
     """
 
     clearance_m: float
@@ -64,10 +69,11 @@ class FallbackLimits(NamedTuple):
 
 @dataclass(frozen=True)
 class FallbackState:
-    """Mode of a chaser without commands. For ``brake``: when it began, ``since_ns``.
+    """Mode of a chaser without commands.
 
-    For ``hold``: ``outward_w`` (3,), unit vector from the target to the chaser, and ``distance_m``
-    between them; without a known target the position itself (3,) and None.
+    ``since_ns``: when ``brake`` began. For ``hold``: ``outward_w`` (3,), unit vector from the
+    target to the chaser, and ``distance_m`` between them; without a known target the position
+    itself (3,) and None.
     """
 
     mode: FallbackMode
@@ -87,8 +93,9 @@ class FallbackState:
 
 
 def interpolate_plan(plan: Plan | None, time_ns: int) -> Setpoint | None:
-    """Return the setpoint of a plan at a time, the first one before its start; None after its end
-    or without a plan.
+    """Return the setpoint of a plan at a time.
+
+    Before the plan's start it is the first one; None after its end or without a plan.
     """
     if plan is None or not plan.inputs:
         return None
@@ -136,8 +143,9 @@ def clearance_m(scenario: FlightScenario, chaser: int) -> float:
 
 
 def fallback_limits(scenario: FlightScenario, chaser: int) -> FallbackLimits:
-    """Return the limits of a chaser's fallback. Thrusters hold rates only within a few of their
-    shortest pulses.
+    """Return the limits of a chaser's fallback.
+
+    With thrusters they allow for rates of a few shortest pulses, which modulation cannot avoid.
     """
     body, rest_m_s, rest_rad_s = scenario.chaser, REST_M_S, REST_RAD_S
     if body.actuation == "thrusters":

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a chaser does without commands of a controller, and from when on. No I/O.
+"""Decide when a chaser acts without commands of a controller, and what it does then. No I/O.
 
-A free chaser flies the fallback (``fallback``); one that was left while it stopped the stack goes
-on with it (``local_damping``); other latched chasers, and those that do not know their motion, fire
-nothing.
+A free chaser flies the fallback (``fallback``). A chaser whose controller became silent while the
+stack was being stopped goes on with it (``local_damping``). Other latched chasers, and those that
+do not know their motion, fire nothing.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from .outbox import Outbox
 
 
 class FallbackControl:
-    """Remembers the last executed command, and replaces the commands that do not come.
+    """Remember the last executed command, and replace commands that do not arrive.
 
-    ``last``: plan and target estimate that belong to that command, which arrive before or after it.
+    ``last``: plan and target estimate that belong to that command; they arrive before or after it.
     """
 
     def __init__(self, scenario: FlightScenario, number: int, outbox: Outbox) -> None:
@@ -92,7 +92,7 @@ class FallbackControl:
         return odometry.sim_time_ns - self._commanded_ns
 
     def report_missing(self, detail: str, odometry: Odometry) -> None:
-        """Warn of the first of a series of missing commands."""
+        """Warn of the first in a series of missing commands."""
         if not self._reported_missing:
             self._outbox.warn("no command", detail, odometry.tick, odometry.sim_time_ns)
         self._reported_missing = True
@@ -100,9 +100,9 @@ class FallbackControl:
     def command(
         self, odometry: Odometry, latched: bool, age_ns: int
     ) -> tuple[ActuatorCommand, Array | None]:
-        """Return the chaser's own command, and thrusts (n,) in place of an allocation.
+        """Return the chaser's own command, and thrusts (n,), N, where they replace an allocation.
 
-        ``age_ns``: for how long no odometry was measured.
+        ``age_ns``: time since odometry was last measured.
         """
         effective_ns = self._scenario.timing.effective_ns(odometry.tick)
         body = self._scenario.chaser

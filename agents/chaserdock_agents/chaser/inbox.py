@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a chaser knows of the open tick and of its own state. No I/O."""
+"""Keep what a chaser knows of the open tick and of its own state. No I/O."""
 
 from __future__ import annotations
 
@@ -72,7 +72,8 @@ class ChaserInbox:
             return False
         self._docking_tick = docking.tick
         if self.docking is not None and self.docking.tick > docking.tick:
-            # Late: the newest known, of a tick for which an older one was assumed.
+            # It belongs to a tick for which an older status was assumed: apply it to the newest
+            # tick.
             docking = _assumed(docking, self.docking.tick, self.docking.sim_time_ns)
         self.docking = docking
         return True

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leases that a chaser grants: to which controller, in which term, until which tick. No I/O; ticks
-are the only clock.
+"""Grant a chaser's leases: to which controller, in which term, until which tick.
 
-As in PaxosLease (M. Trencseni et al., 2012) the acceptors decide: a chaser has promised each tick
-to at most one controller, and a controller commands a tick that a majority has promised to it
-(``chaserdock_protocol.lease_holder``). Every executed command renews the lease. When it has run
-out, or its holder is lost, the next controller gets it in a higher term.
+No I/O; ticks are the only clock. As in PaxosLease (M. Trencseni et al., 2012) the acceptors decide:
+a chaser has promised each tick to at most one controller, and a controller commands a tick that a
+majority has promised to it (``chaserdock_protocol.lease_holder``). Every executed command renews
+the lease. When it has run out, or its holder is lost, the next controller gets it in a higher term.
 """
 
 from __future__ import annotations
@@ -18,18 +17,21 @@ from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 
 FIRST_COMMAND_S = 1.0
-"""Lease of a new holder, s (chosen), which may need longer for its first command."""
+"""First lease of a new holder, s, which may need longer for its first command. Longer: a holder
+that never commands keeps the chaser on its fallback for that time.
+"""
 BACKOFF_RESET_S = 20.0
-"""A lease that runs out again within this time doubles, up to ``leases.LEASE_MAX_S``: repeated
-expiry means that the machine is overloaded, and a change of commander does not help."""
+"""A lease that runs out again within this time, s, is doubled, up to ``leases.LEASE_MAX_S``.
+Repeated expiry means that the machine is overloaded, and a change of commander does not help.
+"""
 
 
 @dataclass
 class LeaseGrantor:
-    """The lease of chaser ``chaser``: granted to ``holder`` (process) and its ``instance`` until
-    tick ``until_tick``.
+    """Lease of chaser ``chaser``, granted to process ``holder`` and its ``instance`` until
+    ``until_tick``.
 
-    ``since``: tick and revision from which on that holder has it.
+    ``since``: tick and revision from which the holder has it.
     """
 
     chaser: int
@@ -48,10 +50,10 @@ class LeaseGrantor:
         self._length = lease_ticks(self.rate_hz)
 
     def update(self, tick: Tick) -> Lease | None:
-        """Take the next tick: keep the lease or grant the next one; return what to state, None if
-        this chaser takes no part.
+        """Take the next tick: keep the lease or grant the next one.
 
-        An older tick than the last would give the lease to a controller that it lists; see
+        Return the lease to state; None if this chaser takes no part in the tick. A tick older than
+        the last would give the lease to a controller that it lists; see
         ``ChaserInbox.is_outdated``.
         """
         if self.chaser not in tick.chasers:
@@ -63,7 +65,7 @@ class LeaseGrantor:
         return self.stated(tick)
 
     def _grant_next(self, tick: Tick, listed: bool) -> None:
-        """Grant the lease to another controller or, where there is no other, to the same again."""
+        """Grant the lease to another controller; to the same again if there is no other."""
         others = [
             n for n in CONTROLLERS if n in tick.controllers and not (listed and n == self.holder)
         ]
@@ -115,8 +117,8 @@ class LeaseGrantor:
         return (command.commander, command.instance) == (self.holder, self.instance)
 
     def refusal(self, command: WrenchCommand) -> str | None:
-        """Return why a command must not be executed: its sender does not hold the lease. None if it
-        does.
+        """Return why a command must not be executed because its sender does not hold the lease, or
+        None.
         """
         if not self.is_of_holder(command):
             holder = self.holder or "no controller"
@@ -139,11 +141,10 @@ class LeaseGrantor:
         self.until_tick = max(self.until_tick, command.tick + self._length - 1)
 
     def give_back(self, command: WrenchCommand) -> None:
-        """Take the lease back after the tick in which its holder, without a majority, yields it.
-        See ``refusal`` first.
+        """Take the lease back after a tick in which its holder yields it, for lack of a majority.
 
-        The holder counts no lease stated up to that tick, but may count one that was stated after
-        it.
+        See ``refusal`` first. The holder counts no lease stated up to that tick, but may count one
+        that was stated after it.
         """
         if command.tick >= self._newest_tick:
             self.until_tick = min(self.until_tick, command.tick)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damping of the stack by one latched chaser whose controller is silent, from its own odometry
-alone. No I/O.
+"""Damp the tumble of a stack by one latched chaser whose controller is silent.
 
-A thruster with unit force d at r fires against the velocity of its own place, u = -d . (v + omega x
-r). The power that it gives to the stack is -f u, never positive while u > 0: whatever the mass, the
-other chasers and their thrusters, the kinetic energy falls. Thrusts are proportional to u, so that
-several chasers together do not overshoot; below a deadband nothing fires.
+It uses the chaser's own odometry alone; no I/O. A thruster with unit force d at r fires against the
+velocity of its own place, u = -d . (v + omega x r). The power that it gives to the stack is -f u,
+never positive while u > 0: whatever the mass, the other chasers and their thrusters, the kinetic
+energy falls. Thrusts are proportional to u, so that several chasers together do not overshoot;
+below a deadband nothing fires.
 """
 
 from __future__ import annotations
@@ -30,20 +30,19 @@ class DampingParameters:
     # Thrust per velocity of a thruster's place. Of 20, 60 and 120 the one that stopped two, three
     # and four chasers soonest.
     gain_N_s_per_m: float = 60.0
-    # A thruster begins to fire above this velocity of its place, unless noise asks for more: at 0.4
-    # m, 0.07 degrees/s;
+    # A thruster starts to fire above this velocity of its place (0.07 degrees/s at 0.4 m), or above
+    # a multiple of the noise. Smaller: more propellant; larger: a faster residual tumble.
     fires_m_s: float = 0.0005
-    # and ends below this one.
+    # A thruster stops below this velocity: a fifth of the one above, so that it does not chatter.
     closes_m_s: float = 0.0001
-    # The deadband is at least so many standard deviations of the filtered velocity, so that noise
-    # fires nothing.
+    # Least start velocity, in standard deviations of the filtered velocity, so that noise fires
+    # nothing.
     noise_share: float = 5.0
-    # The filter is slow below this velocity, where noise matters, and fast above, where the delay
-    # does.
+    # Velocity above which the filter is fast. Below it noise matters most, above it the delay does.
     slow_m_s: float = 0.005
-    # Time constants of the slow
+    # Time constant of the slow filter.
     slow_s: float = 0.8
-    # and of the fast filter.
+    # Time constant of the fast filter.
     fast_s: float = 0.3
 
 
@@ -51,14 +50,15 @@ _LAW = DampingParameters()
 
 
 class LocalDamping:
-    """Damping law of one chaser with a port; one ``thrusts`` a tick. ``reset`` after a tick with
-    another command.
+    """Compute the damping thrusts of one chaser with a port.
+
+    Call ``thrusts_N`` once a tick, and ``reset`` after a tick with another command.
     """
 
     def __init__(self, scenario: FlightScenario, chaser: int) -> None:
         body, errors = scenario.chaser, scenario.navigation.errors()
         ports = {p.chaser for p in scenario.docking.ports if p.chaser is not None}
-        # Which others are latched is not known here: none of them may be hit.
+        # It is not known which other chasers are latched: avoid the ports of all of them.
         self._free = plume_free_thrusters(scenario, ports)[chaser]
         self._wrenches = wrench_matrix(body.thrusters)
         self._full_N = thrusts_max(body.thrusters)
@@ -77,7 +77,7 @@ class LocalDamping:
         self._time_ns, self._thrusts_N = -1, np.zeros(len(self._full_N))
 
     def thrusts_N(self, odometry: Odometry) -> Array:
-        """Return the thrusts (n,) that slow the stack; the same odometry gives the same thrusts."""
+        """Return the thrusts (n,), N, that slow the stack; equal odometry gives equal thrusts."""
         if odometry.sim_time_ns == self._time_ns:
             return self._thrusts_N
         velocity = rotations.rotate_inverse(odometry.q_wxyz, odometry.velocity_m_s)
@@ -87,8 +87,8 @@ class LocalDamping:
             elapsed_s = (odometry.sim_time_ns - self._time_ns) * 1e-9
             share = _share(elapsed_s, _LAW.fast_s if moving else _LAW.slow_s)
             rates = self._rates + share * (rates - self._rates)
-        # A force d at r does work on d . (v + omega x r): the transpose of the wrench of unit
-        # thrusts.
+        # Velocity of a thruster's place along its force: d . (v + omega x r), by the transpose of
+        # the wrench of unit thrusts.
         speeds = -self._wrenches.T @ rates
         self._firing = self._free & (
             speeds > np.where(self._firing, self._closes_m_s, self.fires_m_s)

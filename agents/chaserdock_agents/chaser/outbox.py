@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a chaser publishes while it handles one message, in order."""
+"""Collect what a chaser publishes while it handles one message, in order."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ Outgoing = tuple[Topic, int | str, Message]
 
 @dataclass
 class ChaserOutputs:
-    """What follows from a received message. ``messages``: to be published in this order.
+    """What follows from a received message.
 
-    ``stale``: whether it came too late or twice. ``rejected``: a command that must not count, as
-    the traffic counters name it; empty for others.
+    ``messages``: to be published in this order. ``stale``: whether the message came too late or
+    twice. ``rejected``: why a command must not count, as the traffic counters name it; empty for
+    others.
     """
 
     messages: list[Outgoing] = field(default_factory=list)

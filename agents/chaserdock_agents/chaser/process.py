@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chaser process: receives one message at a time, has it handled, and publishes what
-follows.
-"""
+"""Run a chaser: receive one message at a time, have it handled, and publish what follows."""
 
 from __future__ import annotations
 
@@ -20,8 +18,8 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health, run_
 from .core import ChaserCore
 
 _RECEIVE_TIMEOUT_S = 0.2
-"""The process looks this often whether it was stopped or the world is gone, which asks for twice a
-second (``Heartbeat.world_is_gone``).
+"""Interval, s, at which the process looks whether it was stopped or the world is gone. The latter
+must be asked at least twice a second (``Heartbeat.world_is_gone``).
 """
 
 
@@ -52,9 +50,10 @@ def main(options: ProcessOptions) -> int:
 
 
 class ChaserProcess:
-    """I/O of one chaser. Advertises and subscribes the topics, then starts the heartbeat.
+    """Connect one chaser's core to the network.
 
-    ``replaced``: this process was lost, and the mission goes on with another one of its name.
+    Advertises and subscribes the topics, then starts the heartbeat. ``replaced``: this process was
+    lost, and the mission goes on with another one of its name.
     """
 
     def __init__(self, node: Node, core: ChaserCore, stall_s: float = DEFAULT_STALL_S) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of the chasers' perception on recorded images."""
+"""Replay the chasers' perception on recorded images."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert an image message to a sighting message; a pure function of image, prediction and
-parameters.
+"""Convert an image message to a sighting message.
+
+A pure function of image, prediction and parameters.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Predicted pose of the target: position (3,) in IRF and rotation (4,) TRF to IRF."""
 
 _EXPECTED_FOR_NS = 300_000_000
-"""Age at which an expected pose is not used any more, ns (chosen): four images at 15 Hz, in which a
-target that turns by 10 degrees/s has turned by 3, the reach of a start (``tracking``).
+"""Age above which an expected pose is not used, ns: four images at 15 Hz, in which a target that
+turns by 10 degrees/s has turned by 3, the reach of a start (``tracking``).
 """
 
 
@@ -55,7 +56,7 @@ def decode_image(image: Image) -> NDArray[np.uint8]:
                 f"{shape[0] * shape[1]}"
             )
         return data.reshape(shape)
-    # Checked first, as OpenCV allocates memory for any size that the header states, and accepts
+    # Before decoding, as OpenCV allocates memory for any size that the header states, and accepts
     # other formats.
     size = _jpeg_size(image.data)
     if size is None:
@@ -90,8 +91,11 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def look(perception: PerceptionMethod, image: Image, predicted: Prediction | None) -> Sighting:
-    """Return the sighting of the target in an image, by markers or, where that is more accurate, by
-    bearing and range; the caller sets ``wall_estimate_s``."""
+    """Return the sighting of the target in an image.
+
+    By markers or, where that is more accurate, by bearing and range. The caller sets
+    ``wall_estimate_s``.
+    """
     header: dict[str, Any] = {
         "tick": image.tick,
         "sim_time_ns": image.sim_time_ns,
@@ -110,6 +114,7 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
             rejected_ids=(),
             detail=str(error)[:500],
         )
+
     solutions, detail = tuple(_solution(pose) for pose in seen.solutions), ""
     rejected = tuple(int(i) for i in seen.rejected_ids)
     if image.ranging is not None and isinstance(perception, FarPerception):
@@ -119,6 +124,7 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
                 return _without_markers(header, far, rejected)
         except BearingError as error:
             detail = "" if solutions else str(error)
+
     return Sighting(
         **header,
         status="seen" if solutions else "nothing",
@@ -173,7 +179,7 @@ def _by_bearing(
 
 
 def geometry_message(found: GeometryInformation) -> GeometryMeasurement:
-    """Return what an image tells about the errors of the geometry as a part of a message."""
+    """Convert what an image tells about the errors of the geometry to its part of a message."""
     return GeometryMeasurement(
         information=vector(found.matrix),
         vector=vector(found.vector),
@@ -186,8 +192,9 @@ def geometry_message(found: GeometryInformation) -> GeometryMeasurement:
 def apply_geometry(
     perception: PerceptionMethod | None, estimate: GeometryEstimate | None
 ) -> str | None:
-    """Correct what a perception knows of the target's geometry, if it uses it; return why that was
-    refused.
+    """Correct what a perception knows of the target's geometry, if it uses that.
+
+    Return why the correction was refused, or None.
     """
     correct = getattr(perception, "correct_geometry", None)
     if estimate is None or correct is None:
@@ -213,8 +220,10 @@ def apply_geometry(
 def prediction_from(
     sighting: Sighting | None, expected: ExpectedPose | None = None, time_ns: int = 0
 ) -> Prediction | None:
-    """Return the pose prediction for an image of ``time_ns``: the last measured pose, else the one
-    that the controller expects; None without any."""
+    """Return the predicted pose of the target for an image of ``time_ns``, or None.
+
+    The last measured pose, else the one that the controller expects.
+    """
     if sighting is not None and sighting.solutions:
         best = sighting.solutions[0]
         return np.array(best.position_m), np.array(best.q_wxyz)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A chaser's perception, with what it remembers from image to image. No I/O."""
+"""Run a chaser's perception, with what it remembers from image to image. No I/O."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from .perception import PerceptionMethod
 from .sighting import apply_geometry, look, prediction_from
 
 REMEMBERED_IMAGES = 64
-"""Ticks of processed images that are remembered to recognize repeated ones. Messages are delayed
-by a few ticks at most; the number only bounds the memory.
+"""Ticks of processed images that are remembered to recognize repeated ones. More than the delay of
+any message, a few ticks; the number only bounds the memory.
 """
 
 
 class Vision:
-    """Turns the images of one chaser into sightings; each is searched near the last ``sighting``
-    or where the controller expects the target.
+    """Turn the images of one chaser into sightings.
 
+    Each image is searched near the last ``sighting``, or where the controller expects the target.
     ``perception``: None for a chaser that gets no images, as in studies with drawn sightings.
     """
 
@@ -44,8 +44,9 @@ class Vision:
         return tick in self._processed
 
     def inform(self, command: WrenchCommand) -> str | None:
-        """Pass on what a command states about the target: its geometry, and where it is expected in
-        the next image. Return why the geometry was refused, if it was.
+        """Pass on what a command states about the target: its geometry and its expected pose.
+
+        Return why the geometry was refused, or None.
         """
         self._expected = command.expected
         return apply_geometry(self.perception, command.geometry)

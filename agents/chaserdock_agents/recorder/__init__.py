@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder process: everything that travels, verbatim, into an MCAP file."""
+"""The recorder process: writes every message, verbatim, into an MCAP file."""

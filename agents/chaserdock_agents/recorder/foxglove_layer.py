@@ -43,7 +43,7 @@ from chaserdock_protocol.recording.scan import VIEWER_PREFIX
 from chaserdock_protocol.scenario import FlightScenario
 
 Write = Callable[[str, tuple[str, str, bytes], bytes, int], None]
-"""``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
+"""Signature of ``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
 
 SHOWN = frozenset(
     {
@@ -126,6 +126,7 @@ class ViewerLayer:
                 time_ns,
             )
             shapes.append((f"chaser/{i}", self._scenario.chaser.size_m, _CHASER_COLOUR))
+
         entities = [
             fox.SceneEntity(
                 timestamp=stamp,
@@ -137,6 +138,7 @@ class ViewerLayer:
             for frame, size_m, colour in shapes
         ]
         self._put("scene", fox.SceneUpdate(entities=entities), time_ns)
+
         body = self._scenario.chaser
         chaser = (
             _mesh_points(satellite(body.mesh, _SPACING_M))
@@ -277,8 +279,9 @@ def _image(image: Image, stamp: fox.Timestamp) -> fox.CompressedImage | fox.RawI
 
 
 def _detections(sighting: Sighting, stamp: fox.Timestamp) -> fox.ImageAnnotations:
-    """Return the outlines of the used markers; a viewer's pixel origin is a corner of the first
-    pixel, not its centre.
+    """Return the outlines of the used markers.
+
+    A viewer's pixel origin is a corner of the first pixel, not its centre.
     """
     u, v = sighting.corners_px[0::2], sighting.corners_px[1::2]
     corners = [fox.Point2(x=a + 0.5, y=b + 0.5) for a, b in zip(u, v, strict=False)]

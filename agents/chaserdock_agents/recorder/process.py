@@ -44,17 +44,18 @@ from .foxglove_layer import SHOWN
 from .rotation import Recording
 
 _DRAIN_S = 10.0
-"""Longest wall time for which the recorder waits, after the mission's end, for messages that
-publishers have counted (chosen); those that are missing then are lost and reported.
+"""Longest wall time (s) for which the recorder waits, after the mission's end, for messages that
+publishers have counted. Those that are missing then are lost and reported. Longer: slow links
+deliver more; shorter: a recorder whose network is cut ends sooner.
 """
 _HEALTH_TICKS = 15
 """Ticks between two health messages: one second at the tick rate of most scenarios."""
 _BATCH = 64
-"""Most messages that are written before the recorder looks for a signal and for the world."""
+"""Most messages that are written before the recorder looks for a signal and the world."""
 # glibc's malloc.h
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
 _MAPPED_FROM_BYTES = 1 << 18
-"""Blocks of at least this size, 256 KiB, go back to the system when they are freed: images and
+"""Blocks of at least this size (256 KiB) go back to the system when they are freed: images and
 chunks, but not messages.
 """
 
@@ -132,7 +133,7 @@ def record(
 
 @dataclass
 class Recorder:
-    """Counts the recorded messages and those that the other processes report to have published."""
+    """Record messages, and count those that the other processes report to have published."""
 
     node: Node
     recording: Recording
@@ -161,9 +162,7 @@ class Recorder:
             self.node.counts.rejected["queue full"] += 1
 
     def write_waiting(self, timeout_s: float) -> None:
-        """Write the messages that wait, at most ``_BATCH``; if there are none, the next one that
-        arrives in time.
-        """
+        """Write at most ``_BATCH`` waiting messages; if there are none, wait for the next one."""
         while self.node.receive(0) is not None:
             # the raw subscription receives presence as well; the typed one only serves the join
             # barrier

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of one recording: verbatim and viewer layer, with rotation by size or time."""
+"""Write the files of one recording: verbatim and viewer layer, with rotation by size or time."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from .foxglove_layer import ViewerLayer
 
 
 class Recording:
-    """Writes a mission's log to ``folder``, which is created; every file is self-contained and
-    holds the full scenario.
+    """Write a mission's log to ``folder``, which is created.
 
-    Without ``scenario`` there is no viewer layer. Raises LogError if a file cannot be created or
-    written.
+    Every file is self-contained and holds the full scenario. Without ``scenario`` there is no
+    viewer layer. Raises LogError if a file cannot be created or written.
     """
 
     def __init__(

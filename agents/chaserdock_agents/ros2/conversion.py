@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a mission as messages of ROS 2: pure functions, without network or files.
+"""Convert messages of a mission to messages of ROS 2: pure functions, without network or files.
 
 ROS states poses and their covariances in the parent frame, twists in the child frame, and
 quaternions scalar last (REP 103, REP 105, nav_msgs/Odometry). Frames: ``world`` (WRF), ``target``
@@ -104,8 +104,7 @@ def _transform(
 
 
 def pose_covariance(position: Array, attitude: Array, cross: Array, to_world: Array) -> Array:
-    """Return the covariance (36,) of a pose, row-major over (x, y, z, rotations about the parent's
-    axes).
+    """Return the covariance (36,) of a pose, row-major over (x, y, z, rotations about parent axes).
 
     ``position`` (3, 3) in parent axes; ``attitude`` (3, 3) of dtheta with q_true = q (x)
     exp(dtheta), hence in the axes of the body; ``cross`` (3, 3) of position (rows) with dtheta;
@@ -255,7 +254,7 @@ def wrench(message: m.WrenchCommand) -> ros.geometry_msgs__msg__WrenchStamped:
 def path(message: m.Plan) -> ros.nav_msgs__msg__Path:
     """Return a plan's poses, each with its time."""
     p, q, step_ns = message.positions_m, message.quaternions_wxyz, message.step_s * 1e9
-    # Without the helpers above: most of the bridge's time for a plan goes here.
+    # Without the helpers above, as a plan takes most of the bridge's time.
     stamped, pose = ros.geometry_msgs__msg__PoseStamped, ros.geometry_msgs__msg__Pose
     point, quaternion, header = (
         ros.geometry_msgs__msg__Point,
@@ -278,8 +277,9 @@ def reference(message: m.Reference) -> ros.geometry_msgs__msg__PoseStamped:
 
 
 def chaser_transforms(message: m.Odometry, camera: Camera) -> ros.tf2_msgs__msg__TFMessage:
-    """Return the frames of a chaser and of its camera, which is repeated for readers that join
-    late.
+    """Return the frames of a chaser and of its camera.
+
+    The camera's is repeated for readers that join late.
     """
     chaser, time_ns = message.chaser, message.sim_time_ns
     body = _transform(time_ns, WORLD, chaser_frame(chaser), message.position_m, message.q_wxyz)
@@ -338,8 +338,10 @@ def _marker(
 def body_markers(
     message: m.TargetEstimate, target_size_m: Vector3, chaser_size_m: Vector3, chasers: int
 ) -> ros.visualization_msgs__msg__MarkerArray:
-    """Return target and chasers as boxes in their frames; the target is transparent unless it is
-    tracked, or deleted.
+    """Return target and chasers as boxes in their frames.
+
+    The target is opaque while it is tracked, else transparent; without an estimate its box is
+    deleted.
     """
     known = message.status in ("tracking", "predicting")
     alpha = 0.875 if message.status == "tracking" else 0.25

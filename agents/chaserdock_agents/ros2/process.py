@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge process: shows a mission to ROS 2, and serves its operator commands. Needs no ROS.
+"""Show a mission to ROS 2, and serve its operator commands. Needs no ROS.
 
 It observes: the mission does not wait for it, and receives nothing from it but the commands of its
 services.
@@ -87,8 +87,8 @@ class Bridge:
         )
         self._converter = Converter(scenario)
         self._invalid: Counter[str] = Counter()
-        # In lock-step every message arrives, in real time slow readers miss some, as everywhere in
-        # a mission.
+        # In lock-step every message arrives; in real time slow readers miss some, as within a
+        # mission.
         lockstep = mission.mode == "lockstep"
         self._publishers = {
             topic: ros.publisher(topic, kind, blocking=lockstep)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node of ROS 2 on Zenoh, as ``rmw_zenoh_cpp`` (Jazzy, Kilted) expects it: keys, liveliness
-tokens, attachments, CDR.
+"""Open a node of ROS 2 on Zenoh, as ``rmw_zenoh_cpp`` (Jazzy, Kilted) expects it.
 
 After the design document and the sources of ros2/rmw_zenoh. Data of a topic travel on
-``DOMAIN/TOPIC/TYPE/HASH``; that a node, publisher, subscription or service exists is stated by a
-liveliness token under ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/…``; every message carries its
-number, time and publisher as an attachment.
+``DOMAIN/TOPIC/TYPE/HASH`` as CDR. A liveliness token under
+``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/…`` states that a node, publisher, subscription or
+service exists. Every message carries its number, time and publisher as an attachment.
 """
 
 from __future__ import annotations
@@ -73,8 +72,10 @@ def endpoint_token(
 
 @dataclass(frozen=True)
 class Attachment:
-    """Number (from 1) of a message of its publisher or of a request of its client, wall clock,
-    identity of the sender.
+    """Attachment of a message or request.
+
+    ``number``: counts the messages of a publisher, or the requests of a client, from 1.
+    ``time_ns``: wall clock. ``gid``: identity of the sender.
     """
 
     number: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Operator commands as services of ROS 2: one per verb and chaser."""
+"""Serve operator commands as services of ROS 2: one per verb and chaser."""
 
 from __future__ import annotations
 

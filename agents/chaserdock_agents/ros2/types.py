@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message and service types of ROS 2 Jazzy, which Kilted shares: serialization (CDR) and type
-hashes.
+"""Provide the message and service types of ROS 2 Jazzy, which Kilted shares: CDR and type hashes.
 
 The hash (REP 2016, RIHS01) of a type is part of its keys on the network. Messages come with
 rosbags; services are defined here, those with arguments by the files of the ROS package
@@ -35,8 +34,9 @@ def _name(type_name: str) -> Any:
 
 
 def _register_service(name: str, definition: str) -> None:
-    """Add the types that a service consists of: request, response, event, and the service itself,
-    which has a hash only.
+    """Add the types that a service consists of.
+
+    These are request, response, event, and the service itself, which has a hash only.
     """
     request, _, response = definition.partition("---\n")
     types: dict[str, Any] = {}

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node of ROS 2 as the controller of a mission in real time: wrenches of a topic per chaser
-become its commands.
+"""Control a mission in real time by wrenches of ROS 2: one topic per chaser.
 
 This process takes the controller's place and name. It estimates and plans nothing: a chaser for
 which no wrench arrives has no commands, and does what it does without a controller
@@ -104,7 +103,7 @@ def main(options: ProcessOptions) -> int:
 
 
 class WrenchControl:
-    """Commands each chaser at most once a tick, by the first wrench that arrives in it."""
+    """Command each chaser at most once a tick, by the first wrench that arrives in it."""
 
     def __init__(
         self, node: Node, ros: RosNode, mission: JoinReply, instance: str, stall_s: float
@@ -188,8 +187,9 @@ class WrenchControl:
         self._node.publish(topics.WRENCH, command, chaser)
 
     def _complete_tick(self) -> None:
-        """Renew the leases of chasers without a wrench while one is valid; without a majority, give
-        the leases back.
+        """Renew the leases of chasers without a wrench until the newest wrench of any has expired.
+
+        Without a majority, give the leases back.
         """
         self._deadline_s, tick, leases = math.inf, self._tick, self._leases
         if tick is None:

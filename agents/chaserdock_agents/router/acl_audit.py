@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Audit log of access-control denials, read from Zenoh's log, as Zenoh drops messages without
-notice.
+"""Count access-control denials from Zenoh's log, as Zenoh drops messages without notice.
 
 At level ``trace`` Zenoh writes a line for every decision. Some are not attempts: when a client
 declares a key, all permissions for it are cached (between "caching permissions" and the ninth
@@ -22,8 +21,8 @@ from dataclasses import dataclass, field
 TARGET = "zenoh::net::routing::interceptor::access_control"
 TLS_TARGET = "zenoh_link_tls::unicast"
 MAX_DISTINCT = 4096
-"""Number of distinct denials that are counted separately; bounds the memory for clients that use
-ever new keys.
+"""Most distinct denials that are counted separately. Bounds the memory for clients that use ever
+new keys.
 """
 _MAX_KEY_LENGTH = 200
 """Characters of a denied key that are printed: longer than all keys of ours; bounds the log."""
@@ -142,8 +141,8 @@ class DenialCounter:
     overflow: int = 0
 
     def add(self, denial: Denial) -> str | None:
-        """Count a denial; return a text to be published at the first, tenth, hundredth, ...
-        occurrence, else None.
+        """Count a denial; return a text to publish at the first, tenth, hundredth, ... occurrence,
+        or None.
         """
         if denial not in self.counts and len(self.counts) >= MAX_DISTINCT:
             self.overflow += 1
@@ -208,8 +207,7 @@ class ZenohLog:
         rest = b""
         while piece := os.read(self._lines, _PIPE_BYTES):
             whole, end, rest = (rest + piece).rpartition(b"\n")
-            # Nearly all lines are authorizations, thousands per second, and are skipped without
-            # parsing.
+            # Nearly all lines are authorizations, thousands per second: skip them without parsing.
             only_authorized = whole.count(_AUTHORIZED) == whole.count(b"\n") + len(end)
             if (
                 not only_authorized

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The router process, to which clients on several hosts or in several containers connect.
+"""Route messages between clients on several hosts or in several containers.
 
-It forwards messages, enforces access control (``access_control``) and reports denials on standard
+Forwards messages, enforces access control (``access_control``) and reports denials on standard
 error and as events.
 """
 
@@ -21,14 +21,16 @@ from .acl_audit import DenialCounter, ZenohLog
 
 NAME = "router"
 MAX_CHASERS = 256
-"""Chasers for which access rules are made: they do not know the mission; more than any machine
+"""Chasers for which access rules are made, as rules do not know the mission: more than any machine
 flies.
 """
 POLL_S = 0.2
 """Interval at which the router looks whether it was stopped or is alone, s."""
 GRACE_S = 5.0
-"""Delay between the departure of the process that it waits for and its own end: the process may
-return after a cut link, and with Compose its exit status must be available before the router's."""
+"""Time, s, between the departure of the process that the router waits for and the router's end. The
+process may return after a cut link, and with Compose its exit status must be available before the
+router's.
+"""
 
 
 def main(options: ProcessOptions) -> int:
@@ -40,11 +42,13 @@ def main(options: ProcessOptions) -> int:
     if link.tls is not None:
         link = replace(link, access_control=access_control(link.namespace, MAX_CHASERS))
         log = ZenohLog(link.namespace)
+
     try:
         node = Node(NAME, "operator", link)
     except ChaserdockError as error:
         print_status(NAME, str(error))
         return 2
+
     stop, watched = options.stop_signal(), _WatchedProcess(options.until or "")
     auditor = _AuditLogger(node, log) if log is not None else None
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Content of the page: prose and tables, filled in from the results. A missing result is shown as a
+"""Content of the page: prose and tables, filled in from the results. A missing result appears as a
 dash.
 """
 
@@ -55,7 +55,7 @@ UNITS: dict[Quantity, tuple[float, str]] = {
     "position": (1e2, "1e-2 m^2"),
     "orientation": (1e3, "1e-3 rad^2"),
 }
-"""Factor and name of the paper's units."""
+"""Units of the paper: factor from SI, and name."""
 
 
 def sections(
@@ -75,7 +75,7 @@ def sections(
 def _result(
     plan: ExperimentPlan, results: Summaries, about: Provenance, quick: bool
 ) -> PageSection:
-    """Return provenance, and the number of figures met by column."""
+    """Return provenance, and how many figures of each column were met."""
     rows = []
     for column in COLUMNS:
         cells = [_met(results, column, quantity) for quantity in QUANTITIES]
@@ -127,7 +127,7 @@ def _ratios(results: Summaries, column: str, row, quantity: Quantity) -> list[fl
 
 
 def _table(results: Summaries, quantity: Quantity) -> PageSection:
-    """Return the nine rows of one error: ratios to the paper's, with spread and verdict."""
+    """Return the nine rows of one error: ratios to the paper's values, with spread and verdict."""
     factor, unit = UNITS[quantity]
     rows = []
     for row in ROWS:
@@ -186,7 +186,7 @@ def _spike_text(summary: dict[str, Any] | None) -> str:
 
 
 def pitch_rad(time_s: float) -> float:
-    """Return the pitch (Z-Y-X Euler angles in WRF) of the paper's target, which begins
+    """Return the pitch (Z-Y-X Euler angles in WRF) of the paper's target, which starts
     unrotated.
     """
     attitude = rotations.exp(np.multiply(Target().omega_rad_s, time_s))
@@ -194,8 +194,8 @@ def pitch_rad(time_s: float) -> float:
 
 
 def _spike_explanation(written: str) -> str:
-    """Return how near the target's attitude comes to the singularity that the paper blames, and
-    what EPnP does.
+    """Return how close the target's attitude comes to the singularity that the paper blames, and
+    what EPnP does there.
     """
     times = np.arange(0.0, PAPER_S + 0.5, 0.5)
     pitch = np.abs([pitch_rad(t) for t in times])
@@ -210,7 +210,7 @@ def _spike_explanation(written: str) -> str:
 
 
 def _missions(plan: ExperimentPlan, results: Summaries) -> PageSection:
-    """Return the paper's missions of several chasers."""
+    """Return the section on the paper's missions of several chasers."""
     rows = []
     for flight in missions_of(plan):
         summary = results.get(flight.label)
@@ -261,13 +261,13 @@ def _mission_cells(summary: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _worst(mean_squares: Sequence[float | None]) -> float | None:
-    """Return the largest root of mean squares; None if one is missing."""
+    """Return the largest of the roots of mean squares; None if one is missing."""
     known = [math.sqrt(x) for x in mean_squares if x is not None]
     return max(known) if len(known) == len(mean_squares) else None
 
 
 def _start(results: Summaries) -> PageSection:
-    """Return what the start contributes: other starts, and the lower bound."""
+    """Return how much the start contributes: other starts, and the lower bound."""
     nominal = errors_by_label(results, f"alone/{BASELINE.name}")
     rows = []
     for name in ("nominal", *STARTS):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's results: Fourlas et al., IFAC 2023, table 2. Mean squares over two minutes, average
-of three runs.
+"""Results of the paper: Fourlas et al., IFAC 2023, table 2. Mean squares over two minutes, averaged
+over three runs.
 """
 
 from __future__ import annotations

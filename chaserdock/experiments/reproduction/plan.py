@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plan of a reproduction: single-chaser flights of the paper's table, flights that explain,
-missions of several chasers.
+"""Plan of a reproduction: single-chaser flights of the paper's table, flights that explain its
+trends, missions of several chasers.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ SCENARIO = "paper-single"
 """The scenario of every single-chaser flight: the paper's settings and its baseline row."""
 
 DRAWS = range(3)
-"""The paper flew every row three times. Ours differ by their dispersed start; equal draws have
+"""Draws of the dispersed start of each row. The paper flew every row three times. Equal draws have
 equal starts in all rows.
 """
 
 NOMINAL_OFFSET_M = (0.85, 0.0, 0.0)  # m, TRF
 NOMINAL_ROTATION_RAD = (0.42, 0.0, -0.3927)
-"""The start of ``paper-single``, from the reference pose: in TRF, and as a rotation vector in body
-axes.
+"""Start of ``paper-single`` relative to the reference pose: offset in TRF, and rotation vector in
+body axes.
 """
 
 OFFSET_BOUND_M = 0.05  # m
@@ -46,9 +46,10 @@ ROTATION_BOUND_RAD = 0.05  # rad
 ATTITUDE_BOUND_RAD = 0.2  # rad
 RATE_BOUND = 0.2  # share
 """Bounds of the dispersed starts, uniform about the nominal one: each component of the chaser's
-offset and of its rotation vector; each component of the rotation vector of the target's initial
-attitude; each component of the target's velocity and angular velocity, as a share of its value.
-They are assumed: the paper does not state how well its starts were repeated."""
+offset and rotation vector; each component of the rotation vector of the target's initial attitude;
+each component of the target's velocity and angular velocity, as a share of its value. They are
+assumptions: the paper does not state how repeatable its starts were.
+"""
 
 OPEN = "controller.solver='open'"
 WRITTEN, CODE, DEFAULT = "as written", "as in the authors' code", "ours"
@@ -63,9 +64,10 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "time.latency_s=0.0333333333333333",
     ),
 }
-"""Overrides of ``paper-single``, whose controller has the paper's settings. The paper's chain:
-perception, combiner, and OpEn, with EPnP as the paper writes, or with the PnP of its authors'
-public code. Ours: the default settings."""
+"""Overrides of ``paper-single`` in each column. The scenario has the paper's controller settings.
+The paper's chain: perception, combiner and OpEn, with EPnP as the paper states or with the PnP of
+its authors' public code. Ours: the default settings.
+"""
 
 
 def dispersed_start(draw: int) -> tuple[str, ...]:
@@ -98,8 +100,8 @@ def table_name(column: str, row: PaperRow, draw: int) -> str:
 
 
 def draws_of(quick: bool, column: str, row: PaperRow) -> range:
-    """Return the starts from which a row is flown: ours from one beyond the baseline row; EPnP in
-    that row only.
+    """Return the starts from which a row is flown. Ours flies one start outside the baseline row;
+    EPnP flies that row only.
     """
     draws = DRAWS[:1] if quick else DRAWS
     if row == BASELINE or column == CODE:
@@ -118,7 +120,7 @@ def _stage_weights(factor: float) -> tuple[str, ...]:
 
 
 STAGE_WEIGHTS = {"dt=1-5": 2.0, "dt=1-30": 1.0 / 3.0}
-"""Factors of the stage weights that keep the sum of the stage costs when dt changes."""
+"""Factors on the stage weights that keep the sum of the stage costs when dt changes."""
 STARTS: dict[str, str] = {
     "0.80 m away": "chasers.0.start_offset_m=[0.8, 0.0, 0.0]",
     "0.90 m away": "chasers.0.start_offset_m=[0.9, 0.0, 0.0]",
@@ -130,7 +132,7 @@ DELAYS_S: dict[str, tuple[float, ...]] = {
     "T=0.5": (0.1, 0.3, 0.5, 1.0),
     "T=10": (0.1, 0.3, 0.5, 0.7, 1.0),
 }
-"""Delays of the command with which the rows with failed runs are flown."""
+"""Command delays with which the rows that have failed runs are flown."""
 
 
 _PACKAGES = (
@@ -145,8 +147,8 @@ _PACKAGES = (
 
 @cache
 def code_digest() -> str:
-    """Return a digest of the code that flies and of its scenarios, so that results of another
-    version are not reused. Raise ExperimentError unless all packages are installed.
+    """Return a digest of the flying code and its scenarios, so that results of another version are
+    not reused. Raise ExperimentError unless all packages are installed.
     """
     digest = hashlib.sha256()
     own = Path(__file__).resolve().parent
@@ -175,7 +177,7 @@ def flight_of(
 
 
 def _table(quick: bool, length: str) -> list[PlannedFlight]:
-    """Return the flights of the paper's table; first one of each row."""
+    """Return the flights of the paper's table; the first start of every row comes first."""
     out = []
     for draw in DRAWS:
         for column, settings in COLUMNS.items():
@@ -187,8 +189,8 @@ def _table(quick: bool, length: str) -> list[PlannedFlight]:
 
 
 def _explanations(length: str) -> list[PlannedFlight]:
-    """Return the flights of the paper's controller alone, from the nominal start, and those that
-    give lower bounds.
+    """Return the flights of the paper's controller alone from the nominal start, and those for the
+    lower bounds.
     """
     out = []
 

@@ -64,8 +64,8 @@ def fly_and_report(plan: ExperimentPlan, out: Path, quick: bool = False, jobs: i
 
 
 def begun(out: Path) -> Provenance:
-    """Return where and when the first flight of this code into ``out`` began; later calls only
-    resume it.
+    """Return when and where the first flight of this code into ``out`` began; later calls resume
+    it.
     """
     path = out / f"provenance-{code_digest()}.json"
     if not path.exists():

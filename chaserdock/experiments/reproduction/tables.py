@@ -22,14 +22,14 @@ Summaries = dict[str, dict[str, Any]]
 """Summaries of flights by their label."""
 
 BAND = (1.0 / 1.35, 1.35)
-"""Ratios of a measured value to the paper's that count as met."""
+"""Ratios of a measured to the paper's value that count as met."""
 TREND_BAND = (0.5, 2.0)
 """The same for changes from the baseline row."""
 MIN_DISTANCE_M = 0.35
 """The paper's d_min."""
 LOST_M = math.hypot(*NOMINAL_OFFSET_M)
-"""A chaser whose steady RMS distance from its reference pose exceeds this, the start's, has not
-come nearer.
+"""Steady RMS distance of a chaser from its reference pose above which it has not come closer: that
+of the start.
 """
 Quantity = Literal["position", "orientation"]
 QUANTITIES: tuple[Quantity, Quantity] = ("position", "orientation")
@@ -103,8 +103,8 @@ def results_by_label(plan: ExperimentPlan, outcomes: Mapping[str, FlightOutcome]
 
 
 def errors_of(summary: Mapping[str, Any]) -> Errors:
-    """Return the errors of chaser 0 by a flight's summary. The flight failed if the chaser came
-    closer than d_min or did not come nearer.
+    """Return the errors of chaser 0 from a flight's summary. The flight failed if the chaser came
+    closer than d_min or did not approach its reference.
     """
     own, flown_s = summary["chasers"]["0"], summary["sim_time_s"]
     steady = {name: math.inf if v is None else v for name, v in own["steady"].items()}
@@ -147,7 +147,7 @@ def changes(results: Summaries, column: str, row: PaperRow, quantity: Quantity) 
 
 
 def comes_out(values: Sequence[float], paper: float) -> bool:
-    """Return whether changes have the paper's direction from every start, and about its size in the
+    """Return whether changes have the paper's sign from every start, and roughly its size in the
     median.
     """
     same = min(values) * max(values) > 0.0

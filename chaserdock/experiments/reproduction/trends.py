@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's trends: changes of a row from the baseline row, beside ours, with what measurements
-say about the difference.
+"""Trends of the paper: changes of a row from the baseline row, beside ours, with measurements that
+explain the differences.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def trend_rows(results: Summaries) -> list[tuple[str, ...]]:
 
 
 def change_text(change: float) -> str:
-    """Format a change: in percent up to doubling, above as a factor."""
+    """Format a change in percent; beyond doubling as a factor."""
     return f"{100 * change:+.1f} %" if abs(change) < 1.0 else f"x {1 + change:.3g}"
 
 
@@ -60,7 +60,7 @@ def _chain_text(results: Summaries, column: str, row: PaperRow) -> str:
 
 
 def _alone_change(results: Summaries, name: str, quantity: Quantity) -> float | None:
-    """Return the change of a flight on perfect knowledge from the baseline's; None without
+    """Return the change of a flight with perfect knowledge from the baseline; None without
     results.
     """
     one, base = (errors_by_label(results, n) for n in (name, f"alone/{BASELINE.name}"))
@@ -68,7 +68,7 @@ def _alone_change(results: Summaries, name: str, quantity: Quantity) -> float | 
 
 
 def explanation(results: Summaries, row: PaperRow) -> str:
-    """Return what was measured about a trend that does not come out in both errors of the paper's
+    """Return what was measured about a trend that does not appear in both errors of the paper's
     chain.
     """
     values = [changes(results, CODE, row, q) for q in QUANTITIES]
@@ -87,7 +87,7 @@ def explanation(results: Summaries, row: PaperRow) -> str:
 
 
 def _by_delay(results: Summaries, row: PaperRow) -> str:
-    """Find the delay of the command that brings the position error of the controller alone to the
+    """Find the command delay that brings the position error of the controller alone to the
     paper's.
     """
     solved = results.get(f"alone/{row.name}")

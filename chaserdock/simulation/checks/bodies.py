@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invariants of the true motion of bodies: distances, and what mechanics demands."""
+"""Invariants of the true motion of bodies: distances, and laws of mechanics."""
 
 from __future__ import annotations
 
@@ -22,37 +22,51 @@ from .flight_view import FlightView, FreeStep, inertia_of
 from .reader import reads
 
 KEEP_OUT_SLACK_M = 0.02
-"""Distance (m) by which a chaser may enter a keep-out zone, the errors of its estimate. Chosen."""
+"""Distance (m) by which errors of its estimate may bring a chaser into a keep-out zone. Larger:
+real violations pass; smaller: accurate flights fail.
+"""
 
 POSE_ROUNDING = 1e-6
-"""Largest error of a pose (m, rad) by rounding, of the engine's 64-bit and of message numbers."""
+"""Largest rounding error of a pose (m, rad), by the engine's 64-bit and by message numbers."""
 
 DISPLACEMENT_FLOOR_M = 2e-5
-"""Displacement (m) in a tick that velocities need not explain. Chosen; above rounding."""
+"""Displacement (m) in a tick that velocities need not explain: above rounding. Larger: small jumps
+pass.
+"""
 
 IMPULSE_SHARE = 0.02
-"""Share of the impulses in a tick by which momentum may differ from them: forces act at the
-attitudes of the engine's steps, here at that in the middle of the tick. Chosen."""
+"""Share of the impulses in a tick by which momentum may differ from them. Forces act at the
+attitudes of the engine's steps; the check uses the one in the middle of the tick. Larger: wrong
+forces pass; smaller: fast turns fail.
+"""
 IMPULSE_FLOOR_N_S, ANGULAR_FLOOR_N_M_S = 2e-5, 2e-5
-"""Momentum (N s) and angular momentum (N m s) in a tick without a cause. Chosen; above rounding."""
+"""Momentum (N s) and angular momentum (N m s) in a tick that need no cause: above rounding, below
+the shortest pulse.
+"""
 ARM_M = 0.1
-"""Lever arm (m) of thrusters, the order of a chaser's size: turns impulses into angular ones."""
+"""Lever arm (m) of thrusters, the order of a chaser's size. It converts impulses to angular
+ones.
+"""
 NOISE_SIGMAS = 5.0
-"""Standard deviations of the world's random force in a tick; normal errors exceed it once in 2
-million ticks."""
+"""Standard deviations of the world's random force in a tick. Normal errors exceed them once in 2
+million ticks.
+"""
 
 CONSERVED_SHARE = 2e-3
-"""Largest drift of what the untouched target conserves, as a share of its first value. Chosen."""
+"""Largest drift of what the untouched target conserves, as a share of its initial value. Larger:
+wrong dynamics pass; smaller: the engine's integration errors fail long flights.
+"""
 SPUN_SHARE = 1e-5
-"""Largest unexplained change of angular momentum in a tick in an orbit, as a share of it; the
-turning frame gives 7e-5.
+"""Largest unexplained change of angular momentum in a tick in an orbit, as a share of it. The
+turning frame alone gives 7e-5.
 """
 
 DETUMBLING = frozenset({"identify", "detumble", "stack_hold"})
 """Phases in which latched chasers stop the target, or keep it at rest."""
 TUMBLE_SHARE, TUMBLE_FLOOR_N_M_S = 0.05, 0.02
-"""By how much the angular momentum of a stack may rise above its least while it is stopped: share
-of its first value, and floor (N m s). Chosen.
+"""Rise of a stack's angular momentum above its least value while it is being stopped: share of its
+initial value, plus a floor (N m s). Larger: spinning up passes; smaller: pulses that identify the
+stack fail.
 """
 
 WHILE_MISLED = (
@@ -131,7 +145,8 @@ class KeepOutZone(Check):
 
     def _nearest_allowed_m(self, name: str, offset_m: Array) -> float:
         """Return the smallest allowed distance from the target of a chaser at an offset (3,),
-        TRF."""
+        TRF.
+        """
         cone = self._cones.get(name)
         if cone is not None and (
             cone.room_m(offset_m) > -KEEP_OUT_SLACK_M
@@ -197,7 +212,7 @@ class Displacement(Check):
 
 
 class _OfChasers:
-    """Exceptions that the two checks of momentum share."""
+    """Exceptions that both momentum checks share."""
 
     exceptions = (
         "a chaser that touches another body",
@@ -207,8 +222,9 @@ class _OfChasers:
 
 
 def _judged(step: FreeStep, view: FlightView) -> DrawnBody | None:
-    """Return the mass properties of a chaser whose actuators, disturbances and orbit explain how
-    its momentum changes; None of other bodies."""
+    """Return the mass properties of a chaser if its actuators, disturbances and orbit explain how
+    its momentum changes; None for other bodies.
+    """
     if step.after.body == "target" or step.drawn is None or any(step.drawn.centre_of_mass_m):
         return None
     is_pushed = view.scenario.plume is not None and len(view.scenario.chasers) > 1
@@ -275,7 +291,7 @@ class TargetMotion(Check):
     )
 
     _first: dict[str, float] = field(default_factory=dict)
-    """What was conserved when the target was touched last."""
+    """Conserved quantities when the target was last touched."""
 
     @reads(WorldTruth)
     def begin_again(self, world: WorldTruth) -> None:
@@ -297,7 +313,7 @@ class TargetMotion(Check):
                 self.violate("target", f"{name} from {first:.6g} to {value:.6g}")
 
     def _conserved(self, body: BodyTruth, drawn: DrawnBody) -> dict[str, float]:
-        """Return the values of what the target's kind of motion conserves."""
+        """Return the quantities that the target's kind of motion conserves, by name."""
         omega, inertia = np.array(body.omega_rad_s), inertia_of(drawn)
         conserved = {"rotational energy": 0.5 * float(omega @ inertia @ omega)}
         if not any(drawn.centre_of_mass_m):

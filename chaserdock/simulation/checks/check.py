@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every check of a simulated flight has: its texts, its state, and what it finds."""
+"""Base class of the checks of a simulated flight: texts, state, and what a check finds."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Violation:
 class Check(MessageReader):
     """An invariant of a flight. Its docstring states what holds, in one sentence.
 
-    ``name``: what violations are called. ``exceptions``: when it is not judged. ``view``: the
-    flight so far, the message that is being read included. Names of constants of the module in
-    double backquotes stand for their values in docs/invariants.md.
+    ``name``: name of its violations. ``exceptions``: when it is not judged. ``view``: the flight so
+    far, including the present message. Names of the module's constants in double backquotes stand
+    for their values in docs/invariants.md.
     """
 
     name: ClassVar[str]
@@ -44,10 +44,10 @@ class Check(MessageReader):
         self.begin()
 
     def begin(self) -> None:
-        """Derive what does not change during the flight."""
+        """Derive state that does not change during the flight."""
 
     def violate(self, subject: str, text: str) -> None:
-        """Report that the invariant does not hold for a subject: a body, a process, a key."""
+        """Report that the invariant does not hold for a subject: a body, a process or a key."""
         self.report(self.name, subject, text)
 
     def end(self, flight: SimulatedFlight) -> None:

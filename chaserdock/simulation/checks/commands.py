@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invariants of who commands whom: one commander, no stale command, commands that are flown."""
+"""Invariants of command: one commander, no stale commands, commands that are flown."""
 
 from __future__ import annotations
 
@@ -17,15 +17,20 @@ from .check import Check
 from .reader import reads
 
 KNOWN_AFTER_S = 0.1
-"""Time (s), in addition to the latency, after which a tick is known to a chaser that is not frozen.
-Chosen; ten times the largest mean jitter that seeds draw (`swarm.py`)."""
+"""Time (s), beyond the latency, after which a chaser that is not frozen knows a tick: ten times the
+largest mean jitter that seeds draw (`swarm.py`). Larger: stale commands pass; smaller: jitter
+fails.
+"""
 OPENED_TICKS = 200
-"""Ticks whose opening is remembered: more than what a world that was frozen opens at once."""
+"""Ticks whose opening times are kept: more than a frozen world opens at once when it continues."""
 GAP_S = 1.1
-"""Commands that pause for longer (s), at a hand-over, are published again: 1 s, which a new holder
-of leases has for its first command (docs/redundancy.md), and a tick of 10 Hz."""
+"""Pause (s) of published commands after which the time to fly one starts again: 1 s, which a new
+holder of leases has for its first command (docs/redundancy.md), plus a tick of 10 Hz.
+"""
 PLAN_SHARE = 1e-3
-"""Largest difference of a command from its plan, as a share of the body's limits. Chosen."""
+"""Largest difference of a command from its plan, as a share of the body's limits: above the
+quantization of commands.
+"""
 
 
 @dataclass
@@ -60,7 +65,7 @@ class NoStaleCommand(Check):
             self.violate(name, f"flies tick {command.tick} after {before}")
 
     def _known_tick(self) -> int:
-        """Return the newest tick that has reached the chasers by now."""
+        """Return the newest tick that should be known to the chasers by now."""
         network = self.scenario.simulation
         if network.mode == "lockstep":
             return self.view.tick
@@ -97,7 +102,7 @@ class OneCommander(Check):
     _controllers: int = 0
     _controller_lost: set[int] = field(default_factory=set)
     _term_ticks: dict[int, tuple[int, int]] = field(default_factory=dict)
-    """First and last tick for which commands of a term were flown."""
+    """First and last tick for which commands of each term were flown."""
 
     @reads(Tick)
     def note_tick(self, tick: Tick) -> None:
@@ -117,8 +122,8 @@ class OneCommander(Check):
             text = f"flies a command of {sender} for tick {tick}, in which {other} commands"
             self.violate(name, text)
 
-        # A repeated tick may have commands of both terms. A chaser that was lost may fly its
-        # commands late, but for their own ticks.
+        # A repeated tick may have commands of both terms. A chaser that was lost may fly commands
+        # late, but for their own ticks.
         first, last = self._term_ticks.get(term, (tick, tick))
         self._term_ticks[term] = min(first, tick), max(last, tick)
         for other_term, (from_tick, until_tick) in self._term_ticks.items():
@@ -144,7 +149,7 @@ class NoHandOverWithoutCause(Check):
 
     _term: int = -1
     _last_tick: int = -1
-    """The highest term of commands that were flown, and the last tick of it."""
+    """Highest term of flown commands, and the last tick of it."""
 
     @reads(ActuatorCommand)
     def judge(self, command: ActuatorCommand) -> None:
@@ -176,8 +181,9 @@ class CommandsAreFlown(Check):
     _commanded: dict[int, int] = field(default_factory=dict)
     """Newest tick for which each chaser was commanded."""
     _since: dict[int, int] = field(default_factory=dict)
-    """Tick from which on each chaser is to have flown a command: of the last one that it flew, or
-    the first after a break of commands."""
+    """Tick since which each chaser has to fly a command: that of the last one that it flew, or the
+    first after a break of commands.
+    """
 
     def begin(self) -> None:
         self._gap = math.ceil(GAP_S * self.scenario.time.rate_hz)

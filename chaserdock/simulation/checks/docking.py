@@ -25,28 +25,38 @@ from .flight_view import FlightView
 from .reader import reads
 
 RETREAT_SLACK_M = 0.15
-"""Distance (m) by which the reference of a retreat may come nearer to the target at first: one that
-moves inwards at up to 8 cm/s turns within it."""
+"""Distance (m) by which the reference of a retreat may at first come closer to the target. One that
+moves inwards at up to 8 cm/s turns within it.
+"""
 TURNING_S = 5.0
-"""Time (s) after which a retreat leads to the nominal place. Chosen; longer than a turn."""
+"""Time (s) after which a retreat must lead to the nominal place; longer than a turn. Larger:
+detours pass; smaller: slow turns fail.
+"""
 HOMING_SLACK_M = 0.03
-"""Distance (m) by which a retreat may lead away from its goal again: noise of its reference."""
+"""Distance (m) by which a retreat may move away from its goal again, by noise of its reference."""
 
 LATCH_DELAY_S = 1.0
-"""Time (s) after a fault of a latch within which it may open. Chosen."""
+"""Time (s) after a fault of a latch within which it may open. Larger: an opening without a cause
+passes; smaller: late messages fail.
+"""
 BRAKING_S = 20.0
-"""Longest time (s) in which a chaser without a controller brakes: the 15 s after which its fallback
-ends braking, and 5 s."""
+"""Longest time (s) for which a chaser without a controller brakes: 15 s, after which its fallback
+stops braking, plus 5 s.
+"""
 
 DRIFT_ERROR_M = 0.1
-"""Largest error (m) of the position to which a lost chaser is extrapolated. Chosen."""
+"""Largest error (m) of the extrapolated position of a lost chaser. Larger: more flights count as
+blocked; smaller: chasers that avoid it fail.
+"""
 
 SAFE_PHASES = frozenset(
     {"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate", "inspect"}
 )
-"""Phases in which a chaser keeps its distance, if their reason is in the log."""
+"""Phases in which a chaser keeps its distance. They count as safe if the log states their
+reason.
+"""
 NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate", "inspect")
-"""Commands of an operator that are a reason for it to keep its distance."""
+"""Operator commands that are such a reason."""
 ATTACHED = frozenset({"latched", "verified", "identify", "detumble", "stack_hold"})
 """Phases in which the latch of a chaser is to be closed."""
 DOCKED = ATTACHED | {"docked"}
@@ -93,9 +103,11 @@ class RetreatLeadsAway(Check):
 
     _phases: dict[int, str] = field(default_factory=dict)
     _nearest_m: dict[int, float] = field(default_factory=dict)
-    """Least allowed distance from the target of each chaser's reference in its present phase."""
+    """Least allowed distance from the target, in its present phase, of each chaser's reference."""
     _least_m: dict[int, tuple[str, Array]] = field(default_factory=dict)
-    """Least distances (1 or 2,) from the goals of each chaser's retreat, and whose it is."""
+    """Least distances (1 or 2,) so far from the goals of each chaser's retreat, and under which
+    controller.
+    """
 
     def begin(self) -> None:
         self._goals_m = [retreat_goals(self.scenario, i) for i in range(len(self.scenario.chasers))]
@@ -118,8 +130,9 @@ class RetreatLeadsAway(Check):
             self.violate(f"chaser/{i}", f"its reference is {away_m:.2f} m from the target")
 
     def _judge_homing(self, i: int, reference: Reference) -> None:
-        """Judge the distances from the goals. Controllers begin a retreat by their own estimates:
-        after a hand-over it may be less far."""
+        """Judge the distances from the goals. Controllers start a retreat from their own estimates,
+        so that after a hand-over it may lead less far.
+        """
         sender = self.view.sender
         left_m = np.linalg.norm(self._goals_m[i] - reference.offset_m, axis=1)
         known_sender, least_m = self._least_m.get(i, (sender, left_m))
@@ -228,11 +241,12 @@ class DockedOrSafe(Check):
     )
 
     _reason_s: dict[int, float] = field(default_factory=dict)
-    """Time of the last reason in the log that concerns a chaser."""
+    """Time (s) of the last logged reason that concerns each chaser."""
 
     @reads(Event)
     def note_reason(self, event: Event) -> None:
-        # A phase that guidance chose names its reason: "chaser 0: hold (from approach: REASON)".
+        # Guidance logs the reason of a phase that it chose: "chaser 0: hold (from approach:
+        # REASON)".
         is_chosen = ": " in event.what.partition("(from ")[2]
         is_warning = event.level != "info" and not event.what.startswith("fault ")
         if is_warning or is_chosen:
@@ -248,8 +262,9 @@ class DockedOrSafe(Check):
                 self.violate(f"chaser/{chaser}", f"ends in phase {phase} without a named reason")
 
     def state_of(self, chaser: int) -> str:
-        """Return how a chaser that is to dock ends: ``docked``, ``safe``, ``unfinished``, or empty
-        if it is none of these."""
+        """Return how a chaser that is to dock ends: ``docked``, ``safe`` or ``unfinished``; empty
+        if it is not to dock.
+        """
         view = self.view
         phase, is_on_its_own = view.phases.get(chaser, ""), view.is_on_its_own(chaser)
         if phase in DOCKED and not is_on_its_own:
@@ -267,7 +282,8 @@ class DockedOrSafe(Check):
 
     def _is_blocked(self, chaser: int) -> bool:
         """Return whether a lost chaser drifts so close to the docking place, or to a chaser with a
-        port, that others avoid it."""
+        port, that others avoid it.
+        """
         view = self.view
         own = view.states.get(f"chaser/{chaser}")
         has_port = self.scenario.docking.port_of(chaser) is not None
@@ -278,15 +294,15 @@ class DockedOrSafe(Check):
 
 
 def chasers_to_dock(s: Scenario) -> list[int]:
-    """Return the chasers that are to dock or to latch, and are commanded to approach before the
-    end."""
+    """Return the chasers that are to dock or latch and are commanded to approach before the end."""
     rows = [e for e in s.timeline if e.command == "approach" and e.at_s < s.duration_s]
     return sorted({i for e in rows for i in e.chasers} & {*s.success.docked, *s.success.latched})
 
 
 def concerned(event: Event, chasers: int) -> set[int]:
-    """Return the chasers that an event may keep from docking: the one that publishes it, or those
-    that world or controllers name; all if they name none."""
+    """Return the chasers that an event may keep from docking: its publisher, or those that world or
+    controllers name; all if none is named.
+    """
     if event.process.startswith("chaser/"):
         return {int(event.process.partition("/")[2])}
     named = {int(i) for i in re.findall(r"chaser[ /](\d+)", f"{event.what} {event.detail}")}
@@ -296,8 +312,9 @@ def concerned(event: Event, chasers: int) -> set[int]:
 
 
 def docking_place(view: FlightView, chaser: int) -> Array | None:
-    """Return the true place (WRF, m) where a chaser without a port docks; None if the truth is not
-    known."""
+    """Return the true place (WRF, m) where a chaser without a port docks; None while the truth is
+    unknown.
+    """
     target = view.states.get("target")
     if target is None:
         return None
@@ -308,8 +325,9 @@ def docking_place(view: FlightView, chaser: int) -> Array | None:
 
 
 def retreat_goals(s: Scenario, chaser: int) -> Array:
-    """Return the places (1 or 2, 3), TRF, to which a retreat may lead: the nominal one, and the
-    entry of the corridor to a port."""
+    """Return the goals (1 or 2, 3), TRF, of a retreat: the nominal place, and the entry of the
+    corridor to a port.
+    """
     port, goals_m = s.docking.port_of(chaser), [np.array(s.chasers[chaser].position_m)]
     if port is not None:
         goals_m.append(centre_offset(port, s.chaser.probe_reach_m, s.docking.entry_m))
@@ -317,8 +335,9 @@ def retreat_goals(s: Scenario, chaser: int) -> Array:
 
 
 def settling_s(s: Scenario, chaser: int) -> float:
-    """Return how long a chaser may take after the last disturbance: for an approach from rest, or
-    another attempt (s)."""
+    """Return how long (s) a chaser may take after the last disturbance, for an approach from rest
+    or another attempt.
+    """
     d, approach = s.docking, s.approach
     if d.port_of(chaser) is None:
         way_m = math.hypot(*s.chasers[chaser].position_m) - approach.dock_distance_m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invariants of estimates: accuracy, consistency, and damaged sightings that are named."""
+"""Invariants of estimates: accuracy, consistency, and reports of damaged sightings."""
 
 from __future__ import annotations
 
@@ -29,27 +29,34 @@ from .check import Check
 from .reader import reads
 
 ACCURACY_M = 0.01
-"""Largest error (m) of the target's position beside drift, while two honest chasers see it. Chosen.
+"""Largest error (m) of the target's position, drift aside, while two honest chasers see it. Larger:
+poor estimates pass; smaller: consistent ones fail.
 """
 DRIFT_SIGMAS = 4.0
-"""Standard deviations of the drift of odometry, which the target's position inherits; a normal
-error exceeds four once in 16,000."""
+"""Standard deviations of the drift of odometry, which the target's position inherits. A normal
+error exceeds them once in 16,000.
+"""
 SEEN_S = 0.5
-"""Time (s) for which a chaser that saw the target still counts as seeing it. Chosen."""
+"""Time (s) for which a chaser counts as seeing the target after it last did: a few images may miss
+it.
+"""
 
 DAMAGED_SIGHTINGS = 100.0
-"""Number of damaged sightings of which the controller names at least one as invalid: about one in
-14 decodes and is, so that chance leaves none of them in one flight of 1,700."""
+"""Number of damaged sightings of which the controller must report at least one as invalid. About
+one in 14 still decodes and is invalid, so that chance alone reports none in one flight of 1,700.
+"""
 BESIDE_DAMAGE = frozenset({"corrupt", "flood", "duplicate"})
-"""Kinds of faults beside which the controller still receives sightings, damaged or not."""
+"""Kinds of faults under which the controller still receives sightings, damaged or not."""
 
 LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
-"""Largest mean normalized squared error (6 if consistent) of at least so many estimates of one
-flight. Chosen; successive errors are correlated, so that the mean of one flight scatters."""
+"""Least number of estimates, and largest mean normalized squared error (6 if consistent), of one
+flight. Large, because successive errors are correlated and the mean of one flight scatters.
+"""
 LEAST_FLIGHTS, LEAST_MEAN_NEES, MOST_MEAN_NEES = 20, 1.5, 12.0
-"""Bounds of the mean normalized squared error of the target's pose (6 if consistent) over at least
-so many flights. Chosen, as a quarter and twice; chunks of 40 flights of `fault-drill` have 3.7 to
-6.4 (docs/simulation.md)."""
+"""Least number of flights, and bounds of the mean normalized squared error of the target's pose
+over them (6 if consistent): a quarter and twice. Chunks of 40 flights of `fault-drill` have 3.7 to
+6.4 (docs/simulation.md).
+"""
 
 
 @dataclass
@@ -69,7 +76,7 @@ class AccurateEstimate(Check):
 
     def begin(self) -> None:
         causes = self.view.causes
-        # What late pulses lose is unknown to the chasers.
+        # Chasers do not know what late pulses lose.
         is_late = self.scenario.chaser.actuation == "thrusters" and causes.late_messages
         self._is_judged = len(causes.liars) <= 1 and not causes.wrong_states and not is_late
 
@@ -93,8 +100,9 @@ class AccurateEstimate(Check):
             self.violate("target", text)
 
     def _is_pushed(self) -> bool:
-        """Return whether a thruster of a latched chaser may be stuck on without a report: detection
-        pauses while latched."""
+        """Return whether a thruster of a latched chaser may be stuck on unreported: detection
+        pauses while latched.
+        """
         return any(
             f.kind == "stuck_on"
             and not f.reported
@@ -130,8 +138,9 @@ class DamageIsNamed(Check):
                 self._damaged += self._damaged_share(f"chaser/{sighting.chaser}", commander)
 
     def _damaged_share(self, chaser: str, commander: str) -> float:
-        """Return the share of a chaser's sightings that a fault damages now for the commander, and
-        that it receives in time."""
+        """Return the share of a chaser's sightings that a fault damages now for the commander and
+        that still arrive in time.
+        """
         now_s, faults = self.view.time_s, self.scenario.fault
         active = [f for f in faults if f.at_s <= now_s < f.at_s + (f.duration_s or math.inf)]
         kept = (keeps_commands(f, chaser) for f in active if f.kind not in BESIDE_DAMAGE)

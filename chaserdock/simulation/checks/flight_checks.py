@@ -59,8 +59,9 @@ C = TypeVar("C", bound=Check)
 
 
 class FlightChecks:
-    """Checks one flight, message by message; a violation is noted once per invariant and
-    subject."""
+    """Checks one flight, message by message. A violation is recorded once per invariant and
+    subject.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -106,8 +107,9 @@ class FlightChecks:
 
     @property
     def outcome(self) -> str:
-        """The first violated invariant, or the least final state of the chasers that are to dock:
-        ``unfinished``, ``safe`` or ``docked``."""
+        """Return the first violated invariant, or else the worst final state of the chasers that
+        are to dock: ``unfinished``, ``safe`` or ``docked``.
+        """
         if self.violations:
             return self.violations[0].invariant
         docked_or_safe = self.find(docking.DockedOrSafe)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several checks need to know of a flight: the state of bodies, phases, who commands whom."""
+"""State of a flight that several checks need: bodies, phases, who commands whom."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from .reader import MessageReader, reads
 
 @dataclass(frozen=True)
 class FreeStep:
-    """The true motion of a body in one tick in which nothing touched it.
+    """True motion of a body in one tick in which nothing touched it.
 
-    ``before`` and ``after``: its states at successive ticks, ``dt_s`` apart. ``drawn``: its mass
+    ``before``, ``after``: its states at successive ticks, ``dt_s`` apart. ``drawn``: its mass
     properties and disturbances, None if not published. ``orbit``: None in free space.
     """
 
@@ -52,18 +52,20 @@ class FreeStep:
 
     @cached_property
     def halfway(self) -> Array:
-        """Attitude (4,) in the middle of the tick, body to WRF."""
+        """Return the attitude (4,) in the middle of the tick, body to WRF."""
         q, omega = np.array(self.before.q_wxyz), np.array(self.before.omega_rad_s)
         return rotations.integrate(q, omega, 0.5 * self.dt_s)
 
     @property
     def turned_rad(self) -> float:
-        """Angle (rad) by which the body turns in a tick, at its rate after it."""
+        """Return the angle (rad) by which the body turns in a tick at its final rate."""
         return math.hypot(*self.after.omega_rad_s) * self.dt_s
 
     @cached_property
     def orbital_impulse(self) -> tuple[Array, Array]:
-        """Changes (3,) of momentum (N s) and angular momentum (N m s), WRF, by the orbit."""
+        """Return the changes (3,) of momentum (N s) and angular momentum (N m s), WRF, that the
+        orbit causes.
+        """
         if self.orbit is None or self.drawn is None:
             return np.zeros(3), np.zeros(3)
         before, middle_s = self.before, (self.before.tick + 0.5) * self.dt_s
@@ -88,21 +90,22 @@ class FreeStep:
 
 @dataclass
 class FlightView(MessageReader):
-    """A flight as its messages show it. Checks read it; ``FlightChecks`` updates it, once for each
-    message and before the checks see that.
+    """A flight as its messages show it. ``FlightChecks`` updates it once per message, before the
+    checks see that; checks only read it.
 
-    ``sender``, ``key``, ``sent_ns``: of the present message. ``published``: messages from the first
-    tick on, by key, as the recorder should have them. ``tick``, ``state_tick``: newest tick that
-    is open, and whose true states are known. ``opens_tick``: the newest ``Tick`` did not repeat
-    one. ``states``, ``drawn``: truth of each body, and its
-    mass properties. ``steps``: of the bodies that nothing touched in the newest tick.
-    ``touching``: bodies that touch another one, or are latched to it. ``latched``: chasers whose
+    Present message: ``sender``, ``key``, ``sent_ns``. ``published``: messages since the first tick,
+    by key, as the recorder should have them. ``tick``: newest open tick. ``opens_tick``: the newest
+    ``Tick`` did not repeat one.
+
+    Bodies: ``state_tick``: newest tick whose true states are known. ``states``, ``drawn``: truth
+    and mass properties of each. ``steps``: motion of those that nothing touched in the newest tick.
+    ``touching``: those that touch another body or are latched to it. ``latched``: chasers whose
     latch is truly closed.
 
-    ``phases``: of each chaser, by its newest reference. ``sources``: what each chaser flies, by its
-    newest command of actuators. ``commanders``: the controller whose command was flown first, by
-    tick. ``lost``: processes that do not take part. ``unreachable``: processes that were lost, and
-    chasers whose actuators were stopped, until these have flown commands for ``STOPPING_S``.
+    Chasers: ``phases``: by their newest reference. ``sources``: what each flies, by its newest
+    actuator command. ``commanders``: by tick, the controller whose command was flown first.
+    ``lost``: processes that do not take part. ``unreachable``: processes that were lost, and
+    chasers whose actuators were stopped, until they have flown commands for ``STOPPING_S``.
     """
 
     scenario: Scenario
@@ -158,18 +161,19 @@ class FlightView(MessageReader):
         return is_unreachable or self.sources.get(chaser, "command") != "command"
 
     def truth_of(self, estimate: TargetEstimate) -> BodyTruth | None:
-        """Return the true state of the target at the time of an estimate, None if either is not
-        known."""
+        """Return the true state of the target at the time of an estimate; None if either is
+        unknown.
+        """
         truth = self.states.get("target")
         if truth is None or estimate.status not in ("tracking", "predicting"):
             return None
         return truth if truth.sim_time_ns == estimate.sim_time_ns else None
 
     def receive(self, sender: str, raw: RawSample) -> None:
-        """Note a message that has been published, before it is decoded."""
+        """Record a message that has been published, before it is decoded."""
         self.sender, self.key, self.sent_ns = sender, raw.key, raw.sent_ns
-        # The recorder listens from the first tick on, and is not asked for its own and for
-        # presence.
+        # The recorder listens from the first tick on. It does not record itself, and presence is
+        # not required.
         if (self.published or raw.key == topics.TICK.key) and sender != "recorder":
             self.published[raw.key] += not raw.key.endswith("/presence")
 
@@ -229,8 +233,9 @@ class FlightView(MessageReader):
             self._note_return(command)
 
     def _note_return(self, command: ActuatorCommand) -> None:
-        """Take a chaser as reachable that has flown commands for ``STOPPING_S``, while no fault
-        kept them from its actuators."""
+        """Count a chaser as reachable again that has flown commands for ``STOPPING_S``, while no
+        fault kept them from its actuators.
+        """
         name, now_s = f"chaser/{command.chaser}", self.time_s
         if command.source != "command" or name in self.lost:
             self._follows_since_s.pop(name, None)
@@ -255,8 +260,9 @@ class FlightView(MessageReader):
 
 
 def lost_by(event: Event) -> str | None:
-    """Return the process that an event of the world states as lost, or whose actuators it states
-    as stopped; None of other events."""
+    """Return the process that an event of the world reports as lost or whose actuators it reports
+    as stopped; None for other events.
+    """
     if event.process == "world" and event.what in ("process lost", "actuators stopped"):
         return event.detail.partition(":")[0]
     return None

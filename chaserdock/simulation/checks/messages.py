@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invariant of each published message by itself, beyond what the decoder checks."""
+"""Invariants of single messages beyond what the decoder checks."""
 
 from __future__ import annotations
 
@@ -27,15 +27,17 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from .check import Check
 
 QUATERNION_ROUNDING = 1e-6
-"""Largest difference of a quaternion's length from 1, by rounding."""
+"""Largest deviation of a quaternion's length from 1 by rounding."""
 LIMIT_SHARE = 1.01
 """Share of a limit up to which chasers accept commands."""
 SYMMETRY = 1e-9
-"""Largest asymmetry and largest negative eigenvalue of a covariance, as a share of its largest
-variance; rounding gives less.
+"""Largest asymmetry and negative eigenvalue of a covariance, as a share of its largest variance;
+rounding gives less.
 """
 LIFETIME_ROUNDING_S = 1e-6
-"""Largest difference (s) of a command's lifetime from the stated one: stamps are in whole ns."""
+"""Largest difference (s) of a command's lifetime from the stated one: time stamps are in whole
+ns.
+"""
 
 
 @dataclass
@@ -56,18 +58,18 @@ class ValidMessages(Check):
             self.violate(self.view.key, text)
 
     def refuse(self, why: str) -> None:
-        """Report a message that does not pass the decoder."""
+        """Report a message that the decoder rejects."""
         self.violate(self.view.sender, f"{self.view.key}: {why}")
 
 
 def defects_of(message: Any, scenario: Scenario) -> list[str]:
-    """Return what is wrong with a message, given its scenario; empty if nothing is."""
+    """Return the defects of a message, given its scenario; empty if it has none."""
     find = DEFECTS.get(type(message))
     return [] if find is None else list(find(message, scenario))
 
 
 def covariance_defect(values: Sequence[float]) -> str:
-    """Return why a row-major matrix is no covariance, or an empty string."""
+    """Return why a row-major matrix is not a covariance; empty if it is."""
     size = math.isqrt(len(values))
     if size == 3 and _is_covariance_3(*values):
         return ""
@@ -79,7 +81,7 @@ def covariance_defect(values: Sequence[float]) -> str:
     shifted = matrix.copy()
     shifted.reshape(-1)[:: size + 1] += SYMMETRY * scale
     try:
-        # Exists unless an eigenvalue is below -SYMMETRY * scale, and is faster than the
+        # The factor exists unless an eigenvalue is below -SYMMETRY * scale; it is faster than
         # eigenvalues.
         np.linalg.cholesky(shifted)
         return ""
@@ -93,7 +95,7 @@ def covariance_defect(values: Sequence[float]) -> str:
 def _is_covariance_3(
     a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
 ) -> bool:
-    """Return whether a row-major matrix (3, 3) is exactly symmetric, with positive pivots only."""
+    """Return whether a row-major matrix (3, 3) is exactly symmetric with positive pivots."""
     if not (b == d and c == g and f == h and a > 0.0):
         return False
     e, f, i = e - b * b / a, f - b * c / a, i - c * c / a
@@ -161,8 +163,8 @@ def _plan(plan: Plan, scenario: Scenario) -> Iterator[str]:
 def _within_limits(
     wrenches: Sequence[float], scenario: Scenario, single: bool = False
 ) -> Iterator[str]:
-    """Check wrenches, six numbers each. ``single``: thrusters may be commanded one by one, up to
-    all in the same direction.
+    """Check wrenches, six numbers each. ``single``: thrusters may be commanded individually, up to
+    all in one direction.
     """
     limits, thrusters = scenario.chaser.wrench_max, scenario.chaser.thrusters
     if single:
@@ -215,4 +217,4 @@ DEFECTS: dict[type, Callable[[Any, Scenario], Iterator[str]]] = {
     ActuatorCommand: _actuators,
     ThrusterReport: _report,
 }
-"""What finds the defects of messages of each type."""
+"""Functions that find the defects of a message, by its type."""

@@ -22,11 +22,13 @@ from .flight_view import lost_by
 from .reader import reads
 
 QUEUE_LIMIT = 400
-"""Most messages that may wait for a reader which nothing holds up. Chosen; 7 ticks of four
-chasers with ports and thrusters, which publish 54 messages a tick."""
+"""Most messages that may wait for a reader that nothing delays: 7 ticks of four chasers with ports
+and thrusters, which publish 54 messages a tick. Larger: growing queues are found later.
+"""
 RECORDER_TICKS = RECORDER_WINDOW_TICKS + 2
-"""Ticks whose messages may wait for the recorder: those that it may be behind, and two for ticks
-with more messages than the mean."""
+"""Ticks whose messages may wait for the recorder: those by which it may be behind, plus two, since
+some ticks have more messages than the mean.
+"""
 
 
 @dataclass
@@ -155,10 +157,11 @@ class BoundedQueues(Check):
 
 
 def queue_limit(reader: str, published: int, ticks: int, missed_ticks: float = 0.0) -> int:
-    """Return how many messages may wait for a process in a flight with so many messages and ticks.
+    """Return how many messages may wait for a process in a flight with ``published`` messages and
+    ``ticks`` ticks.
 
-    ``missed_ticks``: the most ticks that a process opens or replies to at once, after it was frozen
-    or slow.
+    ``missed_ticks``: most ticks that a process opens or answers at once after it was frozen or
+    slow.
     """
     behind = missed_ticks + (RECORDER_TICKS if reader == "recorder" else 0)
     return max(QUEUE_LIMIT, math.ceil(behind * published / max(1, ticks)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which method of an object reads the messages of which type."""
+"""Assigns the methods of an object to the message types that they read."""
 
 from __future__ import annotations
 

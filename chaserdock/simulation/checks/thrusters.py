@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invariants of thrusters: what a chaser expects of them, and takes them for."""
+"""Invariants of thrusters: expected impulses are given, and healthy thrusters are not suspected."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from .check import Check
 from .reader import reads
 
 FLOOR_N_S = 0.01
-"""Impulse (N s) by which expected and true impulse may differ. Chosen; as one pulse of 10 ms of
-1 N."""
+"""Impulse (N s) by which expected and true impulse may differ: one pulse of 10 ms of 1 N."""
 THRUST_SHARE = 0.15
-"""Share of the given impulse by which it may differ from the expected one. Chosen."""
+"""Difference of expected and given impulse, as a share of the latter. Larger: wrong models pass;
+smaller: stated errors of thrust fail.
+"""
 SCATTER_SIGMAS = 3.0
-"""Standard deviations of the scatter of thrust and delay that `[truth]` states; a normal error
-exceeds three once in 370."""
+"""Standard deviations of the scatter of thrust and delay in `[truth]`. A normal error exceeds them
+once in 370.
+"""
 
 
 @dataclass
@@ -53,8 +55,9 @@ class ThrustersAsExpected(Check):
     )
 
     _unexplained: dict[int, Array] = field(default_factory=dict)
-    """Impulse (6,) that each chaser expected and its thrusters did not give: N s, and N m s divided
-    by ``ARM_M``."""
+    """Impulse (6,) that each chaser expected but its thrusters did not give: N s, and N m s divided
+    by ``ARM_M``.
+    """
     _given_N_s: dict[int, float] = field(default_factory=dict)
 
     @reads(ThrusterReport)
@@ -79,12 +82,11 @@ class ThrustersAsExpected(Check):
             self.violate(name, f"expects {more}")
 
     def _allowed_N_s(self, name: str, given_N_s: float) -> float:
-        """Return by how much the impulse that thrusters have given may differ from the expected
-        one."""
+        """Return by how much the given impulse of thrusters may differ from the expected one."""
         truth, drawn = self.view.mismatch, self.view.drawn.get(name)
         late_s = truth.delay_s + SCATTER_SIGMAS * truth.delay_jitter_s
         late_s += 0.0 if drawn is None else abs(drawn.clock_offset_s)
-        # A thruster's force acts on position and, by its arm, on attitude.
+        # A thruster's force acts on position and, by its lever arm, on attitude.
         shifted_N_s = 2.0 * late_s * sum(t.thrust_N for t in self.scenario.chaser.thrusters)
         share = THRUST_SHARE + SCATTER_SIGMAS * truth.thrust_share
         return FLOOR_N_S + shifted_N_s + share * given_N_s

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the free rotation of a rigid body depends on: its inertia up to a factor, and its centre of
-mass. Eight numbers.
+"""Shape of a rigid body, all that its free rotation depends on: the inertia up to a factor and the
+centre of mass, eight numbers.
 
-The inertia over its trace differs from an estimate by a symmetric matrix without trace, of which
-five numbers are the coordinates. In these the acceleration is nearly linear and an uncertain
-inertia nearly Gaussian, which they are not in logarithms of the second moments. A body can have an
-inertia I if and only if its second moments 1/2 trace(I) 1 - I are positive (Wensing, Kim and
-Slotine, "Linear matrix inequalities for physically consistent inertial parameter identification",
-2018). This set is convex: an estimate outside it is replaced by the nearest one in it, which is
-nearer to every inertia that a body can have.
+The error of the inertia over its trace is a symmetric matrix without trace, hence five coordinates.
+In these the angular acceleration is nearly linear and an uncertain inertia is nearly Gaussian.
+Neither holds in logarithms of the second moments.
+
+A rigid body with inertia I exists if and only if its second moments 1/2 trace(I) 1 - I are positive
+(Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
+identification", 2018). This set is convex. An estimate outside it is replaced by the nearest one
+inside, which is closer to every possible inertia.
 """
 
 from __future__ import annotations
@@ -45,16 +46,18 @@ RATIO_BASIS = _basis()
 
 @dataclass(frozen=True, eq=False)
 class BodyShape:
-    """``inertia`` (3, 3): about the centre of mass, TRF axes, with trace 1. ``centre_m`` (3,):
-    centre of mass, TRF.
+    """Inertia up to a factor and centre of mass of a rigid body.
+
+    ``inertia`` (3, 3): about the centre of mass, TRF axes, with trace 1. ``centre_m`` (3,): centre
+    of mass, TRF.
     """
 
     inertia: Array
     centre_m: Array
 
     def corrected(self, error: Array) -> BodyShape:
-        """Return the shape that differs by an error (8,), or the nearest one that a body can
-        have.
+        """Return the shape that differs by an error (8,); if no rigid body has it, the nearest
+        possible one.
         """
         inertia = _physical(self.inertia + np.tensordot(error[RATIOS], RATIO_BASIS, 1))
         return BodyShape(inertia, self.centre_m + error[CENTRE_OF_MASS])
@@ -90,8 +93,10 @@ def shape_covariance(inertia: Array, covariance: Array) -> Array:
 
 
 def mass_covariance(covariance: Array, trace: float) -> Array:
-    """Return the covariance (9, 9) of centre of mass and inertia, as in ``shape_covariance``, of a
-    shape with ``covariance`` (8, 8), if the trace of the inertia is ``trace``."""
+    """Return the covariance (9, 9) of centre of mass and inertia, as in ``shape_covariance``.
+
+    ``covariance`` (8, 8): of the error of the shape. ``trace``: of the inertia, kg m².
+    """
     jacobian = np.zeros((9, SHAPE))
     jacobian[:3, CENTRE_OF_MASS] = np.eye(3)
     jacobian[3:, RATIOS] = trace * np.stack([RATIO_BASIS[:, i, j] for i, j in INERTIA_ROWS])

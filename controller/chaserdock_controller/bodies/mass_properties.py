@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mass, centre of mass and inertia of a body with their covariance, and of bodies that are attached
-or detached. Pure functions.
+"""Mass, centre of mass and inertia of a body with their covariance; bodies are attached and
+detached. Pure functions.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ for _k, (_i, _j) in enumerate(INERTIA_ROWS):
 
 @dataclass(frozen=True, eq=False)
 class MassProperties:
-    """A body, and the covariance (10, 10) of mass (kg), centre (m) and inertia (xx, yy, zz, xy, xz,
-    yz; kg m²).
+    """Mass properties of a body with the covariance (10, 10) of mass (kg), centre of mass (m) and
+    inertia (xx, yy, zz, xy, xz, yz; kg m²).
     """
 
     body: TargetBody
@@ -51,13 +51,13 @@ def body_of(values: Array) -> TargetBody:
 def attach(
     target: MassProperties, chasers: Sequence[MountedChaser], body: RigidBody
 ) -> MassProperties:
-    """Return the mass properties of a target with chasers fixed to it; the chasers' are taken as
-    exact.
+    """Return the mass properties of a target with chasers fixed to it. Those of the chasers count
+    as exact.
 
-    Centre and inertia of the stack are not linear in the target's mass: with centre and ratios well
-    known and the mass to 30 %, this moves the centre by centimetres. The covariance contains the
-    second-order term about the estimate, 3 c c' with the curvature c by one sigma of the logarithm
-    of the mass, in which the motion of the stack shows the mass.
+    Centre and inertia of the stack are not linear in the target's mass. With centre and inertia
+    ratios well known and the mass to 30 %, the second-order term moves the centre by centimetres.
+    The covariance contains that term about the estimate, 3 c c', where c is the curvature per sigma
+    of the logarithm of the mass, the parameter that the filter of the stack estimates.
     """
     parts = _parts(chasers, body, 1.0)
     stack = _transformed(target, parts)
@@ -84,9 +84,11 @@ def covariance_by_chasers(
     mass_share: float,
     centre_m: float,
 ) -> Array:
-    """Return the covariance (10, 10) of the mass properties of a stack by what is not known of its
-    chasers: standard deviations of their masses, as a share, and of their centres of mass, per
-    axis."""
+    """Return the covariance (10, 10) that uncertain chasers add to the mass properties of a stack.
+
+    ``mass_share``: standard deviation of a chaser's mass, as a share. ``centre_m``: of its centre
+    of mass, per axis.
+    """
     total = np.zeros((10, 10))
     for k in range(len(chasers)):
         for change in (*np.diag([centre_m] * 3), None):
@@ -108,9 +110,7 @@ def covariance_by_chasers(
 def detach(
     stack: MassProperties, chasers: Sequence[MountedChaser], body: RigidBody
 ) -> MassProperties:
-    """Return the mass properties of the target of a stack: those of the stack without the
-    chasers.
-    """
+    """Return the mass properties of the target alone: those of the stack less its chasers."""
     return _transformed(stack, _parts(chasers, body, -1.0))
 
 
@@ -141,9 +141,11 @@ def _transformed(
 def prior_of(
     target: TargetBody, mass_share: float, inertia_share: float, centre_m: float
 ) -> MassProperties:
-    """Return the stated mass properties of a target with these standard deviations: of the mass, as
-    a share of it; of each element of the inertia, as a share of the mean moment; of the centre of
-    mass per axis."""
+    """Return the stated mass properties of a target with a diagonal covariance.
+
+    Standard deviations: ``mass_share`` of the mass; ``inertia_share`` of each element of the
+    inertia, as a share of the mean moment; ``centre_m`` of the centre of mass per axis.
+    """
     moment = float(np.trace(target.inertia_kg_m2)) / 3.0
     sigmas = [mass_share * target.mass_kg, *[centre_m] * 3]
     return MassProperties(target, np.diag(np.square([*sigmas, *[inertia_share * moment] * 6])))
@@ -158,10 +160,11 @@ def inertia_ratios(properties: MassProperties) -> tuple[Array, Array]:
 
 
 def with_shape(known: MassProperties, shape: BodyShape, covariance: Array) -> MassProperties:
-    """Return mass properties with another centre and ratios of the inertia: those of ``shape``,
-    with its ``covariance`` (8, 8).
+    """Replace centre of mass and inertia ratios by those of ``shape``, with its ``covariance`` (8,
+    8).
 
-    Mass and trace of the inertia stay those of ``known``, as uncertain as a moment is in it.
+    Mass and trace of the inertia stay those of ``known``. The relative sigma of the trace is that
+    of a moment in ``known``.
     """
     inertia = known.body.inertia_kg_m2
     trace = float(np.trace(inertia))

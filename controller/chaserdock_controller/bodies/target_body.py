@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The target as a free rigid body: its predicted path, and its mass properties with captured
-chasers attached.
+"""The target as a free rigid body: predicted path, and mass properties with captured chasers.
 
-TRF's origin need not be the centre of mass: with a captured chaser it is not.
+The origin of TRF need not be the centre of mass; with a captured chaser it is not.
 """
 
 from __future__ import annotations
@@ -19,8 +18,10 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True)
 class TargetBody:
-    """mass_kg; inertia_kg_m2 (3, 3) about the centre of mass, TRF axes; centre_trf_m (3,) the
-    centre of mass.
+    """Mass properties of the target.
+
+    ``inertia_kg_m2`` (3, 3): about the centre of mass, TRF axes. ``centre_trf_m`` (3,): centre of
+    mass in TRF.
     """
 
     mass_kg: float
@@ -30,8 +31,11 @@ class TargetBody:
 
 @dataclass(frozen=True)
 class TargetPath:
-    """The target at K times: positions (K, 3) of TRF's origin in WRF, attitudes (K, 4); in TRF axes
-    the rates, angular accelerations and the origin's acceleration, each (K, 3)."""
+    """Motion of the target at K times.
+
+    Positions (K, 3) of TRF's origin in WRF; attitudes (K, 4), TRF to WRF. Angular rates and
+    accelerations, and the acceleration of TRF's origin, each (K, 3) in TRF axes.
+    """
 
     positions_m: Array
     q_wxyz: Array
@@ -40,17 +44,17 @@ class TargetPath:
     acceleration_m_s2: Array
 
     def at(self, instants: slice | IntArray) -> TargetPath:
-        """Return the target at some of the times."""
+        """Return the path at a subset of the times."""
         return TargetPath(*(getattr(self, f.name)[instants] for f in fields(self)))
 
 
 def attach_bodies(
     target: TargetBody, attached: Sequence[tuple[float, Array, Array, Array]]
 ) -> TargetBody:
-    """Return the target with bodies fixed to it: each mass, principal inertia (3,), centre (3,) and
-    attitude (4,) in TRF.
+    """Return the mass properties of the target with bodies fixed to it.
 
-    Parallel axes: I = sum of R I_i R' + m_i (d'd 1 - d d'), d from the common centre of mass
+    ``attached``: for each body its mass, principal inertia (3,), centre (3,) and attitude (4,) in
+    TRF. Parallel axes: I = sum of R I_i R' + m_i (d'd 1 - d d'), d from the common centre of mass
     (Goldstein, "Classical Mechanics", section 5.3).
     """
     parts = [(target.mass_kg, target.inertia_kg_m2, target.centre_trf_m)]

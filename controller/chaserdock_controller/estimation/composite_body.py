@@ -71,8 +71,11 @@ def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Arra
 
 
 class CompositeBody:
-    """Chasers whose latch holds the target (``latched``), and the body that they form with it
-    (``body``), by what is known of the target alone at the last change of a latch."""
+    """The rigid body that the target and the chasers latched to it form (``body``).
+
+    ``latched``: chasers whose latch holds the target. The body follows from what was known of the
+    target alone when a latch last changed.
+    """
 
     def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self._scenario = scenario
@@ -83,8 +86,8 @@ class CompositeBody:
         self._changed = False
 
     def disturb(self, observation: Observation) -> None:
-        """Inform the estimator of contacts, latch changes and impulses of latched chasers, before a
-        tick's sightings.
+        """Inform the estimator of contacts, latch changes and impulses of latched chasers. Call
+        before a tick's sightings are processed.
         """
         chasers = observation.chasers
         latched = frozenset(c.chaser for c in chasers if self._is_latched(c))
@@ -102,7 +105,9 @@ class CompositeBody:
         self.latched = latched
 
     def _is_latched(self, c: ChaserObservation) -> bool:
-        """Return whether a latch holds the target: as before, without a docking status."""
+        """Return whether a chaser's latch holds the target; without a docking status, as it was
+        before.
+        """
         return c.chaser in self.latched if c.docking is None else c.docking.latched
 
     def _push(self, odometry: Odometry, applied: AppliedImpulse, now_ns: int) -> None:
@@ -128,8 +133,8 @@ class CompositeBody:
 
     @property
     def target(self) -> MassProperties:
-        """Return the mass properties of the target alone: while nothing is latched, with the shape
-        that its motion shows.
+        """Return the mass properties of the target alone. While nothing is latched, its observed
+        motion gives the shape.
         """
         estimated = self._estimator.shape if not self.latched else None
         return (
@@ -138,7 +143,9 @@ class CompositeBody:
 
     @property
     def moving(self) -> TargetBody:
-        """Return the body that moves with the target, with the shape that its motion shows."""
+        """Return the body that moves with the target; while nothing is latched, with the shape that
+        its observed motion gives.
+        """
         estimated = self._estimator.shape
         if estimated is None:
             return self.body
@@ -150,15 +157,18 @@ class CompositeBody:
         )
 
     def refine_target(self, target: MassProperties) -> None:
-        """Replace the target's mass properties by identified ones, from the next update on."""
+        """Replace the target's mass properties by identified ones. They count from the next
+        ``update_body`` on.
+        """
         self._target_alone = target
         self._changed = True
 
     def update_body(self, target: TargetState, own: Sequence[Odometry | None]) -> None:
-        """Recompute the body after a latch change or a better knowledge of the target, after a
-        tick's sightings. ``own``: estimated states of the chasers.
+        """Recompute the body after a latch change or a refinement of the target's mass properties.
+        Call after a tick's sightings are processed.
 
-        The chasers' masses are the scenario's; the poses of the latched chasers are estimated.
+        ``own``: estimated states of the chasers. Their masses are the scenario's; the poses of the
+        latched ones are estimated.
         """
         states = [own[i] for i in sorted(self.latched)]
         known = [state for state in states if state is not None]

@@ -30,7 +30,9 @@ from chaserdock_controller.interfaces import TargetState
 from .types import Estimate, Estimator, EstimatorEvent, EstimatorInputs, no_estimate
 
 _ODOMETRY_KEPT_NS = 2_000_000_000
-"""A sighting that arrives later than this is not used: twice the buffer of the joint filter."""
+"""Time, ns, for which odometry is kept: twice the buffer of the joint filter. A sighting that
+arrives later is not used.
+"""
 
 
 @dataclass(frozen=True)
@@ -47,19 +49,23 @@ class PaperParameters:
     stale_s: float = 0.5
     """A chaser's latest pose is used for this long."""
     outlier_position_m: float = 0.2
-    """A pose farther than this from the median of three and more chasers, or a combination farther
-    than this from the moving average, is removed."""
+    """Limit for outliers: distance of a pose from the median of at least three chasers, or of a
+    combined pose from the moving average.
+    """
     outlier_attitude_rad: float = math.radians(30.0)
-    """The same of the attitude."""
+    """Limit of the attitude for outliers."""
     outlier_patience: int = 10
-    """After this many removed combinations in a row the history is dropped instead."""
+    """After this many consecutive removals the history is dropped instead."""
     tracking_s: float = 0.25
-    """Age of the newest combination beyond which the status is "predicting" (the pose is held)."""
+    """Age of the newest combined pose beyond which the status is "predicting" (the pose is
+    held).
+    """
     lost_s: float = 5.0
-    """The same for "lost"."""
+    """Age of the newest combined pose beyond which the status is "lost"."""
     sigma_position_m: float = 0.02
-    """Stated standard deviation, as the method computes no covariance: the error of the averages of
-    good poses in closed loop, as are the next three."""
+    """Stated standard deviation, as are the next three; the method computes no covariance. Values:
+    errors of averaged good poses in closed loop.
+    """
     sigma_velocity_m_s: float = 0.02
     sigma_attitude_rad: float = math.radians(2.0)
     sigma_omega_rad_s: float = math.radians(5.0)
@@ -86,7 +92,7 @@ def average_quaternion(quaternions: Sequence[Array]) -> Array:
 
 
 class SightedTarget(NamedTuple):
-    """Pose of the target, WRF, by one chaser's sighting at ``time_ns`` and its odometry."""
+    """Pose of the target in WRF, by one chaser's sighting at ``time_ns`` and its odometry."""
 
     time_ns: int
     position_m: Array
@@ -94,10 +100,11 @@ class SightedTarget(NamedTuple):
 
 
 class PaperEstimator(Estimator):
-    """The paper's combiner. It takes odometry as exact, and of an ambiguous view the first pose.
+    """The paper's combiner. Odometry counts as exact; of an ambiguous view the first pose is used.
 
-    A sighting counts once the odometry of its exposure is known, and if it is newer than the newest
-    combination. Pushes and latched chasers change nothing: the rates are differences of poses.
+    A sighting counts once the odometry of its exposure is known, if it is newer than the newest
+    combined pose. Pushes and latched chasers change nothing, since the rates are differences of
+    poses.
     """
 
     def __init__(self, camera: Camera, parameters: PaperParameters | None = None) -> None:
@@ -142,19 +149,22 @@ class PaperEstimator(Estimator):
         return Estimate(estimate, events=tuple(events))
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """Return the newest combination for any time; the method does not predict."""
+        """Return the newest combined pose, whatever the time: the method does not predict."""
         if self._mean is None:
             return no_estimate(time_ns)
+
         p = self.parameters
         combined_ns, position, q = self._mean
         age_s = (time_ns - combined_ns) * 1e-9
         status = (
             "lost" if age_s > p.lost_s else "predicting" if age_s > p.tracking_s else "tracking"
         )
+
         velocity, omega = np.zeros(3), np.zeros(3)
         if self._rates:
             velocity = np.mean([v for v, _ in self._rates], axis=0)
             omega = np.mean([w for _, w in self._rates], axis=0)
+
         sigma = (
             p.sigma_position_m,
             p.sigma_velocity_m_s,
@@ -162,6 +172,7 @@ class PaperEstimator(Estimator):
             p.sigma_omega_rad_s,
         )
         covariance = np.diag(np.repeat(np.square(sigma), 3))
+
         return TargetState(
             time_ns,
             position.copy(),
@@ -190,7 +201,7 @@ class PaperEstimator(Estimator):
         return newest < time_ns <= now_ns and (sighting.chaser, time_ns) in self._odometry
 
     def _take(self, sighting: Sighting) -> None:
-        """Make a sighting the latest of its chaser."""
+        """Store a sighting as the latest of its chaser."""
         if not sighting.solutions:
             self._latest.pop(sighting.chaser, None)
             return
@@ -214,6 +225,7 @@ class PaperEstimator(Estimator):
             for c, view in sorted(self._latest.items())
             if view.time_ns >= horizon
         }
+
         removed: set[int] = set()
         if len(views) > 2:
             middle = np.median([position for position, _ in views.values()], axis=0)
@@ -222,6 +234,7 @@ class PaperEstimator(Estimator):
                 for c, (x, _) in views.items()
                 if float(np.linalg.norm(x - middle)) > p.outlier_position_m
             }
+
             # Median attitude: the one with the smallest sum of angles to the others.
             centre = min(
                 views, key=lambda c: (sum(_angle(views[c][1], q) for _, q in views.values()), c)
@@ -229,8 +242,10 @@ class PaperEstimator(Estimator):
             removed |= {
                 c for c in views if _angle(views[centre][1], views[c][1]) > p.outlier_attitude_rad
             }
+
         self._rejected = tuple(sorted(removed & fresh))
         self._seen = len((views.keys() - removed) & fresh)
+
         kept = [views[c] for c in views if c not in removed]
         if kept:
             self._append(

@@ -41,7 +41,7 @@ _AT_REST = AppliedImpulse.steady(_NOTHING)
 
 
 class EstimationStage:
-    """The estimator, with the body that the target forms with latched chasers."""
+    """Runs the estimator and keeps the body that the target forms with latched chasers."""
 
     def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self.estimator = estimator
@@ -58,10 +58,12 @@ class EstimationStage:
         self.identification = StackIdentification(scenario) if enabled else None
 
     def run(self, observation: Observation, inspecting: Set[int] = frozenset()) -> TargetEstimation:
-        """Update the estimator with a tick's inputs, and with contacts and impulses from before
-        them; then the geometry by pairs of images and those of the chasers that were ``inspecting``
-        after the tick before, and the identification of the stack, whose result the estimator takes
-        from the next tick on."""
+        """Estimate from a tick's inputs.
+
+        Order: contacts and impulses from before the tick, the estimator, the geometry by pairs of
+        images and by images of chasers that were ``inspecting`` after the previous tick, then the
+        identification of the stack. The estimator uses its result from the next tick on.
+        """
         estimation = self._estimate(observation)
         if self.shape is not None:
             estimation = replace(estimation, shape=self.shape.update(observation, inspecting))
@@ -101,7 +103,7 @@ class EstimationStage:
     def _follow_consistency(
         self, o: Observation, seeing: Set[int], target: TargetState
     ) -> list[LogEntry]:
-        """Follow whether the sightings of each chaser agree with the estimate; return the
+        """Track whether the sightings of each chaser agree with the estimate. Returns the
         events.
         """
         for c in o.chasers:
@@ -121,8 +123,8 @@ class EstimationStage:
         seeing: Set[int],
         cameras: Mapping[int, CameraCalibration],
     ) -> ChaserEstimate:
-        """Return what is known of a chaser with the estimated ``state``; ``known``: the target's
-        pose is.
+        """Return what is known of a chaser with the estimated ``state``. ``known``: the target's
+        pose is known.
         """
         i, latched = c.chaser, c.chaser in self.composite.latched
         own = relative = covariance = None
@@ -145,8 +147,8 @@ class EstimationStage:
         )
 
     def _free_target(self, target: TargetState) -> IdentifiedStack | None:
-        """Return what the motion of the target shows of its mass properties while no chaser is
-        latched to it.
+        """Return the mass properties that the target's motion shows while no chaser is latched to
+        it.
         """
         if self.composite.latched or self.estimator.shape is None:
             return None
@@ -174,8 +176,9 @@ class EstimationStage:
         return EstimatorInputs(o.time_ns, self._period_s, chasers, o.sightings)
 
     def _disturbance(self, own: Odometry, motion: ChaserMotion | None, latched: bool) -> Array:
-        """Return the wrench of the orbit on a chaser, with the estimated disturbance; none on a
-        latched one, whose motion is the target's."""
+        """Return the wrench of the orbit on a chaser plus its estimated disturbance; zero for a
+        latched chaser, whose motion is the target's.
+        """
         if latched:
             return _NOTHING
         estimated = _NOTHING if motion is None else motion.disturbance
@@ -190,7 +193,7 @@ class EstimationStage:
 
 
 def _estimated(odometry: Odometry | None, motion: ChaserMotion | None) -> Odometry | None:
-    """Return a chaser's estimated state in place of its odometry, where it is known."""
+    """Return a chaser's odometry with its state replaced by the estimate, if there is one."""
     if odometry is None or motion is None:
         return odometry
     return msgspec.structs.replace(
@@ -205,7 +208,7 @@ def _estimated(odometry: Odometry | None, motion: ChaserMotion | None) -> Odomet
 def camera_calibrations(
     motions: Sequence[ChaserMotion], camera: Camera
 ) -> dict[int, CameraCalibration]:
-    """Return the estimated errors of the chasers' cameras in CRF axes, by chaser; ``camera``: the
+    """Return the estimated errors of the chasers' cameras in CRF axes, by chaser. ``camera``:
     nominal calibration.
     """
     found = [(m.chaser, m.camera) for m in motions if m.camera is not None]

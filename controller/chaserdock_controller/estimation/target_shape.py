@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the target's known geometry, fused over views from all around by an information filter.
+"""Errors of the target's known geometry, fused over views from all sides by an information filter.
 
-A view has information on the geometry for any pose (the Schur complement of the tracker's least
-squares). Views from one direction err alike, by texture and shading that the known mesh does not
-have, and count once. The parameters are in their standard deviations; prior: 0 with covariance 1.
-The distance of two cameras, as their images show it and as odometry measures it, tells the scale.
+A view carries information on the geometry for any pose: the Schur complement of the tracker's least
+squares. Views from one direction have similar errors, caused by texture and shading that the mesh
+lacks, and count once. Parameters are in units of their standard deviations; prior: 0 with
+covariance 1. The scale follows from the distance of two cameras, as their images show it and as
+odometry measures it.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ from chaserdock_controller.interfaces import EstimatedShape, Observation
 VIEW_CELLS = 80
 """Number of directions of view that are distinguished, about 25 degrees from each other."""
 FLOOR_SIGMAS = 0.15
-"""Standard deviation, as a share of the prior one, of what the views of a target have in common."""
+"""Standard deviation that all views have in common, as a share of the prior one."""
 _GATE_SIGMAS = 4.0
 """Gate of a pair of views, in standard deviations: rejects 1 of 16,000 consistent ones."""
 _LEAST_BASELINE = 0.3
-"""Least distance of two cameras, as a share of the range, that tells the scale."""
+"""Least distance of two cameras, as a share of the range, for their images to determine the
+scale.
+"""
 
 
 def _spiral() -> Array:
@@ -46,14 +49,18 @@ _CELLS = _spiral()
 
 
 def view_cell(direction_trf: Array) -> int:
-    """Return the number of the cell of a direction (3,), a unit vector from the target in TRF."""
+    """Return the number of the cell that contains a direction (3,): a unit vector from the target,
+    TRF.
+    """
     return int(np.argmax(_CELLS @ direction_trf))
 
 
 class SeenPlace(Struct, frozen=True, eq=False):
-    """Where an image shows the target from: the place (3,) of the lens in TRF for a geometry
-    without errors, its change (3, k) by the errors, its covariance (3, 3) for known errors, and the
-    cell of the direction of view."""
+    """Place from which an image shows the target.
+
+    The place (3,) of the lens in TRF for exact geometry; its change (3, k) by the geometry's
+    errors; its covariance (3, 3) for known errors; the cell of the direction of view.
+    """
 
     place_m: Array
     by_errors: Array
@@ -62,12 +69,12 @@ class SeenPlace(Struct, frozen=True, eq=False):
 
 
 class ShapeFilter(Struct, frozen=True, eq=False):
-    """Information (k, k) and information vector (k,) of the parameters by single views, with that
-    of the prior, and the cells of the views that were used.
+    """Information (k, k) and information vector (k,) of the geometry parameters, prior included,
+    from single views; and the cells of the views that were used.
 
-    ``baselines`` (k + 1, k + 1) and ``lengths`` (k + 1,): the same by pairs of views, whose
-    distance odometry measures; the last parameter is the error that all these distances have in
-    common, in its standard deviations. ``pairs``: their cells.
+    ``baselines`` (k + 1, k + 1) and ``lengths`` (k + 1,): the same from pairs of views, whose
+    distance odometry measures. The last parameter is the error that all these distances share, in
+    units of its standard deviation. ``pairs``: cells of the pairs that were used.
     """
 
     information: Array
@@ -79,18 +86,18 @@ class ShapeFilter(Struct, frozen=True, eq=False):
 
     @classmethod
     def prior(cls, count: int) -> ShapeFilter:
-        """Return the filter before the first view of ``count`` parameters."""
+        """Return the filter of ``count`` parameters before the first view."""
         both = count + 1
         return cls(np.eye(count), np.zeros(count), np.zeros((both, both)), np.zeros(both))
 
     @property
     def coverage(self) -> float:
-        """Share of all directions of view that were used."""
+        """Return the share of all directions of view that were used."""
         return len(self.cells) / VIEW_CELLS
 
     @property
     def used(self) -> bool:
-        """Whether there is more than the prior."""
+        """Return whether any view was used."""
         return bool(self.cells or self.pairs)
 
     def mean(self) -> Array:
@@ -99,12 +106,12 @@ class ShapeFilter(Struct, frozen=True, eq=False):
         return np.asarray(np.linalg.solve(matrix, vector), dtype=float)[:-1]
 
     def covariance(self) -> Array:
-        """Return the covariance (k, k), with what all views have in common."""
+        """Return the covariance (k, k), including the error that all views share."""
         covariance = np.asarray(np.linalg.inv(self._combined()[0]), dtype=float)[:-1, :-1]
         return 0.5 * (covariance + covariance.T)
 
     def _combined(self) -> tuple[Array, Array]:
-        """Return information (k + 1, k + 1) and vector (k + 1,) of all parameters by prior, views
+        """Return information (k + 1, k + 1) and vector (k + 1,) of all parameters from prior, views
         and baselines.
         """
         k = len(self.vector)
@@ -117,8 +124,8 @@ class ShapeFilter(Struct, frozen=True, eq=False):
         return matrix, vector
 
     def with_view(self, direction_trf: Array, matrix: Array, vector: Array) -> ShapeFilter:
-        """Return the filter after a view from a direction (3,); itself for a known direction, or a
-        view that contradicts it.
+        """Return the filter after a view from a direction (3,). It is unchanged if the direction
+        was used before or the view contradicts the estimate.
         """
         cell = view_cell(direction_trf)
         if cell in self.cells or self._contradicts(matrix, vector):
@@ -129,11 +136,11 @@ class ShapeFilter(Struct, frozen=True, eq=False):
     def with_baseline(
         self, a: SeenPlace, b: SeenPlace, length_m: float, sigma_m: float, common_m: float
     ) -> ShapeFilter:
-        """Return the filter after two views at one time from places at a distance of ``length_m``;
-        itself for known directions, or a distance that contradicts it.
+        """Return the filter after two simultaneous views from places ``length_m`` apart. It is
+        unchanged if the directions were used before or the distance contradicts the estimate.
 
-        ``sigma_m``, ``common_m``: standard deviations of the distance by noise, and by what all
-        distances have in common.
+        ``sigma_m``, ``common_m``: standard deviations of the distance by noise, and by the error
+        that all distances share.
         """
         pair = (min(a.cell, b.cell), max(a.cell, b.cell))
         between = a.place_m - b.place_m
@@ -157,7 +164,7 @@ class ShapeFilter(Struct, frozen=True, eq=False):
         )
 
     def _contradicts(self, matrix: Array, vector: Array) -> bool:
-        """Return whether a view's estimate is farther from this one than their covariances
+        """Return whether a view's estimate differs from this one by more than their covariances
         explain.
         """
         values, vectors = np.linalg.eigh(matrix)
@@ -170,8 +177,8 @@ class ShapeFilter(Struct, frozen=True, eq=False):
 
 
 def shape_parameters(scenario: FlightScenario) -> tuple[GeometryParameter, ...]:
-    """Return the errors of the target's known geometry; none without a mesh, or for a perception
-    that does not use it.
+    """Return the parameters of the target's geometry that are estimated. Empty without a mesh, or
+    for a perception that does not use it.
     """
     mesh, knowledge = scenario.target.known_mesh(), scenario.target.knowledge
     if mesh is None or scenario.perception.name != "model":
@@ -180,8 +187,8 @@ def shape_parameters(scenario: FlightScenario) -> tuple[GeometryParameter, ...]:
 
 
 def seen_place(pose: PoseSolution, measured: GeometryMeasurement, count: int) -> SeenPlace | None:
-    """Return where an image shows the target from; None if it does not tell how that depends on
-    ``count`` errors.
+    """Return the place from which an image shows the target; None if the image has no information
+    on ``count`` parameters.
     """
     if len(measured.position_by_errors) != 3 * count or len(measured.position_covariance_m2) != 9:
         return None
@@ -204,11 +211,11 @@ def seen_place(pose: PoseSolution, measured: GeometryMeasurement, count: int) ->
 
 
 class ShapeEstimation:
-    """Fuses images: single ones of chasers that inspect the target, and pairs of any, whose
-    distance odometry measures.
+    """Fuses single images of chasers that inspect the target, and pairs of images of any chasers,
+    whose distance odometry measures.
 
-    One image hardly tells the scale, as a larger body farther away looks the same; the distance of
-    two cameras does.
+    A single image hardly determines the scale: a larger body farther away looks the same. The
+    distance of two cameras determines it.
     """
 
     def __init__(self, scenario: FlightScenario, parameters: tuple[GeometryParameter, ...]) -> None:
@@ -221,7 +228,7 @@ class ShapeEstimation:
     def update(
         self, observation: Observation, inspecting: Collection[int]
     ) -> EstimatedShape | None:
-        """Return the estimate after a tick; None before the first view."""
+        """Fuse the images of a tick. Returns the estimate, or None before the first view."""
         before = self.filter
         for sighting in observation.sightings:
             if sighting.chaser in inspecting:
@@ -239,7 +246,7 @@ class ShapeEstimation:
         )
 
     def _add_baselines(self, observation: Observation) -> None:
-        """Fuse the distances between the cameras that see the target in this tick."""
+        """Fuse the distances between cameras that see the target in the same tick."""
         seen = []
         for sighting in observation.sightings:
             odometry = observation.chasers[sighting.chaser].measured
@@ -268,7 +275,7 @@ class ShapeEstimation:
             self.filter = self.filter.with_baseline(a, b, length_m, sigma_m, common_m)
 
     def _with(self, sighting: Sighting) -> ShapeFilter:
-        """Return the filter with a sighting; without it where it has no information on these
+        """Return the filter after a sighting, unchanged if that has no information on these
         parameters.
         """
         measured, k = sighting.geometry, len(self.parameters)

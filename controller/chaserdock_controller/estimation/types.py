@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of estimators: what they get in a tick, and what they return. Arrays are float64;
-SI units and radians.
+"""Interface of estimators: inputs and results of a tick. Arrays are float64; SI units and
+radians.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from chaserdock_controller.interfaces import AppliedImpulse, RelativePose, Targe
 class MeasuredChaser:
     """What is measured and known of one chaser in a tick.
 
-    ``odometry``: measured in this tick. ``outdated``: the newest one where there is none of this
-    tick, with the time of the tick at which it was measured. ``impulse``: what its actuators gave
-    in the last ``EstimatorInputs.covered_s``. ``last_command`` (6,):
-    N and N m, of a chaser without odometry in this tick, which flies by a plan that the controller
-    does not know. ``latched``: its latch holds the target. ``contact``: since the tick before.
+    ``odometry``: measured in this tick, else None. ``outdated``: then the newest one, with the time
+    of its tick. ``impulse``: given by its actuators in the last ``EstimatorInputs.covered_s``.
+    ``last_command`` (6,): N and N m, of a chaser without odometry in this tick; the plan that it
+    flies is unknown to the controller. ``latched``: its latch holds the target. ``contact``: it has
+    touched the target since the previous tick.
     """
 
     chaser: int
@@ -68,8 +68,8 @@ class CameraError:
 class Shock:
     """A sudden change of the target's rates.
 
-    sigma_*: standard deviation of the unknown part. velocity_m_s (3,) of TRF's origin in WRF and
-    omega_rad_s (3,) in TRF: the known part.
+    velocity_m_s (3,) of TRF's origin in WRF, omega_rad_s (3,) in TRF: the known part. sigma_*:
+    standard deviations of the unknown part.
     """
 
     sigma_velocity_m_s: float
@@ -88,12 +88,13 @@ class EstimatorEvent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ChaserMotion:
-    """Estimated motion of a chaser, and of its camera.
+    """Estimated motion of a chaser and errors of its camera.
 
     position_m, velocity_m_s (3,): WRF. q_wxyz (4,): CRF to WRF. omega_rad_s (3,): CRF. disturbance
-    (6,): force and torque on it besides the commanded ones, body axes; zero on a latched chaser,
-    whose motion is the target's. relative, motion_covariance: while the target is known; the latter
-    (6, 6) of position and velocity relative to it, WRF. camera: once its errors are estimated.
+    (6,): force and torque besides the commanded ones, body axes; zero on a latched chaser, whose
+    motion is the target's. relative: pose relative to the target, while that is known.
+    motion_covariance (6, 6): of position and velocity relative to the target, WRF, likewise.
+    camera: once its errors are estimated.
     """
 
     chaser: int
@@ -117,45 +118,48 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """Estimates the target's motion, called once a tick with all inputs.
+    """Estimates the target's motion; called once a tick with all inputs.
 
-    Only ``update`` and ``estimate_at`` are required; a class that inherits from this one gets the
-    others for a method without a model of the target's body or of the chasers.
+    Only ``update`` and ``estimate_at`` are required. A class that inherits from this one gets
+    defaults for the others, which suit a method without a model of the target's body or of the
+    chasers.
     """
 
     def update(self, inputs: EstimatorInputs) -> Estimate:
-        """Process a tick and return the estimates at its time. Ticks come in order."""
+        """Process a tick and return the estimates at its time. Ticks arrive in order."""
         ...
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """Return the target's estimate for a time from the newest tick on; changes no state."""
+        """Return the target's estimate for a time not before the newest tick. The state is
+        unchanged.
+        """
         ...
 
     @property
     def shape(self) -> tuple[BodyShape, Array] | None:
-        """Return the shape of the body that the target is from now on, as its motion shows it, and
-        its covariance (8, 8); None if it is not estimated.
+        """Return the shape of the target's present body, as its motion shows it, and its covariance
+        (8, 8); None if it is not estimated.
         """
         return None
 
     @property
     def reinitialisations(self) -> int:
-        """Return how often the target was started again, for statistics."""
+        """Return how often the target's estimate was restarted, for statistics."""
         return 0
 
     def without_drift(self, odometry: Odometry) -> Odometry:
-        """Return odometry without the drift of its position that is estimated up to now."""
+        """Return odometry less the drift of its position, as estimated up to now."""
         return odometry
 
     def disturb(self, shock: Shock) -> None:
-        """Take note that the target's rates change suddenly, after the newest tick."""
+        """Account for a sudden change of the target's rates after the newest tick."""
 
     def change_body(self, body: TargetBody, covariance: Array) -> None:
-        """Take another body for the target from the newest tick on: it was latched or released, or
-        is known better.
+        """Use another body for the target from the newest tick on, after a latch change or a
+        refinement of its mass properties.
 
-        covariance (9, 9): of its centre of mass (m) and of the elements xx, yy, zz, xy, xz, yz of
-        its inertia (kg m²). Raises ValueError for an inertia that no rigid body has.
+        covariance (9, 9): of the centre of mass (m) and the inertia (kg m²; xx, yy, zz, xy, xz,
+        yz). Raises ValueError for an inertia that no rigid body has.
         """
 
 

@@ -18,15 +18,17 @@ from numpy.typing import ArrayLike
 from .docking import dock_of
 
 BESIDE_LINE_M = 0.1
-"""Greatest distance from its line at which an approach to a docking distance may begin; radius of
-its corridor's inner end.
+"""Greatest distance from its line at which an approach to a docking distance may begin. Also the
+radius of its corridor's inner end.
 """
 
 
 @dataclass(frozen=True)
 class Cone:
-    """``axis`` (3,) TRF, unit, outwards; the apex lies ``apex_m`` from the target's centre along it
-    (may be negative).
+    """Cone about an axis through the target's centre.
+
+    ``axis`` (3,): TRF, unit length, outwards. ``apex_m``: distance of the apex from the centre
+    along the axis; may be negative.
     """
 
     axis: Array
@@ -34,8 +36,8 @@ class Cone:
     apex_m: float
 
     def room_m(self, offset_m: ArrayLike) -> float:
-        """Return the distance of ``offset_m`` (3,), TRF, from the cone's surface (from the apex
-        plane beside it), positive inside.
+        """Return the distance (m) of a point ``offset_m`` (3,), TRF, from the cone's surface,
+        positive inside. Behind the apex the surface counts as extended.
         """
         offset = np.asarray(offset_m, dtype=float)
         along = float(offset @ self.axis)
@@ -48,8 +50,10 @@ class Cone:
 
 def cone_about(axis: ArrayLike, innermost_m: float, aside_m: float, half_angle_rad: float) -> Cone:
     """Return the cone about ``axis`` (3,), TRF, with radius ``aside_m`` at the distance
-    ``innermost_m`` from the target's centre. Raises ValueError for an axis that is not a unit
-    vector or an angle outside 0 to pi / 2."""
+    ``innermost_m`` from the target's centre.
+
+    Raises ValueError for an axis that is not a unit vector or an angle outside 0 to pi / 2.
+    """
     direction = np.asarray(axis, dtype=float)
     if abs(float(np.linalg.norm(direction)) - 1.0) > 1e-6:
         raise ValueError(f"axis must be a unit vector, not {direction.tolist()}")
@@ -60,7 +64,10 @@ def cone_about(axis: ArrayLike, innermost_m: float, aside_m: float, half_angle_r
 
 def cone_of(scenario: FlightScenario, chaser: int) -> Cone:
     """Return a chaser's corridor: about its port's axis, or about its nominal direction if it docks
-    at a distance. The inner end is wide enough for the path and for the permitted lateral error."""
+    at a distance.
+
+    The inner end is wide enough for the path and the permitted lateral error.
+    """
     docking, dock = scenario.docking, dock_of(scenario, chaser)
     angle = math.radians(docking.corridor_angle_deg)
     if dock is None:
@@ -78,8 +85,8 @@ def cone_of(scenario: FlightScenario, chaser: int) -> Cone:
 
 
 def corridor_rows(cones: Sequence[Cone | None], q_target_wxyz: Array) -> Array | None:
-    """Return `NmpcInput.corridors` (N, K, 5) for the target's attitudes (K, 4), TRF to WRF; None
-    without any cone.
+    """Return `NmpcInput.corridors` (N, K, 5) for target attitudes (K, 4), TRF to WRF; None without
+    any cone.
     """
     if not any(cones):
         return None

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State machine of one chaser, and what an activity of it has to offer. No I/O; time is an
-argument.
+"""State machine of one chaser, and the interface of its activities. No I/O; time is an argument.
 
-Phases and transitions: ``phases``. Every phase change looks up its target in the transition table,
-and the activity to which the target belongs begins there.
+Phases and transitions: ``phases``. Every phase change looks up its target in the transition table;
+the activity to which that phase belongs then begins.
 """
 
 from __future__ import annotations
@@ -57,14 +56,14 @@ _FAILURES = (
     Trigger.ATTEMPT_FAILED,
     Trigger.SAFETY_LOST,
 )
-"""Triggers whose phase changes are warnings."""
+"""Triggers whose phase changes are logged as warnings."""
 
 
 class Activity:
     """What a chaser does in ``phases``, and the operator ``commands`` that it answers.
 
     ``by_capture``: for chasers that dock by capture (True), at a distance (False), or both (None).
-    The object serves all chasers; what it knows of one is in that chaser's state.
+    One object serves all chasers; the state of a chaser's activity is in its machine.
     """
 
     phases: tuple[Phase, ...] = ()
@@ -72,19 +71,21 @@ class Activity:
     by_capture: bool | None = None
 
     def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:
-        """Return why a command that would start it is refused now, or an empty string."""
+        """Return why a command that would start the activity is refused now; empty if it is not."""
         phase, by_capture = chaser.state.phase, chaser.by_capture
         if next_phase(phase, trigger_of(command.command), by_capture) is not None:
             return ""
         return f"in phase {phase} permitted: {', '.join(permitted_commands(phase, by_capture))}"
 
     def start(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> None:
-        """Obey a command that is not refused."""
+        """Execute a command that is not refused."""
         chaser.fire(trigger_of(command.command), now_s)
 
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
-        """Return the state that a phase begins with: ``begun``, which keeps the motion, with its
-        own motion. ``chaser`` is still in the phase before.
+        """Return the state with which a phase begins: ``begun``, which keeps the present motion, or
+        a copy with the phase's own motion.
+
+        ``chaser`` is still in the previous phase.
         """
         return begun
 
@@ -92,8 +93,8 @@ class Activity:
         """Advance by a tick in which the target's pose and the chaser's state are known."""
 
     def command(self, chaser: ChaserMachine, known: ChaserTick) -> DirectCommand | None:
-        """Return the command of this tick, or None where the NMPC flies the chaser: a chaser at
-        its port only coasts.
+        """Return the command of this tick, or None where the NMPC flies the chaser. By default a
+        chaser at its port only coasts.
         """
         return pull(0.0) if chaser.is_attached(known) else None
 
@@ -103,14 +104,16 @@ class Activity:
         observation: Observation,
         estimation: TargetEstimation,
     ) -> None:
-        """Take what its chasers need together, before the ``commands`` of a tick are obeyed."""
+        """Compute what the chasers of this activity share, before the ``commands`` of a tick are
+        executed.
+        """
 
     def conclude(self, observation: Observation) -> None:
-        """Do what its chasers do together, after each was stepped."""
+        """Do what the chasers of this activity do together, after each was stepped."""
 
 
 def pull(force_N: float) -> DirectCommand:
-    """Return the command of a chaser at its port: a pull along -X, CRF, or none."""
+    """Return the command of a chaser at its port: a pull along -X (CRF), N; zero to coast."""
     wrench = np.array([-force_N, 0.0, 0.0, 0.0, 0.0, 0.0])
     return DirectCommand("pull" if force_N else "coast", wrench)
 
@@ -118,11 +121,11 @@ def pull(force_N: float) -> DirectCommand:
 class ChaserMachine:
     """Phase, motion and observed state of one chaser.
 
-    ``position_m`` (3,): its estimated centre, TRF; ``seen``: its state at its port; ``relative``:
-    its state relative to the target where passive safety is enforced; each as of the last tick with
-    it. ``failure``: why no plan of it can be flown. ``interrupted``: it resumes its approach when
-    the target is seen again. ``abort_margin``: sigmas of its best abort. ``changes``: the log,
-    which all chasers share.
+    As of the last tick in which they were known: ``position_m`` (3,), its estimated centre in TRF;
+    ``seen``, its state at its port; ``relative``, its state relative to the target where passive
+    safety is enforced. ``failure``: why no plan of it can be flown. ``interrupted``: it resumes its
+    approach when the target is seen again. ``abort_margin``: sigmas of its best abort. ``changes``:
+    log that all chasers share.
     """
 
     def __init__(self, scenario: FlightScenario, number: int, changes: list[PhaseChange]) -> None:
@@ -148,23 +151,23 @@ class ChaserMachine:
 
     @property
     def phase(self) -> Phase:
-        """Return what the chaser does."""
+        """Return the phase that the chaser is in."""
         return self.state.phase
 
     def take_up(self, activities: Sequence[Activity]) -> None:
-        """Let the chaser do those of ``activities`` that suit its kind of docking."""
+        """Register those of ``activities`` that suit the chaser's kind of docking."""
         for activity in activities:
             if activity.by_capture in (None, self.by_capture):
                 self._activities |= dict.fromkeys(activity.phases, activity)
                 self._answering |= dict.fromkeys(activity.commands, activity)
 
-    # -- what changes the phase --------------------------------------------------------------------
+    # -- phase changes -----------------------------------------------------------------------------
 
     def fire(
         self, trigger: Trigger, now_s: float, reason: str = "", place_m: Array | None = None
     ) -> Phase | None:
-        """Enter the phase that the transition table gives for ``trigger``, and return it; do
-        nothing where it gives none.
+        """Make the transition of ``trigger``, if the table has one in this phase. Returns the new
+        phase, or None.
         """
         before = self.state
         phase = next_phase(before.phase, trigger, self.by_capture)
@@ -181,20 +184,20 @@ class ChaserMachine:
         return phase
 
     def log(self, detail: str, warns: bool = False, phase: Phase | None = None) -> None:
-        """Report what happens in the present phase, or in ``phase``, which is about to begin."""
+        """Log an event in the present phase, or in ``phase``, which is about to begin."""
         level = "warning" if warns else "info"
         self._changes.append(PhaseChange(self.number, phase or self.phase, detail, level))
 
     def lose_target(self, now_s: float) -> None:
         """Stop, or back out of a port's corridor, because the target is lost."""
         ends = next_phase(self.phase, Trigger.TARGET_LOST, self.by_capture)
-        # The loss is an event of its own in the log; where the chaser stops it needs no reason.
+        # The loss is logged as an event of its own; a chaser that stops needs no further reason.
         reason = "the target is lost" if ends is Phase.RETREAT else ""
         self.fire(Trigger.TARGET_LOST, now_s, reason)
 
     def follow_sight(self, known: ChaserTick, unseen_s: float) -> None:
-        """Interrupt an approach to a target that no chaser has seen for ``unseen_s``, or by
-        doubtful odometry; resume it afterwards.
+        """Interrupt an approach while no chaser has seen the target for ``unseen_s`` or odometry is
+        doubtful. Resume it afterwards.
         """
         if unseen_s >= GUIDANCE.sight_loss_s or known.doubtful:
             reason = f"no chaser has seen the target for {GUIDANCE.sight_loss_s:g} s"
@@ -208,9 +211,7 @@ class ChaserMachine:
         self.interrupted &= self.phase is Phase.HOLD
 
     def follow_planning(self, known: ChaserTick) -> None:
-        """Retreat when planning fails: once per failure, and again when it becomes one without
-        plans.
-        """
+        """Retreat when planning fails: once per failure, and again if no plans are left."""
         before, failure = self.failure, known.failure
         self.relative = known.relative
         if failure is not None and (
@@ -220,15 +221,14 @@ class ChaserMachine:
         self.failure = failure
 
     def follow_safety(self, known: ChaserTick) -> None:
-        """Abort where passive safety is enforced, but plans are unsafe."""
+        """Abort where passive safety is enforced and plans are unsafe."""
         if known.unsafe and self.enforces_safety():
             self.fire(Trigger.SAFETY_LOST, known.now_s, known.unsafe)
 
     def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
-        """Apply or refuse a command.
+        """Execute or refuse a command.
 
-        Of different commands in one tick only the first is accepted, except that an abort always
-        is.
+        In one tick only the first of different commands is accepted; an abort always is.
         """
         if self.phase in (Phase.ACQUIRE, Phase.SEARCHING):
             return CommandResult(False, "the target has not been found yet")
@@ -257,14 +257,12 @@ class ChaserMachine:
     # -- a tick ------------------------------------------------------------------------------------
 
     def step(self, known: ChaserTick, errors: TrackingErrors) -> None:
-        """Advance the phase by the estimated errors from the reference and by the docking
-        sensor.
-        """
+        """Advance the phase by the estimated tracking errors and the docking sensor."""
         self.position_m, self.seen = known.offset_m, known.port
         self._activities[self.phase].step(self, known, errors)
 
     def directive(self, known: ChaserTick, reference: ReferencePose | None) -> Directive:
-        """Return what the chaser is to do after this tick. One with invalid odometry coasts."""
+        """Return what the chaser is to do after this tick; with invalid odometry it coasts."""
         direct = DirectCommand("coast", np.zeros(6)) if known.invalid else None
         if known.own is not None:
             direct = self._activities[self.phase].command(self, known)
@@ -283,19 +281,19 @@ class ChaserMachine:
         )
 
     def motion(self, now_s: float) -> Motion:
-        """Return the motion in TRF: in place of an abort's, which is in WRF, rest at the estimated
-        position.
+        """Return the motion in TRF. During an abort, whose motion is in WRF, it is rest at the
+        estimated position.
         """
         if not isinstance(self.state.move, Escape):
             return self.state.move
         assert self.position_m is not None
         return stay(self.position_m, now_s)
 
-    # -- what the plan and the commands depend on --------------------------------------------------
+    # -- conditions for plan and commands ----------------------------------------------------------
 
     def is_attached(self, known: ChaserTick) -> bool:
-        """Return whether the chaser is latched and is to stay, or cannot leave; its actuators are
-        off but for the latch test.
+        """Return whether the chaser is latched and is to stay, or cannot leave. Its actuators are
+        then off except for the latch test.
         """
         return known.latched and (self.phase not in BACKING_OUT or self.state.stuck)
 
@@ -304,8 +302,8 @@ class ChaserMachine:
         return self.seen is None or not (self.seen.contact or self.seen.latched)
 
     def in_corridor(self) -> bool:
-        """Return whether the chaser is in its corridor or at its port, by its phase or its
-        estimated position.
+        """Return whether the chaser is in its corridor or at its port, by phase or estimated
+        position.
         """
         if self.dock is None or self.seen is None:
             return False
@@ -313,21 +311,21 @@ class ChaserMachine:
         return self.phase in at_port or self.dock.inside(self.seen.offset_m)
 
     def _is_held(self) -> bool:
-        """Return whether the latch holds the target, by the phase, or because it does not open."""
+        """Return whether the latch holds the target: by the phase, or because it does not open."""
         return self.phase in ATTACHED or self.state.stuck
 
     def enforces_safety(self) -> bool:
-        """Return whether passive safety is enforced now: outside the final corridor."""
+        """Return whether passive safety applies now; it does not in the final corridor."""
         if self.position_m is None or self.relative is None or self._is_held():
             return False
         final = float(np.linalg.norm(self.position_m)) <= self.scenario.limits.final_corridor_m
         return not (final or self.in_corridor() or self.corridor() is not None)
 
     def corridor(self) -> Cone | None:
-        """Return the cone in which a chaser on its way in or out is planned; None outside of it.
+        """Return the cone that limits the plan of a chaser on its way in or out, else None.
 
-        A chaser that docks at a distance has its cone from the command on, and on its way out until
-        it is at the distance that every chaser keeps.
+        A chaser that docks at a distance has its cone from the command on. On its way out it keeps
+        the cone until it is at the distance that every chaser keeps.
         """
         position = self.position_m
         if position is None or self._is_held():
@@ -340,7 +338,7 @@ class ChaserMachine:
         return self._cone if applies and self._cone.room_m(position) > -GUIDANCE.outside_m else None
 
     def min_distance_target_m(self) -> float:
-        """Return the distance from the target that a plan keeps; 0 when the latch holds it."""
+        """Return the distance from the target that a plan must keep; 0 while the latch holds it."""
         limit, dock = self.scenario.limits.min_distance_target_m, self.dock
         if dock is None:
             docked_m = max(0.0, self.scenario.approach.dock_distance_m - GUIDANCE.held_margin_m)
@@ -350,15 +348,15 @@ class ChaserMachine:
         return 0.0 if self._is_held() else min(limit, dock.keep_out_m())
 
     def min_distance_shape_m(self) -> float:
-        """Return the distance from the target's shape that a plan keeps; 0 in the corridor and at
-        the port.
+        """Return the distance from the target's shape that a plan must keep; 0 in the corridor and
+        at the port.
         """
         free = self.corridor() is None and not self.in_corridor() and not self._is_held()
         return self.scenario.limits.min_distance_shape_m if free else 0.0
 
     def latch(self) -> Latch:
-        """Return the latch command: armed from the final approach on, open before and when backing
-        out.
+        """Return the latch command: armed from the final approach on, open before it and when
+        backing out.
         """
         if self.dock is None:
             return "keep"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What guidance keeps of one chaser, what it is told of it in a tick, and what it answers."""
+"""State that guidance keeps of one chaser, its inputs in a tick, and its answers."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ class NextMove(StrEnum):
 
 @dataclass(frozen=True)
 class ChaserGuidance:
-    """Phase since ``since_s`` (simulated time) and motion of the reference in TRF.
+    """Phase of a chaser and motion of its reference (TRF).
 
-    ``inside_since_s``: since when the chaser is within its tolerances. ``attempt``: number of the
-    docking attempt, from 1. ``held``: position (3,) and attitude (4,) in TRF when the pull test
-    began. ``faces``: the reference attitude turns with the offset so that the chaser faces the
-    target. ``turns``: the body flies the calibration manoeuvre. ``stuck``: it is to back out, but
-    its latch does not open. ``search``: progress along the search pattern.
+    ``since_s``: simulated time at which the phase began. ``inside_since_s``: time since which the
+    chaser is within its tolerances. ``attempt``: number of the docking attempt, from 1. ``held``:
+    position (3,) and attitude (4,) in TRF when the pull test began. ``faces``: the reference
+    attitude turns with the offset so that the chaser faces the target. ``turns``: the body flies
+    the calibration manoeuvre. ``stuck``: it is to back out, but its latch does not open.
+    ``search``: progress along the search pattern.
     """
 
     phase: Phase
@@ -52,14 +53,16 @@ class ChaserGuidance:
     search: SearchProgress | None = None
 
     def inside_since(self, inside: bool, now_s: float) -> float | None:
-        """Return since when the chaser is within its tolerances if now it is ``inside``, or not."""
+        """Return the time since which the chaser is within its tolerances, given whether it is
+        ``inside`` now; None if it is not.
+        """
         if not inside:
             return None
         return now_s if self.inside_since_s is None else self.inside_since_s
 
 
 class Cause(NamedTuple):
-    """Why a phase begins. ``place_m`` (3,), TRF: where a commanded move ends, or where a search
+    """Why a phase begins. ``place_m`` (3,), TRF: end of a commanded move, or place where a search
     ended.
     """
 
@@ -72,13 +75,13 @@ class Cause(NamedTuple):
 class ChaserTick:
     """What is known of one chaser in a tick.
 
-    ``own``: its estimated state, None without odometry; ``invalid``: its odometry is not valid.
-    ``target``: the target's estimate; ``offset_m`` (3,): the chaser's centre, TRF, and ``port``:
-    its state at its port, where the target's pose and its own are known. ``latched``: its latch
-    holds the target. ``doubtful``: its odometry may be wrong. ``acquiring``: it looks for the
-    target in an earlier image; None without a sighting. ``stuck_thrusters``: found in the motion of
-    the stack. ``relative``: its state relative to the target where passive safety is enforced;
-    ``unsafe``: why its plans are not passively safe, or empty.
+    ``own``: its estimated state, None without odometry. ``invalid``: its odometry is not valid.
+    ``target``: the target's estimate. ``offset_m`` (3,): its centre in TRF; ``port``: its state at
+    its port; both while the poses of target and chaser are known. ``latched``: its latch holds the
+    target. ``doubtful``: its odometry may be wrong. ``acquiring``: it looks for the target in an
+    earlier image; None without a sighting. ``stuck_thrusters``: found in the motion of the stack.
+    ``relative``: its state relative to the target where passive safety is enforced. ``unsafe``: why
+    its plans are not passively safe, or empty.
     """
 
     now_s: float
@@ -106,7 +109,7 @@ class TrackingErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class CommandResult:
-    """Whether a command is accepted, and why or why not."""
+    """Whether a command is accepted, and the reason."""
 
     accepted: bool
     reason: str
@@ -114,8 +117,8 @@ class CommandResult:
 
 @dataclass(frozen=True)
 class PhaseChange:
-    """A chaser entered ``phase``; ``detail`` names the phase before and the reason, or what has
-    happened in the phase.
+    """A chaser entered ``phase``, or something happened in it. ``detail``: the previous phase and
+    the reason, or the event.
     """
 
     chaser: int

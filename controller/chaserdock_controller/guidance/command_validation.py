@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reasons for refusing a command; an empty string where there is none. Pure functions."""
+"""Reasons for refusing a command; each function returns an empty string if there is none. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,7 @@ def why_not_inspect(scenario: FlightScenario, chaser: int, offset_m: Array, at_r
 
 
 def why_not_offset(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
-    """Check the distance of a chaser at an offset (3,), TRF, from the target."""
+    """Check the distance from the target of a chaser at an offset (3,), TRF."""
     distance = float(np.linalg.norm(offset_m))
     nearest = scenario.limits.min_distance_target_m
     if not nearest < distance <= scenario.limits.max_reference_distance_m:
@@ -90,8 +92,8 @@ def why_not_offset(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -
 
 
 def why_not_off_shape(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
-    """Check the distance of a chaser's shape at an offset (3,), TRF, from the cuboids of the
-    target's shape.
+    """Check the distance of a chaser's shape, at an offset (3,), TRF, from the cuboids of the
+    target.
     """
     least_m = scenario.limits.min_distance_shape_m
     if not least_m or (distance_m := shape_distance_m(scenario, chaser, offset_m)) >= least_m:
@@ -143,13 +145,13 @@ def why_not_goto(
 
 
 def superseded_by(done: OperatorCommand) -> CommandResult:
-    """Refuse a command because ``done`` came first in the same tick."""
+    """Return the refusal of a command because ``done`` came first in the same tick."""
     operator = f" by {done.operator}" if done.operator else ""
     return CommandResult(False, f"{done.command}{operator} came first in this tick")
 
 
 def why_not_identify(scenario: FlightScenario) -> str:
-    """Return why the stack cannot be identified, or an empty string."""
+    """Check that the scenario allows to identify the stack."""
     if not scenario.detumble.identification.enabled:
         return "detumble.identification.enabled is false"
     if not scenario.chaser.thrusters or scenario.chaser.actuation != "thrusters":
@@ -158,8 +160,10 @@ def why_not_identify(scenario: FlightScenario) -> str:
 
 
 def refused_by(failure: PlanningFailure) -> tuple[str, ...]:
-    """Return the operator commands that are refused while planning fails. With degraded plans an
-    operator may still lead a chaser out.
+    """Return the operator commands that are refused while planning fails.
+
+    Without any plan these are all that need one. With degraded plans `goto` stays allowed, so that
+    an operator can lead a chaser out.
     """
     always = ("approach", "inspect")
     return (*always, "goto", "calibrate") if failure.without_plan else always

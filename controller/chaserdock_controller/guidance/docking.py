@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docking by capture: geometry of a port's corridor, and what is seen of a chaser at its port."""
+"""Docking by capture: geometry of a port's corridor, and observed state of a chaser at its port."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.docking import Docking, Port
 
 _ENTERED_M = 0.02
-"""A chaser this far behind the entry is in the corridor: less, and one that waits at the entry
-would be, too, with each error of its estimate."""
+"""A chaser this far behind the entry counts as in the corridor. With less, errors of the estimate
+would put a chaser that waits at the entry inside.
+"""
 _KEEP_OUT_MARGIN_M = 0.03
-"""A plan may lead this much nearer than the innermost reference, so that the keep-out does not
-push against it."""
+"""Distance by which a plan may come closer than the innermost reference, so that the keep-out does
+not push against that.
+"""
 
 
 @dataclass(frozen=True)
 class Dock:
-    """A chaser's port, the distance ``reach_m`` from its centre to the probe tip, and the docking
-    limits.
+    """A chaser's port with its docking limits. ``reach_m``: distance from the chaser's centre to
+    the probe tip.
     """
 
     port: Port
@@ -30,7 +32,7 @@ class Dock:
     docking: Docking
 
     def offset(self, gap_m: float) -> Array:
-        """Return the chaser's centre (3,), TRF, when its tip is ``gap_m`` before the port."""
+        """Return the chaser's centre (3,), TRF, when its tip is ``gap_m`` in front of the port."""
         return centre_offset(self.port, self.reach_m, gap_m)
 
     def entry(self) -> Array:
@@ -38,7 +40,7 @@ class Dock:
         return self.offset(self.docking.entry_m)
 
     def gap_and_lateral(self, offset_m: Array) -> tuple[float, float]:
-        """Return gap and lateral distance (m) of a centre at ``offset_m`` (3,), TRF, for the
+        """Return gap and lateral distance (m) of the tip for a centre at ``offset_m`` (3,), TRF, in
         nominal attitude.
         """
         off, axis = offset_m - self.offset(0.0), np.asarray(self.port.axis)
@@ -46,7 +48,7 @@ class Dock:
         return gap, float(np.linalg.norm(off - gap * axis))
 
     def inside(self, offset_m: Array) -> bool:
-        """Return whether a centre at ``offset_m`` (3,), TRF, is in the corridor, nearer than its
+        """Return whether a centre at ``offset_m`` (3,), TRF, is in the corridor, closer than its
         entry.
         """
         gap, lateral = self.gap_and_lateral(offset_m)
@@ -65,7 +67,7 @@ class Dock:
 
 
 def dock_of(scenario: FlightScenario, chaser: int) -> Dock | None:
-    """Return the dock of a chaser, or None if it does not dock by capture."""
+    """Return the dock of a chaser; None if it does not dock by capture."""
     port = scenario.docking.port_of(chaser)
     return None if port is None else Dock(port, scenario.chaser.probe_reach_m, scenario.docking)
 
@@ -78,10 +80,10 @@ def corridors_apart(a: Dock, b: Dock) -> float:
 
 @dataclass(frozen=True)
 class DockingObservation:
-    """Estimated geometry of a chaser at its port, and the state of its docking sensor.
+    """Estimated geometry of a chaser at its port, and state of its docking sensor.
 
-    ``offset_m`` (3,) and ``q_wxyz`` (4,): estimated pose of its centre and body in TRF. ``sensed``:
-    the sensor has reported in this tick; otherwise ``latched`` is its last report.
+    ``offset_m`` (3,), ``q_wxyz`` (4,): estimated centre and attitude in TRF. ``sensed``: the sensor
+    has reported in this tick; otherwise ``latched`` is its last report.
     """
 
     view: PortView

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passive safety enforced: moves whose coasts stay clear of the target, and aborts onto a safe
+"""Enforced passive safety: moves whose coasts stay clear of the target, and aborts onto a safe
 coast.
 
-An abort is a burn of a few seconds in one of several directions, and then the coast. All coasts are
-those after a loss of all thrust (chaserdock_models/passive_safety.py); a collision avoidance
-manoeuvre of this kind: Fehse, Automated Rendezvous and Docking of Spacecraft, section 4.5.
+An abort is a burn of a few seconds in one of several directions, followed by a coast. A coast is
+the motion after a loss of all thrust (chaserdock_models/passive_safety.py). Collision avoidance
+manoeuvres of this kind: Fehse, Automated Rendezvous and Docking of Spacecraft, section 4.5.
 """
 
 from __future__ import annotations
@@ -26,36 +26,36 @@ from chaserdock_controller.nmpc.passive_safety import coast_duration_s
 from .trajectories import Escape, Motion
 
 _COARSE_STEP_S = 60.0
-"""Step of the coasts in an orbit, by which moves and aborts are selected. The monitor's is shorter.
+"""Step of coasts in an orbit, s, when moves and aborts are selected. The monitor uses a shorter
+one.
 """
 _SPEED_SHARES = 0.7 ** np.arange(14)
 _MOVE_SAMPLES, _TURN_SAMPLES = 33, 12
-"""States of a move, and of one turn of the target after it, from which the coast is checked: every
-3 % of the move, and every 30 degrees.
+"""Number of states of a move, and of one turn of the target after it, from which coasts are
+checked: every 3 % of the move, every 30 degrees.
 """
 _LONGEST_TURN_S = 600.0
-"""Longest time, s, for which the wait at the goal of a move is checked: as long as a coast counts.
-"""
+"""Longest wait at the goal of a move that is checked, s: as long as a coast counts."""
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1)[:, None]
 _IMPULSE_SHARES = (0.5, 1.0, 2.0, 4.0)
 """Changes of velocity of an abort, as shares of the speed of an abort by a move."""
 _FORCE_SHARE = 0.4
-"""Share of the largest force per axis with which an abort burns; the rest is left to attitude and
-feedback.
+"""Share of the largest force per axis with which an abort burns; the rest is left for attitude
+control and feedback.
 """
 _BURN_ERROR = 0.03
 """Standard deviation of a burn's change of velocity, as a share of it."""
 _SPARE = 1.5
-"""An abort with this multiple of the required margin is as good as any with more, and the smallest
-such burn is taken.
+"""A margin of this multiple of the required one is ample: of the burns that reach it the smallest
+is taken.
 """
 
 
 @dataclass(frozen=True)
 class RelativeState:
-    """Estimated state (6,) of a chaser relative to the target, WRF, with covariance (6, 6), at one
-    moment.
+    """Estimated state (6,) of a chaser relative to the target, WRF, with its covariance (6, 6), at
+    one time.
     """
 
     state: Array
@@ -64,7 +64,7 @@ class RelativeState:
 
 
 class EscapePlanner:
-    """Selects moves and aborts by their coasts."""
+    """Selects moves and aborts by the safety of their coasts."""
 
     def __init__(self, scenario: FlightScenario, abort_speed_m_s: float) -> None:
         orbit, limits, body = scenario.orbit, scenario.limits, scenario.chaser
@@ -86,11 +86,11 @@ class EscapePlanner:
         speed_m_s: float,
         now_s: float,
     ) -> Motion | None:
-        """Return the fastest of the moves at shares of ``speed_m_s`` whose coasts are safe, or None
-        if none is.
+        """Return the fastest move, at a share of ``speed_m_s``, whose coasts are safe; None if none
+        is.
 
-        ``move``: maps a speed to the move, which must be in TRF. Without a ``known`` state of the
-        chaser the first is returned.
+        ``move``: maps a speed to the move, in TRF. Without a ``known`` state of the chaser the full
+        speed is returned.
         """
         for share in _SPEED_SHARES:
             found = move(speed_m_s * float(share))
@@ -99,8 +99,8 @@ class EscapePlanner:
         return None
 
     def move_margin(self, known: RelativeState, move: Motion, now_s: float) -> float:
-        """Return the smallest margin of the coasts from a move outside the final corridor; infinity
-        if there is none.
+        """Return the smallest margin (sigmas) of the coasts from a move outside the final corridor;
+        infinity if it has no part there.
         """
         omega = np.asarray(known.target.omega_rad_s)
         rate = float(np.linalg.norm(omega))
@@ -129,9 +129,10 @@ class EscapePlanner:
     # -- aborts ------------------------------------------------------------------------------------
 
     def escape(self, known: RelativeState, now_s: float) -> tuple[Escape, float]:
-        """Return the abort from the newest state of a chaser, and the margin of its coast.
+        """Return the best abort from the newest state of a chaser, and the margin of its coast.
 
-        The smallest burn whose coast has spare margin, otherwise the one with the largest margin.
+        It is the smallest burn whose coast has ample margin, otherwise the one with the largest
+        margin.
         """
         best = self._best_of(known, _IMPULSE_SHARES[0] * self._speed_m_s, now_s)
         for share in _IMPULSE_SHARES[1:]:
@@ -145,7 +146,7 @@ class EscapePlanner:
     def _best_of(
         self, known: RelativeState, impulse_m_s: float, now_s: float
     ) -> tuple[Escape, float]:
-        """Return the abort with a change of velocity that has the largest margin, over all
+        """Return the abort with this change of velocity that has the largest margin over all
         directions.
         """
         burn_s = impulse_m_s / self._acceleration_m_s2
@@ -166,7 +167,7 @@ class EscapePlanner:
         margins = self._coast.closest(ends, covariance, self._keep_out_m).margin_sigmas
         times_s = now_s + np.linspace(0.0, burn_s, 9)
         nearest_m = np.array([np.linalg.norm(e.at(times_s)[0], axis=1).min() for e in escapes])
-        # A burn through the keep-out is worse than any coast that is not.
+        # A burn through the keep-out is worse than any coast that stays outside.
         margins = np.where(nearest_m < self._keep_out_m, np.minimum(margins, -1.0), margins)
         best = int(np.argmax(margins))
         return escapes[best], float(margins[best])

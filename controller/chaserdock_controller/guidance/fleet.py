@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What concerns several chasers: the timeline, the commands of one tick, who is in whose way."""
+"""What concerns several chasers: timeline, commands of one tick, and who blocks whom."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ from .thruster_commands import THRUSTER_COMMANDS
 
 
 class ChaserFleet:
-    """All ``chasers``, by number. ``changes``: their phase changes in this tick, in order;
-    ``notes``: what else is to be logged in it.
+    """All ``chasers``, by number.
+
+    ``changes``: their phase changes in this tick, in order. ``notes``: other log entries of it.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -44,7 +45,7 @@ class ChaserFleet:
         return (other for other in self.chasers if other is not chaser)
 
     def drain_events(self) -> tuple[LogEntry, ...]:
-        """Return what has happened since the last call."""
+        """Return the log entries since the last call."""
         events: list[LogEntry] = [
             (c.level, f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in self.changes
         ]
@@ -56,8 +57,8 @@ class ChaserFleet:
     # -- the target's estimate ---------------------------------------------------------------------
 
     def miss_target(self, now_s: float, lost: bool) -> None:
-        """Without the target's pose: stop every chaser that moves relative to it when it is
-        ``lost``, and let those search that have waited for a while.
+        """React to an unknown pose of the target. If it is ``lost``, stop every chaser that moves
+        relative to it; let chasers search that have waited for a while.
         """
         if lost:
             for chaser in self.chasers:
@@ -69,9 +70,10 @@ class ChaserFleet:
     def follow_target(
         self, now_s: float, known: Sequence[ChaserTick], seen: bool, settled: bool
     ) -> None:
-        """With the target's pose: interrupt and resume approaches by whether any chaser has
-        ``seen`` it, let those hold that waited for it, and those that searched come when its
-        motion is ``settled``.
+        """React to a known pose of the target.
+
+        Interrupt and resume approaches by whether any chaser has ``seen`` it. Chasers that waited
+        for it hold. Chasers that searched come when its motion is ``settled``.
         """
         self._seen_s = now_s if seen or self._seen_s is None else self._seen_s
         for chaser, tick in zip(self.chasers, known, strict=True):
@@ -86,8 +88,8 @@ class ChaserFleet:
     # -- commands ----------------------------------------------------------------------------------
 
     def due_commands(self, now_s: float) -> list[OperatorCommand]:
-        """Return the commands of the scenario's timeline that are due and were not returned
-        before.
+        """Return the commands of the scenario's timeline that have become due since the last
+        call.
         """
         out = []
         while self._timeline and self._timeline[0].at_s <= now_s + 1e-9:
@@ -102,8 +104,8 @@ class ChaserFleet:
         return out
 
     def apply(self, commands: Sequence[OperatorCommand], now_s: float) -> list[CommandResult]:
-        """Apply or refuse the commands of one tick, knowing all goals, so that two chasers can swap
-        their places.
+        """Execute or refuse the commands of one tick. All goals are known in advance, so that two
+        chasers can swap places.
         """
         self._pending_inspections = {c.chaser for c in commands if c.command == "inspect"}
         self._pending_goals = {
@@ -127,10 +129,10 @@ class ChaserFleet:
             return chaser.thrusters.command(command, now_s)
         return chaser.command(command, now_s)
 
-    # -- who is in whose way -----------------------------------------------------------------------
+    # -- who blocks whom ---------------------------------------------------------------------------
 
     def goals_besides(self, chaser: ChaserMachine) -> dict[int, Array]:
-        """Return where the other chasers go (3,), TRF, after the commands of this tick."""
+        """Return the goals (3,), TRF, of the other chasers after the commands of this tick."""
         return {
             other.number: self._pending_goals.get(other.number, other.state.move.goal_m)
             for other in self.others(chaser)
@@ -141,7 +143,7 @@ class ChaserFleet:
         return chaser.phase is Phase.INSPECT or chaser.number in self._pending_inspections
 
     def why_corridor_occupied(self, chaser: ChaserMachine) -> str:
-        """Return which chaser blocks an approach to a port, or an empty string."""
+        """Return which chaser blocks an approach to a port; empty if none does."""
         docking, active = self.scenario.docking, 0
         assert chaser.dock is not None
         for other in self.others(chaser):

@@ -22,16 +22,16 @@ from .pointing import calibration_turns
 from .trajectories import Escape
 
 _GREATEST_MARGIN_M = 0.1
-"""Largest distance, m, that an uncertain estimate adds to the keep-out: more would push chasers out
-of places that they can hold. Chosen.
+"""Largest distance, m, that an uncertain estimate adds to the keep-out. Larger: chasers are pushed
+out of places that they can hold; smaller: a poor estimate leaves less room.
 """
 
 
 def target_path(
     body: TargetBody, torque_free: bool, start: TargetState, step_s: float, steps: int
 ) -> TargetPath:
-    """Return the target's predicted motion at 0, step_s, ... steps * step_s, and then in the
-    middles between.
+    """Return the target's predicted motion at 0, step_s, ... steps * step_s, followed by that at
+    the midpoints.
     """
     state = (start.position_m, start.velocity_m_s, start.q_wxyz, start.omega_rad_s)
     if torque_free:
@@ -45,7 +45,7 @@ def target_path(
 
 
 class ReferenceBuilder:
-    """Computes references from the moves and phases of the chasers."""
+    """Computes the references of chasers from their moves and phases."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
@@ -57,8 +57,8 @@ class ReferenceBuilder:
     def pose(
         self, chaser: ChaserMachine, target: TargetState, now_s: float
     ) -> tuple[Array, Array, Array]:
-        """Return a chaser's reference now: position (3,) and attitude (4,) in WRF, offset (3,) in
-        TRF.
+        """Return a chaser's present reference: position (3,) and attitude (4,) in WRF, offset (3,)
+        in TRF.
         """
         move = chaser.state.move
         offset = move.at(np.array([now_s]))[0][0]
@@ -78,16 +78,19 @@ class ReferenceBuilder:
     ) -> HorizonReference:
         """Return the references of ``chasers`` from the time of ``start`` on.
 
-        ``relative``: their poses relative to the target, whose covariance widens the distance to
-        keep from it; None where they are not estimated.
+        ``relative``: their poses relative to the target, None where not estimated; their covariance
+        widens the distance to keep from the target.
         """
         s, step_s = self._scenario, self._step_s
         torque_free = s.target.motion == "torque_free"
         path, k = target_path(body, torque_free, start, step_s, self._stages), self._stages + 1
         nodes, middles = path.at(slice(k)), path.at(slice(k, None))
+
+        # References at the nodes and, for the feed-forward, at the middles of the stages.
         times_s = start.time_ns / 1e9 + np.arange(k, dtype=float) * step_s
         both_s = np.concatenate([times_s, times_s[:-1] + step_s / 2])
         (positions, velocities, accelerations), q_off = self._offsets(chasers, both_s, path)
+
         u_ref = np.zeros((len(chasers), self._stages, 6))
         if s.controller.feed_forward:
             u_ref = reference.feed_forward(
@@ -101,22 +104,25 @@ class ReferenceBuilder:
                 middles.alpha_rad_s2,
                 middles.acceleration_m_s2,
             )
+
         margins = self._margins_m(
             [start.covariance if r is None else r.covariance for r in relative]
         )
         distances = np.array([c.min_distance_target_m() for c in chasers])
-        # An uncertain pose pushes no chaser out of the corridor of its port, where no other place
-        # is safe.
+        # An uncertain pose must not push a chaser out of its port's corridor: no other place is
+        # safe there.
         room = [
             length(r.position_m) - d if r is not None and c.in_corridor() else np.inf
             for c, r, d in zip(chasers, relative, distances.tolist(), strict=True)
         ]
         distances = distances + np.minimum(margins, np.maximum(room, 0.0))
+
         boxes = clearance = None
         if self._boxes is not None:
             boxes = moved(self._boxes, nodes.positions_m, nodes.q_wxyz)
             kept = np.array([c.min_distance_shape_m() for c in chasers])
             clearance = np.where(kept > 0.0, kept + margins, 0.0)
+
         return HorizonReference(
             chasers=tuple(c.number for c in chasers),
             references=reference.references_on(
@@ -134,8 +140,11 @@ class ReferenceBuilder:
     def _offsets(
         self, chasers: Sequence[ChaserMachine], times_s: Array, target: TargetPath
     ) -> tuple[tuple[Array, Array, Array], Array]:
-        """Return offsets, their velocities and accelerations in TRF, each (N, K, 3), and attitudes,
-        body to TRF, (N, K, 4), at times (K,), at which the target moves as ``target``."""
+        """Return the offsets of chasers at times (K,) at which the target moves as ``target``.
+
+        Offsets, velocities and accelerations in TRF, each (N, K, 3); attitudes, body to TRF, (N, K,
+        4).
+        """
         moves = [_motion(c, times_s, target) for c in chasers]
         q_off = np.empty((len(chasers), len(times_s), 4))
         for row, c in enumerate(chasers):
@@ -156,8 +165,8 @@ class ReferenceBuilder:
         return rotations.multiply(q, calibration_turns(times_s - state.since_s))
 
     def _margins_m(self, covariances: Sequence[Array]) -> Array:
-        """Return the additions (N,) to the distance from the target for uncertain positions, the
-        first blocks of ``covariances``.
+        """Return the distances (N,), m, added to the keep-out for uncertain positions, the first
+        blocks of ``covariances``.
         """
         sigmas_m = np.sqrt(np.linalg.eigvalsh(np.array([c[:3, :3] for c in covariances]))[:, -1])
         return np.minimum(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Moves of the reference in TRF: within the speed limits and, if enforced, passively safe."""
+"""Plans moves of the reference in TRF within speed limits; passively safe ones if enforced."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class MovePlanner:
             self.escapes = EscapePlanner(scenario, self.abort_m_s)
 
     def move(self, chaser: ChaserMachine, goal_m: Array, now_s: float, speed_m_s: float) -> Motion:
-        """Return the move to a goal (3,), TRF, at most at a speed; if passive safety is enforced,
-        as slow as it needs.
+        """Return the move to a goal (3,), TRF, at most at ``speed_m_s``; slower where passive
+        safety requires it.
         """
         return self._safe(chaser, goal_m, now_s, speed_m_s) or move_to(
             chaser.motion(now_s), goal_m, now_s, speed_m_s
         )
 
     def why_not_safe(self, chaser: ChaserMachine, goal_m: Array, now_s: float) -> str:
-        """Return why no move to a goal (3,), TRF, is passively safe, or an empty string."""
+        """Return why no move to a goal (3,), TRF, is passively safe; empty if one is."""
         if self._safe(chaser, goal_m, now_s, self.goto_m_s) is not None:
             return ""
         return (
@@ -57,8 +57,8 @@ class MovePlanner:
         )
 
     def _closing_speed(self, start: Motion, goal_m: Array, now_s: float, speed_m_s: float) -> float:
-        """Return the largest speed of a move that keeps the speed limit by range all along its way,
-        at least ``speed_m_s``.
+        """Return the largest speed, at least ``speed_m_s``, at which a move keeps the speed limit
+        by range along its whole way.
         """
         slope = self._scenario.approach.closing_per_s
         if not slope:

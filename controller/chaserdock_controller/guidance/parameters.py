@@ -13,29 +13,33 @@ class GuidanceParameters:
     goto_speed_factor: float = 2.0
     """Moves that end far from the target may be faster than an approach."""
     abort_speed_factor: float = 2.0
-    """An abort leaves faster than a retreat, which flies back as slowly as an approach."""
+    """An abort leaves faster than a retreat, which backs out as slowly as an approach."""
     search_after_s: float = 1.0
-    """Time without the target's pose after which a chaser searches; a few images may miss it."""
+    """Time without the target's pose after which a chaser searches. A few images may miss the
+    target.
+    """
     sight_loss_s: float = 3.0
     """An approach stops when no chaser has seen the target for this long."""
     held_margin_m: float = 0.03
-    """A chaser that docks at a distance may be planned this much nearer than that distance, so
-    that its keep-out does not push it off its reference."""
+    """Distance by which the plan of a chaser that docks at a distance may come closer than that, so
+    that its keep-out does not push it off its reference.
+    """
     outside_m: float = 0.02
-    """A chaser this far outside of its cone is planned without it (docs/controller.md)."""
+    """A chaser this far outside its cone is planned without it (docs/controller.md)."""
     aligned_s: float = 1.0
     """Time for which a chaser must keep the corridor's limits before it flies in."""
     in_line_m: float = 0.3
     """Greatest distance from its port's axis from which a chaser flies straight to its corridor."""
     release_s: float = 1.0
-    """A latch that is closed for this long after the command to release it does not open."""
+    """A latch still closed this long after the command to release it counts as stuck."""
     stack_rest_s: float = 0.5
     """Time for which a stack must be below its limits to count as stopped."""
     stack_moving_s: float = 0.2
-    """Time for which a stopped stack must move to be stopped again; it drifts meanwhile."""
+    """Time for which a stopped stack must move before it is stopped again; meanwhile it drifts."""
     stack_settling_s: float = 0.5
-    """Time after the last thrust in which the mean motion of the stack, whose time constant this
-    is, still contains the motion before it."""
+    """Time after the last thrust before a stopped stack is judged again. The mean motion, whose
+    time constant this is, still contains the motion before.
+    """
 
 
 GUIDANCE = GuidanceParameters()

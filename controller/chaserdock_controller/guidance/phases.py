@@ -76,8 +76,8 @@ class Trigger(StrEnum):
 
 @dataclass(frozen=True)
 class Transition:
-    """``by_capture``: valid for chasers that dock by capture (True), at a distance (False), or both
-    (None).
+    """A row of the table. ``by_capture``: valid for chasers that dock by capture (True), at a
+    distance (False), or both (None).
     """
 
     sources: tuple[Phase, ...]
@@ -90,13 +90,13 @@ _P, _T = Phase, Trigger
 CORRIDOR = (_P.ALIGN, _P.APPROACH, _P.FINAL, _P.CONTACT)
 """Phases of an approach to a port before the latch has closed."""
 DETUMBLING = (_P.DETUMBLE, _P.STACK_HOLD)
-"""Phases in which the controller commands the thrusters of a latched chaser one by one."""
+"""Phases in which the controller commands the thrusters of a latched chaser individually."""
 ATTACHED = (_P.LATCHED, _P.VERIFIED, _P.IDENTIFY, *DETUMBLING)
 """Phases of a chaser whose latch holds the target."""
 APPROACHING = (_P.WAIT, *CORRIDOR, *ATTACHED, _P.DOCKED)
 """Phases that an ``approach`` command leads through."""
 BACKING_OUT = (_P.RETREAT, _P.ABORT)
-"""Phases in which a chaser leaves its port, or the neighbourhood of the target."""
+"""Phases in which a chaser leaves its port or the vicinity of the target."""
 _MOVING = (*BACKING_OUT, _P.GOTO)
 _FREE = (_P.HOLD, _P.CALIBRATE, _P.INSPECT, *_MOVING)
 
@@ -160,7 +160,7 @@ TRANSITIONS = (
     Transition((_P.APPROACH, _P.DOCKED), _T.SAFETY_LOST, _P.ABORT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR), _T.SAFETY_LOST, _P.ABORT, by_capture=True),
 )
-"""All transitions. There is at most one for a phase, a trigger and a kind of docking."""
+"""All transitions, at most one for a phase, a trigger and a kind of docking."""
 
 _TARGETS = {
     (source, t.trigger, by_capture): t.target
@@ -182,9 +182,7 @@ _COMMANDS = {
 
 
 def next_phase(phase: Phase, trigger: Trigger, by_capture: bool) -> Phase | None:
-    """Return the phase that ``trigger`` leads to from ``phase``, or None where there is no such
-    transition.
-    """
+    """Return the phase that ``trigger`` leads to from ``phase``; None without such a transition."""
     return _TARGETS.get((phase, trigger, by_capture))
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pointing: the search pattern for the target, and the manoeuvre that makes camera errors
-observable. Pure functions of time; SI units, radians.
+"""Pointing: search pattern for the target, and manoeuvre that makes camera errors observable. Pure
+functions of time; SI units, radians.
 """
 
 from __future__ import annotations
@@ -19,25 +19,28 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 SEARCH_RATE_RAD_S = math.radians(15.0)
-"""Mean rate at which the line of sight moves along a ring of the search."""
+"""Mean rate of the line of sight along a ring of the search."""
 _RING_SHARE = 0.9
-"""Rings grow by this share of the image's height, so that each overlaps the one before."""
+"""Each ring of the search is wider than the last by this share of the image's height, so that they
+overlap.
+"""
 _WIDEST_RAD = math.radians(170.0)
 _PAUSE_S, _BETWEEN_PAUSES_S = 8.0, 2.0
-"""Longest time for which a chaser stops turning while it searches one of its images, and least time
-of turning between two of these: an acquisition by shape takes up to 120 images, and half a field of
-view passes in 2 s."""
+"""Longest pause of the turn while one image is searched, and least time of turning between two
+pauses, s. An acquisition by shape takes up to 120 images; half a field of view passes in 2 s.
+"""
 
 CALIBRATION_S = 30.0
 """Duration of the calibration manoeuvre."""
 _RAMP_S = 6.0
-"""Time, s, in which the rotations of the calibration begin and end smoothly: a fifth of it."""
+"""Time, s, in which the calibration's rotations grow and fade smoothly: a fifth of its duration."""
 _ROLL, _YAW, _PITCH = math.radians(70.0), math.radians(12.0), math.radians(6.0)
 
 # Attitude law of the search: a critically damped oscillator of 2 rad/s.
 _STIFFNESS, _DAMPING = 4.0, 4.0
 _STEP_S = 0.02
-"""Time, s, over which the rate of the search's attitude is a difference: 0.3 degrees at 15 deg/s.
+"""Interval, s, for the finite difference that gives the search's angular rate: 0.3 degrees at 15
+degrees/s.
 """
 
 
@@ -50,11 +53,11 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[float, float]:
-    """Return yaw and pitch of the line of sight (about Z and Y of the body at the start) at
-    ``time_s`` of a search.
+    """Return yaw and pitch of the line of sight at ``time_s`` of a search, about Z and Y of the
+    body at the start.
 
-    The pattern is ellipses about the first line of sight. After the k-th, everything within
-    height/2 + k 0.9 height of it has been in the image. The last ellipse is repeated.
+    The pattern is a sequence of ellipses about the first line of sight. After the k-th, everything
+    within height/2 + k 0.9 height of it has been in the image. The last ellipse is repeated.
     """
     before, left_s, k = (0.0, 0.0), max(time_s, 0.0), 1
     while True:
@@ -70,7 +73,7 @@ def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[f
             / SEARCH_RATE_RAD_S
         )
         if left_s < out_s:
-            # Out along the pitch axis, where the image is lowest.
+            # Move out along the pitch axis, where the image is smallest.
             return 0.0, before[1] + (pitch - before[1]) * left_s / out_s
         left_s -= out_s
         if left_s < round_s or edge >= _WIDEST_RAD:
@@ -89,7 +92,7 @@ def search_attitude(q_start_wxyz: ArrayLike, camera: Camera, time_s: float) -> A
 
 
 def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
-    """Return the attitude (4,) nearest to ``q_wxyz``, CRF to WRF, with +X along ``direction_w``
+    """Return the attitude (4,), CRF to WRF, nearest to ``q_wxyz`` with +X along ``direction_w``
     (3,), which is not zero.
     """
     a = rotations.rotate(q_wxyz, [1.0, 0.0, 0.0])
@@ -103,8 +106,9 @@ def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
 
 
 def turning_wrench(odometry: Odometry, body: Body, q_wxyz: Array, q_soon_wxyz: Array) -> Array:
-    """Return force and torque (6,), body axes, that brake and turn to ``q_wxyz`` (4,), which moves
-    to ``q_soon_wxyz`` in 0.02 s."""
+    """Return force and torque (6,), body axes, that brake and turn the chaser to ``q_wxyz`` (4,).
+    The attitude moves to ``q_soon_wxyz`` in 0.02 s.
+    """
     wrench = brake_wrench(odometry, body)
     error = rotations.log(rotations.multiply(rotations.conjugate(odometry.q_wxyz), q_wxyz))
     ahead = rotations.log(rotations.multiply(rotations.conjugate(q_wxyz), q_soon_wxyz)) / _STEP_S
@@ -125,10 +129,10 @@ def search_wrench(
 
 
 class SearchProgress(Struct, frozen=True):
-    """Search of one chaser: the attitude at its begin, and its pauses.
+    """Progress of a chaser's search: the attitude at its beginning, and its pauses.
 
-    ``paused_s``: of all pauses; ``pause_s``: of the present one; ``resumed_s``: when the last one
-    ended; ``updated_s``: time of this state.
+    ``paused_s``: total of all pauses. ``pause_s``: length of the present one. ``resumed_s``: end of
+    the last one. ``updated_s``: time of this state.
     """
 
     q_start_wxyz: Array
@@ -138,10 +142,10 @@ class SearchProgress(Struct, frozen=True):
     resumed_s: float = -math.inf
 
     def at(self, now_s: float, acquiring: bool | None) -> SearchProgress:
-        """Return the progress at ``now_s`` of a chaser that is ``acquiring`` the target in an
-        earlier image, or is not.
+        """Return the progress at ``now_s``. ``acquiring``: the chaser searches an earlier image for
+        the target.
 
-        None: not known, as no sighting has come; a pause goes on.
+        None: unknown, as no sighting has arrived; a pause continues.
         """
         step_s = now_s - self.updated_s
         if acquiring is None:
@@ -162,9 +166,9 @@ def calibration_turns(times_s: ArrayLike) -> Array:
     """Return rotations (K, 4) of the body from its reference attitude at times (K,) of the
     calibration manoeuvre; identity before and after it.
 
-    Rotation about the line of sight makes the mounting's yaw and pitch observable, small rotations
-    about the other axes its roll: three sines of one, two and three periods, with smooth ends
-    (fifth-degree polynomials).
+    Rotation about the line of sight makes yaw and pitch of the mounting observable; small rotations
+    about the other axes make roll observable. They are sines of one, two and three periods with
+    smooth ends (fifth-degree polynomials).
     """
     t = np.clip(np.asarray(times_s, dtype=float), 0.0, CALIBRATION_S)
     x = np.clip(np.minimum(t, CALIBRATION_S - t) / _RAMP_S, 0.0, 1.0)

@@ -64,11 +64,11 @@ def reference_trajectory(
 def references_on(
     positions_m: Array, attitudes_wxyz: Array, offset_position_m: ArrayLike, q_off_wxyz: ArrayLike
 ) -> Array:
-    """Return reference poses (..., K, 7) for a target at ``positions_m`` (K, 3), WRF, and
+    """Return reference poses (..., K, 7) for a target at ``positions_m`` (K, 3), WRF, with
     ``attitudes_wxyz`` (K, 4).
 
-    As `reference_trajectory`, for any motion of the target and, with leading axes, for several
-    chasers; ``q_off_wxyz`` is of unit length.
+    As `reference_trajectory`, but for any motion of the target and, by leading axes, for several
+    chasers. ``q_off_wxyz`` has unit length.
     """
     return np.concatenate(
         [
@@ -109,10 +109,10 @@ def reference_state(
 def seen_from(
     target: TargetPath, position_m: Array, velocity_m_s: Array, acceleration_m_s2: Array
 ) -> tuple[Array, Array, Array]:
-    """Return positions, velocities and accelerations (K, 3) in TRF of a motion (K, 3) relative to
-    TRF's origin in WRF.
+    """Return a motion (K, 3), given relative to TRF's origin in WRF, as positions, velocities and
+    accelerations (K, 3) in TRF.
 
-    The inverse of the acceleration in a rotating frame, see ``feed_forward``.
+    It inverts the acceleration in a rotating frame, see ``feed_forward``.
     """
     q, omega, alpha = target.q_wxyz, target.omega_rad_s, target.alpha_rad_s2
     p = rotate_inverse(q, position_m)
@@ -132,17 +132,18 @@ def feed_forward(
     alpha_rad_s2: ArrayLike = (0.0, 0.0, 0.0),
     origin_acceleration_m_s2: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Array:
-    """Return the force and torque (..., K, 6), N and N m in chaser body axes, needed to follow the
+    """Return the force and torque (..., K, 6), N and N m in chaser body axes, that follow the
     reference.
 
     omega, alpha (its derivative) and the acceleration of TRF's origin: each (3,) or (K, 3), in TRF
-    axes. Offset position, velocity and acceleration (..., K, 3) in TRF, one row per instant (for an
-    input held over a stage, give the stage's middle), leading axes for several chasers; q_off_wxyz,
-    unit, (4,) or (..., K, 4) chaser body to TRF, whose own rotation is neglected. Acceleration in a
-    rotating frame, a = a_0 + p'' + alpha x p + 2 omega x p' + omega x (omega x p) (Goldstein,
-    "Classical Mechanics", eq. 4.91), turned into body axes; torque I alpha_b + omega_b x I omega_b.
-    The target's position, velocity and attitude do not enter: in body axes the wrench is the same
-    anywhere. Raises ValueError for a mass that is not positive.
+    axes. Offset position, velocity and acceleration: (..., K, 3) in TRF, one row per instant, with
+    leading axes for several chasers. For an input held over a stage give the stage's middle.
+    q_off_wxyz: unit length, (4,) or (..., K, 4), chaser body to TRF; its own rotation is neglected.
+
+    Acceleration in a rotating frame: a = a_0 + p'' + alpha x p + 2 omega x p' + omega x (omega x p)
+    (Goldstein, "Classical Mechanics", eq. 4.91), turned into body axes. Torque: I alpha_b + omega_b
+    x I omega_b. Position, velocity and attitude of the target cancel: in body axes the wrench is
+    the same anywhere. Raises ValueError for a mass that is not positive.
     """
     if not mass_kg > 0.0:
         raise ValueError(f"mass_kg must be positive, not {mass_kg!r}")

@@ -38,7 +38,7 @@ from .phases import Phase
 
 
 class GuidanceStage:
-    """The chasers as a fleet, and their activities."""
+    """Runs the state machines of the chasers and their activities."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
@@ -59,8 +59,8 @@ class GuidanceStage:
         estimation: TargetEstimation,
         history: PlanningHistory,
     ) -> GuidanceResult:
-        """Return what every chaser is to do in this tick; ``history``: how planning went in the
-        ticks before.
+        """Return what every chaser is to do in this tick. ``history``: results of planning in
+        earlier ticks.
         """
         now_s, fleet, target = observation.time_s, self.fleet, estimation.target
         known = self._known(observation, estimation, history)
@@ -126,8 +126,8 @@ class GuidanceStage:
         estimate: ChaserEstimate,
         estimation: TargetEstimation,
     ) -> DockingObservation | None:
-        """Return what is known of a chaser at its port; None where it has none, or its pose
-        relative to the target is not known.
+        """Return the state of a chaser at its port; None without a port, or if its pose relative to
+        the target is unknown.
         """
         dock, target = chaser.dock, estimation.target
         if dock is None or estimate.own is None or not estimation.known:
@@ -143,7 +143,9 @@ class GuidanceStage:
         return DockingObservation(view, contact, estimate.latched, *pose, sensed=status is not None)
 
     def _relative(self, estimate: ChaserEstimate, target: TargetState) -> RelativeState | None:
-        """Return a chaser's state relative to the target where passive safety is enforced."""
+        """Return a chaser's state relative to the target; None unless passive safety is
+        enforced.
+        """
         covariance, enforced = estimate.motion_covariance, self._scenario.limits.passive_safety
         if covariance is None or estimate.own is None or enforced != "enforce":
             return None
@@ -156,7 +158,7 @@ class GuidanceStage:
     def _reply(
         self, commands: Sequence[OperatorCommand], observation: Observation
     ) -> tuple[CommandReply, ...]:
-        """Apply the commands; return the replies to them."""
+        """Execute or refuse the commands. Returns the replies."""
         results = self.fleet.apply(commands, observation.time_s)
         return tuple(
             CommandReply(
@@ -172,8 +174,8 @@ class GuidanceStage:
         )
 
     def _step(self, chaser: ChaserMachine, known: ChaserTick, own: Odometry) -> ReferencePose:
-        """Advance a chaser's phase by its errors and its docking sensor; return its reference at
-        the start of the tick.
+        """Advance a chaser's phase by its tracking errors and its docking sensor. Returns its
+        reference at the start of the tick.
         """
         pose = self.references.pose(chaser, known.target, known.now_s)
         error_m = length(pose[0] - own.position_m)
@@ -184,11 +186,11 @@ class GuidanceStage:
     def _horizon(
         self, known: Sequence[ChaserTick], estimation: TargetEstimation
     ) -> HorizonReference | None:
-        """Return the references of the chasers that are planned for; None without any."""
+        """Return the references of the chasers that are planned for; None if there are none."""
         present = [(c, tick) for c, tick in zip(self.chasers, known, strict=True) if tick.own]
         planned = [c for c, _ in present if c.phase is not Phase.SEARCHING]
         attached = frozenset(c.number for c, tick in present if c.is_attached(tick))
-        # Latched chasers are planned for only where others have to fly around them.
+        # Latched chasers are planned for only while others have to fly around them.
         if estimation.at_effect is None or not planned or len(attached) == len(present):
             return None
         relative = [estimation.chasers[c.number].relative for c in planned]
@@ -198,7 +200,7 @@ class GuidanceStage:
 
 
 def _offset_m(estimate: ChaserEstimate, estimation: TargetEstimation) -> Array | None:
-    """Return a chaser's estimated centre (3,), TRF; None where it is not known."""
+    """Return a chaser's estimated centre (3,), TRF; None if unknown."""
     if estimate.own is None or not estimation.known:
         return None
     return centre_in_target(estimation.target, estimate.own.state)

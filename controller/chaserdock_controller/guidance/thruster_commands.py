@@ -15,8 +15,8 @@ THRUSTER_COMMANDS = ("isolate", "restore")
 
 
 class ThrusterCommands:
-    """Thrusters of one chaser that operators have isolated, or restored: these are trusted, and
-    fault detection must not isolate them.
+    """Thrusters of one chaser that operators have isolated or restored. Fault detection must not
+    isolate restored ones.
     """
 
     def __init__(self, body: Body) -> None:
@@ -34,7 +34,7 @@ class ThrusterCommands:
         return tuple(k for k in thrusters if k not in self.trusted)
 
     def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
-        """Apply or refuse a command. Of different commands to one thruster in one tick only the
+        """Execute or refuse a command. Of different commands to one thruster in one tick only the
         first is accepted.
         """
         thruster, count = command.thruster, self._thrusters

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Smooth motions of a reference position: polynomials between states of motion. Pure functions.
+"""Smooth motions of a reference position: polynomials in time between states. Pure functions.
 
-A motion from rest to rest is the fifth-degree polynomial of least jerk (T. Flash and N. Hogan,
-1985). A motion from a moving state adds the polynomial that brings the current motion to rest: a
-single polynomial with initial acceleration overshoots more the longer it takes, and may not reach a
-bound on its speed. Acceleration is continuous, and so is the feed-forward.
+From rest to rest: the fifth-degree polynomial of least jerk (T. Flash and N. Hogan, 1985). From a
+moving state: the same plus the polynomial that brings the present motion to rest. A single
+polynomial with initial acceleration would overshoot more, the longer it takes, and might never keep
+a speed limit. Acceleration is continuous, and so is the feed-forward.
 """
 
 from __future__ import annotations
@@ -19,13 +19,19 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 PEAK_SPEED = 1.875
-"""Peak speed of a move of least jerk over its mean."""
+"""Ratio of peak to mean speed in a move of least jerk."""
 _RAMP_S = 2.0
-"""Time, s, of each change of speed of an approach. Chosen."""
+"""Time, s, of each change of speed of an approach. Peak acceleration is 1.5 dv / _RAMP_S: smaller
+needs more force, larger makes the approach longer.
+"""
 _SHORTEST_S = 2.0
-"""Shortest duration, s, of a move, however short the way. Chosen."""
+"""Shortest duration, s, of a move. Peak acceleration is 5.8 d / _SHORTEST_S^2 for a distance d:
+smaller needs more force, larger delays small corrections.
+"""
 _STOP_S = 3.0
-"""Time, s, in which a moving chaser comes to rest. Chosen."""
+"""Time, s, in which a moving chaser comes to rest. From speed v it covers v _STOP_S / 2 and brakes
+with at most 1.5 v / _STOP_S: smaller needs more force, larger more room.
+"""
 # Factors of the derivatives of powers 1 to 5, and 2 to 5.
 _FIRST = np.arange(1.0, 6.0)[:, None]
 _SECOND = np.array([2.0, 6.0, 12.0, 20.0])[:, None]
@@ -33,8 +39,8 @@ _SAMPLES_PER_PART = np.linspace(0.0, 1.0, 41)
 
 
 class Part(Struct, frozen=True, eq=False, dict=True):
-    """A polynomial over ``duration_s`` with ``coefficients`` (6, 3) of powers of time, metres and
-    seconds. Ends at rest.
+    """A polynomial of position over ``duration_s``, at rest afterwards. ``coefficients`` (6, 3): of
+    powers 0 to 5 of time, m and s.
     """
 
     duration_s: float
@@ -53,7 +59,7 @@ class Part(Struct, frozen=True, eq=False, dict=True):
 
 
 def _powers(times_s: Array) -> Array:
-    """Return the powers 0 to 5 (K, 6) of times (K,), as ``numpy.vander`` does in twice the time."""
+    """Return the powers 0 to 5 (K, 6) of times (K,). `numpy.vander` takes twice as long."""
     powers = np.empty((len(times_s), 6))
     powers[:, 0] = 1.0
     powers[:, 1:] = times_s[:, None]
@@ -70,7 +76,7 @@ def _at_rest(count: int) -> Array:
 
 
 class Move(Struct, frozen=True, eq=False, tag=True):
-    """The sum of ``parts``, which all begin at ``start_s``."""
+    """A move: the sum of ``parts``, all of which begin at ``start_s``."""
 
     start_s: float
     parts: tuple[Part, ...]
@@ -93,7 +99,7 @@ class Move(Struct, frozen=True, eq=False, tag=True):
         earliest_s = float(t.min(initial=math.inf))
         if all(
             earliest_s > part.duration_s for part in self.parts
-        ):  # a chaser that holds, most of the time
+        ):  # the most frequent case: a chaser that holds
             position = sum((part.rest(len(t)) for part in self.parts), start=np.zeros((len(t), 3)))
             return position, _at_rest(len(t)), _at_rest(len(t))
         position, velocity, acceleration = np.zeros((3, len(t), 3))
@@ -128,10 +134,10 @@ def stay(position_m: ArrayLike, time_s: float) -> Move:
 
 
 class Glide(Struct, frozen=True, eq=False, tag=True):
-    """A straight path at piecewise constant speeds with smooth changes, from rest to rest.
+    """A straight motion from rest to rest at piecewise constant speeds with smooth changes.
 
     It begins at ``from_m`` (3,) along the unit vector ``along`` (3,). ``speeds_m_s`` (n,) are held
-    for ``holds_s`` (n,), with ramps of ``ramps_s`` (n + 1,) before, between and after them: cubics
+    for ``holds_s`` (n,). Ramps of ``ramps_s`` (n + 1,) come before, between and after them: cubics
     in speed with zero slope at both ends.
     """
 
@@ -183,12 +189,12 @@ class Glide(Struct, frozen=True, eq=False, tag=True):
 
 
 class Escape(Struct, frozen=True, eq=False, tag=True):
-    """A constant acceleration for ``burn_s`` in addition to a coast, then the coast. Relative to
-    the target's centre, in WRF.
+    """An abort, relative to the target's centre in WRF: a burn of constant acceleration for
+    ``burn_s`` on top of a coast, then the coast alone.
 
-    ``state`` (6,): position and velocity at ``start_s``; ``acceleration_m_s2`` (3,). The coast is
-    that of Clohessy and Wiltshire, in free space (``mean_motion_rad_s`` = 0) a straight line. After
-    ``duration_s`` it counts as complete, and goes on.
+    ``state`` (6,): position and velocity at ``start_s``. ``acceleration_m_s2`` (3,): of the burn.
+    The coast obeys Clohessy-Wiltshire; in free space (``mean_motion_rad_s`` = 0) it is a straight
+    line. After ``duration_s`` the motion counts as complete but continues.
     """
 
     start_s: float
@@ -235,12 +241,12 @@ class Escape(Struct, frozen=True, eq=False, tag=True):
 
 
 class Circuit(Struct, frozen=True, eq=False, tag=True):
-    """One turn about an axis through TRF's origin, from rest to rest: the angle follows the
+    """One turn about an axis through TRF's origin, from rest to rest; the angle follows the
     polynomial of least jerk.
 
-    ``from_m`` (3,): start; ``axis`` (3,): unit vector. The distance from the origin changes to
-    ``distance_m`` over the first quarter of the time, as smoothly. The end is the start at that
-    distance.
+    ``from_m`` (3,): start. ``axis`` (3,): unit vector. Over the first quarter of the time the
+    distance from the origin changes, likewise smoothly, to ``distance_m``. The turn ends in the
+    direction of the start.
     """
 
     start_s: float
@@ -280,8 +286,8 @@ class Circuit(Struct, frozen=True, eq=False, tag=True):
 
 
 def _least_jerk(t: Array, duration_s: float) -> tuple[Array, Array, Array]:
-    """Return the fifth-degree polynomial of least jerk from 0 to 1 at times (K,), with its first
-    and second derivative.
+    """Return the least-jerk polynomial from 0 to 1 at times (K,), with its first and second
+    derivative.
     """
     x = np.clip(t / duration_s, 0.0, 1.0)
     value = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
@@ -293,10 +299,10 @@ def _least_jerk(t: Array, duration_s: float) -> tuple[Array, Array, Array]:
 def circuit(
     from_m: ArrayLike, axis: ArrayLike, distance_m: float, now_s: float, speed_m_s: float
 ) -> Circuit:
-    """Return a turn from rest at ``from_m`` (3,) about ``axis`` (3,), any length, as fast as
-    ``speed_m_s`` at the equator.
+    """Return a turn from rest at ``from_m`` (3,) about ``axis`` (3,), of any length. ``speed_m_s``:
+    largest speed at the equator.
 
-    The duration does not depend on the start, so that chasers that begin together keep their angles
+    The duration does not depend on the start, so that chasers that start together keep their angles
     to each other. Raises ValueError for a speed or a distance that is not positive.
     """
     if not (speed_m_s > 0.0 and distance_m > 0.0):
@@ -343,10 +349,10 @@ def glide(
 
 
 def stop(current: Motion, now_s: float) -> Move:
-    """Return a move that brings ``current`` to rest in 3 s.
+    """Return a move that brings ``current`` to rest in ``_STOP_S``.
 
-    Its velocity is the cubic from the velocity and acceleration of ``current`` to zero velocity and
-    acceleration.
+    Its velocity is the cubic that starts with the velocity and acceleration of ``current`` and ends
+    with zeros of both.
     """
     p, v, a = (x[0] for x in current.at(np.array([now_s])))
     if not (v.any() or a.any()):
@@ -365,7 +371,7 @@ def move_to(current: Motion, goal_m: ArrayLike, now_s: float, max_speed_m_s: flo
     """Return a move from the state of ``current`` at ``now_s`` to rest at ``goal_m`` (3,), at most
     at ``max_speed_m_s``.
 
-    Where ``stop`` is faster than that, its speed is the limit (both within half a percent). Raises
+    If ``stop`` alone is faster, its peak speed is the limit (both to half a percent). Raises
     ValueError unless the speed is positive.
     """
     if not max_speed_m_s > 0.0:
@@ -377,7 +383,7 @@ def move_to(current: Motion, goal_m: ArrayLike, now_s: float, max_speed_m_s: flo
     )  # more than what lies between two samples
     duration_s = max(_SHORTEST_S, PEAK_SPEED * float(np.linalg.norm(displacement)) / max_speed_m_s)
     move = Move(now_s, (*stopping.parts, _straight(displacement, duration_s)))
-    # Terminates: the longer the displacement takes, the less it adds to the speed of stopping.
+    # The loop ends: a longer displacement adds less to the speed of stopping.
     while move._fastest() > limit:
         duration_s *= 1.1
         move = Move(now_s, (*stopping.parts, _straight(displacement, duration_s)))

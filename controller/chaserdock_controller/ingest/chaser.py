@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ingest keeps of one chaser, and what follows from its messages in a tick. No I/O."""
+"""Ingest of one chaser: its state between ticks, and checks of its messages. No I/O."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ from .odometry_validation import why_invalid
 
 
 class ChaserIngest:
-    """Keeps the newest thruster ``report`` of one chaser, and for how long it has sent nothing."""
+    """Checks the messages of one chaser. Keeps its newest thruster ``report`` and for how long it
+    has been silent.
+    """
 
     def __init__(self, scenario: FlightScenario, chaser: int) -> None:
         self.chaser = chaser
@@ -34,11 +36,13 @@ class ChaserIngest:
     def observe(
         self, inputs: ChaserInputs, tick: int, time_ns: int, sent: CommandHistory
     ) -> tuple[ChaserObservation, LogEntry | None]:
-        """Check the messages of a tick; return what is known of the chaser, and an event if it was
-        lost or is lost no more. ``sent``: the commands to this chaser so far.
+        """Check the messages of a tick. Returns what is known of the chaser, and an event when it
+        is lost or found again.
+
+        ``sent``: commands to this chaser so far.
         """
         self.report = inputs.thrusters or self.report
-        # What is extrapolated from an invalid state is invalid.
+        # A state extrapolated from an invalid one is invalid, too.
         source = None if inputs.odometry is None else inputs.outdated or inputs.odometry
         invalid = "" if source is None else why_invalid(source)
         odometry = None if invalid else inputs.odometry
@@ -63,14 +67,16 @@ class ChaserIngest:
         return observation, event
 
     def _outdated(self, odometry: Odometry | None) -> Odometry | None:
-        """Return valid odometry with the time of its tick: the clock of a chaser may be wrong."""
+        """Return valid odometry stamped with its tick's time, since a chaser's clock may be
+        wrong.
+        """
         if odometry is None or why_invalid(odometry):
             return None
         time_ns = self._timing.tick_time_ns(odometry.tick)
         return msgspec.structs.replace(odometry, sim_time_ns=time_ns)
 
     def _limits(self) -> Array:
-        """Return the greatest force and torque (6,) per body axis that the chaser can produce
+        """Return the largest force and torque (6,) per body axis that the chaser can produce
         now.
         """
         report = self.report
@@ -79,7 +85,9 @@ class ChaserIngest:
         return np.minimum(self._nominal, np.abs([*report.force_max_N, *report.torque_max_N_m]))
 
     def _impulse(self, tick: int, time_ns: int, sent: CommandHistory) -> AppliedImpulse:
-        """Return the impulse since the tick before: as thrusters report it, or as commanded."""
+        """Return the impulse since the previous tick, as thrusters report it or else as
+        commanded.
+        """
         r = self.report
         if r is not None and r.tick == tick:
             return AppliedImpulse(
@@ -101,8 +109,8 @@ class ChaserIngest:
     def _ahead(
         self, tick: int, time_ns: int, effective_ns: int, sent: CommandHistory
     ) -> tuple[tuple[float, Array], ...]:
-        """Return what acts until the tick's command does; an impulse of pulses that are still to
-        fire is spread evenly.
+        """Return what acts on the chaser until the tick's command does, as durations (s) and
+        wrenches (6,). The impulse of pulses yet to fire is spread evenly.
         """
         r = self.report
         if r is None or r.tick != tick:
@@ -112,7 +120,9 @@ class ChaserIngest:
         return ((duration_s, coming / duration_s),) if duration_s > 0.0 else ()
 
     def _thruster_impulses(self, tick: int) -> Array | None:
-        """Return the impulses (n,) of the thrusters since the tick before, as reported."""
+        """Return the impulses (n,) that the thrusters report for the time since the previous
+        tick.
+        """
         r = self.report
         if r is None or r.tick != tick or not r.given_thrusters_N_s:
             return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prediction of a chaser's own state to the time when the next command takes effect."""
+"""Predicts a chaser's own state to the time at which the next command takes effect."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from chaserdock_protocol.messages import Odometry
 
 
 class CommandHistory:
-    """Wrenches (6,), body axes, sent to a chaser, with the times at which they take effect."""
+    """Wrenches (6,), body axes, that were sent to a chaser, with the times at which they take
+    effect.
+    """
 
     def __init__(self) -> None:
         self._sent: list[tuple[int, Array]] = []
@@ -23,7 +25,7 @@ class CommandHistory:
         self._sent.append((effective_ns, np.array(wrench)))
 
     def segments(self, from_ns: int, to_ns: int) -> list[tuple[int, int, Array]]:
-        """Return what acts between two times as (from, to, wrench); zero before the first
+        """Return the wrenches between two times as (from, to, wrench); zero before the first
         command.
         """
         edges = [from_ns, *sorted({t for t, _ in self._sent if from_ns < t < to_ns}), to_ns]
@@ -34,13 +36,13 @@ class CommandHistory:
         return out
 
     def ahead(self, from_ns: int, to_ns: int) -> tuple[tuple[float, Array], ...]:
-        """Return what acts between two times as durations (s) and wrenches (6,)."""
+        """Return the wrenches between two times as durations (s) and wrenches (6,)."""
         return tuple(
             ((end - begin) / 1e9, wrench) for begin, end, wrench in self.segments(from_ns, to_ns)
         )
 
     def forget_before(self, time_ns: int) -> None:
-        """Remove commands that do not act after ``time_ns``."""
+        """Drop the commands that no longer act after ``time_ns``."""
         last = max((k for k, (t, _) in enumerate(self._sent) if t <= time_ns), default=0)
         self._sent = self._sent[last:]
 
@@ -48,10 +50,10 @@ class CommandHistory:
 def predict_state(
     odometry: Odometry, ahead: Iterable[tuple[float, Array]], disturbance: Array, body: RigidBody
 ) -> Array:
-    """Return the state (13,) of a chaser after all of ``ahead``: durations (s) and wrenches (6,)
-    that act on it.
+    """Return the state (13,) of a chaser after the wrenches of ``ahead``: durations (s) and
+    wrenches (6,).
 
-    ``disturbance`` (6,) acts as well. Wrenches are force and torque in body axes, N and N m.
+    ``disturbance`` (6,) acts in addition. Wrenches are force and torque in body axes, N and N m.
     """
     x = np.array(
         [*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation of odometry: states that no rigid body can have, and jumps that a chaser cannot have
-made. No I/O.
+"""Validates odometry: rejects states that no rigid body can have, removes jumps that no chaser can
+make. No I/O.
 
-A chaser whose odometry jumps would fly to the wrong place, through the target if that lies between.
-A jump is therefore removed and the state before it continued; a jump back removes the correction.
-Where sightings contradict the state before the jump and have never confirmed it, the jump may lead
-back to the truth, and is accepted.
+A chaser whose odometry jumps would fly to the wrong place, possibly through the target. A jump is
+therefore removed by a correction that continues the state before it; a jump back removes the
+correction. If sightings contradict the state before the jump and have never confirmed it, the jump
+may lead to the truth and is accepted.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Level, Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
-# Change of position (m) and attitude between two ticks, beyond what motion and stated noise
-# explain, up to which odometry has not jumped: larger than steps of motion capture, smaller than
-# the errors that endanger a docking. Chosen.
+# Change of position (m) and attitude between two ticks, beyond motion and stated noise, up to which
+# odometry has not jumped. Larger than steps of motion capture, smaller than errors that endanger a
+# docking.
 PLAUSIBLE_M = 0.02
 PLAUSIBLE_RAD = math.radians(2.0)
 LONGEST_S = 1.0
 """After a longer gap every state is accepted."""
 _UNIT_WITHIN = 0.1
-"""Deviation of a quaternion's length from 1 that is taken for rounding of its sender."""
+"""Deviation of a quaternion's length from 1 that passes as its sender's rounding."""
 _ROUNDING = 1e-9
-"""Asymmetry and negative eigenvalues of a covariance, as a share of its largest element, that are
-rounding.
+"""Asymmetry and negative eigenvalues of a covariance, as a share of its largest element, that pass
+as rounding.
 """
 
 COVARIANCES = (
@@ -47,9 +47,7 @@ COVARIANCES = (
 
 
 def why_invalid(odometry: Odometry) -> str:
-    """Return why an odometry is not the state of a rigid body with covariances, or an empty
-    string.
-    """
+    """Return why an odometry is not the state of a rigid body with covariances; empty if it is."""
     for name in ("position_m", "velocity_m_s", "q_wxyz", "omega_rad_s"):
         if not all(map(math.isfinite, getattr(odometry, name))):
             return f"{name} holds a value that is not finite"
@@ -67,7 +65,7 @@ def why_invalid(odometry: Odometry) -> str:
 
 @lru_cache(maxsize=64)  # sensors mostly state the same covariances in every message
 def _why_no_covariances(*covariances: tuple[float, ...]) -> str:
-    """Return which of ``COVARIANCES`` is none, or an empty string."""
+    """Return which of ``COVARIANCES`` is not a covariance; empty if all are."""
     named = zip(COVARIANCES, covariances, strict=True)
     return next(
         (f"{name} is not a covariance" for name, elements in named if not _is_covariance(elements)),
@@ -76,7 +74,7 @@ def _why_no_covariances(*covariances: tuple[float, ...]) -> str:
 
 
 def _is_covariance(elements: tuple[float, ...]) -> bool:
-    """Return whether elements (9,) are a symmetric positive semi-definite (3, 3) matrix, up to
+    """Return whether elements (9,) form a symmetric positive semi-definite (3, 3) matrix, up to
     rounding.
     """
     matrix = np.array(elements).reshape(3, 3)
@@ -88,8 +86,8 @@ def _is_covariance(elements: tuple[float, ...]) -> bool:
 
 @dataclass
 class Known:
-    """The last corrected odometry of a chaser, and the correction, if any: offset (3,) in WRF,
-    rotation (4,) in CRF.
+    """Last corrected odometry of a chaser, with the correction in use: offset (3,) in WRF, rotation
+    (4,) in CRF.
     """
 
     last: Odometry
@@ -114,8 +112,9 @@ class OdometryValidation:
     def update(
         self, odometry: Odometry, doubtful: bool = False
     ) -> tuple[Odometry, list[tuple[Level, str]]]:
-        """Return the chaser's next odometry without jumps, and the events to log. ``doubtful``:
-        what was received before it may be wrong."""
+        """Return the chaser's next odometry with jumps removed, and the events to log.
+        ``doubtful``: its odometry before may be wrong.
+        """
         i, known = odometry.chaser, self.known
         gap_s = 0.0 if known is None else (odometry.sim_time_ns - known.last.sim_time_ns) / 1e9
         if known is None or not 0.0 < gap_s <= LONGEST_S:
@@ -158,7 +157,7 @@ def _distance(a: Odometry, b: Odometry) -> tuple[float, float]:
 
 
 def _remove(odometry: Odometry, offset_m: Array, rotation: Array) -> Odometry:
-    """Return odometry less an offset (WRF) and a rotation (4,) (CRF)."""
+    """Return odometry with an offset (WRF) and a rotation (4,) (CRF) subtracted."""
     q = rotations.multiply(odometry.q_wxyz, rotations.conjugate(rotation))
     return msgspec.structs.replace(
         odometry,

@@ -10,17 +10,19 @@ from chaserdock_protocol.messages import Level
 DISAGREES_S = 0.6
 """A chaser whose sightings were all rejected for this long is inconsistent."""
 AGREES_S = 0.6
-"""Time, s, for which its sightings must be accepted to be trusted (again): as long as the above."""
+"""Time, s, for which its sightings must be accepted before they are trusted: as long as
+``DISAGREES_S``.
+"""
 
 
 @dataclass
 class SensorConsistency:
-    """Follows whether the estimator keeps rejecting the sightings of one chaser, by a fault of
-    camera or odometry (``inconsistent``).
+    """Tracks whether the estimator keeps rejecting the sightings of one chaser (``inconsistent``),
+    because of a fault of camera or odometry.
 
-    ``confirmed``: they were accepted for ``AGREES_S`` since its odometry was last interrupted, at
-    ``interrupted_s``. ``agrees``: whether the last one was accepted; ``since_s``: since when it is
-    so.
+    ``confirmed``: sightings were accepted for ``AGREES_S`` since its odometry was last interrupted,
+    at ``interrupted_s``. ``agrees``: the last one was accepted; ``since_s``: time since which that
+    has not changed.
     """
 
     chaser: int
@@ -32,16 +34,17 @@ class SensorConsistency:
 
     @property
     def doubtful(self) -> bool:
-        """Return whether the odometry may be wrong: a jump between two of its states would have
-        been noticed, but none before its first state, or while it was interrupted."""
+        """Return whether the odometry may be wrong. A jump would be noticed between two states, but
+        not before the first one or during an interruption.
+        """
         return self.inconsistent and not self.confirmed
 
     def interrupt(self, now_s: float) -> None:
-        """Take note that the odometry was interrupted before this tick."""
+        """Record that the odometry was interrupted before this tick."""
         self.interrupted_s, self.confirmed = now_s, False
 
     def update(self, now_s: float, agrees: bool) -> tuple[Level, str] | None:
-        """Take whether the sightings of a tick were accepted; return an event, if any."""
+        """Record whether the sightings of a tick were accepted. Returns an event, or None."""
         lasts_s = now_s - self.since_s
         if agrees and self.agrees:
             trusted_s = now_s - max(self.since_s, self.interrupted_s)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks that sightings are poses with covariances: a damaged one must not reach an estimator."""
+"""Checks that sightings are poses with covariances, so that no damaged one reaches an estimator."""
 
 from __future__ import annotations
 
@@ -11,17 +11,15 @@ import numpy as np
 from chaserdock_protocol.messages import Level, PoseSolution, Sighting
 
 _UNIT_WITHIN = 0.1
-"""Deviation of a quaternion's length from 1 that is taken for rounding of its sender."""
+"""Deviation of a quaternion's length from 1 that passes as its sender's rounding."""
 _ROUNDING = 1e-6
-"""Asymmetry of a covariance, as a share of its largest element, that is rounding: perception may
-compute in single precision.
+"""Asymmetry of a covariance, as a share of its largest element, that passes as rounding: perception
+may compute in single precision.
 """
 
 
 def why_invalid(solution: PoseSolution) -> str:
-    """Return why a solution is not a pose with a positive definite covariance, or an empty
-    string.
-    """
+    """Return why a solution is not a pose with a positive definite covariance; empty if it is."""
     length = math.hypot(*solution.q_wxyz)
     if not abs(length - 1.0) <= _UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"
@@ -36,7 +34,7 @@ def why_invalid(solution: PoseSolution) -> str:
 
 
 def _are_valid(solutions: Sequence[PoseSolution]) -> bool:
-    """Return whether ``why_invalid`` finds nothing in any solution, without a call for each."""
+    """Return whether ``why_invalid`` would pass all solutions, without a call for each."""
     if not all(abs(math.hypot(*s.q_wxyz) - 1.0) <= _UNIT_WITHIN for s in solutions):
         return False
     covariances = np.array([s.covariance for s in solutions]).reshape(-1, 6, 6)
@@ -54,8 +52,8 @@ def _are_valid(solutions: Sequence[PoseSolution]) -> bool:
 def valid_sightings(
     sightings: Iterable[Sighting],
 ) -> tuple[tuple[Sighting, ...], list[tuple[Level, str]]]:
-    """Return the sightings with their valid solutions only, and an event for each sighting that
-    loses one.
+    """Return the sightings with their valid solutions, and an event for each sighting that has lost
+    one.
     """
     valid: list[Sighting] = []
     events: list[tuple[Level, str]] = []

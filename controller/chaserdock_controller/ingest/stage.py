@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""First stage of a tick: check the inputs, and collect what acts on the chasers."""
+"""First stage of a tick: check the inputs, collect the wrenches that act on the chasers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .sighting_validation import valid_sightings
 
 
 class IngestStage:
-    """What ingest keeps of each of the ``chasers``."""
+    """Runs ingest for all ``chasers``."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._timing = scenario.timing

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collects the messages of a tick: which have arrived, which were lost, which are duplicates or
-stale. No I/O.
+"""Collects the messages of a tick and tracks which have arrived, are lost, duplicated or stale. No
+I/O.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from chaserdock_controller.interfaces import ChaserInputs, LogEntry, TickInputs
 from .odometry_validation import OdometryValidation
 
 _REMEMBERED_TICKS = 256
-"""Ticks for which it is known whether their sightings were usable; memory is bounded by twice as
-many.
+"""Ticks for which it is remembered whether their sightings could be used; memory is bounded by
+twice as many.
 """
 
 
 class Mailbox:
-    """The newest messages of one chaser; ``validation`` removes jumps from its odometry."""
+    """The newest messages of one chaser. ``validation``: removes jumps from its odometry."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         self.validation = OdometryValidation(scenario)
@@ -40,8 +40,8 @@ class Mailbox:
 
 
 class TickInputCollector:
-    """The newest messages of the ``chasers``, the sightings since the tick before, and the lost
-    messages. Messages of chasers that the mission does not have are refused.
+    """Collects the newest messages of the ``chasers``, the sightings since the previous tick, and
+    which messages are lost. Refuses messages of chasers that are not in the mission.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -58,8 +58,11 @@ class TickInputCollector:
         self._extrapolation_ns = scenario.controller.command_lifetime_s * 1e9
 
     def add_odometry(self, odometry: Odometry, doubtful: bool = False) -> list[LogEntry] | None:
-        """Add an odometry and return the events to log; None if one of that chaser as new is known.
-        ``doubtful``: what was received before it may be wrong."""
+        """Add odometry. Returns the events to log; None if the known odometry of that chaser is as
+        new.
+
+        ``doubtful``: its odometry before may be wrong.
+        """
         own = self._mailbox(odometry.chaser)
         if own is None or _is_overtaken(odometry, own.odometry):
             return None
@@ -67,7 +70,7 @@ class TickInputCollector:
         return events
 
     def add_docking(self, docking: DockingStatus) -> bool:
-        """Add a docking status; return False if one of that chaser as new is known."""
+        """Add a docking status; return False if the known one of that chaser is as new."""
         own = self._mailbox(docking.chaser)
         if own is None or _is_overtaken(docking, own.docking):
             return False
@@ -75,7 +78,7 @@ class TickInputCollector:
         return True
 
     def add_thruster_report(self, report: ThrusterReport) -> bool:
-        """Add a thruster report; return False if one of that chaser as new is known."""
+        """Add a thruster report; return False if the known one of that chaser is as new."""
         own = self._mailbox(report.chaser)
         if own is None or _is_overtaken(report, own.thrusters):
             return False
@@ -86,7 +89,7 @@ class TickInputCollector:
         return self.chasers[chaser] if chaser < len(self.chasers) else None
 
     def add_sighting(self, sighting: Sighting) -> bool:
-        """Add a sighting; return False for a duplicate, which must not count as evidence twice."""
+        """Add a sighting; return False for a duplicate, which must not count twice as evidence."""
         key = (sighting.tick, sighting.chaser)
         if self._mailbox(sighting.chaser) is None:
             return False
@@ -98,7 +101,7 @@ class TickInputCollector:
         return True
 
     def add_lost(self, topic: Topic, chaser: int, tick: int) -> None:
-        """Note that a message of a tick will not arrive."""
+        """Record that a message of a tick will not arrive."""
         self._lost.add((topic.key, chaser, tick))
 
     def is_complete(self, tick: Tick) -> bool:
@@ -131,12 +134,12 @@ class TickInputCollector:
         return (topic.key, i, tick.tick) in self._lost
 
     def take(self, tick: Tick, commands: tuple[OperatorCommand, ...]) -> TickInputs:
-        """Return the inputs of a tick and remove what only that tick uses."""
+        """Return the inputs of a tick and drop what only that tick uses."""
         inputs = TickInputs(
             tick.tick,
             tick.sim_time_ns,
             tuple(self._inputs_of(i, own, tick) for i, own in enumerate(self.chasers)),
-            # Equal inputs in any order of arrival give equal results.
+            # The order of arrival must not affect results.
             tuple(sorted(self._sightings, key=lambda s: (s.tick, s.chaser))),
             commands,
         )
@@ -163,8 +166,8 @@ class TickInputCollector:
         )
 
     def _odometry_at(self, i: int, newest: Odometry | None, tick: Tick) -> Odometry | None:
-        """Return the odometry of a tick; a lost one is extrapolated for the lifetime of a
-        command.
+        """Return the odometry of a tick. A lost one is extrapolated for at most a command's
+        lifetime.
         """
         if newest is None or newest.tick == tick.tick:
             return newest
@@ -175,5 +178,5 @@ class TickInputCollector:
 
 
 def _is_overtaken(message: Message, known: Message | None) -> bool:
-    """Return whether a message is a duplicate of the known one, or older."""
+    """Return whether a message is as old as the known one, or older."""
     return known is not None and message.tick <= known.tick

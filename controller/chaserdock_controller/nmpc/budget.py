@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Iteration limit for a real-time budget in seconds, from the measured durations of previous
+"""Converts a real-time budget in seconds into an iteration limit, by the measured durations of
 solves.
 
-A solve is limited by iterations and never reads a clock, so its result depends on its inputs and
-that limit only. In lock-step the limit comes from the scenario, which makes flights reproducible.
+A solve is limited by iterations and never reads a clock. Its result therefore depends on its inputs
+and that limit only. In lock-step the limit comes from the scenario, which makes flights
+reproducible.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 _DECAY = 0.05
-"""Share of the difference by which a faster solve lowers the estimate: a disturbed solve counts for
-20 ticks, 1.3 s at 15 Hz.
+"""Share of the difference by which a faster solve lowers the estimate. A disturbed solve thus
+counts for 20 ticks, 1.3 s at 15 Hz.
 """
 _INITIAL_ITERATION_S = 1e-4
-"""Time of an iteration before one was measured, s: 2.6 times what it takes on one core of 2024 (38
+"""Assumed time of an iteration before one is measured, s: 2.6 times that on one core of 2024 (38
 us), so that the first solve keeps its budget.
 """
 
@@ -29,11 +30,11 @@ class Bounded(Protocol):
 
 @dataclass
 class SolveBudget:
-    """Track the duration of a solve: seconds without iterations, and seconds per iteration.
+    """Tracks the duration of a solve as seconds without iterations plus seconds per iteration.
 
-    Both follow an increase immediately and a decrease by `_DECAY` of it per solve, so a disturbed
-    solve counts for a while. ``most``: upper bound of the limit. Raises ValueError for a budget
-    that is not positive.
+    Both follow an increase immediately and a decrease by `_DECAY` of it per solve, so that a
+    disturbed solve counts for a while. ``most``: upper bound of the limit. Raises ValueError for a
+    budget that is not positive.
     """
 
     budget_s: float
@@ -46,8 +47,8 @@ class SolveBudget:
             raise ValueError(f"budget_s must be positive, not {self.budget_s!r}")
 
     def iterations(self) -> int:
-        """Return the iteration limit of the next solve; 0 leaves the shifted plan, or a solution
-        without iterations.
+        """Return the iteration limit of the next solve. With 0 the plan is the shifted one, or a
+        solution that needs no iterations.
         """
         fit = max(0, int((self.budget_s - self.base_s) / self.iteration_s))
         return fit if self.most is None else min(fit, self.most)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Back end `ipopt`, and bases of back ends that solve the problem of `casadi_problem` for all
-chasers at once.
+"""Back end `ipopt`, and base classes of back ends that solve `casadi_problem` for all chasers at
+once.
 
-ipopt with MUMPS, from CasADi's wheel, converges in tens of milliseconds; it is the reference for
-faster back ends, not a real-time controller. Limited by iterations, never by time.
+ipopt with MUMPS, from CasADi's wheel, converges in tens of milliseconds. It is the reference for
+faster back ends, not a real-time controller. Solves are limited by iterations, never by time.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .types import Array, NmpcInput, NmpcPlan
 from .warm_start import Frame, status_of
 
 MAX_ITERATIONS = 200
-"""Most iterations of a solve: far starts and swaps in closed loop take 89 at most, so that only
-failures meet it.
+"""Iteration limit of a solve. Far starts and swaps in closed loop take at most 89, so that only
+failures reach it.
 """
 
 
@@ -43,14 +43,16 @@ class CoupledSolver:
 
 
 class SingleShootingSolver(CoupledSolver, ABC):
-    """Base of the back ends without states: inputs, by stage, scaled by their limits to -1 to 1."""
+    """Base of the back ends without states. Variables: the inputs stage by stage, scaled by their
+    limits to -1 to 1.
+    """
 
     @abstractmethod
     def _run(
         self, nlp: Nlp, program: Any, parameters: Array, floor: Array, start: Array
     ) -> tuple[Array, bool, bool, int]:
-        """Return solution, whether it converged, whether the iterations were used up, and their
-        number.
+        """Solve the program. Returns the solution, whether it converged, whether the iteration
+        limit was reached, and the number of iterations.
         """
 
     def solve(
@@ -81,8 +83,8 @@ class SingleShootingSolver(CoupledSolver, ABC):
 
 
 class MultipleShootingSolver(CoupledSolver, ABC):
-    """Base of the back ends with states, by a solver that CasADi calls ``PLUGIN``, for up to
-    ``n_chasers`` chasers, warm-started from the last plans.
+    """Base of the back ends with states for up to ``n_chasers`` chasers, warm-started from the last
+    plans. ``PLUGIN``: CasADi's name of the solver.
 
     The constructor builds a program for every number of chasers, so that a change of the number
     delays no tick. ``max_iterations`` bounds a solve, MAX_ITERATIONS if None. Raises ValueError for
@@ -92,7 +94,9 @@ class MultipleShootingSolver(CoupledSolver, ABC):
     PLUGIN: ClassVar[str]
     SOLVED: ClassVar[tuple[str, ...]] = ()
     LIMITED: ClassVar[tuple[str, ...]] = ()
-    """The solver's return codes for a usable solution, and for the iteration limit."""
+    """Return codes of the solver for a usable solution (SOLVED) and for the iteration limit
+    (LIMITED).
+    """
 
     def __init__(
         self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
@@ -123,9 +127,12 @@ class MultipleShootingSolver(CoupledSolver, ABC):
         task = frame.begin(problem, shift_s, ids)
         u = task.start.copy()
         n, d = len(u), frame.params.stages
+
         nlp, program = self._programs[n]
         x, limits = frame.rolled(task, u), task.problem.input_max
         floor = row_floor(nlp, frame.params, task.problem)
+
+        # Start and bounds of the variables and the constraints, in the order of `Nlp`.
         start, low, high, bottom, top = [], [], [], [], []
         input_columns = []
         for k in range(d + 1):
@@ -139,6 +146,7 @@ class MultipleShootingSolver(CoupledSolver, ABC):
             defects = np.zeros((13 * n if k < d else 0) + (13 * n if k == 0 else 0))
             bottom += [defects, floor[k - 1] if k > 0 else slack]
             top += [defects, slack + np.inf]
+
         result = program(
             x0=np.concatenate(start),
             p=pack(frame.params, task.problem),
@@ -147,17 +155,20 @@ class MultipleShootingSolver(CoupledSolver, ABC):
             lbg=np.concatenate(bottom),
             ubg=np.concatenate(top),
         )
+
         stats = program.stats()
         flat = np.array(result["x"]).ravel()
         solution = np.stack(
             [flat[at : at + 6 * n].reshape(n, 6) for at in input_columns[:d]], axis=1
         )
+
         code = str(stats.get("return_status", ""))
         solved = bool(stats["success"]) or code in self.SOLVED
         iterations = int(stats.get("iter_count", 0))
         late = not solved and (
             code in self.LIMITED or stats.get("unified_return_status") == "SOLVER_RET_LIMITED"
         )
+
         usable = (solved or late) and bool(np.isfinite(solution).all())
         if usable:
             u = np.clip(solution, -limits[:, None, :], limits[:, None, :])

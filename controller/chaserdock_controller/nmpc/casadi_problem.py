@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The problem in CasADi, the sum of the same terms as for `rti`: for `ipopt`, for `open`, and for
-the tests, which compare with C.
+"""The problem in CasADi, as the sum of the terms of `rti`. Used by `ipopt`, by `open`, and by tests
+that compare with C.
 
 Terms that only `rti` keeps are left out. The distances (4b to 4d of the paper) apply at stages
-1..D, as stage 0 cannot be changed.
+1..D, since stage 0 cannot be changed.
 """
 
 from __future__ import annotations
@@ -23,15 +23,20 @@ from .types import Array, NmpcInput
 
 @dataclass(frozen=True)
 class Nlp:
-    """The nonlinear program of ``n`` chasers over ``stages``, and its layout stage by stage.
+    """Nonlinear program of ``n`` chasers over ``stages``, and its layout.
 
-    ``problem``: CasADi dictionary x, p, f, g. Multiple shooting: x = for k = 0..D: states of all
-    chasers (13 each), inputs of all (6 each; not at D), slacks of the stage's constraints (not at
-    0). g = for k = 0..D: the defects to stage k + 1 (not at D), the margins of the stage with
-    slack; at 0 instead x - x_0. Single shooting: x is the inputs, stage by stage, chaser by chaser,
-    and g the margins without slack. p: see `pack`. ``rows``: margins a stage: of each chaser those
-    of its constraints, then the pairs. ``stage_sizes``: (states, inputs and slacks, constraints
-    besides the defects) of stages 0..D.
+    ``problem``: CasADi dictionary x, p, f, g; parameters p as in `pack`.
+
+    Multiple shooting, for k = 0..D:
+        x: states of all chasers (13 each), inputs of all (6 each; not at D), slacks of the stage's
+            constraints (not at 0).
+        g: defects to stage k + 1 (not at D), margins of the stage with slack; at 0 instead x - x_0.
+    Single shooting:
+        x: inputs, stage by stage, chaser by chaser.
+        g: margins without slack.
+
+    ``rows``: margins per stage; those of each chaser's constraints, then those of the pairs.
+    ``stage_sizes``: (states, inputs and slacks, constraints besides the defects) of stages 0..D.
     """
 
     n: int
@@ -68,8 +73,9 @@ def stage_weights(params: NmpcParameters) -> Array:
 
 
 def _margins(n: int, params: NmpcParameters) -> ca.Function:
-    """Return the margins of a stage: states (13, n), references (7, n), target (3), the data of
-    all chasers' constraints (W, n), and of the pairs -> (rows)."""
+    """Return the margins of a stage as a function of states (13, n), references (7, n), target (3),
+    and the data of the chasers' constraints (W, n) and of the pairs.
+    """
     terms, pair_terms = params.of_kind(ChaserConstraint), params.of_kind(PairConstraint)
     x, references, target = ca.SX.sym("x", 13, n), ca.SX.sym("reference", 7, n), ca.SX.sym("t", 3)
     data = ca.SX.sym("data", sum(t.DATA for t in terms), n)
@@ -87,9 +93,11 @@ def _margins(n: int, params: NmpcParameters) -> ca.Function:
 
 
 def pack(params: NmpcParameters, problem: NmpcInput) -> Array:
-    """Return the parameters p of `Nlp` for a checked problem: per chaser x_0 (13), references
-    (7 (D+1)), u_ref (6 D), data of its constraints (W (D+1)); then target positions (3 (D+1)), data
-    of the pairs (upper triangle, row by row), L1 weight of the slacks (1).
+    """Return the parameters p of `Nlp` for a checked problem.
+
+    Per chaser: x_0 (13), references (7 (D+1)), u_ref (6 D), data of its constraints (W (D+1)). Then
+    target positions (3 (D+1)), data of the pairs (upper triangle, row by row), L1 weight of the
+    slacks (1).
     """
     data = np.concatenate([t.data(problem) for t in params.of_kind(ChaserConstraint)], axis=-1)
     parts: list[Any] = []
@@ -105,7 +113,7 @@ def pack(params: NmpcParameters, problem: NmpcInput) -> Array:
 
 
 NO_CONSTRAINT_M = -1e4
-"""Lower bound, m, of a margin that does not apply: no chaser comes so far."""
+"""Lower bound, m, of a margin that does not apply: chasers never come so close to it."""
 
 
 def row_floor(nlp: Nlp, params: NmpcParameters, problem: NmpcInput) -> Array:
@@ -119,8 +127,8 @@ def row_floor(nlp: Nlp, params: NmpcParameters, problem: NmpcInput) -> Array:
 
 
 def _stage_sizes(n: int, k: int, stages: int, rows: int, multiple: bool) -> tuple[int, int, int]:
-    """Return the numbers of states, inputs with slacks, and constraints besides the defects of
-    stage ``k``.
+    """Return the numbers of states, of inputs with slacks, and of constraints besides the defects
+    at stage ``k``.
     """
     inputs = 6 * n if k < stages else 0
     if not multiple:
@@ -162,19 +170,22 @@ def build_nlp(
         state = x
         variables += state if multiple else []
         inputs = [symbol(f"u_{i}_{k}", 6) for i in range(n)] if k < d else [ca.DM.zeros(6)] * n
+
         for i in range(n):
             aim = u_ref[i][:, k] if k < d else ca.DM.zeros(6)
             at = (state[i], references[i][:, k], targets[:, k], inputs[i], aim)
             cost += cost_of(*at, ca.DM(weights[k]))
+
         if k < d:
             variables += inputs
             x = [step(a, u) for a, u in zip(state, inputs, strict=True)]
             if multiple:
                 propagated, x = x, [symbol(f"x_{i}_{k + 1}", 13) for i in range(n)]
-                # The next state first, with positive sign, as structured solvers require.
+                # The next state comes first with positive sign, as structured solvers require.
                 constraints += [b - a for a, b in zip(propagated, x, strict=True)]
                 if k == 0:
                     constraints += [a - b for a, b in zip(state, x0, strict=True)]
+
         if k > 0:
             margin = margins_of(
                 ca.horzcat(*state),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array interface of the compiled NMPC kernels (`native`), with the same names.
+"""Array interface of the compiled NMPC kernels (`native`); names are the same.
 
-Arrays are C-contiguous float64 (int64 where stated) of the given shapes; nothing is checked here.
+Arrays are C-contiguous float64 (int64 where stated) of the given shapes. Nothing is checked here.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from .native import LIBRARY, function
 LIMIT, BROKEN = 2, 3
 """Return codes of a chaser's QP, as in native/ipm.c."""
 MAX_ITERATIONS = 40
-"""Most interior-point iterations of a chaser in a solve. Closed loops take 29 at most; one that
-needs more makes none: the best point is flown, and the next tick continues from it.
+"""Iteration limit of the interior point for one chaser. Closed loops take at most 29. A chaser at
+the limit flies the best point, and the next tick continues from there.
 """
 
 
@@ -115,7 +115,8 @@ class _Tick(Structure):
 
 def tick_workspace(n: int, d: int, extra: int) -> Array:
     """Allocate working memory of `solve_tick` for up to ``n`` chasers, ``d`` stages and ``extra``
-    cuboids and coasts; for one thread at a time."""
+    cuboids and coasts. One thread at a time may use it.
+    """
     return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d), c_int64(extra)))
 
 
@@ -130,12 +131,12 @@ def solve_tick(
     budget: int,
     workspace: Array,
 ) -> tuple[IntArray, IntArray]:
-    """Run one real-time iteration for every chaser; ``inputs`` (N, D, 6) hold the start and receive
+    """Run one real-time iteration for every chaser. ``inputs`` (N, D, 6): initial plan, replaced by
     the solution.
 
-    ``problem`` as `native_problem` returns it. states (N, 13). reach_m_per_N (D+1,): displacement
-    of a chaser by each stage for 1 N on each axis. w1 (N,), w2: slack weights. ``budget``: total
-    iterations. ``workspace`` from `tick_workspace`. Returns code and iterations, each (N,); the
+    ``problem``: from `native_problem`. states (N, 13). reach_m_per_N (D+1,): displacement of a
+    chaser by each stage per 1 N on each axis. w1 (N,), w2: slack weights. ``budget``: total
+    iterations. ``workspace``: from `tick_workspace`. Returns codes and iterations, each (N,). The
     inputs of a chaser with code BROKEN are unchanged.
     """
     n = len(inputs)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Obstacle rows of lost chasers in the NMPC problem. Pure functions."""
+"""Adds lost chasers to the NMPC problem as obstacles. Pure functions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .types import NmpcInput
 
 
 def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
-    """Return positions (K, 3), WRF, extrapolated from a last odometry to ``times_s`` (K,) after
+    """Return positions (K, 3), WRF, extrapolated from the last odometry to ``times_s`` (K,) after
     ``from_ns``.
     """
     ahead = extrapolate(last, last.tick, from_ns)
@@ -27,10 +27,10 @@ def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
 def with_lost_chasers(
     problem: NmpcInput, params: NmpcParameters, lost: Sequence[Odometry], from_ns: int
 ) -> NmpcInput:
-    """Return the problem with a row for each lost chaser after the others: it coasts, and only the
-    others avoid it.
+    """Return the problem with a row appended for each lost chaser, which coasts and is avoided by
+    the others.
 
-    ``from_ns``: the time of stage 0. The margin is that of the end of the horizon.
+    ``from_ns``: time of stage 0. The margin is that at the end of the horizon.
     """
     if not lost:
         return problem

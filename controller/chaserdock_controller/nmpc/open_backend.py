@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Back end `open`: OpEn (Optimization Engine), the paper's own solver, through opengen.
+"""Back end `open`: OpEn (Optimization Engine), the paper's solver, through opengen.
 
 Sopasakis, Fresk and Patrinos, "OpEn: Code generation for embedded nonconvex optimization", IFAC
-2020: PANOC over the box of inputs, single shooting. A quadratic penalty of fixed weight in the cost
-enforces the distances: with OpEn's own constraints (`with_penalty_constraints`,
-`with_aug_lagrangian_constraints`) opengen differentiates every distance separately and writes tens
-of megabytes of C for four chasers, too much to compile. opengen writes Rust code for each number of
-chasers; cargo compiles it, which takes a minute once. The library is cached under a digest of the
-problem in ``$XDG_CACHE_HOME/chaserdock/open`` (``~/.cache``). Limited by iterations, never by time.
+2020: PANOC over the box of inputs, single shooting.
+
+A quadratic penalty of fixed weight in the cost enforces the distances. OpEn's own constraints
+(`with_penalty_constraints`, `with_aug_lagrangian_constraints`) are not used: opengen differentiates
+every distance separately and writes tens of megabytes of C for four chasers, too much to compile.
+
+opengen writes Rust code for each number of chasers; cargo compiles it, which takes a minute once.
+The library is cached under a digest of the problem in ``$XDG_CACHE_HOME/chaserdock/open``
+(``~/.cache``). Solves are limited by iterations, never by time.
 """
 
 from __future__ import annotations
@@ -32,15 +35,17 @@ from .problem import NmpcParameters
 from .types import Array
 
 MAX_INNER = 500
-"""Most iterations of PANOC in a solve. Chosen; half and twice were not tried, as OpEn takes minutes
-to compile.
+"""Iteration limit of PANOC in a solve. Larger: slower solves; smaller: more plans end before they
+converge. Half and twice were not tried, as OpEn takes minutes to compile.
 """
 TOLERANCE = 1e-3
-"""Norm of the fixed-point residual at which PANOC stops, for inputs scaled by their limits. Chosen
-likewise.
+"""Norm of the fixed-point residual at which PANOC stops, for inputs scaled by their limits. Larger:
+faster, less exact plans; smaller: more iterations. Half and twice were not tried.
 """
 PENALTY = 1e6
-"""Twice the cost of one square metre of violation, 1/m^2: 1 mm for a multiplier of 1e3."""
+"""Penalty weight: twice the cost of one square metre of violation, 1/m^2. A multiplier of 1e3
+violates by 1 mm.
+"""
 _NEVER_US = 60_000_000
 """OpEn requires a time limit, us; this one is never reached, since iterations limit a solve."""
 # Suffixes of shared libraries from cargo, and of Python extension modules.
@@ -49,8 +54,8 @@ _SUFFIX = {"win32": ".pyd"}
 
 
 def missing_part() -> str | None:
-    """Return what this machine lacks to compile the solver, as an error message; None if it is
-    complete.
+    """Return, as an error message, what this machine lacks to compile the solver; None if
+    nothing.
     """
     if importlib.util.find_spec("opengen") is None:
         return "solver 'open' needs the package opengen: pip install 'chaserdock[open]'"
@@ -109,8 +114,8 @@ def _load_solver(nlp: Nlp, inner: int) -> Any:
     """Return the compiled solver of a problem, from the cache or newly built."""
     import opengen as og  # pyright: ignore[reportMissingImports] (an extra)
 
-    # Inputs are scaled by their limits, so that the box is well scaled. Lower bounds of the
-    # distances are parameters.
+    # Inputs scaled by their limits give a well scaled box. Lower bounds of the distances are
+    # parameters.
     inputs, distances = 6 * nlp.n * nlp.stages, nlp.stages * nlp.rows
     w, p = ca.MX.sym("w", inputs), ca.MX.sym("p", nlp.problem["p"].numel())
     limits, floor = ca.MX.sym("limits", 6 * nlp.n), ca.MX.sym("floor", distances)
@@ -154,18 +159,21 @@ def _build(
         .with_max_outer_iterations(1)
         .with_max_duration_micros(_NEVER_US)
     )
+
     build = (
         og.config.BuildConfiguration()
         .with_build_directory(str(cache))
         .with_build_mode("release")
         .with_build_python_bindings()
     )
+
     meta = og.config.OptimizerMeta().with_optimizer_name(name)
     cache.mkdir(parents=True, exist_ok=True)
     # opengen writes temporary files into the current folder.
     with contextlib.chdir(cache):
         builder = og.builder.OpEnOptimizerBuilder(problem, meta, build, solver)
         builder.with_verbosity_level(logging.WARNING).with_generate_not_build_flag(True).build()
+
     # opengen would compile the solver twice and its dependencies again for each problem.
     target = cache / "target"
     completed = subprocess.run(
@@ -177,6 +185,7 @@ def _build(
     )
     if completed.returncode:
         raise RuntimeError(f"cargo failed to compile the OpEn solver:\n{completed.stderr}")
+
     built = next(
         path for path in (target / "release").glob(f"*{name}.*") if path.suffix in _LIBRARY_SUFFIXES
     )

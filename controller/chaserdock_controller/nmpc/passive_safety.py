@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor of passive safety: whether the coast from any state of a plan stays clear of the
+"""Monitor of passive safety: checks whether the coast from every state of a plan stays clear of the
 target.
 """
 
@@ -19,23 +19,23 @@ from chaserdock_controller.interfaces import LogEntry, PlanCertificate, TargetEs
 from .types import CoastSafety
 
 ORBITS = 2.0
-"""Length of a coast in an orbit, in its periods, unless the scenario states one. Chosen: the drift
-of a coast repeats with the orbit.
+"""Length of a coast in an orbit, in orbital periods, unless the scenario states one. The drift of a
+coast repeats with the orbit, so that a second period shows whether it returns.
 """
 FREE_SPACE_S = 600.0
-"""Length of a coast without an orbit, s, unless the scenario states one. Chosen: 18 m at the 3 cm/s
-of an approach.
+"""Length of a coast without an orbit, s, unless the scenario states one: 18 m at the 3 cm/s of an
+approach. Larger: stricter for slow drifts; smaller: later collisions are missed.
 """
 PERSISTENT_S = 1.0
-"""Time for which plans must be safe, or not, to count as such in the log and for an abort."""
+"""Time, s, for which plans must be safe, or unsafe, before the log or an abort takes note."""
 CONVERGED_S, ARMED_AFTER_S = 10.0, 60.0
-"""A chaser whose plans were safe for the first, or known for the second of these times counts: the
-filter has converged.
+"""A chaser is monitored for aborts once its plans were safe for the first of these times, or known
+for the second: the filter has then converged.
 """
 
 
 def coast_duration_s(scenario: FlightScenario) -> float:
-    """Return the length of the coast that is to be safe."""
+    """Return the length (s) of the coast that has to be safe."""
     orbit = scenario.orbit
     default_s = FREE_SPACE_S if orbit is None else ORBITS * orbit.elements.period_s
     return scenario.limits.passive_safety_s or default_s
@@ -45,9 +45,9 @@ def coast_duration_s(scenario: FlightScenario) -> float:
 class ChaserSafety:
     """Passive safety of the plans of one chaser.
 
-    ``certificate``: of its newest plan. ``reported``: whether the log says that its plans are safe.
-    ``since``: whether they are, and since when; ``first_ns``: of its first plan. ``armed``: it
-    counts, see ``PassiveSafetyMonitor.unsafe``.
+    ``certificate``: of its newest plan. ``reported``: the log states that its plans are safe.
+    ``since``: whether they are safe, and since when. ``first_ns``: time of its first plan.
+    ``armed``: it may have to abort, see ``PassiveSafetyMonitor.unsafe``.
     """
 
     certificate: PlanCertificate | None = None
@@ -57,15 +57,15 @@ class ChaserSafety:
     armed: bool = False
 
     def forget(self) -> None:
-        """Start again, but for whether the chaser counts."""
+        """Start again, but keep whether the chaser is armed."""
         self.certificate = self.reported = self.first_ns = self.since = None
 
     def lasts(self, time_ns: int, duration_s: float = PERSISTENT_S) -> bool:
-        """Return whether the plans have been safe, or not, for a time."""
+        """Return whether the plans have been safe, or unsafe, without a change for a time."""
         return self.since is not None and time_ns - self.since[1] >= duration_s * 1e9
 
     def follow(self, safe: bool, time_ns: int) -> None:
-        """Take whether the plan of a tick is safe."""
+        """Record whether the plan of a tick is safe."""
         self.first_ns = time_ns if self.first_ns is None else self.first_ns
         if self.since is None or self.since[0] != safe:
             self.since = safe, time_ns
@@ -74,8 +74,8 @@ class ChaserSafety:
 
 
 class PassiveSafetyMonitor:
-    """Certifies the plans of a tick. ``chasers``: what it knows of each. See ``guidance.escape``
-    for what follows.
+    """Certifies the plans of a tick. ``chasers``: state of each. ``guidance.escape`` reacts to
+    unsafe plans.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -95,11 +95,11 @@ class PassiveSafetyMonitor:
         time_ns: int = 0,
         known: Mapping[int, CoastCertificate] = MappingProxyType({}),
     ) -> tuple[LogEntry, ...]:
-        """Certify the plans ``states`` (N, D+1, 13) of these chasers; return what has changed since
-        the last tick.
+        """Certify the plans ``states`` (N, D+1, 13) of these chasers. Returns log entries for
+        changes since the last tick.
 
         A plan is safe if its margin is at least ``limits.estimate_margin_sigmas``. Chasers that
-        hold the target are left out. ``known``: certificates that the solver has found, by row.
+        hold the target are left out. ``known``: certificates from the solver, by row.
         """
         target, events = estimation.at_effect, []
         if target is None:
@@ -129,9 +129,9 @@ class PassiveSafetyMonitor:
         self, chasers: Sequence[int], enforced: Set[int], estimation: TargetEstimation
     ) -> CoastSafety | None:
         """Return the passive safety that the plans of ``chasers``, the rows of a problem, have to
-        keep; None for none.
+        keep; None without any.
 
-        It applies to those of ``enforced`` that count (see ``unsafe``).
+        It applies to armed chasers among ``enforced`` (see ``unsafe``).
         """
         target, kept = estimation.at_effect, {}
         for row, i in enumerate(chasers):
@@ -143,11 +143,11 @@ class PassiveSafetyMonitor:
         return CoastSafety(self._coast, self._keep_out_m, self._sigmas, target.velocity_m_s, kept)
 
     def unsafe(self, chaser: int, time_ns: int) -> str:
-        """Return why a chaser has to abort at ``time_ns``, or an empty string: its plans are not
-        safe for `PERSISTENT_S`.
+        """Return why a chaser has to abort at ``time_ns``: its plans were unsafe for
+        `PERSISTENT_S`. Empty if it need not.
 
-        A chaser counts once its plans were safe for `CONVERGED_S`, or `ARMED_AFTER_S` after its
-        first plan: until the filter has converged, plans are safe at times only.
+        A chaser is armed once its plans were safe for `CONVERGED_S`, or `ARMED_AFTER_S` after its
+        first plan. Before that the filter has not converged and plans are safe only at times.
         """
         safety = self.chasers[chaser]
         if safety.certificate is None or safety.since is None or safety.since[0]:

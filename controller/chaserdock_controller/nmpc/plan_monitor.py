@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last usable plan of a chaser, and for how long planning has failed for it."""
+"""Tracks the last usable plan of a chaser, and for how long its planning has failed."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from chaserdock_controller.interfaces import ChaserPlan, PlanningFailure
 from .types import BUDGET, FAILED, INFEASIBLE_RELAXED
 
 FAILED_S = 1.0
-"""Time (s) without a usable plan after which a chaser retreats. Until then it flies its last plan,
-which is longer (3 s by default) but was made for an approach that must not go on without feedback.
+"""Time, s, without a usable plan after which a chaser retreats. Until then it flies its last plan.
+That is longer (3 s by default), but an approach must not continue without feedback.
 """
 DEGRADED_S = 5.0
-"""Time (s) with failed solves, or with plans that violate distances or are cut short, after which a
+"""Time, s, of failed solves, or of plans that violate distances or are cut short, after which a
 chaser retreats. Such plans lead out of a keep-out zone at a few cm/s, which takes seconds. The
-clock runs back while plans are sound."""
+clock runs back while plans are sound.
+"""
 
 
 class PlanMonitor:
-    """Follows the results of the solver for one chaser."""
+    """Tracks the solver's results for one chaser."""
 
     def __init__(self) -> None:
         self._last: ChaserPlan | None = None
@@ -28,12 +29,12 @@ class PlanMonitor:
         self._time_ns = 0
 
     def forget(self) -> None:
-        """Start again: the chaser is not planned for."""
+        """Reset, because the chaser is not planned for."""
         self._last = self._failed_since_ns = self._degraded_since_ns = None
         self._degraded = False
 
     def update(self, status: str, plan: ChaserPlan | None, time_ns: int) -> None:
-        """Record the result of the tick at ``time_ns``; ``plan``: None where the solver failed."""
+        """Record the result of the tick at ``time_ns``. ``plan``: None if the solver failed."""
         if plan is None:
             first_ns = self._failed_since_ns
             self._failed_since_ns = time_ns if first_ns is None else first_ns
@@ -43,14 +44,15 @@ class PlanMonitor:
         self._time_ns = time_ns
 
     def flyable(self, time_ns: int) -> ChaserPlan | None:
-        """Return what the chaser may fly at ``time_ns``: the newest plan, or an older one within
-        `FAILED_S`.
+        """Return the plan that the chaser may fly at ``time_ns``: the last usable one. None once
+        there was no usable one for `FAILED_S`.
         """
         return None if self._has_failed(time_ns) else self._last
 
     def failure(self, time_ns: int) -> PlanningFailure | None:
         """Return why the chaser has to retreat at ``time_ns``: no usable plan for `FAILED_S`, or
-        degraded ones for `DEGRADED_S`, until sound ones for as long.
+        degraded ones for `DEGRADED_S`. None otherwise; degraded planning ends after sound plans for
+        as long.
         """
         since_ns = self._degraded_since_ns
         if since_ns is None:
@@ -66,8 +68,8 @@ class PlanMonitor:
         return since_ns is not None and time_ns - since_ns >= FAILED_S * 1e9
 
     def _follow_degraded(self, time_ns: int, degraded: bool) -> None:
-        """Let the clock of degraded plans run, or back to zero, where a failure ends; it shows
-        `DEGRADED_S` at most.
+        """Run the clock of degraded plans up, or down to zero, where a failure ends. It is limited
+        to `DEGRADED_S`.
         """
         begun_ns, limit_ns = self._degraded_since_ns, round(DEGRADED_S * 1e9)
         since_ns = time_ns if begun_ns is None else begun_ns

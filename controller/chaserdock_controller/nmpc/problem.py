@@ -34,14 +34,14 @@ from .terms import TERMS
 from .types import INTEGRATORS, NmpcInput
 
 QUATERNION_NORM_TOLERANCE = 0.1
-"""Largest deviation of a quaternion's length from 1: measured quaternions are normalized, so that a
+"""Largest deviation of a quaternion's length from 1. Measured quaternions are normalized, so that a
 larger one is an error, not rounding.
 """
 
 
 RK_NODES = {"euler": (0.0,), "rk4": (0.0, 0.5, 0.5, 1.0)}
 RK_WEIGHTS = {"euler": (1.0,), "rk4": (1.0 / 6.0, 2.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0)}
-"""Explicit Runge-Kutta tableaus with one subdiagonal: nodes and weights of each integrator."""
+"""Weights of explicit Runge-Kutta methods by name; their tableaus have one subdiagonal."""
 
 T = TypeVar("T", bound=Term)
 
@@ -133,7 +133,7 @@ def settings_of(terms: Sequence[Term]) -> dict[str, float]:
 
 
 def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
-    """Return body and discretization, with step ``params.dt_s`` by default."""
+    """Return body and discretization for C. The step is ``params.dt_s`` by default."""
     inertia = np.array(params.inertia_kg_m2, dtype=float)
     nodes, weights = RK_NODES[params.integrator], RK_WEIGHTS[params.integrator]
     return Model(
@@ -146,7 +146,7 @@ def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
 
 @LIBRARY.structure("Problem")
 class NativeProblem(Structure):
-    """`Problem` of native/problem.c: what all terms use, and each term's members."""
+    """`Problem` of native/problem.c: members that all terms use, then those of each term."""
 
     n_boxes: int
     n_coasts: int
@@ -162,7 +162,7 @@ class NativeProblem(Structure):
 
 
 def native_problem(problem: NmpcInput, params: NmpcParameters) -> NativeProblem:
-    """Return a checked problem for C; it holds addresses of arrays of ``problem`` and
+    """Return a checked problem for C. It holds addresses of arrays of ``problem`` and
     ``params``.
     """
     values: list[Any] = [len(problem.states), params.stages, params.dt_s]
@@ -176,8 +176,8 @@ def native_problem(problem: NmpcInput, params: NmpcParameters) -> NativeProblem:
 
 
 def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
-    """Return a copy of ``problem`` with contiguous arrays, unit quaternions and all optional values
-    expanded by their terms.
+    """Check a problem. Returns a copy with contiguous arrays, unit quaternions and all optional
+    values expanded by their terms.
 
     Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off
     unit length, a negative distance or limit, an asymmetric distance matrix, an invalid corridor,
@@ -212,9 +212,9 @@ def with_obstacles(
     references: Array,
     margins_m: Sequence[float],
 ) -> NmpcInput:
-    """Return a problem that is not checked yet with a row after the others for each lost chaser:
-    its state (13,), and where it is expected at the stages (D+1, 7).
+    """Append a row for each lost chaser to a problem that is not checked yet.
 
+    ``states``: (13,) of each. ``references``: where it is expected at the stages (D+1, 7).
     ``margins_m``: added to the others' distances from it, as each term states.
     """
     u_ref = problem.u_ref

@@ -23,20 +23,19 @@ from .types import BUDGET, Array, IntArray, NmpcInput, NmpcPlan
 from .warm_start import Frame, status_of
 
 REACH_SAFETY = 1.5
-"""Safety factor of the bound by which rows that no admissible input can reach are omitted: the
-bound holds for the nonlinear model, rows are linear. 0.75 and 3 keep the same distances.
+"""Safety factor of the bound by which rows out of reach of admissible inputs are omitted. The bound
+holds for the nonlinear model, rows are linear. 0.75 and 3 keep the same distances.
 """
 
 
 class RtiSolver:
-    """Real-time iteration for up to ``n_chasers`` chasers; keeps the last plan of each as its warm
-    start.
+    """Real-time iteration for up to ``n_chasers`` chasers, warm-started from the last plan of each.
 
-    ``max_iterations`` bounds the interior point's iterations of all chasers together in one solve;
-    each chaser may use an even share of the remaining iterations, at most `MAX_ITERATIONS`. It may
-    be changed between solves. A chaser that is stopped by this bound has the status "budget".
-    Solvers share no memory: each may run in its own thread. Raises ValueError for n_chasers < 1 or
-    a negative budget.
+    ``max_iterations`` bounds the interior point's iterations of all chasers together in one solve.
+    Each chaser may use an even share of the remaining ones, at most `MAX_ITERATIONS`. The bound may
+    change between solves; a chaser stopped by it has the status "budget". Solvers share no memory,
+    so that each may run in its own thread. Raises ValueError for n_chasers < 1 or a negative
+    budget.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class RtiSolver:
         self.max_iterations = max_iterations
         self._extra = 0
         self._workspace = tick_workspace(n_chasers, params.stages, self._extra)
-        # Largest displacement of a chaser by stage k for a change of the inputs by 1 N.
+        # Largest displacement of a chaser by stage k per 1 N of change of its inputs.
         times = params.dt_s * np.arange(params.stages + 1)
         self._horizon_s = params.stages * params.dt_s
         self._reach = REACH_SAFETY * np.sqrt(3.0) / params.mass_kg * times**2
@@ -60,10 +59,10 @@ class RtiSolver:
     def solve(
         self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None
     ) -> NmpcPlan:
-        """Solve one tick. ``shift_s``: time since the previous call, s; ``ids``: chasers of the
-        rows, 0..N-1 if None.
+        """Solve one tick.
 
-        The warm start follows the id: a chaser whose id was not in the previous call starts from
+        ``shift_s``: time since the previous call, s. ``ids``: chasers of the rows, 0..N-1 if None.
+        The warm start follows the id; a chaser whose id was not in the previous call starts from
         its u_ref. Raises ValueError as `check_input`, `check_ids` and `check_shift`.
         """
         frame = self._frame
@@ -97,8 +96,8 @@ class RtiSolver:
     def _iterate(
         self, problem: NmpcInput, native: NativeProblem, start: Array, budget: int
     ) -> tuple[Array, IntArray, IntArray]:
-        """Return inputs (N, D, 6), codes and iterations (N,) of one iteration from ``start`` (N, D,
-        6).
+        """Run one iteration from ``start`` (N, D, 6). Returns inputs (N, D, 6), codes and
+        iterations (N,).
         """
         frame, u = self._frame, start.copy()
         extra = native.n_boxes + native.n_coasts

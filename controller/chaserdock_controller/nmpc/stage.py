@@ -39,17 +39,19 @@ from .types import FAILED, NmpcInput, NmpcPlan
 from .warm_start import check_plan
 
 _ATTACHED_FACTOR = 1.2
-"""Input limit of an attached chaser, in terms of the largest input that following the target needs:
-room for feedback. 0.6 and 2.4 change no bit of `docking-contact`.
+"""Input limit of an attached chaser, relative to the largest input that follows the target; the
+rest is for feedback. 0.6 and 2.4 change no bit of `docking-contact`.
 """
 _ATTACHED_MARGIN = 1e-3
-"""Added to that limit, N and N m: the solver needs some where the target does not move."""
+"""Added to that limit, N and N m, because the solver needs a positive one where the target does not
+move.
+"""
 _CANCELLED_SHARE = 0.5
-"""Largest share of an input limit that cancels a disturbance."""
+"""Largest share of an input limit that may cancel a disturbance."""
 
 
 class PlanHistory(PlanningHistory):
-    """Failures and passive safety of the plans so far, for the guidance of the next tick."""
+    """Failures and passive safety of earlier plans, for the guidance of the next tick."""
 
     def __init__(
         self, monitors: Sequence[PlanMonitor], passive_safety: PassiveSafetyMonitor | None
@@ -57,18 +59,19 @@ class PlanHistory(PlanningHistory):
         self._monitors, self._passive_safety = monitors, passive_safety
 
     def failure(self, chaser: int, time_ns: int) -> PlanningFailure | None:
-        """Return why a chaser has to retreat at ``time_ns`` because planning has failed."""
+        """Return why a chaser has to retreat at ``time_ns``, or None if planning has not failed."""
         return self._monitors[chaser].failure(time_ns)
 
     def unsafe(self, chaser: int, time_ns: int) -> str:
-        """Return why the plans of a chaser are not passively safe at ``time_ns``, or an empty
-        string; whether it aborts is guidance's matter.
+        """Return why a chaser's plans are not passively safe at ``time_ns``; empty if they are.
+        Guidance decides whether it aborts.
         """
         return "" if self._passive_safety is None else self._passive_safety.unsafe(chaser, time_ns)
 
 
 class PlanningStage:
-    """The solver with its warm starts, in real time its budget, and the plans of the last ticks.
+    """Runs the solver with its warm starts and, in real time, its budget; keeps the plans of the
+    last ticks.
 
     Raises PluginError for an installed solver that cannot be held to a budget when there is one.
     """
@@ -104,35 +107,41 @@ class PlanningStage:
     def run(
         self, observation: Observation, estimation: TargetEstimation, guidance: GuidanceResult
     ) -> PlanResult:
-        """Plan for the chasers of the guidance horizon, or keep their last plans for a while; lost
-        chasers are obstacles.
+        """Plan for the chasers of the guidance horizon; where that fails, keep their last plans for
+        a while. Lost chasers are obstacles.
 
-        The problem is solved for the input plus the estimated disturbance, which is then
-        subtracted: the input cost keeps its reference, and the disturbance causes no offset.
+        The problem is solved for the input plus the estimated disturbance, which is subtracted
+        afterwards. The input cost thus keeps its reference, and the disturbance causes no offset.
         """
         horizon = guidance.horizon
         if horizon is None:
             for monitor in self.monitors:
                 monitor.forget()
             return self._result(observation.time_ns, None, (), 0.0, ())
+
         own = [_own(estimation.chasers[i]) for i in horizon.chasers]
         limits = np.array([observation.chasers[i].input_limits for i in horizon.chasers])
         disturbances = np.array(
             [_bounded(m.disturbance, row) for m, row in zip(own, limits, strict=True)]
         )
+
+        # The solver sees the input plus the disturbance: leave the actuators room to cancel it.
         states = np.array([m.at_effect for m in own])
         problem = self.problem(horizon, states, limits - np.abs(disturbances))
         lost = {c.chaser: c.lost for c in observation.chasers if c.lost is not None}
         problem = with_lost_chasers(
             problem, self._parameters, tuple(lost.values()), observation.effective_ns
         )
+
         enforced = {d.chaser for d in guidance.directives if d.abort_margin is not None}
         if self._passive_safety is not None and enforced:
             safety = self._passive_safety.restriction(horizon.chasers, enforced, estimation)
             problem = replace(problem, coast_safety=safety)
+
         since_ns = 0 if self._last_solve_ns is None else observation.time_ns - self._last_solve_ns
         if self._budget is not None:
             cast(Bounded, self.solver).max_iterations = self._budget.iterations()
+
         plan: NmpcPlan | None = None
         events: tuple[LogEntry, ...] = ()
         start_s = self._now_s()
@@ -144,10 +153,12 @@ class PlanningStage:
             plan = None
             events = (("error", f"solver error: {type(error).__name__}: {error}"),)
         wall_s = self._now_s() - start_s
+
         if self._budget is not None and plan is not None:
             self._budget.note(wall_s, int(plan.iterations.sum()))
         if plan is not None:
             plan = _without(plan, disturbances)
+
         self._follow(horizon.chasers, plan, observation)
         if self._passive_safety is not None and plan is not None:
             events += self._passive_safety.update(
@@ -158,9 +169,7 @@ class PlanningStage:
     def _follow(
         self, chasers: Sequence[int], plan: NmpcPlan | None, observation: Observation
     ) -> None:
-        """Let the monitors of the ``chasers`` take their rows of a plan; those of the others forget
-        what was.
-        """
+        """Pass the rows of a plan to the monitors of ``chasers``, and reset those of all others."""
         rows = {i: row for row, i in enumerate(chasers)}
         for i, monitor in enumerate(self.monitors):
             if i not in rows:
@@ -180,7 +189,9 @@ class PlanningStage:
         wall_s: float,
         events: tuple[LogEntry, ...],
     ) -> PlanResult:
-        """Return what is planned for each chaser; ``chasers``: the first rows of the ``plan``."""
+        """Return the planning results of all chasers. ``chasers``: those of the first rows of
+        ``plan``.
+        """
         solves = {} if plan is None else {i: _solve(plan, row) for row, i in enumerate(chasers)}
         safety = self._passive_safety
         planned = tuple(
@@ -195,8 +206,9 @@ class PlanningStage:
         return PlanResult(planned, wall_s, events)
 
     def problem(self, horizon: HorizonReference, states: Array, input_limits: Array) -> NmpcInput:
-        """Return the problem at the time when the commands take effect, without lost chasers:
-        ``states`` (N, 13) and ``input_limits`` (N, 6) of the chasers in the horizon.
+        """Return the problem at the time when the commands take effect, without lost chasers.
+
+        ``states`` (N, 13), ``input_limits`` (N, 6): of the chasers in the horizon.
         """
         limits = input_limits.copy()
         for row, i in enumerate(horizon.chasers):
@@ -221,8 +233,8 @@ class PlanningStage:
         )
 
     def _between_shapes(self, box_clearance_m: Array | None) -> Array | None:
-        """Return the distances (N, N) of the shapes of chasers: none between two in their corridors
-        or at their ports.
+        """Return the distances (N, N) that the shapes of chasers keep; zero between two that are in
+        their corridors or at their ports.
         """
         if box_clearance_m is None:
             return None
@@ -231,14 +243,12 @@ class PlanningStage:
 
 
 def _bounded(disturbance: Array, limits: Array) -> Array:
-    """Return a disturbance (6,) of which an actuator with these limits can always cancel the whole
-    and keep half its range.
-    """
+    """Limit a disturbance (6,) so that the actuators can cancel it and keep half of their range."""
     return limited(disturbance, _CANCELLED_SHARE * limits)
 
 
 def _own(estimate: ChaserEstimate) -> OwnMotion:
-    """Return the motion of a chaser that is planned for."""
+    """Return the motion of a chaser that is planned for, which is known."""
     assert estimate.own is not None
     return estimate.own
 
@@ -250,8 +260,8 @@ def _solve(plan: NmpcPlan, row: int) -> SolveStatus:
 
 
 def _without(plan: NmpcPlan, disturbances: Array) -> NmpcPlan:
-    """Return the plan with the inputs that the actuators are to give, in its first rows, less the
-    ``disturbances`` (N, 6) that are cancelled.
+    """Return the plan with the actuators' inputs in its first rows: planned ones less the cancelled
+    ``disturbances`` (N, 6).
     """
     if not disturbances.any():
         return plan

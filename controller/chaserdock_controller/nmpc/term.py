@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A term of the problem: one cost or constraint, stated in one file of `terms`.
+"""Base classes of the terms of the problem. A term is one cost or constraint, stated in one file of
+`terms`.
 
-A term is a frozen dataclass. Its fields are its settings: keys of the scenario's sections
-``controller`` and ``limits`` with the same names, which state default and range. Beside them it
-declares what it checks of a problem, the members of C's `Problem` (native/problem.c) that it fills,
-and the same term in CasADi, which `ipopt` solves and the tests compare with C.
+A term is a frozen dataclass. Its fields are its settings, which are keys of the same names in the
+scenario's sections ``controller`` and ``limits`` (default and range there). It also declares its
+checks of a problem, the members of C's `Problem` (native/problem.c) that it fills, and the same
+term in CasADi, which `ipopt` solves and tests compare with C.
 """
 
 from __future__ import annotations
@@ -30,24 +31,25 @@ class Term:
     """Base of all terms."""
 
     MEMBERS: ClassVar[tuple[tuple[str, Any], ...]]
-    """Name and ctypes type of its members of `Problem`, in the order of that structure."""
+    """Names and ctypes types of the term's members of `Problem`, in the order of that structure."""
 
     def check(self, problem: NmpcInput, n: int, d: int) -> Mapping[str, Array]:
-        """Return its fields of ``problem``, for ``n`` chasers and ``d`` stages, expanded as
-        contiguous arrays. Raises ValueError, naming the field.
+        """Check the term's fields of ``problem`` for ``n`` chasers and ``d`` stages. Returns them
+        expanded to contiguous arrays. Raises ValueError, naming the field.
         """
         return {}
 
     def of_lost(self, problem: NmpcInput, margins_m: Sequence[float]) -> Mapping[str, Array | None]:
-        """Return its fields of a problem that is not checked yet with a row more for each lost
-        chaser, an obstacle; ``margins_m``: added to the others' distances from it.
+        """Return the term's fields of an unchecked problem, extended by a row for each lost chaser.
+
+        A lost chaser is an obstacle. ``margins_m``: added to the others' distances from it.
         """
         return {}
 
 
 @dataclass(frozen=True)
 class CostTerm(Term, ABC):
-    """A term of the cost: a weighted sum of squares of each chaser at each stage. Its member of
+    """A term of the cost: a weighted sum of squares for each chaser and stage. Its member of
     `Problem` are the weights.
     """
 
@@ -66,28 +68,30 @@ class CostTerm(Term, ABC):
 
 @dataclass(frozen=True)
 class Constraint(Term, ABC):
-    """A term that restricts states or inputs. One that is not among its subclasses below has no
-    twin in CasADi: only `rti` keeps it.
+    """A term that restricts states or inputs. Unless it derives from a subclass below it has no
+    twin in CasADi, and only `rti` keeps it.
     """
 
     @abstractmethod
     def native(self, problem: NmpcInput) -> Sequence[Any]:
-        """Return the values of `MEMBERS` for a checked problem; addresses by `address_of`."""
+        """Return the values of `MEMBERS` for a checked problem; `address_of` gives addresses of
+        arrays.
+        """
 
 
 @dataclass(frozen=True)
 class ChaserConstraint(Constraint, ABC):
-    """A constraint of each chaser: a margin (m) that is not negative, soft, at stages 1..D."""
+    """A soft constraint of each chaser at stages 1..D: a margin (m) that is not to be negative."""
 
     DATA: ClassVar[int]
-    """Number of values that a problem states of it for each chaser and stage."""
+    """Number of values per chaser and stage that state the constraint."""
 
     def data(self, problem: NmpcInput) -> Array:
-        """Return these values (N, D+1, DATA) of a checked problem."""
+        """Return these values (N, D+1, DATA) from a checked problem."""
         return np.empty((*problem.references.shape[:2], 0))
 
     def applies(self, problem: NmpcInput) -> NDArray[np.bool_]:
-        """Return for which chasers and stages (N, D+1) it applies."""
+        """Return at which chasers and stages (N, D+1) the constraint applies."""
         return np.ones(problem.references.shape[:2], dtype=bool)
 
     @abstractmethod
@@ -97,11 +101,11 @@ class ChaserConstraint(Constraint, ABC):
 
 @dataclass(frozen=True)
 class PairConstraint(Constraint, ABC):
-    """A constraint of each pair of chasers, as `ChaserConstraint`; one value states it."""
+    """A soft constraint of each pair of chasers, as `ChaserConstraint`, stated by one value."""
 
     @abstractmethod
     def data(self, problem: NmpcInput) -> Array:
-        """Return these values of a checked problem, (N, N), symmetric."""
+        """Return these values from a checked problem, (N, N), symmetric."""
 
     @abstractmethod
     def margin(self, one: Any, other: Any, data: Any) -> Any:

@@ -29,8 +29,8 @@ from .types import (
 
 @dataclass(frozen=True)
 class PreparedProblem:
-    """A checked problem, the same for C, the ids of its rows, and the initial inputs (N, D, 6)
-    within the box.
+    """A checked problem, also in the form for C, with the ids of its rows and the initial inputs
+    (N, D, 6) within the box.
     """
 
     problem: NmpcInput
@@ -41,7 +41,8 @@ class PreparedProblem:
 
 @dataclass
 class Frame:
-    """Parameters as arrays, and the last plan of each chaser by id.
+    """Steps of a solve that all back ends share. Keeps the parameters as arrays and the last plan
+    of each chaser by id.
 
     Raises ValueError for n_max < 1 and ImportError if the compiled kernels are not available.
     """
@@ -68,14 +69,16 @@ class Frame:
         return PreparedProblem(checked, native_problem(checked, self.params), names, start)
 
     def rolled(self, task: PreparedProblem, u: Array) -> Array:
-        """Return the states (N, D+1, 13) of inputs ``u`` (N, D, 6) through the nonlinear model."""
+        """Return the states (N, D+1, 13) that inputs ``u`` (N, D, 6) give through the nonlinear
+        model.
+        """
         x = np.empty((len(u), self.params.stages + 1, 13))
         x[:, 0] = task.problem.states
         roll(self.model, x, u)
         return x
 
     def evaluate(self, task: PreparedProblem, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return the cost (eq. 6) (N,) and the deepest violation, m (N,), of a plan."""
+        """Return cost (eq. 6) and deepest violation, m, of a plan, each (N,)."""
         return plan_cost(task.native, x, u), plan_violation(task.native, x)
 
     def finish(
@@ -83,7 +86,7 @@ class Frame:
     ) -> NmpcPlan:
         """Return the plan of inputs ``u`` and keep it as the next warm start.
 
-        ``status``: the back end's status of each row. A row at the iteration limit uses the better
+        ``status``: the back end's status of each row. A row at the iteration limit takes the better
         of its solution and its start, since an unconverged solution may be worse than the warm
         start.
         """
@@ -118,8 +121,8 @@ def status_of(usable: bool, at_limit: bool) -> str:
 
 
 def check_plan(plan: NmpcPlan, n: int, d: int) -> None:
-    """Raise ValueError for a plan of other than ``n`` chasers or ``d`` stages, or with a value that
-    is not finite.
+    """Raise ValueError unless a plan is of ``n`` chasers and ``d`` stages and all its values are
+    finite.
     """
     for name, value, shape in (
         ("inputs", plan.inputs, (n, d, 6)),
@@ -131,8 +134,8 @@ def check_plan(plan: NmpcPlan, n: int, d: int) -> None:
 
 
 def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
-    """Return the chasers' ids, 0..N-1 by default. Raises ValueError for a wrong number or a
-    repetition.
+    """Return the chasers' ids, 0..N-1 by default. Raises ValueError for a wrong number of them or
+    duplicates.
     """
     chosen = tuple(range(n)) if ids is None else tuple(int(i) for i in ids)
     if len(chosen) != n or len(set(chosen)) != n:
@@ -162,8 +165,8 @@ def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
 def warm_start(
     plans: dict[int, Array], names: tuple[int, ...], problem: NmpcInput, shift_s: float, dt_s: float
 ) -> Array:
-    """Return the initial inputs (N, D, 6) within the box: each chaser's shifted plan, or u_ref
-    without a plan.
+    """Return the initial inputs (N, D, 6) within the box: the shifted plan of each chaser, or its
+    u_ref if it has none.
     """
     start = problem.u_ref.copy()
     known = [row for row, name in enumerate(names) if name in plans]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages built from the results of a tick."""
+"""Builds messages from the results of a tick."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from chaserdock_controller.interfaces import (
 
 
 def plan_message(chaser: int, tick: int, step_s: float, plan: ChaserPlan) -> Plan:
-    """Return the plan that one chaser flies from a tick on."""
+    """Build the message of the plan that a chaser flies from a tick on."""
     return Plan(
         tick=tick,
         sim_time_ns=plan.time_ns,
@@ -54,7 +54,7 @@ def plan_message(chaser: int, tick: int, step_s: float, plan: ChaserPlan) -> Pla
 
 
 def target_message(observation: Observation, estimation: TargetEstimation) -> TargetEstimate:
-    """Return the target's estimate."""
+    """Build the message of the target's estimate."""
     target = estimation.target
     return TargetEstimate(
         tick=observation.tick,
@@ -86,7 +86,7 @@ def target_message(observation: Observation, estimation: TargetEstimation) -> Ta
 
 
 def geometry_estimate(shape: EstimatedShape) -> GeometryEstimate:
-    """Return the estimated errors of the geometry in their units."""
+    """Build the message of the estimated errors of the geometry, in their own units."""
     sigmas = np.array([p.sigma for p in shape.parameters])
     return GeometryEstimate(
         names=tuple(p.name for p in shape.parameters),
@@ -101,7 +101,7 @@ def geometry_estimate(shape: EstimatedShape) -> GeometryEstimate:
 def expected_pose(
     target: TargetState, own: Odometry, camera: Camera, time_ns: int, ahead_s: float
 ) -> ExpectedPose:
-    """Return where the target will be in the camera of a chaser, ``ahead_s`` after the estimates of
+    """Return where the target will appear to a chaser's camera, ``ahead_s`` after the estimates of
     ``time_ns``.
     """
     p_own, q_own = _moved(own.position_m, own.velocity_m_s, own.q_wxyz, own.omega_rad_s, ahead_s)
@@ -131,7 +131,7 @@ def _moved(
 
 
 def stack_message(observation: Observation, stack: IdentifiedStack) -> StackEstimate:
-    """Return the identified mass properties."""
+    """Build the message of the identified mass properties."""
     return StackEstimate(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,
@@ -156,7 +156,7 @@ def _mass_estimate(properties: MassProperties) -> MassEstimate:
 def reference_message(
     observation: Observation, directive: Directive, reference: ReferencePose
 ) -> Reference:
-    """Return the reference of one chaser."""
+    """Build the message of a chaser's reference."""
     return Reference(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,
@@ -171,7 +171,7 @@ def reference_message(
 
 
 def solver_message(observation: Observation, solver: str, result: PlanResult) -> SolverStatus:
-    """Return the solver's status; without a plan it lists no chasers."""
+    """Build the message of the solver's status. Without a plan it lists no chasers."""
     solved = [(c.chaser, c.solve) for c in result.chasers if c.solve is not None]
     return SolverStatus(
         tick=observation.tick,
@@ -189,7 +189,7 @@ def solver_message(observation: Observation, solver: str, result: PlanResult) ->
 def safety_message(
     observation: Observation, directive: Directive, certificate: PlanCertificate
 ) -> PassiveSafety:
-    """Return the certificate of a chaser's newest plan."""
+    """Build the message of the certificate of a chaser's newest plan."""
     return PassiveSafety(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,
@@ -205,7 +205,7 @@ def safety_message(
 
 
 def event_message(observation: Observation, level: Level, text: str) -> Event:
-    """Return an event of the controller."""
+    """Build the message of an event of the controller."""
     return Event(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,

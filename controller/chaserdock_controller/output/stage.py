@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Last stage of a tick: select each chaser's command and build the messages."""
+"""Last stage of a tick: select each chaser's command, build the messages."""
 
 from __future__ import annotations
 
@@ -56,7 +56,9 @@ class ChaserResult(NamedTuple):
 
 
 class OutputStage:
-    """Keeps the commands sent to each chaser so far (``sent``), and which chasers have no plan."""
+    """Builds the outputs of a tick. Keeps the commands sent to each chaser so far (``sent``), and
+    which chasers have no plan.
+    """
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
@@ -75,12 +77,14 @@ class OutputStage:
         """Return all messages of a tick."""
         o, out = observation, TickOutputs(target=target_message(observation, estimation))
         out.replies = list(guidance.replies)
+
         periodic = o.tick % self._scenario.time.rate_hz == 0
         if estimation.stack is not None and periodic:
             out.stack = stack_message(o, estimation.stack)
         shape, geometry = estimation.shape, None
         if shape is not None and (shape.changed or periodic):
             geometry = geometry_estimate(shape)
+
         events = [*o.events, *estimation.events, *guidance.events, *planning.events]
         chasers = [
             ChaserResult(*parts)
@@ -88,15 +92,18 @@ class OutputStage:
                 o.chasers, estimation.chasers, guidance.directives, planning.chasers, strict=True
             )
         ]
+
         for c in chasers:
             if c.estimate.own is not None:
                 command = self._command(o, estimation, guidance, c, c.estimate.own, out, events)
                 expected = self._expected(o, estimation, c.estimate)
                 out.wrenches[c.seen.chaser] = self._send(o, c, command, geometry, expected)
+
         for c in chasers:
             if c.seen.invalid:
                 command = self._coast(c, events)
                 out.wrenches[c.seen.chaser] = self._send(o, c, command, geometry, None)
+
         for sent in self.sent:
             sent.forget_before(o.time_ns)
         out.safety = {
@@ -104,6 +111,7 @@ class OutputStage:
             for c in chasers
             if c.planning.certificate is not None
         }
+
         out.solver = solver_message(o, self._scenario.controller.solver, planning)
         out.events = [event_message(o, level, text) for level, text in events]
         return out
@@ -118,7 +126,7 @@ class OutputStage:
         out: TickOutputs,
         events: list[LogEntry],
     ) -> DirectCommand:
-        """Return the command of a chaser with the state ``own``, and add its reference and plan to
+        """Return the command of a chaser with the state ``own``. Adds its reference and plan to
         ``out``.
         """
         i, directive = c.seen.chaser, c.directive
@@ -137,8 +145,8 @@ class OutputStage:
         return DirectCommand("nmpc", wrench)
 
     def _report_plan(self, i: int, new: bool, flies: bool, events: list[LogEntry]) -> None:
-        """Log when a chaser has no ``new`` plan any more, and whether it ``flies`` an older one; or
-        has one again.
+        """Log a change: the chaser has no ``new`` plan any more, ``flies`` an older one or none, or
+        has a new one again.
         """
         if new == (i not in self._without_plan):
             return
@@ -151,8 +159,8 @@ class OutputStage:
             self._without_plan.add(i)
 
     def _safe(self, i: int, own: OwnMotion, horizon: HorizonReference | None) -> DirectCommand:
-        """Return a command without a plan: follow the reference, and so move with the target;
-        without a target, brake to rest in WRF.
+        """Return the command of a chaser without a plan: follow the reference and so move with the
+        target. Without a target: brake to rest in WRF.
         """
         body = self._scenario.chaser
         if horizon is None or i not in horizon.chasers:
@@ -161,7 +169,7 @@ class OutputStage:
         return DirectCommand("track", track_setpoint(_body_state(own.at_effect), body, setpoint))
 
     def _coast(self, c: ChaserResult, events: list[LogEntry]) -> DirectCommand:
-        """Return the command of a chaser with invalid odometry, and log it once."""
+        """Return the command of a chaser with invalid odometry; log it once."""
         i = c.seen.chaser
         if i not in self._without_plan:
             events.append(("error", f"chaser {i}: invalid odometry, coasting: {c.seen.invalid}"))
@@ -172,8 +180,8 @@ class OutputStage:
     def _expected(
         self, o: Observation, estimation: TargetEstimation, estimate: ChaserEstimate
     ) -> ExpectedPose | None:
-        """Return where a chaser that does not see a target without markers will have it in its next
-        image.
+        """Return where a target without markers, which the chaser does not see, will appear in its
+        next image.
         """
         unseen = self._scenario.perception.name == "model" and not estimate.visible
         if not unseen or not estimation.known or estimate.own is None:
@@ -190,7 +198,8 @@ class OutputStage:
         expected: ExpectedPose | None,
     ) -> WrenchCommand:
         seen, directive, thrusts = c.seen, c.directive, command.thrusts_N
-        # The limits hold on all axes at once; commanded thrusters need none but their own.
+        # The limits hold for all axes together; for commanded thrusters only their own limits
+        # apply.
         limits = seen.input_limits if thrusts is None else np.abs(command.wrench) + COMMAND_STEP
         wrench = in_steps(command.wrench, limits)
         self.sent[seen.chaser].add(observation.effective_ns, wrench)
@@ -217,12 +226,12 @@ class OutputStage:
 
 
 def _body_state(x: Array) -> BodyState:
-    """Return a state (13,) by its parts."""
+    """Split a state (13,) into its parts."""
     return BodyState(x[:3], x[3:6], x[6:10], x[10:])
 
 
 def _setpoint(horizon: HorizonReference, row: int, step_s: float) -> Setpoint:
-    """Return the reference at the beginning of the horizon; its rates are those over the first
+    """Return the reference at the beginning of the horizon, with its mean rates over the first
     stage.
     """
     now, then = horizon.references[row, :2]

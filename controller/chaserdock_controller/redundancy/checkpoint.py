@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serialize and restore controller state for a standby that joins late.
+"""Serializes and restores controller state for a standby that joins late.
 
-Of the filter's buffer only the newest exposure is included: a sighting older than that cannot be
-used after a restore. The state of estimators and solvers of installed packages is not included:
-they start from their initial state.
+Of the filter's buffer only the newest exposure is included; older sightings cannot be used after a
+restore. The state of installed estimators and solvers is not included; they restart.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ PartT = TypeVar("PartT", bound=Struct)
 
 
 class CheckpointError(ValueError):
-    """The bytes are not a controller state of this mission; the text says why."""
+    """The bytes are not a controller state of this mission. The text states why."""
 
 
-# The fields of each part are the attributes of the object that it is taken from.
+# Each part has fields named like the attributes of the object that it is copied from.
 
 
 class CoreState(Struct, forbid_unknown_fields=True):
@@ -143,7 +142,7 @@ class SentState(Struct, forbid_unknown_fields=True):
 
 
 class ChaserCheckpoint(Struct, forbid_unknown_fields=True):
-    """State of all that is kept of one chaser."""
+    """State of one chaser."""
 
     ingest: IngestState
     loss: LossState
@@ -183,13 +182,16 @@ _ESTIMATORS: dict[type, type[JointEstimatorState | PaperEstimatorState]] = {
     JointEstimator: JointEstimatorState,
     PaperEstimator: PaperEstimatorState,
 }
-"""What is copied of an estimator. Of those of installed packages, nothing is."""
+"""State that is copied, by type of estimator. Nothing is copied of installed ones."""
 
 
 class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
-    """State of a controller after a tick. ``timeline_left``: commands of the scenario's timeline
-    that are not yet due. ``identification``: None without it. ``plans``: warm starts of the NMPC
-    solver, inputs by chaser."""
+    """State of a controller after a tick.
+
+    ``timeline_left``: commands of the scenario's timeline that are not yet due. ``identification``:
+    None if the scenario does not identify. ``plans``: warm starts of the NMPC solver, inputs by
+    chaser.
+    """
 
     core: CoreState
     planning: PlanningState
@@ -209,15 +211,17 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
 
 
 class Checkpoint:
-    """Saves and restores the state of one controller. ``odometry``: the validation of each
-    chaser's.
+    """Saves and restores the state of one controller. ``odometry``: odometry validation of each
+    chaser.
     """
 
     def __init__(self, core: ControllerCore, odometry: Sequence[OdometryValidation]) -> None:
         self._core, self._odometry = core, odometry
 
     def _chaser_parts(self, i: int) -> dict[str, tuple[Any, type[Struct]]]:
-        """Return what is copied of one chaser, by field of its checkpoint."""
+        """Return the objects of one chaser whose attributes are copied, by field of its
+        checkpoint.
+        """
         core, machine = self._core, self._core.guidance.chasers[i]
         return {
             "ingest": (core.ingest.chasers[i], IngestState),
@@ -231,7 +235,7 @@ class Checkpoint:
         }
 
     def _parts(self) -> dict[str, tuple[Any, type[Struct]]]:
-        """Return the objects whose attributes are copied, and what is copied of them, by field of
+        """Return the objects whose attributes are copied and the types of their copies, by field of
         the checkpoint.
         """
         core = self._core
@@ -252,8 +256,8 @@ class Checkpoint:
         return parts
 
     def save(self) -> bytes:
-        """Return the state now. Raises CheckpointError when it contains something other than
-        data.
+        """Return the present state as bytes. Raises CheckpointError if it contains something other
+        than data.
         """
         parts: dict[str, Any] = {"shape": None, **_read_all(self._parts())}
         frame, identification = self._warm_starts(), self._core.estimation.identification
@@ -276,7 +280,9 @@ class Checkpoint:
             raise CheckpointError(str(error)) from None
 
     def restore(self, data: bytes) -> None:
-        """Replace the state by a saved one, completely or not at all. Raises CheckpointError."""
+        """Replace the state by a saved one, completely or not at all. Raises CheckpointError if it
+        does not fit.
+        """
         try:
             state = decode(data, ControllerCheckpoint)
         except (ValueError, RecursionError) as error:
@@ -347,7 +353,7 @@ def _data(value: Any) -> Any:
 def _write(owner: Any, state: Struct) -> None:
     for name in state.__struct_fields__:
         value, current = getattr(state, name), vars(owner).get(name)
-        if isinstance(current, dict):  # in place: it may have a default factory
+        if isinstance(current, dict):  # in place, as it may have a default factory
             current.clear()
             current.update(value)
         elif isinstance(current, deque):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Operator commands that wait for the next tick. Thread-safe; no I/O."""
+"""Queue of operator commands for the next tick. Thread-safe; no I/O."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SendReply = Callable[[CommandReply], None]
 
 
 class OperatorRequests:
-    """Requests with the functions that send their replies."""
+    """Waiting requests with the functions that send their replies."""
 
     def __init__(self) -> None:
         self._requests: list[tuple[OperatorCommand, SendReply]] = []
@@ -30,7 +30,7 @@ class OperatorRequests:
         return requests
 
     def refuse(self, tick: Tick, commander: str) -> None:
-        """Refuse all requests: ``commander`` commands, or none if it is empty."""
+        """Refuse all requests because ``commander`` commands, or none if empty."""
         reason = f"{commander or 'no controller'} commands now: repeat the command"
         for command, reply in self.take():
             reply(

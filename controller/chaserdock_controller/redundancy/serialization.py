@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encode and decode controller state as msgpack. Only values of the declared types are decoded; no
-code travels.
+"""Encodes and decodes controller state as msgpack. Only values of the declared types are decoded;
+no code travels.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _DTYPES = {"f": np.float64, "i": np.int64, "b": np.bool_}
 
 
 class EncodedArray(Struct, array_like=True, forbid_unknown_fields=True):
-    """An array in a message: kind of its numbers, shape, and content in row-major order."""
+    """An array in a message: kind of its numbers, shape, content in row-major order."""
 
     kind: str
     shape: tuple[int, ...]
@@ -31,9 +31,9 @@ def encode(state: Any) -> bytes:
 
 
 def decode(data: bytes, kind: type[Decoded]) -> Decoded:
-    """Return the object of type ``kind`` that ``encode`` made ``data`` of.
+    """Return the object of type ``kind`` whose ``encode`` result is ``data``.
 
-    Raises ValueError (msgspec's errors are ones) for anything else, and for a number that is NaN.
+    Raises ValueError (as msgspec's errors are) for anything else, and for a NaN.
     """
     _reject_nan(msgspec.msgpack.decode(data))
     return msgspec.msgpack.decode(data, type=kind, dec_hook=_decode_array)

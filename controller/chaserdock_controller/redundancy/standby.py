@@ -3,8 +3,8 @@
 No I/O.
 
 In lock-step a standby processes a tick once it has the same inputs and the leader's operator
-commands of that tick, so that both have the same state after each tick. In real time it does not
-wait. A standby that joins late or has missed ticks restores the leader's state first.
+commands of that tick. Both then have the same state after each tick. In real time it does not wait.
+A standby that joins late or has missed ticks first restores the leader's state.
 """
 
 from __future__ import annotations
@@ -18,18 +18,20 @@ from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
 from chaserdock_protocol.transport import ReceivedMessage
 
 _MISSABLE_TICKS = 10
-"""In real time a standby may miss this many ticks and keep its state."""
+"""In real time, number of ticks that a standby may miss and keep its state."""
 _MOST_HELD = 100_000
-"""Messages that a process keeps until it knows its role: bounds its memory; older ones are dropped.
+"""Messages that are held until the process knows its role; bounds its memory. Older ones are
+dropped.
 """
 
 
 @dataclass
 class HotStandby:
-    """Role of this process. ``leads``: it commands the newest tick; ``since``: from which tick on.
+    """Role of this process.
 
-    ``leader``: who commands the newest tick, None if no controller does. ``replayed``: in a replay,
-    in which this process commands every tick, the commander in the log.
+    ``leads``: it commands the newest tick; ``since``: first such tick. ``leader``: who commands the
+    newest tick, None if no controller does. ``replayed``: in a replay, where this process commands
+    every tick, the commander in the log.
     """
 
     name: str
@@ -52,11 +54,11 @@ class HotStandby:
         self.leases = LeaseHolder(self.name)
 
     def join(self, instance: str) -> None:
-        """Take the instance of this process."""
+        """Set the instance of this process."""
         self.instance = self.leases.instance = instance
 
     def update(self, tick: Tick) -> None:
-        """Take a new tick, before held messages."""
+        """Process a new tick, before held messages."""
         self.leases.add_tick(tick)
         before = self.newest
         if before is not None and (tick.tick, tick.revision) < (before.tick, before.revision):
@@ -68,8 +70,8 @@ class HotStandby:
             self.leads, self.leader = True, self.replayed
 
     def is_decided(self, tick: Tick) -> bool:
-        """Return whether it is known who commands a tick: in lock-step, once each chaser has stated
-        its lease.
+        """Return whether it is known who commands a tick. In lock-step it is once each chaser has
+        stated its lease.
         """
         newest = self.newest
         if self.realtime or self.replaying or newest is None or newest.tick > tick.tick:
@@ -77,11 +79,12 @@ class HotStandby:
         return not self.leases.missing(newest)
 
     def decide(self, processed: Tick | None = None) -> bool:
-        """Determine who commands the newest tick; return whether this process begins to, without
-        any state.
+        """Determine who commands the newest tick. Returns whether this process starts to command
+        without any state.
 
-        In real time leases of a tick may be on their way: a commander continues until it processes
-        a tick (``processed``) that it does not command, or until another one commands.
+        In real time the leases of a tick may still be on their way. A commander therefore continues
+        until it processes a tick (``processed``) that it does not command, or until another one
+        commands.
         """
         tick = processed or self.newest
         if tick is None or self.replaying or not self.is_decided(tick):
@@ -105,12 +108,12 @@ class HotStandby:
 
     @property
     def authority(self) -> Commander:
-        """Name, instance and term of this process' commands."""
+        """Return name, instance and term that this process' commands carry."""
         return self.replayed or Commander(self.name, self.instance, self.leases.term)
 
     @property
     def others(self) -> dict[str, str]:
-        """The other controllers that take part in the newest tick, with their instances."""
+        """Return the other controllers that take part in the newest tick, with their instances."""
         controllers = {} if self.newest is None or self.replaying else self.newest.controllers
         return {n: i for n, i in controllers.items() if (n, i) != (self.name, self.instance)}
 
@@ -124,8 +127,8 @@ class HotStandby:
         return self.leads and tick >= self.since
 
     def hold_back(self, received: ReceivedMessage, done_tick: int) -> bool:
-        """Hold back a message of a tick after the next one to process; return whether it was held
-        back.
+        """Hold back a message of a tick after the next one to process. Returns whether it was
+        held.
         """
         if self.realtime or self.replaying or received.message.tick < 0:
             return False
@@ -137,7 +140,7 @@ class HotStandby:
         return True
 
     def release(self, done_tick: int) -> ReceivedMessage | None:
-        """Return the next held message that may be processed now."""
+        """Return the next held message that may be processed now, or None."""
         if not self._synced:
             return None
         for k, held in enumerate(self._held):
@@ -148,14 +151,14 @@ class HotStandby:
         return None
 
     def may_process(self) -> bool:
-        """Return whether the state is good enough to process ticks."""
+        """Return whether the state is complete enough to process ticks."""
         return self._synced or self.realtime
 
     def on_idle(self, open_tick: int) -> bool:
-        """Return whether to process the open tick although no more messages arrive.
+        """Return whether to process the open tick although no more messages arrive: the world has
+        published a later one.
 
-        The world has published a later tick. A standby has missed its messages then, and waits for
-        the leader's state instead.
+        A standby has then missed its messages and waits for the leader's state instead.
         """
         if self.newest is None or self.newest.tick <= open_tick:
             return False
@@ -164,11 +167,11 @@ class HotStandby:
         return self.leads
 
     def is_deposed(self, state: ControllerState) -> bool:
-        """Return whether the sender of a state message has lost the command, in real time, and may
-        not know it yet.
+        """Return whether the sender of a state message has lost the command without knowing it yet;
+        only in real time.
 
-        A term above all known ones is of a commander whose leases are on their way. In lock-step a
-        standby uses messages of its own tick only.
+        A term above all known ones belongs to a commander whose leases are still on their way. In
+        lock-step a standby uses messages of its own tick only.
         """
         leader = self.leader
         if not self.realtime:
@@ -178,18 +181,18 @@ class HotStandby:
         return state.term <= max(self.leases.term, 0 if leader is None else leader.term)
 
     def add_leader_commands(self, state: ControllerState) -> None:
-        """Add the operator commands that the leader has processed in a tick."""
+        """Store the operator commands that the leader has processed in a tick."""
         self.leader_commands[state.tick] = state.operated
 
     def has_leader_commands(self, tick: int) -> bool:
-        """Return whether the operator commands of a tick are known, or need not be waited for."""
+        """Return whether the operator commands of a tick are known or need not be waited for."""
         if self.realtime or self.replaying or self.leads or self.newest is None:
             return True
         return tick in self.leader_commands or self.leader is None
 
     def take_leader_commands(self, tick: int) -> tuple[OperatorCommand, ...]:
-        """Return the operator commands of a tick that another leader has accepted; in real time,
-        since the last call.
+        """Return the operator commands of a tick that another leader has accepted; in real time
+        those since the last call.
         """
         commands = [
             c for t, c in sorted(self.leader_commands.items()) if t == tick or self.realtime
@@ -204,7 +207,7 @@ class HotStandby:
         return not self.leads and not self._synced and (self.realtime or tick >= done_tick)
 
     def state_restored(self, tick: int) -> None:
-        """Note that the leader's state after a tick was restored."""
+        """Record that the leader's state after a tick was restored."""
         self._synced = True
         self._keep(lambda held_tick: held_tick > tick)
 

@@ -32,14 +32,18 @@ _INSTALL = "reinstall chaserdock (in a clone: pip install --no-deps -e .), which
 
 
 class _Member(ctypes.Structure):
-    """`Member` of base.h, the one structure that nothing checks."""
+    """Mirror ``Member`` of base.h: one line of the table that C exports of a structure.
+
+    No table describes this structure itself.
+    """
 
     _fields_ = [("name", ctypes.c_char_p), ("size", ctypes.c_int64), ("offset", ctypes.c_int64)]
 
 
 class KernelLibrary:
-    """The compiled kernels of one package, loaded on first use from the folder of ``file``, its
-    ``native/__init__.py``.
+    """Load the compiled kernels of one package on first use.
+
+    ``file``: the package's ``native/__init__.py``, beside which the library stands.
     """
 
     def __init__(self, file: str) -> None:
@@ -48,12 +52,11 @@ class KernelLibrary:
         self._structures: dict[str, type[ctypes.Structure]] = {}
 
     def structure(self, name: str) -> Callable[[S], S]:
-        """Return a class decorator for the ctypes structure that C calls ``name``, which states its
-        members by LAYOUT (base.h).
+        """Return a class decorator for the ctypes counterpart of the C structure ``name``.
 
-        Names, sizes and offsets of the members are compared when the library is loaded, or at once
-        if it is: a structure that differs would pass C other values than Python wrote. Raises
-        ImportError for the first difference.
+        C lists the structure's members by LAYOUT (base.h). Names, sizes and offsets are compared
+        when the library is loaded, or at once if it is: otherwise C would read other values than
+        Python wrote. Raises ImportError for the first difference.
         """
 
         def register(structure: S) -> S:
@@ -135,11 +138,11 @@ def _describe(member: tuple[str, int, int] | None) -> str:
 
 
 address: Callable[[Any], ctypes.Array[ctypes.c_char]] = (ctypes.c_char * 0).from_buffer
-"""Return a writable C-contiguous array as an argument of a kernel: its address, which keeps it
-alive.
+"""Pass a writable C-contiguous array to a kernel: return its address, which keeps the array alive.
 
-A type without a size rejects arrays that are not contiguous, and takes a fifteenth of the time of
-``array.ctypes``."""
+Rejects arrays that are not contiguous, as the type has no size. Takes a fifteenth of the time of
+``array.ctypes``.
+"""
 
 
 def location(array: NDArray[Any]) -> int:

@@ -3,9 +3,9 @@
  *
  * Results are the same to the last bit on every processor. The compiler does not contract or
  * reorder expressions (-ffp-contract=off, no fast-math), the source fixes the order of every sum,
- * and vectors are four wide on every processor. Only operations that IEEE 754 defines exactly are used: + - * / and the
- * square root. Fused multiply-add is exact as well, but it gained 15 % with hardware support and
- * cost a factor of twenty without.
+ * and vectors are four wide on every processor. Only operations that IEEE 754 defines exactly are
+ * used: + - * / and the square root. Fused multiply-add is exact as well, but it gained 15 % with
+ * hardware support and cost a factor of twenty without.
  *
  * Counts, indices and array sizes must be right; a floating-point argument may be anything.
  * Whatever it is, a kernel stays within its arrays, converts no number to an integer that cannot
@@ -43,7 +43,7 @@ typedef struct {
         __VA_OPT__(MEMBERS_AGAIN NOTHING(type, __VA_ARGS__))
 #define MEMBERS_AGAIN() MEMBERS
 #define NOTHING ()
-/* Expand again and again: each time MEMBERS takes the next of at most 81 members. */
+/* Rescan the expansion, at least 81 times: each time MEMBERS takes the next member. */
 #define REPEAT(...) REPEAT_27(REPEAT_27(REPEAT_27(__VA_ARGS__)))
 #define REPEAT_27(...) REPEAT_9(REPEAT_9(REPEAT_9(__VA_ARGS__)))
 #define REPEAT_9(...) REPEAT_3(REPEAT_3(REPEAT_3(__VA_ARGS__)))

@@ -55,8 +55,9 @@ _FREESTANDING = ("-nostdlib", "-s", "-Wl,-z,defs")
 
 @dataclass(frozen=True)
 class BuildTarget:
-    """A kind of machine: its instruction sets, zig's flags for compiling and linking, and the
-    platform tag of its wheel.
+    """A kind of machine that kernels can be compiled for.
+
+    Its instruction sets, zig's flags for compiling and linking, and the platform tag of its wheel.
     """
 
     levels: tuple[tuple[int, str], ...]
@@ -109,11 +110,10 @@ def source_digest(folder: Path) -> str:
 def compile_kernels(
     folder: Path, target: BuildTarget | None = None, library: Path | None = None
 ) -> Path:
-    """Compile ``kernels.c`` of ``folder`` for ``target`` (default: this machine) into a shared
-    library and return its path.
+    """Compile ``kernels.c`` of ``folder`` into a shared library and return the library's path.
 
-    ``library``: the path to write, by default LIBRARY_NAME in ``folder``. Raises RuntimeError with
-    the compiler's output if compilation fails.
+    ``target``: by default this machine. ``library``: the path to write, by default LIBRARY_NAME in
+    ``folder``. Raises RuntimeError with the compiler's output if compilation fails.
     """
     target = target or this_machine()
     library = library or folder / LIBRARY_NAME

@@ -2,8 +2,8 @@
 /* Lower bounds on the distance of coasts from the target (passive_safety.py). */
 #include "base.h"
 
-/* out (6) = the state after a transition of Clohessy-Wiltshire or of free motion: the motion out of
- * the plane is by itself. */
+/* out (6) = the state after a transition of Clohessy-Wiltshire or of free motion, both of which
+ * decouple the motion out of the orbital plane from that within it. */
 static inline void coasted(const double *phi, const v4 *x, v4 *out) {
     static const int plane[4] = {0, 1, 3, 4};
     for (int i = 0; i < 4; i++) {
@@ -21,9 +21,10 @@ static inline v4 square_of(const v4 *a) {
 }
 static inline double greatest4(v4 a) { return max_of(max_of(a[0], a[1]), max_of(a[2], a[3])); }
 
-/* room (T,): in each step between the T + 1 transitions (T + 1, 6, 6), no coast comes nearer to the
- * origin than this, m: the nearest end, less half of the longest step and `bulge_s` times the
- * greatest change of velocity. states (6, M): M a multiple of four; work: 6 M doubles. */
+/* Compute lower bounds room (T,), m, on the distance of all coasts from the origin in each step
+ * between the T + 1 transitions (T + 1, 6, 6): the nearest end of a step, less half of the longest
+ * step and `bulge_s` times the greatest change of velocity. states (6, M): M a multiple of four;
+ * work: 6 M doubles. */
 EXPORT void NAME(coast_room)(int64_t steps, const double *transitions, int64_t m,
                              const double *states, double bulge_s, double *room, double *work) {
     double nearest_before = 0.0;
@@ -50,8 +51,8 @@ EXPORT void NAME(coast_room)(int64_t steps, const double *transitions, int64_t m
     }
 }
 
-/* Covariance (3, 3) of the position after a transition phi (6, 6) of a state with this covariance
- * (6, 6). */
+/* out (3, 3) = covariance of the position after a transition phi (6, 6) of a state with this
+ * covariance (6, 6). */
 static void spread(const double *phi, const double *covariance, double *out) {
     for (int i = 0; i < 3; i++) {
         double row[6] = {0};
@@ -77,8 +78,8 @@ typedef struct {
         *moment; /* each (M,): smallest margin, distance there (m), and its moment in steps */
 } Approaches;
 
-/* Approach of one coast between the states begin and end (6) of step k; `covariances` (2, 9): of
- * the positions there. */
+/* Replace margin, distance and moment of one coast if it comes closer in step k, between the states
+ * begin and end (6). `covariances` (2, 9): of the positions there. */
 static void approach(int64_t k, const double *begin, const double *end, const double *covariances,
                      double keep_out, double bulge_s, double *margin, double *away,
                      double *moment) {
@@ -100,9 +101,9 @@ static void approach(int64_t k, const double *begin, const double *end, const do
     *moment = (double)k + share;
 }
 
-/* Closest approach, by the margin in standard deviations, of the coasts from states (6, M) within
- * `count` steps (columns); transitions, states and bulge_s as in `coast_room`, covariance (6, 6) of
- * a state. NaN in a state gives a margin of NaN. */
+/* Find the closest approach, by the margin in standard deviations, of the coasts from states (6, M)
+ * within `count` steps (columns). transitions, states and bulge_s: as in `coast_room`; covariance
+ * (6, 6): of a state. NaN in a state gives a margin of NaN. */
 EXPORT void NAME(coast_closest)(int64_t count, const int64_t *columns, const double *transitions,
                                 int64_t m, const double *states, const double *covariance,
                                 double keep_out, double bulge_s, const Approaches *found) {

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP writer of the logs: the ``mcap`` package's, with faster messages and a compact list of chunk
-indexes.
+"""Write logs by the package ``mcap``, with faster messages and a compact list of chunk indexes.
 
 The package keeps one object per chunk until the file is closed. With 60 channels and a flush every
 0.5 s that is 4.6 kB per chunk, 330 MB in a flight of ten hours, and slows down garbage collection;
@@ -39,8 +38,9 @@ def create_writer(output: Any, compressed: bool = True) -> Writer:
 
 
 class _LogFileWriter(Writer):
-    """The package's writer, whose parts for messages are replaced: private attributes, as no option
-    selects them.
+    """Replace the parts of the package's writer that handle messages.
+
+    These are private attributes, as the package has no option for them.
     """
 
     def __init__(self, output: Any, compression: CompressionType) -> None:
@@ -62,7 +62,7 @@ class _LogFileWriter(Writer):
 
 
 class _Chunk(ChunkBuilder):
-    """Chunk in progress, which counts its messages in the statistics of the file."""
+    """Chunk in progress, which also counts its messages in the statistics of the file."""
 
     def __init__(self, statistics: Statistics) -> None:
         super().__init__()
@@ -98,7 +98,7 @@ class _Chunk(ChunkBuilder):
 
 
 class _MessageIndex:
-    """Index of a channel's messages in a chunk: times and offsets, in turn."""
+    """Index of one channel's messages in a chunk: time and offset of each, alternating."""
 
     def __init__(self, channel: int) -> None:
         self._channel = channel

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages that a log lacks, by the gaps in their sequence numbers."""
+"""Detect messages that a log lacks, by the gaps in their sequence numbers."""
 
 from __future__ import annotations
 

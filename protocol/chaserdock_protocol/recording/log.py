@@ -164,8 +164,10 @@ class LogWriter:
         return self._sink.size
 
     def describe(self, scenario_json: str, run: dict[str, str]) -> None:
-        """Write the resolved scenario, the run's data, the lock file, the package versions, the
-        commit where there is one, and the BLAS in use.
+        """Write what a reader needs to reproduce the run.
+
+        Resolved scenario, the run's data, lock file, package versions, commit if there is one, BLAS
+        in use.
         """
         now = time.time_ns()
         attached = [

@@ -60,11 +60,10 @@ def versions_json() -> bytes:
 
 @lru_cache
 def blas_in_use() -> str:
-    """Return name, version and processor type of NumPy's BLAS, such as "openblas 0.3.31 Haswell";
-    empty if not known.
+    """Return name, version and processor type of NumPy's BLAS; empty if not known.
 
-    OpenBLAS has kernels for each processor type, which differ in the last bits. The environment
-    variable OPENBLAS_CORETYPE overrides the type.
+    Such as "openblas 0.3.31 Haswell". OpenBLAS has kernels for each processor type, which differ in
+    the last bits. The environment variable OPENBLAS_CORETYPE overrides the type.
     """
     found = [library for library in threadpool_info() if library["user_api"] == "blas"]
     own = [

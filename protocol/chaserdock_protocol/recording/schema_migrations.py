@@ -114,6 +114,7 @@ def decode_logged(kind: type[T], payload: bytes, encoding: str) -> T:
     """
     if encoding == encoding_of(kind):
         return decode(kind, payload, encoding)
+
     found = _ENCODING.fullmatch(encoding)
     if (
         found is None
@@ -125,6 +126,7 @@ def decode_logged(kind: type[T], payload: bytes, encoding: str) -> T:
         )
     if len(payload) > MAX_BYTES:
         raise Rejected("size", f"{len(payload)} bytes, at most {MAX_BYTES}")
+
     try:
         fields = msgspec.msgpack.decode(payload, type=dict[str, Any])
         for version in range(int(found[2]), VERSION[kind]):

@@ -182,8 +182,9 @@ class FlightTarget(Section):
         return satellite(self.model, tolerance_m) if self.shape().satellite else None
 
     def as_known(self) -> FlightTarget:
-        """Return what the flight software knows: of a mesh from a file, only the simplified surface
-        without missing parts.
+        """Return the target as the flight software knows it.
+
+        Of a mesh from a file it knows the simplified surface only, without missing parts.
         """
         surface = None if self.geometry is None else self.geometry.surface
         if self.geometry is None or surface is None or surface.known:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks across several sections of a scenario. Each raises ValueError with the path of what is
+"""Check a scenario across its sections. Every check raises ValueError with the path of what is
 wrong.
 """
 
@@ -48,6 +48,7 @@ def check_flight(scenario: FlightScenario) -> None:
     _check_detumble(scenario)
     _check_hold_points(scenario)
     _check_approach_cone(scenario)
+
     if scenario.ranging is not None and scenario.perception.name not in MARKER_PERCEPTIONS:
         raise ValueError(
             f"ranging: needs a perception by markers ({', '.join(MARKER_PERCEPTIONS)}), not "
@@ -57,6 +58,7 @@ def check_flight(scenario: FlightScenario) -> None:
         raise ValueError(
             'plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"'
         )
+
     if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
         raise ValueError(
             'limits.passive_safety: needs the covariance of estimator.name = "joint", '
@@ -70,7 +72,7 @@ def check_flight(scenario: FlightScenario) -> None:
 
 
 def check_consistent(scenario: Scenario) -> None:
-    """Run the other checks, which need the full scenario."""
+    """Run the checks that need the full scenario."""
     _check_start_positions(scenario)
     _check_orbit(scenario)
     _check_mesh(scenario)
@@ -140,9 +142,7 @@ def _check_references(scenario: FlightScenario) -> None:
 
 
 def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> float:
-    """Return the distance (m) of a chaser's shape at an offset (3,), TRF, from the cuboids of the
-    target's shape.
-    """
+    """Return the distance (m) of a chaser at an offset (3,), TRF, from the cuboids of the target."""
     pose = _reference_pose(scenario, chaser, offset_m)
     return distance_from_cuboids(
         box_table(scenario.target_model().boxes), box_table(scenario.chaser.boxes()), *pose
@@ -150,8 +150,9 @@ def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike)
 
 
 def shapes_apart_m(scenario: FlightScenario, *places: tuple[int, ArrayLike]) -> float:
-    """Return the distance (m) between the shapes of two chasers at offsets (3,), TRF: ``places``
-    are (chaser, offset).
+    """Return the distance (m) between the shapes of two chasers.
+
+    ``places``: chaser and offset (3,), TRF, of each.
     """
     one, other = (_reference_pose(scenario, i, offset_m) for i, offset_m in places)
     return distance_between(box_table(scenario.chaser.boxes()), one, other)
@@ -176,6 +177,7 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
             'limits.min_distance_shape_m: needs controller.solver = "rti", not '
             f"{scenario.controller.solver!r}"
         )
+
     places = [(f"chasers.{i}.position_m", i, c.position_m) for i, c in enumerate(scenario.chasers)]
     places += [
         (f"timeline.{k}.offset_m", i, e.offset_m)
@@ -183,12 +185,14 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
         for i in e.chasers
         if e.offset_m and i < len(scenario.chasers)
     ]
+
     for name, i, offset_m in places:
         if (distance_m := shape_distance_m(scenario, i, offset_m)) < least_m:
             raise ValueError(
                 f"{name}: chaser {i} is {distance_m:.3g} m from the target's shape there, nearer "
                 f"than limits.min_distance_shape_m ({least_m:g} m) allows"
             )
+
     for (i, a), (j, b) in combinations(enumerate(c.position_m for c in scenario.chasers), 2):
         if (distance_m := shapes_apart_m(scenario, (i, a), (j, b))) < least_m:
             raise ValueError(
@@ -372,10 +376,12 @@ def _check_truth(scenario: Scenario) -> None:
         key := next((k for k in sorted(given) if getattr(scenario.truth.target, k)), None)
     ):
         raise ValueError(f'truth.target.{key}: needs target.motion = "torque_free"')
+
     latches = scenario.truth.latch
     key = next((k for k in sorted(latches.model_fields_set) if getattr(latches, k)), None)
     if key and scenario.docking.kind != "capture":
         raise ValueError(f'truth.latch.{key}: latches exist only with docking.kind = "capture"')
+
     named: set[int | None] = set()
     for k, values in enumerate(scenario.truth.values):
         path, name = (
@@ -407,8 +413,9 @@ def _check_latched(scenario: Scenario) -> None:
 
 
 def _check_load_limits(scenario: Scenario) -> None:
-    """Check that the ports carry what the tumble at the start exerts once their chaser is latched,
-    with nominal masses.
+    """Check that the ports carry the load of the tumble at the start, once their chaser is latched.
+
+    With nominal masses.
     """
     if scenario.docking.kind != "capture":
         return
@@ -469,8 +476,9 @@ def _check_detumble(scenario: FlightScenario) -> None:
 
 
 def _check_stopping_time(scenario: Scenario) -> None:
-    """Check that detumbling is not longer than allowed even if all thrusters could always push
-    where it helps most.
+    """Check that detumbling can end within the allowed time.
+
+    It takes as if all thrusters could always push where they help most.
     """
     for k, entry in _detumblings(scenario):
         linear, angular, force_N, torque_N_m, mass_kg = _momentum_and_thrust(
@@ -489,9 +497,11 @@ def _check_stopping_time(scenario: Scenario) -> None:
 def _momentum_and_thrust(
     scenario: Scenario, chasers: set[int]
 ) -> tuple[float, float, float, float, float]:
-    """Return linear (N s) and angular momentum (N m s) of the target at the start with these
-    chasers fixed to it, upper bounds of force and torque of their plume-free thrusters in any
-    direction, and the mass."""
+    """Return what bounds the time to stop the target with these chasers fixed to it.
+
+    Linear (N s) and angular momentum (N m s) at the start; upper bounds of force (N) and torque (N
+    m) of the plume-free thrusters in any direction; the mass (kg).
+    """
     target, body, mounted = scenario.target, scenario.chaser, {}
     omega = np.array(target.omega_rad_s)
     inertias = [target.inertia_tensor]
@@ -501,6 +511,7 @@ def _momentum_and_thrust(
         turn = rotations.to_matrix(mounted[i].q_wxyz)
         inertias.append(turn @ np.diag(body.inertia) @ turn.T)
         places.append(mounted[i].position_m)
+
     masses = np.array([target.mass_kg] + [body.mass_kg] * len(mounted))
     centre = masses @ np.array(places) / masses.sum()
     velocity = rotations.rotate_inverse(target.q_wxyz, target.velocity_m_s) + np.cross(
@@ -510,6 +521,7 @@ def _momentum_and_thrust(
         inertia @ omega + mass * np.cross(place - centre, np.cross(omega, place - centre))
         for inertia, mass, place in zip(inertias, masses, places, strict=True)
     )
+
     free = np.concatenate(list(plume_free_thrusters(scenario, chasers).values()))
     limits = np.where(free, np.tile(thrusts_max(body.thrusters), len(mounted)), 0.0)
     own = wrench_matrix(body.thrusters)
@@ -528,8 +540,8 @@ def _momentum_and_thrust(
 def _largest_sum(vectors: Array) -> float:
     """Return an upper bound of the length of the sum of some of these vectors (3, n).
 
-    The largest sum of components along a direction, over directions of which one is within 0.15 rad
-    of any other.
+    It is the largest sum of components along a direction, of a set of which one is within 0.15 rad
+    of any direction.
     """
     k = np.arange(400) + 0.5
     z, turn = 1.0 - 2.0 * k / len(k), math.pi * (1.0 + math.sqrt(5.0)) * k

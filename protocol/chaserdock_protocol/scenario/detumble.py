@@ -49,8 +49,9 @@ class Detumble(RestLimits):
     """
 
     response_s: ClassVar[float] = 0.5
-    """Time in which the feedback would stop the stack with unlimited thrust, s: some ticks of the
-    default rate. Thrusters are far from unlimited, so that it only matters near rest."""
+    """Time in which the feedback would stop the stack if thrust were unlimited, s: some ticks of
+    the default rate. As thrust is limited, it matters near rest only.
+    """
     timeout_s: Positive = Field(
         default=60.0,
         description="Longest time to stop the stack, s. A command that needs longer is refused; "

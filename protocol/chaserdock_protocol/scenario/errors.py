@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of scenario files: one line per error, with its path and what would be right."""
+"""Explain errors of scenario files: one line per error, with its path and what would be right."""
 
 from __future__ import annotations
 

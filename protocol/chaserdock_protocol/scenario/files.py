@@ -154,10 +154,12 @@ def read_calibration(path: Path) -> dict[str, Any]:
     except (cv2.error, SystemError) as error:
         reason = str(error).strip().splitlines()[-1]
         raise ScenarioError(f"{path}: not a calibration file of OpenCV: {reason}") from None
+
     if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
         raise ScenarioError(f"{path}: camera_matrix must be a 3 x 3 matrix")
     if width < 1 or height < 1:
         raise ScenarioError(f"{path}: image_width and image_height must be positive")
+
     coefficients = [] if lens is None else np.ravel(lens).astype(float).tolist()
     while len(coefficients) > 5 and coefficients[-1] == 0.0:
         coefficients.pop()

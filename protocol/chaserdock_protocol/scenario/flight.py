@@ -51,8 +51,9 @@ def _timing(physics_hz: int, rate_hz: int, image_hz: int, latency_steps: int) ->
 
 
 class FlightScenario(Section):
-    """The part of a scenario that the flight software receives: nominal bodies and sensors, its own
-    settings, the mission.
+    """The part of a scenario that the flight software receives.
+
+    Nominal bodies and sensors, its own settings, and the mission.
     """
 
     format: Literal[3] = Field(

@@ -11,7 +11,7 @@ from .fields import Positive, Section, Vector
 
 
 class Inspection(Section):
-    """Flight around the target by the command `inspect`, during which panel angles and scale of a
+    """Flight around the target by the command `inspect`. During it, panel angles and scale of a
     known mesh are estimated.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario's JSON schema: for editors, for the reference page, and for the texts of validation
+"""Derive the scenario's JSON schema, for editors, the reference page and the texts of validation
 errors.
 """
 
@@ -74,7 +74,7 @@ def number_text(value: float) -> str:
 
 
 def range_text(node: SchemaNode, every: bool = False) -> str:
-    """Return the range of a number in words. ``every``: include the bound that all numbers have."""
+    """Return the range of a number in words; ``every``: including the bound that all numbers have."""
     bounds = {
         k: node[k]
         for k in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum")

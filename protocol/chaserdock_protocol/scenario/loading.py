@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Load scenarios: files with their variants and overrides, and the JSON that the world sends and
-logs store.
-"""
+"""Load scenarios from files with variants and overrides, and from the JSON of world and logs."""
 
 from __future__ import annotations
 
@@ -23,7 +21,9 @@ from .overrides import Values, merge, with_override
 from .schema import ESTIMATORS, PERCEPTIONS, SOLVERS
 
 Step = tuple[str, Callable[[Values], Values]]
-"""Source of values (file or override), and the function that applies them to what precedes."""
+"""One step of loading: its source (a file or an override), and the function that applies the
+source's values to those of the steps before.
+"""
 
 
 def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
@@ -124,8 +124,9 @@ def _overriding(text: str) -> Callable[[Values], Values]:
 
 
 def _check_camera(before: Values, after: Values, source: str) -> None:
-    """Drop the values that ``camera.intrinsics`` replaces, in place. Raise ScenarioError where the
-    source states one.
+    """Drop, in place, the values that ``camera.intrinsics`` replaces.
+
+    Raises ScenarioError where the source itself states one of them.
     """
     was, now = (v["camera"] if isinstance(v.get("camera"), dict) else {} for v in (before, after))
     for key in REPLACED_BY_INTRINSICS if now.get("intrinsics") else ():
@@ -162,8 +163,9 @@ def _validated(steps: Sequence[Step], source: str) -> Scenario:
 
 
 def _with_sources(steps: Sequence[Step], lines: list[str], source: str) -> list[str]:
-    """Prefix each line with the first step after which it appears. What is missing is missing in
-    ``source``.
+    """Prefix each line with the source of the first step after which it appears.
+
+    A missing key belongs to ``source``, whatever the step.
     """
     first: dict[str, str] = {}
     values: Values = {}

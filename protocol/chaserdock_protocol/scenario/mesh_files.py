@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read mesh files (GLB, glTF, OBJ, STL, PLY) through trimesh; every problem is one line that says
-what would be right.
+"""Read mesh files (GLB, glTF, OBJ, STL, PLY) through trimesh.
 
-A part is a node of the file with its material. What the format cannot say (texture, density,
-joints) is in the extras of nodes and scene under ``EXTRAS``, as `chaserdock target --mesh` writes
-them.
+Every problem is one line that says what would be right. A part is a node of the file with its
+material. What the format cannot say (texture, density, joints) is in the extras of nodes and scene
+under ``EXTRAS``, as `chaserdock target --mesh` writes them.
 """
 
 from __future__ import annotations
@@ -39,8 +38,9 @@ _UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (100
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh that was read, what was changed or assumed (``notes``), and the deviation by
-    decimation.
+    """A mesh that was read.
+
+    ``notes``: what was changed or assumed. ``deviation_m``: by decimation.
     """
 
     mesh: TriangleMesh
@@ -55,11 +55,11 @@ def read_surface(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 
 
 
 def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0)) -> MeshFile:
-    """Read a mesh file; ``scale`` is the factor to metres, ``origin_m`` the point of the file that
-    becomes the origin.
+    """Read a mesh file.
 
-    Raises ScenarioError with one line for a file that is not a mesh, is not closed, or has an
-    absurd size.
+    ``scale``: factor from the file's unit to metres. ``origin_m``: point of the file that becomes
+    the origin. Raises ScenarioError with one line for a file that is not a mesh, is not closed, or
+    has an absurd size.
     """
     scene, notes = _load(path), []
     parts = [
@@ -69,6 +69,7 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
         raise ScenarioError(f"{path}: contains no triangles; a target needs closed surfaces")
     if len(parts) > MAX_PARTS:
         raise ScenarioError(f"{path}: has {len(parts)} parts; join them to at most {MAX_PARTS}")
+
     parts = _with_unique_names(parts)
     mesh = TriangleMesh(path.stem, tuple(parts), _joints(path, scene, scale, np.array(origin_m)))
     _check_size(path, mesh, scale)
@@ -76,6 +77,7 @@ def read_mesh(path: Path, scale: float = 1.0, origin_m: Vector3 = (0.0, 0.0, 0.0
         raise ScenarioError(
             f"{path}: has {mesh.triangle_count:,} triangles; simplify it to at most {_MOST_READ:,}"
         )
+
     mesh = replace(mesh, parts=tuple(_closed(path, part, notes) for part in mesh.parts))
     before = mesh.triangle_count
     mesh, deviation_m = decimation.limited(mesh, MAX_TRIANGLES)
@@ -161,8 +163,9 @@ def _part(
 
 
 def _welded(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
-    """Join vertices of one place, which files split at creases, round them to 32 bits, and drop
-    triangles without area.
+    """Join vertices at one place, and drop triangles without area.
+
+    Files split vertices at creases. Coordinates are rounded to 32 bits.
     """
     vertices = vertices.astype(np.float32).astype(float)
     grain = max(float(np.ptp(vertices, axis=0).max()) * _WELD_SHARE, 1e-12)
@@ -209,6 +212,7 @@ def _material(name: str, geometry: Any, notes: list[str]) -> Material:
             )
         notes.append(f"{name}: no material; it is drawn in uniform grey of reflectance 0.5")
         return Material("grey")
+
     label = str(getattr(given, "name", None) or "material")[:64]
     image = getattr(given, "baseColorTexture", None) or getattr(given, "image", None)
     share = 1.0
@@ -219,6 +223,7 @@ def _material(name: str, geometry: Any, notes: list[str]) -> Material:
         notes.append(f"{name}: no texture; uniform surface of {label!r}") if not _has_colour(
             given
         ) else None
+
     if hasattr(given, "baseColorFactor"):
         return _of_pbr(label, given, share)
     diffuse = (
@@ -239,8 +244,9 @@ def _has_colour(material: Any) -> bool:
 
 
 def _of_pbr(label: str, given: Any, share: float) -> Material:
-    """Return a material of metallic-roughness shading: a metal reflects mostly in its highlight,
-    whose exponent is 2 / r^4 - 2.
+    """Return the material of metallic-roughness shading.
+
+    A metal reflects mostly in its highlight, whose exponent is 2 / r^4 - 2 at the roughness r.
     """
     factor = given.baseColorFactor
     grey = 1.0 if factor is None else _grey(np.asarray(factor, dtype=float)[None, :3] / 255.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Older scenario formats: scenarios stored in logs are migrated, files get an error that names the
+"""Migrate older scenario formats: those of logs are converted, files get an error that names the
 new key.
 """
 

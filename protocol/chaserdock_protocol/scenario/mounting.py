@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chasers at their ports: nominal poses, and the thrusters whose plume is free there."""
+"""Derive what holds for chasers at their ports: nominal poses, and thrusters whose plume is free."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 def nominal_mounting(scenario: FlightScenario, chaser: int) -> MountedChaser:
-    """Return where a chaser is that is latched exactly at its port. Raises ValueError without
-    one.
+    """Return the nominal pose of a chaser that is latched at its port. Raises ValueError without a
+    port.
     """
     port = scenario.docking.port_of(chaser)
     if port is None:
@@ -30,8 +30,9 @@ def nominal_mounting(scenario: FlightScenario, chaser: int) -> MountedChaser:
 def plume_free_thrusters(
     scenario: FlightScenario, latched: Set[int]
 ) -> dict[int, NDArray[np.bool_]]:
-    """Return which thrusters (n,) of latched chasers may fire, by their nominal poses, so that
-    noise changes nothing.
+    """Return which thrusters (n,) of each latched chaser may fire without a plume hitting anything.
+
+    Uses nominal poses, so that noise changes nothing.
     """
     mounted = {i: nominal_mounting(scenario, i) for i in sorted(latched)}
     free = plume_free(

@@ -79,10 +79,12 @@ class Orbit(Section):
             raise ValueError(
                 "altitude_m: is of a circular orbit; give semi_major_axis_m with an eccentricity"
             )
+
         if self.epoch.tzinfo is None:
             raise ValueError(f"epoch: needs a time zone, as in {self.epoch.isoformat()}Z")
         if not 1950 <= self.epoch.year <= 2050:
             raise ValueError(f"epoch: must be in the years 1950 to 2050, not {self.epoch.year}")
+
         lowest_m = self.elements.perigee_radius_m - EARTH_RADIUS_M
         if lowest_m < 0.0:
             raise ValueError(
@@ -94,6 +96,7 @@ class Orbit(Section):
                 f"the perigee is at {lowest_m / 1e3:.1f} km, inside the atmosphere; at least "
                 f"{LOWEST_ALTITUDE_M / 1e3:g} km are needed"
             )
+
         drag = (self.target_ballistic_coefficient_kg_m2, self.chaser_ballistic_coefficient_kg_m2)
         if drag.count(None) == 1:
             raise ValueError(

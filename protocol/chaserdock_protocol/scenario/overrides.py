@@ -29,8 +29,9 @@ def merge(base: Values, variant: Values) -> Values:
 
 
 def _drop_alternatives(table: Values, key: str, value: Any) -> None:
-    """Remove from a table what a new value of ``key`` replaces: other forms of an attitude, a
-    target's own geometry.
+    """Remove from a table what a new value of ``key`` replaces.
+
+    These are other forms of an attitude, and a target's own geometry.
     """
     if key in ATTITUDE_KEYS:
         for other in ATTITUDE_KEYS:

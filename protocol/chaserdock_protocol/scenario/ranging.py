@@ -14,13 +14,14 @@ from .fields import Fraction, NotNegative, Positive, Section
 
 
 class Ranging(Section):
-    """Measurements at far range, of a target too small in the image for its markers: its range,
-    from a range sensor, and its attitude, as a cooperative target sends it, with white errors. The
+    """Measurements at far range, of a target too small in the image for its markers. A range sensor
+    measures its range, and a cooperative target sends its attitude; both have white errors. The
     bearing is measured in the image, where the target is the spot of the size that it has at that
-    range; with `perception.name = "statistical"`, which has no image, it is drawn with a white
-    error. In images in which markers give the more accurate position, these are used
+    range. With `perception.name = "statistical"`, which has no image, the bearing is drawn with a
+    white error. Markers are used in images in which they give the more accurate position
     ([estimation.md](estimation.md#far-range)). Without this section: a target whose markers are too
-    small is not seen."""
+    small is not seen.
+    """
 
     range_noise_m: Positive = Field(
         default=0.02, description="Standard deviation of the range, m, of a target nearby."

@@ -14,7 +14,8 @@ from .fields import Index, NotNegative, Positive, Section, Vector
 
 class SpeedLimit(Section):
     """Largest speed of every chaser relative to the target (WRF) until its first abort: `speed_m_s`
-    + `per_s` x (distance of the centres - `from_m`)."""
+    + `per_s` x (distance of the centres - `from_m`).
+    """
 
     speed_m_s: Positive = Field(description="Speed at the distance `from_m`, m/s.")
     per_s: NotNegative = Field(default=0.0, description="Increase with the distance, 1/s.")

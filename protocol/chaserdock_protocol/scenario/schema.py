@@ -30,8 +30,7 @@ MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
 PERCEPTIONS = (*MARKER_PERCEPTIONS, "model")
 ESTIMATORS = ("joint", "paper")
 SOLVERS = ("rti", "ipopt", "open")
-"""Built-in parts, by the names that a scenario selects them with; others may be installed (see
-``plugins``).
+"""Names of the built-in parts that a scenario selects. Further ones may be installed (``plugins``).
 """
 
 MAX_STAGES = 500

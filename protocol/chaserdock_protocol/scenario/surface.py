@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The content of a mesh file as part of a scenario: vertices and triangles as compressed text,
+"""Store the content of a mesh file in a scenario: vertices and triangles as compressed text,
 materials, joints.
 
 Processes without the file receive it in this form; the flight software's version has fewer

@@ -39,9 +39,10 @@ MISMATCH: dict[str, dict[str, float]] = {
 
 
 class ChaserTruth(Section):
-    """Differences of each chaser's body and actuators: standard deviations per axis, drawn from the
-    seed once per chaser and limited to three of them, unless stated otherwise. Without a figure:
-    that of the preset."""
+    """Differences of each chaser's body and actuators. Figures are standard deviations per axis,
+    drawn from the seed once per chaser and limited to three of them, unless stated otherwise. A
+    figure that is not given is that of the preset.
+    """
 
     mass_share: MismatchShare | None = Field(
         default=None, description="Relative error of the mass."
@@ -101,8 +102,9 @@ class ChaserTruth(Section):
 
 
 class TargetTruth(Section):
-    """Differences of the target: standard deviations per axis. Mass, inertia and centre of mass
-    need `target.motion = "torque_free"`. Without a figure: that of the preset."""
+    """Differences of the target. Figures are standard deviations per axis. Mass, inertia and centre
+    of mass need `target.motion = "torque_free"`. A figure that is not given is that of the preset.
+    """
 
     mass_share: MismatchShare | None = Field(
         default=None, description="Relative error of the mass."
@@ -244,8 +246,9 @@ _OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))  # places of the products of inertia xy
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Resolved figures of a chaser or the target, SI units and radians; standard deviations per
-    axis, ``delay_s`` exact.
+    """Resolved figures of a chaser or the target, SI units and radians.
+
+    Standard deviations per axis; ``delay_s`` is exact.
     """
 
     mass_share: float = 0.0

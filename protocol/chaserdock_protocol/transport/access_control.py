@@ -132,6 +132,7 @@ def access_control(namespace: str, chasers: int) -> dict[str, Any]:
             living,
         ),
     ]
+
     policies: list[dict[str, Any]] = []
     everyone = identities(chasers)
     for who in everyone:
@@ -154,6 +155,7 @@ def access_control(namespace: str, chasers: int) -> dict[str, Any]:
             ),
         ]
         policies.append({"subjects": [name], "rules": [*common, *own]})
+
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -13,7 +13,7 @@ MAX_BYTES = 256_000_000
 """A quarter of the memory of a process in compose.yaml: ten seconds of 1280 x 720 JPEG images of 16
 chasers at 15 Hz."""
 MAX_ITEMS = 200_000
-"""Small messages for which Python's objects would take more memory than their bytes."""
+"""Bound for small messages, whose Python objects take more memory than their bytes."""
 
 
 class BoundedQueue(Generic[T]):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions that publish on the world's keys without being the mission's world."""
+"""Detect sessions that publish on the world's keys without being the mission's world."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from chaserdock_protocol.messages import Message
 from .network import RawSample
 
 MOST_REPORTED = 16
-"""Sessions of foreign publishers that are reported; whoever forges an identity per message fills no
-log.
+"""Sessions that are reported at most: whoever forges an identity per message must not fill the log.
 """
 
 
 class ForeignPublishers:
-    """Recognizes samples of other sessions than ``world_source`` (empty: accepts all), and reports
-    each session once. Samples are checked on any thread, reports are made on the reader's.
+    """Recognize samples of other sessions than the world's, and report each such session once.
+
+    ``world_source``: session of the world; empty accepts all. Samples are checked on any thread,
+    reports are made on the reader's.
     """
 
     def __init__(self) -> None:

@@ -26,7 +26,7 @@ from .bounded_queue import BoundedQueue
 
 T = TypeVar("T", bound=Struct)
 Undo = Callable[[], None]
-"""Ends what the call that returned it has begun."""
+"""Function that ends what the call that returned it has begun."""
 
 
 class Host(Protocol):
@@ -51,7 +51,7 @@ class Host(Protocol):
         ...
 
     def finish_startup(self) -> None:
-        """Take note that the process has made its long-lived objects."""
+        """Tell the host that the process has created its long-lived objects."""
         ...
 
     def lower_priority(self) -> None:
@@ -206,8 +206,9 @@ class Machine:
         return end
 
     def finish_startup(self) -> None:
-        """Exclude the objects created so far from garbage collection, which would otherwise pause
-        the flight for some 10 ms.
+        """Exclude the objects created so far from garbage collection.
+
+        It would otherwise pause the flight for some 10 ms.
         """
         gc.collect()
         gc.freeze()

@@ -69,8 +69,8 @@ class Node:
         self.counts = TrafficCounters()
         self.message_filter: MessageFilter | None = None
         self.blocking = True
-        """True (lock-step): a slow reader blocks the publisher. False: it misses messages. Set
-        before publishing.
+        """Whether a slow reader blocks the publisher (lock-step) or misses messages. Set before
+        publishing.
         """
         self._ready: deque[ReceivedMessage] = deque()
         self._latest: dict[str, _Arrival] = {}
@@ -109,8 +109,9 @@ class Node:
         self._foreign.expect(source, on_foreign)
 
     def _is_foreign(self, raw: RawSample) -> bool:
-        """Count a message on the world's keys that is not the world's. Runs on the network's or the
-        reader's thread.
+        """Return whether a message on the world's keys is not the world's, and count it.
+
+        Runs on the network's or the reader's thread.
         """
         foreign = self._foreign.sent(raw)
         if foreign:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joining a mission, and the discovery barrier before its first tick.
+"""Join a mission, and hold its first tick until all processes have discovered each other.
 
 Zenoh propagates declarations one by one, so that a message published too early may miss a
 subscriber. Every process therefore publishes at intervals from which processes it has received
@@ -135,7 +135,8 @@ def run_member(
 
 
 def ask_as_world(node: Node) -> JoinReply | None:
-    """Return how the world of this namespace refuses a second one, or None without a world.
+    """Return how the world of this namespace refuses a second one; None without a world.
+
     Reserves no name.
     """
     request = JoinRequest(process="world", instance=node.host.unique_id())
@@ -170,8 +171,9 @@ def ignore_foreign_publishers(
 
 
 def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
-    """Make a node ignore messages on the world's keys that are not the world's, and publish a
-    warning about each session.
+    """Make a node ignore messages of other sessions on the world's keys.
+
+    Publishes a warning about each such session.
     """
 
     def warn(detail: str, newest: Message | None) -> None:
@@ -200,7 +202,7 @@ def required_peers(process: str, present: set[str]) -> set[str]:
 
 
 class Heartbeat:
-    """Publishes this process' presence at intervals in the background, and collects that of the
+    """Publish this process' presence at intervals in the background, and collect that of the
     others.
 
     Construct it after all other subscriptions of the node. ``waiting_for``: see ``Presence``.
@@ -260,7 +262,7 @@ class Heartbeat:
             self.waiting_for = ()
 
     def world_heard(self) -> None:
-        """Take note of a message of the world."""
+        """Note that the world has sent a message."""
         self._without_world.reset()
 
     def world_is_gone(self) -> bool:

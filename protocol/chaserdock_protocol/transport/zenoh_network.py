@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network that is Eclipse Zenoh, with safe defaults. No other module imports zenoh.
+"""Connect nodes through Eclipse Zenoh, with safe defaults. No other module imports zenoh.
 
 Defaults: no multicast, loopback only, one namespace per run, no shared memory.
 """
@@ -40,7 +40,9 @@ _LOG_FILTER = "error,zenoh::api::session=off"
 the declarations of their keys, which Zenoh discards and reports as errors."""
 
 _FIRST_ATTEMPT_S, _LONGEST_ATTEMPT_S = 1.0, 5.0
-"""Wall time of the attempts of a client to connect."""
+"""Wall time (s) of a client's first and longest attempts to connect. Shorter: Ctrl-C acts sooner;
+longer: a slow TLS handshake succeeds.
+"""
 
 
 def zenoh_config(link: Link) -> zenoh.Config:
@@ -55,6 +57,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
         config = zenoh.Config.from_file(str(link.config)) if link.config else zenoh.Config()
     except zenoh.ZError as error:
         raise TransportError(f"Zenoh configuration {link.config}: {error}") from None
+
     values: dict[str, Any] = {
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
@@ -73,6 +76,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
     values |= {
         name: value for name, value in retry.items() if config.get_json(name) in ("null", None)
     }
+
     if link.config is None:
         values |= {
             "mode": link.mode,
@@ -85,6 +89,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
         values |= _tls_values(link.tls)
     if link.access_control is not None:
         values["access_control"] = link.access_control
+
     try:
         config.insert_json5("namespace", json.dumps(link.namespace))
         for name, value in values.items():
@@ -170,7 +175,7 @@ class ZenohNetwork:
 
 
 class _ZenohConnection:
-    """A ``Connection`` over one Zenoh session, which all declarations live as long as."""
+    """Carry one node's messages over a Zenoh session; all declarations live as long as the session."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session

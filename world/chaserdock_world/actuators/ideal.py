@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators of a chaser in the simulation: the interface, and ideal actuators that give the
-commanded wrench.
+"""Simulate ideal actuators, which give the commanded wrench, and define the interface of all.
 
-Commands wait until they take effect; ideal actuators limit each axis of a command to the body's
+Commands wait until they take effect. Ideal actuators limit each axis of a command to the body's
 limits.
 """
 
@@ -26,9 +25,10 @@ from chaserdock_world.plant import ActuationErrors
 class ActuatorOutput(NamedTuple):
     """Output of a chaser's actuators over an interval.
 
-    ``impulse`` (6,): N s and N m s, body axes; ``absolute_impulse_N_s``: time integral of the force
-    components' absolute values; ``saturated``: a command exceeded the limits; ``late``: number of
-    commands after their effective time; thrusters: see BodyTruth.
+    ``impulse`` (6,): N s and N m s, body axes. ``absolute_impulse_N_s``: time integral of the sum
+    of the force components' magnitudes. ``saturated``: whether a command exceeded the limits.
+    ``late``: number of commands that came after their effective time. Fields of thrusters: see
+    ``BodyTruth``.
     """
 
     impulse: Array
@@ -56,10 +56,10 @@ class Actuators(Protocol):
         ...
 
     def act(self, step: int, steps: int, step_s: float) -> Array:
-        """Return the wrench (6,), body axes, N and N m, from ``step`` on and account for ``steps``
-        steps of it.
+        """Return the wrench (6,), body axes, N and N m, from ``step`` on, and account for it.
 
-        The wrench must not change in between (see ``next_change``).
+        It is accounted for during ``steps`` steps, in which it must not change (see
+        ``next_change``).
         """
         ...
 
@@ -156,7 +156,9 @@ class IdealActuators:
 
 
 def _given(errors: ActuationErrors, wrench: Array, step: int) -> Array:
-    """Return what actuators with errors give for a command (6,) that acts from ``step`` on."""
+    """Return the wrench (6,) that actuators with errors give for a command that acts from ``step``
+    on.
+    """
     wrench = wrench * (1.0 + errors.thrust_share)
     if errors.scatter_share:
         wrench = wrench * errors.scatter(0, step, 6)

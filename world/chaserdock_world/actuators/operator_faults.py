@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster faults injected by an operator in flight: requested at any time, applied and answered
-between ticks.
+"""Inject thruster faults on request of an operator in flight.
+
+They are requested at any time, applied and answered between ticks.
 """
 
 from __future__ import annotations
@@ -17,9 +18,7 @@ from .thrusters import ThrusterActuators
 
 
 class ThrusterFaultHandler:
-    """Collects thruster fault commands and applies them at the next tick. The chaser is not
-    informed.
-    """
+    """Collect thruster fault commands and apply them at the next tick, unknown to the chaser."""
 
     def __init__(self, scenario: Scenario, actuators: Mapping[str, Actuators]) -> None:
         self._scenario, self._actuators = scenario, actuators

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated thrusters of a chaser: valves that open and close as commanded, with failures.
+"""Simulate a chaser's thrusters: valves that open and close as commanded, with failures.
 
 The wrench about the centre of mass is constant in body axes over a physics step and equals the mean
 over the step. Propellant consumption is computed; the body's mass stays constant.
@@ -23,13 +23,13 @@ from chaserdock_world.plant import ActuationErrors, actuation_errors
 from .ideal import ActuatorOutput, Actuators, IdealActuators
 
 _LOOK_AHEAD_STEPS = 32
-"""Physics steps for which wrenches are computed at once: 32 take 32 us, two take 38 us; a change of
-the pulses discards the rest.
+"""Physics steps for which wrenches are computed at once. A change of the pulses discards the rest;
+32 steps take 32 us, two take 38 us.
 """
 
 
 class ThrusterActuators:
-    """The thrusters of one chaser; implements ``Actuators``.
+    """Simulate the thrusters of one chaser; implements ``Actuators``.
 
     Pulses have absolute times. The part of a pulse that has passed when a late command arrives is
     lost.

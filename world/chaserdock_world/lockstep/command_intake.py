@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which actuator commands act: their way from the network to actuators and latches. No I/O."""
+"""Pass actuator commands from the network to actuators and latches, and reject those that do not
+act.
+
+No I/O.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +19,16 @@ from .observed_commander import ObservedCommander
 from .open_tick import OpenTick
 
 _MAX_CLOCK_ERROR_NS = 1_000_000_000
-"""A command whose effective time differs from its tick's by more comes from a wrong clock."""
+"""Largest difference (ns) between a command's effective time and its tick's. More comes from a
+wrong clock.
+"""
 
 
 class Taken(NamedTuple):
-    """What became of a command: why it is ``rejected``, and why the commander has changed with it;
-    empty if not.
+    """What became of a command.
+
+    ``rejected``: why it does not act; empty if it does. ``hand_over``: why the commander changed
+    with it; empty if it did not.
     """
 
     rejected: str = ""
@@ -28,9 +36,10 @@ class Taken(NamedTuple):
 
 
 class CommandIntake:
-    """Hands commands to ``actuators``, by the chasers' names, and stops those that get none.
+    """Pass commands to ``actuators``, by the chasers' names, and stop actuators that get none.
 
-    ``current_step``: physics step now. ``command_latch(chaser, latch, step)``: commands a latch.
+    ``current_step``: returns the present physics step. ``command_latch(chaser, latch, step)``:
+    commands a latch.
     """
 
     def __init__(
@@ -46,7 +55,7 @@ class CommandIntake:
         self._actuators = actuators
         self._current_step = current_step
         self._command_latch = command_latch
-        # At least two ticks, as a command acts until that of the next tick arrives.
+        # At least two ticks, as a command acts until the next tick's arrives.
         self._watchdog_ns = round(max(watchdog_s, 2.0 / timing.rate_hz) * 1e9)
         self._commanded_ns: dict[str, int] = {}
         self._executed_tick: dict[int, int] = {}
@@ -57,7 +66,7 @@ class CommandIntake:
         return tuple(self._actuators)
 
     def take(self, command: ActuatorCommand, opened: OpenTick, now_s: float, once: bool) -> Taken:
-        """Let a command act, and note the reply to the open tick; or reject it.
+        """Apply a command, and note the reply to the open tick; or reject it.
 
         ``once``: whether a second reply to the same tick is rejected. ``now_s``: the clock by which
         silent commanders are reported.

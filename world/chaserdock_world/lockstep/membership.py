@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Membership of a mission: admits processes, tracks their liveliness and which of them have
-discovered each other.
-"""
+"""Admit processes to a mission, and track which are alive and have discovered each other."""
 
 from __future__ import annotations
 
@@ -18,18 +16,18 @@ from chaserdock_protocol.transport.session import required_peers
 from .stall import WaitReport
 
 JOIN_TIMEOUT_S = 5.0
-"""An admitted process keeps its name reserved for so long before its liveliness token appears."""
+"""Time, s, for which an admitted process keeps its name before its liveliness token appears."""
 
 
 @dataclass
 class Membership:
-    """The processes of a mission as the world knows them. Thread-safe: called from Zenoh's threads
-    and the main loop.
+    """Track the processes of a mission as the world knows them.
 
-    ``instance`` and ``source``: the world's own instance and session. ``flying``: set at the first
-    tick, from when on connected processes no longer wait for processes that are only joining (see
-    ``connected``). ``scenario_json``: the flight scenario. ``faults_of``: JSON of the faults to
-    inject at a process, by its name.
+    Thread-safe: called from Zenoh's threads and the main loop. ``instance`` and ``source``: the
+    world's own instance and session. ``flying``: set at the first tick; from then on connected
+    processes no longer wait for processes that are only joining (see ``connected``).
+    ``scenario_json``: the flight scenario. ``faults_of``: JSON of the faults to inject at a
+    process, by its name.
     """
 
     chasers: int

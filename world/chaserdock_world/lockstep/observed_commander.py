@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who commands, as the world sees it in the commands that chasers execute. It decides nothing. No
-I/O; time is passed in.
+"""Observe in the commands that chasers execute which controller commands. Decides nothing.
+
+No I/O; time is passed in.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from chaserdock_protocol.messages import ActuatorCommand
 
 @dataclass
 class ObservedCommander:
-    """The controller ``name`` of the newest ``term`` that a chaser has flown."""
+    """The controller ``name`` with the newest ``term`` that a chaser has flown."""
 
     name: str = ""
     term: int = 0
@@ -22,8 +23,8 @@ class ObservedCommander:
     _commanded_s: float = 0.0
 
     def update(self, command: ActuatorCommand, controllers: Mapping[str, str], now_s: float) -> str:
-        """Take an executed command; return the change of commander as text for the log, empty
-        without one.
+        """Take an executed command; return a change of commander as text for the log, empty without
+        one.
 
         ``controllers``: those connected, name to instance.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tick that is open, who takes part in it, and who has replied. No I/O."""
+"""Track who takes part in the open tick, and who has replied. No I/O."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from chaserdock_protocol.messages import Tick
 
 @dataclass
 class OpenTick:
-    """A tick that expects a reply of ``chasers``. ``revision`` counts how often it was published
-    again; ``controllers``, ``instances`` (of chasers) and ``since``: see ``Tick``.
+    """A tick that expects a reply of ``chasers``.
+
+    ``revision``: how often it was published again. ``controllers``, ``instances`` (of chasers) and
+    ``since``: see ``Tick``.
     """
 
     tick: int = -1
@@ -31,7 +33,7 @@ class OpenTick:
         return [i for i in self.chasers if i not in self.replied]
 
     def remove(self, process: str) -> bool:
-        """Expect nothing of a process that was lost; return whether it took part."""
+        """Stop expecting a reply of a lost process; return whether it took part."""
         self.since.pop(process, None)
         if self.controllers.pop(process, None) is not None:
             return True

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Explanation of a lock-step tick that does not end: who owes which message, and what it waits for
-itself. No I/O.
+"""Explain why a lock-step tick does not end: who owes which message, and waits for what itself.
+
+No I/O.
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ from dataclasses import dataclass
 from chaserdock_protocol import topics
 
 SILENT_S = 5.0
-"""A process whose last presence is older has stopped running, or is cut off."""
+"""Age (s) of its last presence above which a process has stopped running, or is cut off."""
 _MOST_NAMED = 12
-"""Sentences of an explanation; the causes come first, and the rest is counted."""
+"""Most sentences of an explanation. The causes come first, and the rest is counted."""
 
 
 @dataclass(frozen=True)
 class WaitReport:
-    """A process by its last presence, received ``age_s`` ago: ``waiting_for``, keys of the messages
-    that it waits for.
+    """State of a process by its last presence, received ``age_s`` ago.
+
+    ``waiting_for``: keys of the messages that it waits for.
     """
 
     waiting_for: tuple[str, ...]
@@ -39,11 +41,10 @@ def publisher_of(key: str, leader: str) -> str:
 
 
 def explain_stall(owed: Mapping[str, str], leader: str, processes: Mapping[str, WaitReport]) -> str:
-    """Return who owes which message, beginning with the causes: what waits for nothing else, and
-    what was lost.
+    """Explain who owes which message; causes first.
 
-    ``owed``: keys of the messages that the world waits for, by process. ``processes``: living
-    processes by name.
+    A cause is a process that was lost or waits for nothing else. ``owed``: keys of the messages
+    that the world waits for, by process. ``processes``: living processes by name.
     """
     todo, seen = deque(owed.items()), set(owed.items())
     causes: list[str] = []
@@ -67,7 +68,7 @@ def explain_stall(owed: Mapping[str, str], leader: str, processes: Mapping[str, 
 
 
 def _state_of(progress: WaitReport | None) -> tuple[str, tuple[str, ...]]:
-    """Return what a process does instead of publishing, and the keys that it waits for."""
+    """Return what a process does in place of publishing, and the keys that it waits for."""
     if progress is None:
         return "not running", ()
     if progress.age_s > SILENT_S:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lock-step barrier: opens ticks, and waits for the replies that they expect."""
+"""Open ticks in lock-step, and wait for the replies that they expect."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ from .open_tick import OpenTick
 from .stall import explain_stall
 
 RECORDER_WINDOW_TICKS = 8
-"""The flight is at most this far ahead of the recorder's acknowledgements, which bounds the data in
+"""Most ticks by which the flight is ahead of the recorder's acknowledgements. Bounds the data in
 the network.
 """
 LONGEST_STEP_S = 5.0
-"""Time (s) without a look at its messages after which the world publishes no presence, as if it
+"""Time, s, without a look at its messages after which the world publishes no presence, as if it
 were gone.
 """
 _STATUS_INTERVAL_S = 5.0
-"""Wall time after which the world prints again what it waits for, s."""
+"""Wall time, s, after which the world prints again what it waits for."""
 _POLL_S = 0.02
-"""Longest wait for one message, s: as soon is a departed process noticed."""
+"""Longest wait for one message, s. A departed process is noticed as soon."""
 _REPEAT_S, _MOST_REPEATS = 2.0, 3
-"""The first tick after all processes have returned is repeated after this wall time without a
-reply: chasers then state their leases again, which the network may have lost while it came up."""
+"""Wall time, s, without a reply after which the first tick since all processes have returned is
+repeated, and how often. Chasers then state their leases again, which the network may have lost
+while it came up.
+"""
 
 
 class TickBarrier:
-    """Opens ticks, collects the replies to them and decides when a tick is complete.
+    """Open ticks, collect the replies to them, and decide when a tick is complete.
 
-    ``commands``: takes the actuator commands. Who commands is decided by the chasers, which grant
-    leases; this process sees it in the commands that they execute.
+    ``commands``: takes the actuator commands. The chasers decide who commands, by granting leases;
+    this process sees it in the commands that they execute.
     """
 
     def __init__(
@@ -124,10 +126,10 @@ class TickBarrier:
         return keeps_up and not self._open.missing
 
     def await_replies(self, stopped: Callable[[], bool], stall_s: float) -> str:
-        """Process messages until the open tick is complete or ``stopped``; return why it never will
-        be, empty otherwise.
+        """Process messages until the open tick is complete or ``stopped``.
 
-        Without any reply to the tick for ``stall_s``, the text names who owes which message.
+        Return why it never will be complete, empty otherwise. Without any reply to the tick for
+        ``stall_s``, the text names who owes which message.
         """
         timer, progress = StallTimer(self._node.host.now_s), (0, 0, 0)
 
@@ -213,8 +215,9 @@ class TickBarrier:
     def wait_until(
         self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]
     ) -> bool:
-        """Process messages until ``done``; return False if ``stopped`` first. Prints at intervals
-        what it waits for.
+        """Process messages until ``done``; return False if ``stopped`` first.
+
+        Prints at intervals what it waits for.
         """
         printed_s = self._node.host.now_s()
         while not done():
@@ -244,14 +247,14 @@ class TickBarrier:
                 if self._membership.update_presence(presence):
                     self._heartbeat.take(presence)
             case LostMessage(tick=tick) if received is not None and tick == self._open.tick:
-                # Its actuators keep their last command.
+                # The chaser's actuators keep their last command.
                 self._open.replied.add(int(received.place or 0))
         if self._remove_departed():
             self._revise_tick()
 
     def _apply_command(self, command: ActuatorCommand) -> None:
-        """Let a command act, or count why it is rejected."""
-        # In real time a chaser may brake before its command arrives: the later reply replaces the
+        """Apply a command, or count why it is rejected."""
+        # In real time a chaser may brake before its command arrives: a later reply replaces the
         # first.
         once = not self._membership.realtime
         taken = self._commands.take(command, self._open, self._now_s(), once)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Import PyBullet and connect to it without its messages on standard output and error, which other
-programs may parse.
+"""Import PyBullet and connect to it, without its messages on standard output and error.
+
+Other programs may parse these.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid bodies in PyBullet (the interface is engine.py); with bullet.py the only module that uses
-its conventions.
+"""Simulate rigid bodies in PyBullet (the interface is engine.py).
 
-PyBullet orders quaternions x, y, z, w.
+With bullet.py the only module that uses its conventions: PyBullet orders quaternions x, y, z, w.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _NO_LOAD = (0.0, 0.0, 0.0)  # N or N m
 
 
 class BulletEngine:
-    """Bodies in a PyBullet client of their own; see ``RigidBodyEngine``."""
+    """Simulate bodies in a PyBullet client of their own; see ``RigidBodyEngine``."""
 
     def __init__(self, setup: EngineSetup) -> None:
         self._bullet = connect()
@@ -47,8 +46,8 @@ class BulletEngine:
         self._ids = [self._add(body, setup) for body in setup.bodies]
         self._numbers = {identity: number for number, identity in enumerate(self._ids)}
         if setup.joints:
-            # Else the solver stops early, and joint reactions lag behind changes of thrust by a few
-            # steps.
+            # Otherwise the solver stops early, and joint reactions lag behind changes of thrust by
+            # a few steps.
             self._bullet.setPhysicsEngineParameter(solverResidualThreshold=0.0)
         self._joints: dict[tuple[int, int], int] = {}
         self._step_s = setup.step_s

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of free bodies in PyBullet without Python calls for each step and body; the bits are those
-of these calls.
+"""Step free bodies in PyBullet without a Python call for each step and body, to the same bits.
 
 ``native/bullet.c`` calls Bullet's C interface, which PyBullet's library exports, with the client
-that Bullet hands to a plugin in the same world.
+that Bullet passes to a plugin in the same world.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ def _addresses() -> IntArray | None:
 
 @LIBRARY.structure("Path")
 class _Path(ctypes.Structure):
-    """`Path` of native/bullet.c."""
+    """Mirror `Path` of native/bullet.c."""
 
     _fields_ = [(name, ctypes.c_int64) for name in ("body", "next", "every")] + [
         ("motion", ctypes.c_void_p)
@@ -61,8 +60,9 @@ class _Path(ctypes.Structure):
 
 
 def _motion_of(path: PlacementPath) -> Array:
-    """Return position, attitude x, y, z, w, velocity and rate (K, 13) of the placements, as Bullet
-    takes them.
+    """Return the placements (K, 13) as Bullet takes them.
+
+    Position, attitude x, y, z, w, velocity, rate.
     """
     s = path.states
     motion = np.empty((len(s.position_m), 13))
@@ -72,7 +72,7 @@ def _motion_of(path: PlacementPath) -> Array:
 
 
 class BulletStepper:
-    """Makes the steps of free bodies in one PyBullet client; ``bodies``: their identities there."""
+    """Step free bodies in one PyBullet client; ``bodies``: their identities there."""
 
     def __init__(
         self, bodies: Sequence[int], functions: IntArray, client: int, step_s: float
@@ -110,9 +110,7 @@ class BulletStepper:
 
 
 def make_stepper(bodies: Sequence[int], client: int, step_s: float) -> BulletStepper | None:
-    """Return a stepper for a PyBullet client, None if this build of PyBullet does not offer what it
-    needs.
-    """
+    """Return a stepper for a PyBullet client; None if this build of PyBullet lacks what it needs."""
     functions = _addresses()
     if functions is None:
         return None

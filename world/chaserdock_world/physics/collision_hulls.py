@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convex pieces of a mesh for collisions: the engines need convex shapes.
+"""Divide a mesh into convex pieces for collisions, as the engines need convex shapes.
 
 Each connected surface of a part is cut in two across its longest direction until the convex hull of
 a piece is at most ``tolerance_m`` in front of it, or until there are ``MOST_PIECES`` of it. A
@@ -21,20 +21,24 @@ if TYPE_CHECKING:  # as slow to import as the whole world, and needed for target
     from scipy.spatial import ConvexHull
 
 MOST_PIECES = 16
-"""Largest number of convex pieces of a surface (chosen): bounds the contacts of a step."""
+"""Most convex pieces of a surface. More: closer to the surface; fewer: fewer contacts to check in a
+step.
+"""
 _WITHIN = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / np.array([[3], [6], [6], [6]])
 """Barycentric coordinates of the points of a triangle at which a gap is measured."""
 _MOST_VERTICES = 128
-"""Largest number of vertices of a piece (chosen): Bullet searches all of them in a contact."""
+"""Most vertices of a piece. More: closer to the surface; fewer: faster, as Bullet searches all of
+them in a contact.
+"""
 _MOST_TRIANGLES = 1500
-"""Triangles of a surface, beyond which it is simplified before it is cut (chosen): the time to cut
-it grows with them.
+"""Triangles of a surface above which it is simplified before it is cut. More: closer to the
+surface; fewer: faster, as the time to cut it grows with them.
 """
 _UNCUT = 10.0
-"""Pieces shorter than this many tolerances are not cut."""
+"""Length of a piece, in tolerances, below which it is not cut."""
 
 Cut = tuple[int, float]
-"""A plane across one axis of a piece: the axis and its coordinate, m."""
+"""A plane across one axis of a piece: number of the axis, and coordinate on it, m."""
 
 
 def collision_hulls(mesh: TriangleMesh, tolerance_m: float = 0.004) -> list[Array]:
@@ -117,19 +121,22 @@ def _few(vertices: Array) -> Array:
 
 
 def _gap_m(corners: Array, hull: ConvexHull, cuts: list[Cut]) -> float:
-    """Return the largest distance from a surface (m, 3, 3) along its normal to the hull, whose
-    facets in cuts count as open.
+    """Return the largest distance, m, from a surface (m, 3, 3) along its normal to the hull.
+
+    Facets of the hull in cuts count as open.
     """
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
     solid = length > 1e-12
     points = np.einsum("sk,mkj->smj", _WITHIN, corners[solid]).reshape(-1, 3)
     normal = np.tile(normal[solid] / length[solid, None], (len(_WITHIN), 1))
+
     planes = np.unique(np.round(hull.equations, 9), axis=0)
     for axis, at in cuts:
         planes = planes[
             (np.abs(planes[:, axis]) < 1.0 - 1e-6) | (np.abs(np.abs(planes[:, 3]) - abs(at)) > 1e-7)
         ]
+
     every = max(1, len(points) // _MOST_TRIANGLES)
     points, normal = points[::every], normal[::every]
     towards = normal @ planes[:, :3].T
@@ -140,8 +147,9 @@ def _gap_m(corners: Array, hull: ConvexHull, cuts: list[Cut]) -> float:
 
 
 def _clipped(corners: Array, axis: int, at: float, side: float) -> Array:
-    """Return the parts of triangles (m, 3, 3) with ``side * (x - at) >= 0`` along an axis, as
-    triangles.
+    """Return the triangles (., 3, 3) of the part of ``corners`` with ``side * (x - at) >= 0``.
+
+    x is the coordinate along ``axis``.
     """
     height = side * (corners[:, :, axis] - at)
     kept = [corners[(height >= 0.0).all(axis=1)]]
@@ -163,7 +171,7 @@ def _clipped(corners: Array, axis: int, at: float, side: float) -> Array:
 
 
 def triangles_of(vertices: Array) -> IntArray:
-    """Return the triangles (m, 3) of the hull of ``vertices`` (n, 3); a plane piece has none."""
+    """Return the triangles (m, 3) of the hull of ``vertices`` (n, 3); none for points in a plane."""
     hull = _hull(vertices)
     return (
         np.zeros((0, 3), dtype=np.int64)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A closed latch with play, or one that slips: a spring and damper between probe and port, with a
-dead zone and a grip.
+"""Simulate a closed latch with play, or one that slips.
 
-Within the play nothing acts. Beyond it the latch is as stiff as a contact. A load above the grip
-moves the place at which the probe is held (Coulomb friction). A latch without play that does not
-slip is a rigid joint instead.
+Between probe and port act a spring and a damper with a dead zone and a grip. Within the play
+nothing acts. Beyond it the latch is as stiff as a contact. A load above the grip moves the place at
+which the probe is held (Coulomb friction). A latch without play that does not slip is a rigid joint
+instead.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
 
 STIFFNESS_N_M, DAMPING_N_S_M = 1e4, 200.0
-"""Of the end of the play: as stiff as a contact (``definitions.ContactParameters``), with the
-damping of both bodies of one.
+"""Stiffness and damping at the end of the play: as stiff as a contact
+(``definitions.ContactParameters``), with the damping of both bodies of one.
 """
 TURN_STIFFNESS_N_M_RAD, TURN_DAMPING_N_M_S_RAD = 1000.0, 20.0
-"""The same about the tip: that stiffness and damping at an arm of 0.32 m, as of a body of that
-length.
+"""Stiffness and damping of a rotation about the tip: those above at an arm of 0.32 m, as of a body
+of that length.
 """
 ENGAGED_M = 0.02
-"""A probe that has slipped farther than this is out of its port."""
+"""Slip of a probe, m, above which it is out of its port."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,11 @@ class Grip:
 
 @dataclass
 class CompliantLatch:
-    """A closed latch. ``anchor_m`` (3,) and ``anchor_q_wxyz`` (4,): where it holds the tip and how
-    the chaser is turned, TRF.
+    """A closed latch.
 
-    ``slipped_m``: displacement of the anchor since the latch closed.
+    ``anchor_m`` (3,) and ``anchor_q_wxyz`` (4,): where it holds the tip, and the chaser's attitude
+    there, TRF. ``play_m``, ``play_rad``: motion on either side without a load. ``slipped_m``:
+    displacement of the anchor since the latch closed.
     """
 
     anchor_m: Array
@@ -60,22 +61,27 @@ class CompliantLatch:
     def load(
         self, target: BodyState, chaser: BodyState, reach_m: float, grip: Grip
     ) -> tuple[Array, Array, Array]:
-        """Return force (3,) and torque about the tip (3,) on the port, WRF, and the tip (3,), WRF.
-        Moves the anchor in a slip.
+        """Return force (3,) and torque (3,) about the tip on the port, and the tip (3,); all WRF.
 
-        ``reach_m``: distance of the tip from the chaser's origin along +X.
+        Moves the anchor in a slip. ``reach_m``: distance of the tip from the chaser's origin along
+        +X.
         """
         arm = rotations.rotate(chaser.q_wxyz, np.array([reach_m, 0.0, 0.0]))
         tip = chaser.position_m + arm
+
+        # Velocity and rate of the tip relative to the port.
         turn = rotations.rotate(chaser.q_wxyz, chaser.omega_rad_s) - rotations.rotate(
             target.q_wxyz, target.omega_rad_s
         )
         spin = rotations.rotate(target.q_wxyz, target.omega_rad_s)
         velocity = chaser.velocity_m_s + rotations.cross(turn + spin, arm)
         velocity = velocity - target.velocity_m_s - rotations.cross(spin, tip - target.position_m)
+
+        # Displacement from the anchor, TRF.
         place = rotations.rotate_inverse(target.q_wxyz, tip - target.position_m)
         attitude = rotations.multiply(rotations.conjugate(target.q_wxyz), chaser.q_wxyz)
         turned = rotations.multiply(attitude, rotations.conjugate(self.anchor_q_wxyz))
+
         force, slip = _transmitted(
             place - self.anchor_m,
             rotations.rotate_inverse(target.q_wxyz, velocity),
@@ -90,6 +96,7 @@ class CompliantLatch:
             (TURN_STIFFNESS_N_M_RAD, TURN_DAMPING_N_M_S_RAD),
             grip.torque_N_m,
         )
+
         self.anchor_m = self.anchor_m + slip
         if slip_rad.any():
             self.anchor_q_wxyz = rotations.multiply(rotations.exp(slip_rad), self.anchor_q_wxyz)
@@ -99,8 +106,8 @@ class CompliantLatch:
 def _transmitted(
     displacement: Array, rate: Array, play: float, spring: tuple[float, float], grip: float
 ) -> tuple[Array, Array]:
-    """Return the load (3,) that a displacement (3,) at a rate (3,) transmits, and by how much the
-    anchor slips (3,).
+    """Return the load (3,) that a displacement (3,) at a rate (3,) transmits, and the anchor's slip
+    (3,).
     """
     stiffness, damping = spring
     size = float(np.linalg.norm(displacement))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bodies of a scenario as an engine needs them: masses, collision shapes, initial states."""
+"""Define the bodies of a scenario for an engine: masses, collision shapes, initial states."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from .target_motion import prescribed_state
 
 TARGET = "target"
 PROBE_RADIUS_M = 0.006
-"""Radius of the probe's rod and of its round tip (docs/docking.md)."""
+"""Radius, m, of the probe's rod and of its round tip (docs/docking.md)."""
 _Z_TO_X_WXYZ = np.array([0.5**0.5, 0.0, 0.5**0.5, 0.0])
-"""Turns an engine's capsule, which is along z, along x."""
+"""Rotates an engine's capsule, which is along z, to x."""
 
 
 @dataclass(frozen=True)

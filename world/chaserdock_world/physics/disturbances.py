@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forces and torques on the bodies that nobody commands: constant ones, and noise."""
+"""Apply forces and torques that nobody commands: constant ones, and noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from chaserdock_world.random_draws import GaussMarkov, Stream
 
 
 class Disturbances:
-    """Disturbances of all bodies. Noise changes once a tick."""
+    """Disturb all bodies. Noise changes once a tick."""
 
     def __init__(self, scenario: Scenario, plants: Mapping[str, Plant]) -> None:
         self._steps_per_tick = scenario.timing.steps_per_tick

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interface of a rigid-body engine: what the simulation needs of PyBullet or MuJoCo.
+"""Define the interface of a rigid-body engine: what the simulation needs of PyBullet or MuJoCo.
 
 Bodies are numbered in the order in which they were defined. The frame of a body is that of its
 principal axes at its centre of mass. Quaternions are scalar first, body to world; rates are in
@@ -29,8 +29,9 @@ BodyMotion = tuple[Scalars3, Scalars4, Scalars3, Scalars3]
 
 @dataclass(frozen=True, eq=False)
 class SolidBox:
-    """A cuboid with half edges ``half_m`` (3,). ``position_m`` (3,) and ``q_wxyz`` (4,): its pose
-    in the frame of the body.
+    """A cuboid with half edges ``half_m`` (3,).
+
+    ``position_m`` (3,) and ``q_wxyz`` (4,): its pose in the frame of the body.
     """
 
     half_m: Sequence[float]
@@ -40,9 +41,7 @@ class SolidBox:
 
 @dataclass(frozen=True, eq=False)
 class SolidCapsule:
-    """A cylinder of ``length_m`` along z with round ends of ``radius_m``; its pose as that of a
-    ``SolidBox``.
-    """
+    """A cylinder of ``length_m`` along z with round ends of ``radius_m``; posed as a ``SolidBox``."""
 
     radius_m: float
     length_m: float
@@ -52,8 +51,9 @@ class SolidCapsule:
 
 @dataclass(frozen=True, eq=False)
 class SolidHull:
-    """The convex hull of ``vertices_m`` (n, 3) in the frame of the body, and its triangles (m, 3),
-    none for points in a plane.
+    """The convex hull of ``vertices_m`` (n, 3) in the frame of the body.
+
+    Triangles (m, 3); none for points in a plane.
     """
 
     vertices_m: Array
@@ -92,10 +92,10 @@ class ContactSpring:
 
 @dataclass(frozen=True, eq=False)
 class EngineSetup:
-    """The bodies of a simulation with steps of ``step_s``. ``spring``: of all contacts; None: they
-    are hard and do not rebound.
+    """The bodies of a simulation with steps of ``step_s``.
 
-    ``joints``: pairs of bodies that a rigid joint may hold.
+    ``spring``: compliance of all contacts; None: they are hard and do not rebound. ``joints``:
+    pairs of bodies that a rigid joint may hold.
     """
 
     bodies: Sequence[RigidBodyDefinition]
@@ -106,7 +106,7 @@ class EngineSetup:
 
 @dataclass(frozen=True, eq=False)
 class PlacementPath:
-    """States at which a body is placed after the ``first`` step from now, and then every ``every``
+    """States at which a body is placed: after step ``first`` from now, and then every ``every``
     steps.
 
     ``states``: position (K, 3), velocity (3,), attitude (K, 4) and rate (3,) of K placements.
@@ -118,7 +118,7 @@ class PlacementPath:
     states: BodyState
 
     def placement(self, steps: int) -> BodyState | None:
-        """Return the state at which the body is placed after so many steps, if it is."""
+        """Return the state at which the body is placed after this many steps, or None."""
         k, rest = divmod(steps - self.first, self.every)
         if rest or k < 0:
             return None
@@ -136,7 +136,7 @@ class BodyContact(NamedTuple):
 
 
 class RigidBodyEngine(Protocol):
-    """Rigid bodies, their contacts and joints. Loads are cleared after each step."""
+    """Simulate rigid bodies, their contacts and joints. Loads are cleared after each step."""
 
     def motion(self, body: int) -> BodyMotion:
         """Return the present motion of a body."""
@@ -165,12 +165,12 @@ class RigidBodyEngine(Protocol):
     def advance(
         self, bodies: IntArray, loads: Array, steps: int, path: PlacementPath | None = None
     ) -> tuple[int, bool]:
-        """Make at most ``steps`` steps of free ``bodies`` (n,) under constant loads, and stop after
-        one with contacts.
+        """Step free ``bodies`` (n,) under constant loads at most ``steps`` times.
 
-        ``loads`` (n, 9): principal moments, force and torque in body axes; gyroscopic.py corrects
-        the torque. ``path``: of another body; its placement after a step with contacts is left to
-        the caller. Return the number of steps made, and whether ``contacts`` may return any.
+        Stops after a step with contacts. ``loads`` (n, 9): principal moments, force and torque in
+        body axes; gyroscopic.py corrects the torque. ``path``: of another body; its placement after
+        a step with contacts is left to the caller. Return the number of steps made, and whether
+        ``contacts`` may return any.
         """
         ...
 
@@ -199,10 +199,10 @@ class RigidBodyEngine(Protocol):
         ...
 
     def reaction(self, a: int, b: int) -> Sequence[float]:
-        """Return what b exerted on a at their joint in the last step.
+        """Return what b exerted on a at their joint in the last step (6,).
 
-        (6,): force, N, in WRF; torque about the anchor, N m, in the axes that b had at the
-        beginning of the step.
+        Force, N, in WRF; torque about the anchor, N m, in the axes that b had at the beginning of
+        the step.
         """
         ...
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine that a scenario names. Its package is imported only when it is used."""
+"""Make the engine that a scenario names. Its package is imported only when it is used."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correction torque that makes an engine's integration of rotation second order.
+"""Compute the torque that makes an engine's integration of rotation second order.
 
 The engines evaluate the gyroscopic torque omega x I omega at the beginning of a step, so that
 angular momentum drifts in proportion to the step. The midpoint rule evaluates it in the middle of
@@ -44,11 +44,11 @@ def midpoint_torque(
     torque: Sequence[float],
     step_s: float,
 ) -> tuple[float, float, float]:
-    """Return the torque (3,), N m, body axes, to add to ``torque`` (body axes) for one step of
-    ``step_s``.
+    """Return the torque (3,), N m, body axes, to add to ``torque`` for one step of ``step_s``.
 
-    ``inertia``: principal moments, kg m^2; ``q_wxyz``: attitude body to world; ``omega_world``:
-    rate in world axes, rad/s. Plain floats, as this runs for every body in every physics step.
+    ``torque`` (3,): N m, body axes. ``inertia``: principal moments, kg m^2. ``q_wxyz``: attitude
+    body to world. ``omega_world``: rate in world axes, rad/s. Plain floats, as this runs for every
+    body in every physics step.
     """
     a, b, c = _rotate_to_body(q_wxyz, omega_world)
     ia, ib, ic = inertia
@@ -68,11 +68,10 @@ def midpoint_torque_of_rates(
     omega_world: Sequence[float],
     omega_world_before: Sequence[float],
 ) -> tuple[float, float, float]:
-    """Return the torque of ``midpoint_torque`` for a body with a joint, whose constraint torque is
-    not known in advance.
+    """Return the torque of ``midpoint_torque`` for a body with a joint.
 
-    The rate in the middle of the step is extrapolated from that of the previous step,
-    ``omega_world_before``.
+    The constraint torque is not known in advance. So the rate in the middle of the step is
+    extrapolated from that of the previous step, ``omega_world_before``.
     """
     middle = [a + 0.5 * (a - b) for a, b in zip(omega_world, omega_world_before, strict=True)]
     gx, gy, gz = _gyroscopic_torque(inertia, *_rotate_to_body(q_wxyz, omega_world))
@@ -83,8 +82,9 @@ def midpoint_torque_of_rates(
 def split_loads(
     bodies: IntArray, loads: Array
 ) -> list[tuple[int, list[float], list[float], list[float]]]:
-    """Return body, principal moments, force and torque of each row of
-    ``RigidBodyEngine.advance``.
+    """Return body, principal moments, force and torque of each row of ``loads``.
+
+    As ``RigidBodyEngine.advance`` takes them.
     """
     return [
         (b, row[:3], row[3:6], row[6:])

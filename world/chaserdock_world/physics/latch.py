@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State machine of a probe's latch: due commands, faults, and whether a touch closes it. Contains
-no physics.
-"""
+"""Decide when a probe's latch closes and opens: commands, faults, touches. Contains no physics."""
 
 from __future__ import annotations
 
@@ -18,13 +16,14 @@ from chaserdock_protocol.scenario.faults import LATCH_FAULTS
 from .compliant_latch import Grip
 
 _NEW_TOUCH_AFTER_S = 0.02
-"""Contact after at least this time without contact is a new touch."""
+"""Time, s, without contact after which a contact is a new touch."""
 
 
 @dataclass(frozen=True)
 class LatchFault:
-    """A fault of a latch from physics step ``begin`` to before ``end``. ``grip``: of a latch that
-    slips.
+    """A fault of a latch from physics step ``begin`` to before ``end``.
+
+    ``grip``: of a latch that slips.
     """
 
     kind: str
@@ -80,8 +79,9 @@ class ProbeLatch:
         return next((f for f in self.faults if f.kind == kind and f.begin <= step < f.end), None)
 
     def apply_due_commands(self, step: int) -> bool:
-        """Apply the commands due at ``step``; return whether the latch opens. A stuck one opens
-        when it is free again.
+        """Apply the commands due at ``step``; return whether the latch opens.
+
+        A stuck latch opens when it is free again.
         """
         while self._queue and self._queue[0][0] <= step:
             self.armed = heapq.heappop(self._queue)[2] == "arm"

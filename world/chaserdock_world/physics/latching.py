@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What touches and latches do to the bodies: probes on ports, joints, their loads and their faults.
+"""Simulate touches and latches: probes on ports, joints, their loads and their faults.
 
 A latch without play is a rigid joint of the engine, one with play or that slips is a spring
-(``compliant_latch``). When a latch closes or opens is decided by ``latch``.
+(``compliant_latch``). ``latch`` decides when a latch closes or opens.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ContactPairs = tuple[tuple[str, str], ...]
 
 
 class Latching:
-    """Latches of the chasers that have a port, by name, and the loads at their ports.
+    """Hold the chasers that have a port, by latches, and record the loads at their ports.
 
     ``openings``: chaser and reason of latches that no command has opened.
     """
@@ -64,8 +64,9 @@ class Latching:
     # -- in every step -----------------------------------------------------------------------------
 
     def begin_step(self) -> set[int]:
-        """Execute the latches' commands and faults that are due; return the numbers of the bodies
-        with a closed latch.
+        """Execute commands and faults of the latches that are due.
+
+        Return the numbers of the bodies with a closed latch.
         """
         for name, latch in self.latches.items():
             if latch.apply_due_commands(self._bodies.step_count):
@@ -96,8 +97,8 @@ class Latching:
                 self._open(name, f"slipped {compliant.slipped_m * 1e3:.0f} mm, out of its port")
 
     def end_step(self) -> None:
-        """Record the loads at the ports with rigid joints in the last step; open latches that they
-        are too large for.
+        """Record the loads at the ports with rigid joints in the last step; open overloaded
+        latches.
         """
         if not self._joints:
             return
@@ -131,8 +132,10 @@ class Latching:
     # -- contacts ----------------------------------------------------------------------------------
 
     def find_contacts(self) -> tuple[ContactPairs, set[str]]:
-        """Return the pairs of bodies in contact after the last step, sorted, without probe tips on
-        the target, and the chasers whose tips touch it.
+        """Return the contacts after the last step.
+
+        The pairs of bodies, sorted, without probe tips on the target; and the chasers whose tips
+        touch it.
         """
         names = self._bodies.names
         pairs, tips = set(), set()
@@ -153,9 +156,7 @@ class Latching:
         return None
 
     def _is_tip(self, name: str, point_m: Sequence[float]) -> bool:
-        """Return whether a point (3,), WRF, of a chaser's surface is on the round end of its
-        probe.
-        """
+        """Return whether a point (3,), WRF, of a chaser's surface is on the round end of its probe."""
         if name not in self.latches:
             return False
         s = self._bodies.state(name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bodies of a scenario on an engine, by name, with their states in their own frames."""
+"""Track the bodies of a scenario on an engine, by name, with states in their own frames."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class MovingBodies:
     """Names and numbers of the bodies on ``engine``, and their motion after ``step_count`` steps.
 
     ``prescribed``: motion of the target, None if the engine integrates it. ``before``: motion of
-    the free bodies, by number, at the beginning of the last step, where steps are made one by one.
+    the free bodies, by number, at the beginning of the last step; while steps are made one by one.
     """
 
     def __init__(
@@ -58,6 +58,6 @@ class MovingBodies:
         self.engine.place(self.numbers[name], self.plants[name].to_engine(state))
 
     def place_target(self) -> None:
-        """Move the engine's copy of a prescribed target, if it is due."""
+        """Move the engine's copy of a prescribed target, if that is due."""
         if self.prescribed is not None and self.prescribed.is_placed_at(self.step_count):
             self.place(TARGET, self.state(TARGET))

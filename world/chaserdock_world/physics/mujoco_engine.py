@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid bodies in MuJoCo (the interface is engine.py); the only module that imports it.
+"""Simulate rigid bodies in MuJoCo (the interface is engine.py). No other module imports it.
 
 Integrator: ``Euler``, semi-implicit. With the correction of gyroscopic.py its rotation is of second
 order, and a step exerts exactly the constraint forces that it reports, which are the loads at the
@@ -42,15 +42,15 @@ from .gyroscopic import advance_free
 mujoco: Any = untyped_mujoco  # has no type stubs
 
 _IMPEDANCE = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-"""d of constraints, the largest that MuJoCo takes, whatever the violation."""
+"""Impedance d of constraints, whatever the violation: the largest that MuJoCo takes."""
 _FRICTION = [0.25, 0.005, 0.0001]
-"""Coefficient of sliding friction as in PyBullet; torsion and rolling are not used."""
+"""Coefficients of friction: sliding as in PyBullet; torsion and rolling are not used."""
 _PLANE_HULL_HALF_M = 0.0005
-"""Points in a plane are not a body: they become a plate of twice this thickness."""
+"""Half thickness, m, of the plate that stands for points in a plane, which are no body."""
 
 
 class MujocoEngine:
-    """Bodies in a MuJoCo model of their own; see ``RigidBodyEngine``."""
+    """Simulate bodies in a MuJoCo model of their own; see ``RigidBodyEngine``."""
 
     def __init__(self, setup: EngineSetup) -> None:
         spec = mujoco.MjSpec()
@@ -63,8 +63,8 @@ class MujocoEngine:
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._free = [body.mass_kg > 0.0 for body in setup.bodies]
-        # First of a body's six velocities and seven coordinates; of a placed body, its number among
-        # these.
+        # Index of a body's first velocity (of six) and coordinate (of seven); of a placed body, its
+        # number among these.
         numbers = {True: 0, False: 0}
         self._index = []
         for free in self._free:
@@ -202,12 +202,12 @@ class MujocoEngine:
         applied as they are.
         """
         data, first = self._data, 6 * self._index[b]
-        # The constraints begin with the joints that are closed, six rows each.
+        # The rows of the closed joints come first, six each.
         row = 6 * self._solved.index(self._joints[a, b])
         jacobian = data.efc_J.reshape(-1, self._model.nv)[row : row + 6, first : first + 6]
         fx, fy, fz, tx, ty, tz = (data.efc_force[row : row + 6] @ jacobian).tolist()
-        # The attitude at the beginning of the step: a step moves coordinates, but not what follows
-        # from them.
+        # The attitude at the beginning of the step: the step has moved the coordinates, but xquat,
+        # which follows from them, is still that of before.
         w, x, y, z = data.xquat[b + 1].tolist()
         mx, my, mz = cross_components(
             *self._anchors[a, b], *rotated_components(w, -x, -y, -z, fx, fy, fz)

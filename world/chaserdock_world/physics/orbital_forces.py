@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads by which the motion of free bodies in the Hill frame differs from that in free space, for
-every physics step.
+"""Compute the loads of an orbit on free bodies, for every physics step.
 
-The Hill frame of the middle of a tick holds for the whole tick: it changes by about 1e-4 of its
-rate from one to the next.
+By them the motion in the Hill frame differs from that in free space. The Hill frame of the middle
+of a tick holds for the whole tick: it changes by about 1e-4 of its rate from one to the next.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from chaserdock_world.orbit import TargetOrbit
 
 
 class OrbitalForces:
-    """Forces and torques of an orbit on bodies that an engine integrates with steps of
+    """Compute forces and torques of an orbit on bodies that an engine integrates by steps of
     ``step_s``.
     """
 
@@ -52,7 +51,7 @@ class OrbitalForces:
 
         The engines take the velocity at the end of a step for the whole step. So the acceleration
         is that at the middle of the step, with the velocity there from the acceleration of the last
-        step: else the Coriolis force adds energy.
+        step; otherwise the Coriolis force would add energy.
         """
         h = 0.5 * self._step_s
         ax, ay, az = self._last.get(body, (0.0, 0.0, 0.0))
@@ -67,8 +66,9 @@ class OrbitalForces:
     def torque(
         self, q_wxyz: Sequence[float], omega_world: Sequence[float], moments: Scalars3
     ) -> tuple[float, ...]:
-        """Return the torque (3,) about a body's principal axes, in these, from its attitude and its
-        rate in world axes.
+        """Return the torque (3,) about a body's principal axes, in these axes.
+
+        ``omega_world``: rate in world axes.
         """
         w, x, y, z = q_wxyz
         a, b, c = rotated_components(w, -x, -y, -z, *omega_world)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the plumes of the chasers' thrusters exert on the target and on the other chasers."""
+"""Compute the loads of thrusters' plumes on the target and on the other chasers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PlumeImpulse(NamedTuple):
 
 
 class PlumeLoads:
-    """Computes the loads, and adds them up until they are taken."""
+    """Compute the loads of all plumes, and add them up until they are taken."""
 
     def __init__(self, scenario: Scenario, plume: PlumeSection) -> None:
         self._flux, self._reach_m = plume.flux(), plume.reach_m
@@ -50,10 +50,9 @@ class PlumeLoads:
     def act(
         self, states: Mapping[str, BodyState], thrusts_N: Mapping[str, Array], time_s: float
     ) -> dict[str, Array]:
-        """Return the wrenches (6,), body axes about the body's origin, on the bodies that plumes
-        hit, and add up ``time_s`` of them.
+        """Return the wrenches (6,) on the bodies that plumes hit, and add them up over ``time_s``.
 
-        ``thrusts_N`` (n,): of each chaser's thrusters.
+        Body axes, about the body's origin. ``thrusts_N`` (n,): of each chaser's thrusters.
         """
         loads: dict[str, Array] = {}
         for name, thrusts in thrusts_N.items():

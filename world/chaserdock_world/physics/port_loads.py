@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads at the ports of latched chasers: what a chaser exerts on its port, from the joint's
-reaction in every physics step.
+"""Record the loads at the ports of latched chasers, by the joint's reaction in every physics step.
 
-A rigid joint stops the relative motion of the bodies in the single step in which its latch closes.
-The load of that step, at all ports, depends on the length of the step; its impulse does not, and is
-counted instead.
+A load is what a chaser exerts on its port. A rigid joint stops the relative motion of the bodies in
+the single step in which its latch closes. The load of that step, at all ports, depends on the
+length of the step; its impulse does not, and is recorded instead.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ _HALF_TURN_ABOUT_Z = (0.0, 0.0, 0.0, 1.0)  # a quaternion, scalar first
 
 
 def port_attitude(q_off_wxyz: Array) -> Array:
-    """Return the attitude (4,) of a port's axes in TRF: x outward, z as that of CRF of the docked
-    chaser.
+    """Return the attitude (4,) of a port's axes in TRF: x outward, z that of the docked chaser's
+    CRF.
 
     ``q_off_wxyz`` (4,): docked attitude, CRF to TRF, with +X into the port.
     """
@@ -30,10 +29,10 @@ def port_attitude(q_off_wxyz: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class IntervalLoads:
-    """Loads of an interval, port axes: ``force_N`` and ``torque_N_m`` (3,) in its last step, and
-    the largest magnitudes.
+    """Loads of an interval, port axes.
 
-    ``peak_axial_N``: of the force along the axis; ``peak_shear_N``: across it.
+    ``force_N`` and ``torque_N_m`` (3,): in its last step. ``peak_*``: largest magnitudes;
+    ``peak_axial_N``: of the force along the axis; ``peak_shear_N``: across it;
     ``peak_bending_N_m``: of the torque across the axis. ``closing_impulse_N_s``: sum over the steps
     in which a latch closed.
     """
@@ -50,8 +49,9 @@ class IntervalLoads:
 
 @dataclass
 class PortLoadRecorder:
-    """Collects the loads at one port. ``q_port_wxyz`` (4,): axes of the port in the engine's frame
-    of the target.
+    """Collect the loads at one port.
+
+    ``q_port_wxyz`` (4,): axes of the port in the engine's frame of the target.
     """
 
     q_port_wxyz: Array

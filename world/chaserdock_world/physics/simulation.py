@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid-body simulation of a scenario on one of the engines (engine.py): bodies, disturbances,
-latches and loads.
+"""Simulate the rigid bodies of a scenario, with disturbances, latches and loads, on an engine.
 
 The interface is in body frames with body rates. The forces of an orbit are applied to every body
 (orbital_forces.py).
@@ -35,10 +34,10 @@ _NO_WRENCH = np.zeros(6)
 
 
 class Physics:
-    """Simulates the bodies of a scenario on an engine of its own. Raises MissingPackageError
-    without the engine's package.
+    """Simulate the bodies of a scenario on an engine of its own.
 
-    ``plumes``: loads of the thrusters' plumes, None if the scenario has none.
+    ``plumes``: loads of the thrusters' plumes, None if the scenario has none. Raises
+    MissingPackageError without the engine's package.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -104,16 +103,17 @@ class Physics:
             latch.command(command, effective_step)
 
     def close_latch(self, chaser: int) -> None:
-        """Latch a chaser to the target in their present relative pose, without contact: the start
-        of a flight as a stack.
+        """Latch a chaser to the target in their present relative pose, without contact.
+
+        So a flight as a stack starts.
         """
         latch = self.latches[f"chaser/{chaser}"]
         latch.armed = latch.latched = True
         self._latching.attach(f"chaser/{chaser}")
 
     def take_openings(self) -> list[tuple[int, str]]:
-        """Return the latches that have opened without a command since the last call: chaser and
-        reason.
+        """Return chaser and reason of each latch that has opened without a command since the last
+        call.
         """
         openings, self._latching.openings = self._latching.openings, []
         return openings

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of a target that is prescribed: at constant velocity and body rate, whatever touches
-it.
-"""
+"""Move a target as prescribed: at constant velocity and body rate, whatever touches it."""
 
 from __future__ import annotations
 
@@ -14,14 +12,14 @@ from chaserdock_protocol.scenario import Scenario
 from .engine import PlacementPath
 
 PLACEMENTS_HZ = 120
-"""Rate at which the engine's copy of a prescribed target is moved. Collisions only need it: a
-target that turns at 10 degrees/s moves by 0.6 mm at 0.4 m from its centre in between. The stated
+"""Rate, Hz, at which the engine's copy of a prescribed target is moved; only collisions need it. In
+between, a target that turns at 10 degrees/s moves by 0.6 mm at 0.4 m from its centre. The stated
 motion is exact at every step.
 """
 
 
 class PrescribedMotion:
-    """The exact motion of a prescribed target, and where the engine's copy is placed."""
+    """Compute the exact motion of a prescribed target, and when the engine's copy is placed."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._physics_hz = scenario.time.physics_hz

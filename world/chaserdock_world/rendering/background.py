@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Background of an image: space, stars and the Earth; and the illumination of the scene."""
+"""Draw the background of an image, space, stars and the Earth, and describe the light on the scene."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ WHITE_LEVEL = 235.0
 SPACE_LEVEL = 4
 """Grey level of empty space: a sensor's black level, above 0 so that noise does not clip on it."""
 _STARS = 400
-"""Stars on the whole sky: some 20 in an image of 60 degrees."""
-# The Earth has no fine detail: it is computed on a grid of this step and interpolated.
+"""Number of stars on the whole sky: some 20 in an image of 60 degrees."""
+# Step of the grid, px, on which the Earth is computed and interpolated, as it has no fine detail.
 _EARTH_STEP_PX = 4
 # Reflectance of the sea, and the additional reflectance of the thickest clouds.
 _SEA, _CLOUDS = 0.12, 0.6
@@ -91,15 +91,16 @@ class Light:
 
 @dataclass(frozen=True)
 class Earth:
-    """The Earth's disc: direction to its centre (WRF) and angular radius."""
+    """Disc of the Earth: direction to its centre (WRF) and angular radius."""
 
     direction_w: tuple[float, float, float]
     radius_rad: float
 
 
 class Background:
-    """Draws the background of ideal images that start at ``origin_px`` and have ``size_px`` (width,
-    height).
+    """Draw the background of ideal images that begin at ``origin_px``.
+
+    ``size_px``: width and height.
     """
 
     def __init__(
@@ -154,10 +155,10 @@ class Background:
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_WRAP,
         )
-        # In the target's eclipse the Earth's night side is visible.
+        # The Earth's night side is visible while the target is in eclipse.
         day = np.maximum(normals @ light.direction_w, 0.0) * light.sun / (1.0 - AMBIENT)
         level = SPACE_LEVEL + WHITE_LEVEL * albedo * day
-        # The limb is narrower than a grid step; ``inside`` is zero where a ray is tangent.
+        # The limb is narrower than a grid step: fade it in, from zero where a ray is tangent.
         edge = np.clip(inside / 2e-3, 0.0, 1.0) * (cosine > 0.0)
         height, width = canvas.shape
         size_px = (width, height)
@@ -180,9 +181,7 @@ def _rays(camera: Camera, origin_px: Array, size_px: tuple[int, int], step_px: i
 
 
 def _albedo_map(generator: np.random.Generator) -> NDArray[np.float32]:
-    """Return reflectance by latitude and longitude: sea with clouds, from noise at several
-    scales.
-    """
+    """Return reflectance by latitude and longitude: sea with clouds, noise at several scales."""
     clouds = np.zeros((_MAP_ROWS, _MAP_COLUMNS), dtype=np.float32)
     for octave in range(5):
         size = (8 << octave, 4 << octave)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chasers' cameras: rendering, motion blur, glare, sensor effects, compression."""
+"""Simulate the chasers' cameras: rendering, motion blur, glare, sensor effects, compression."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ from .mesh_renderer import MeshRenderer
 from .rasterizer import Renderer
 from .scene_geometry import Obstacle
 
-# Motion blur: one sample of the exposure per this many pixels of motion, and at most so many.
+# Motion of the target, px, for which motion blur takes one sample of the exposure, and most
+# samples.
 _BLUR_STEP_PX, _BLUR_SAMPLES_MAX = 0.5, 16
 
 States = dict[str, BodyState]
 
 
 class Cameras:
-    """Makes the images of all chasers of a scenario; an image depends on its arguments only."""
+    """Make the images of all chasers of a scenario; an image depends on its arguments only."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, section = scenario, scenario.camera
@@ -88,9 +89,7 @@ class Cameras:
     def images(
         self, chasers: Sequence[int], number: int, tick: int, time_ns: int, states: States
     ) -> list[Image]:
-        """Return ``image`` of several chasers at one time, in their order, rendered on two
-        threads.
-        """
+        """Return ``image`` of several chasers at one time, in their order, rendered on two threads."""
         exposure = (number, tick, time_ns, states)
         futures = {i: self._second_thread.submit(self.image, i, *exposure) for i in chasers[1::2]}
         images = {i: self.image(i, *exposure) for i in chasers[::2]}
@@ -172,8 +171,9 @@ class Cameras:
         ]
 
     def _sample_exposure(self, chaser: int, states: States) -> list[States]:
-        """Return the bodies at times spread over the exposure, as many as the motion of the target
-        in the image needs.
+        """Return the bodies at times spread over the exposure.
+
+        As many as the motion of the target in the image needs.
         """
         if self._exposure_s == 0.0:
             return [states]

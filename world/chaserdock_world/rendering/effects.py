@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera effects on the rendered image: exposure, noise. Point spread and distortion are part of
-rendering (``lens``).
+"""Apply camera effects to the rendered image: exposure, noise.
 
-Deterministic: the noise of an image depends on the seed, the chaser and the image number only. It
-is added in C (native/noise.c): 1280 x 960 pixels take 0.3 ms, with NumPy 4 ms, with OpenCV 7 ms.
+Point spread and distortion are part of rendering (``lens``). Deterministic: the noise of an image
+depends on the seed, the chaser and the image number only. It is added in C (native/noise.c): 1280 x
+960 pixels take 0.3 ms, with NumPy 4 ms, with OpenCV 7 ms.
 """
 
 from __future__ import annotations
@@ -18,20 +18,22 @@ from numpy.typing import NDArray
 
 from .native import function
 
-# The noise bank exceeds an image by these (coprime) numbers of pixels, which gives as many
-# different offsets.
+# Numbers of pixels, coprime, by which the noise bank exceeds an image: as many offsets as their
+# product.
 _SPARE_ROWS, _SPARE_COLUMNS = 251, 256
 # Fixed-point steps per unit of white noise: 16 bits hold eight standard deviations.
 _NOISE_STEPS = 4096.0
 _METERED_SHARE, _LARGEST_GAIN = 0.01, 8.0
-"""Automatic exposure: share of the brightest pixels that it is set by, and its largest gain, 18 dB
-(both chosen; docs/cameras.md).
+"""Automatic exposure: share of the brightest pixels by which it is set, and its largest gain, 18 dB
+(docs/cameras.md). Smaller share: fewer pixels saturate; larger gain: a brighter target at night,
+with more noise.
 """
 
 
 def exposure_gain(image: NDArray[np.uint8], level: float) -> float:
-    """Return the factor, 1/8 to 8, that brings the darkest of the brightest hundredth of the pixels
-    to ``level``.
+    """Return the factor, 1/8 to 8, that brings the brightest hundredth of the pixels to ``level``.
+
+    It is set by the darkest pixel of these.
     """
     above = np.cumsum(np.bincount(image.ravel(), minlength=256)[::-1])
     bright = 255 - int(np.searchsorted(above, _METERED_SHARE * image.size))
@@ -39,9 +41,7 @@ def exposure_gain(image: NDArray[np.uint8], level: float) -> float:
 
 
 class CameraEffects:
-    """Applies gain, read noise and shot noise of ``effects`` to images of one size; ``seed`` fixes
-    all noise.
-    """
+    """Apply gain, read noise and shot noise to images of one size; ``seed`` fixes all noise."""
 
     def __init__(self, width_px: int, height_px: int, effects: Effects, seed: int):
         self.effects = effects
@@ -51,8 +51,8 @@ class CameraEffects:
         sigma = np.sqrt(effects.read_noise**2 + effects.shot_noise * level)
         self._bank: NDArray[np.int16] | None = None
         if sigma.any():
-            # One bank of white noise, read at a random offset for each image: generating new noise
-            # for every image costs several times as much as all other effects.
+            # One bank of white noise is read at a random offset for each image: new noise for every
+            # image would cost several times as much as all other effects.
             generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, 0])))
             size = (height_px + _SPARE_ROWS, width_px + _SPARE_COLUMNS)
             noise = generator.standard_normal(size, dtype=np.float32) * np.float32(_NOISE_STEPS)

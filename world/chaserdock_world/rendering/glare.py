@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Glare of the sun in or near the image: its disc, and stray light in the lens."""
+"""Add the glare of the sun in or near the image: its disc, and stray light in the lens."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 from .scene_geometry import Obstacle
 
 SUN_RADIUS_RAD = 0.00465
-"""Angular radius of the sun at 1 AU (696,000 km of 149.6 million km)."""
+"""Angular radius of the sun at 1 AU, rad (696,000 km of 149.6 million km)."""
 _STEP_PX = 4
-"""Stray light is computed on a grid of this step, px, and interpolated: it changes slowly but for
-the sun itself, which is drawn.
+"""Step of the grid, px, on which stray light is computed and interpolated. It changes slowly but
+for the sun itself, which is drawn.
 """
 
 
 class Glare:
-    """Adds the sun's disc, and stray light inversely proportional to the squared angle from the
-    sun.
+    """Add the sun's disc, and stray light that falls with the squared angle from the sun.
 
     ``level_at_1_deg``: grey levels at one degree (W. S. Stiles, J. Holladay, 1929).
     """
@@ -68,7 +67,9 @@ class Glare:
 
 def is_occluded(origin_w_m: Array, direction_w: Array, bodies: Sequence[Obstacle]) -> bool:
     """Return whether a ray from ``origin_w_m`` (3,) along ``direction_w`` (3,) hits a box of the
-    bodies (slab method).
+    bodies.
+
+    By the slab method.
     """
     for boxes, p_w, q_w in bodies:
         for box in boxes:

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lens: point spread, the extent of the ideal image that a distorted image needs, and the
-mapping between them.
-"""
+"""Simulate the lens: point spread, and the mapping from the ideal image to the distorted one."""
 
 from __future__ import annotations
 
@@ -14,8 +12,8 @@ from numpy.typing import NDArray
 
 
 def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
-    """Return an image (h, w) after the lens' point spread, a Gaussian with this standard deviation;
-    itself if that is 0.
+    """Return an image (h, w) blurred by a Gaussian with this standard deviation; itself if that is
+    0.
     """
     if sigma_px == 0.0:
         return image
@@ -25,9 +23,9 @@ def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8
 
 
 class Lens:
-    """Maps the ideal image, which renderers draw, to the distorted image of ``camera``.
+    """Map the ideal image, which renderers draw, to the distorted image of ``camera``.
 
-    ``origin_px`` (2,): ideal pixel coordinates of the ideal image's first pixel; ``size_px``: its
+    ``origin_px`` (2,): ideal pixel coordinates of the ideal image's first pixel. ``size_px``: its
     width and height, larger than the frame where the lens covers more. Raises ValueError if the
     distortion is not invertible everywhere in the image.
     """
@@ -68,8 +66,9 @@ class Lens:
         self._maps = (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]))
 
     def distort(self, ideal: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the distorted image (h, w) of an ideal image of ``size_px``; without distortion
-        the image itself.
+        """Return the distorted image (h, w) of an ideal image of ``size_px``.
+
+        Without distortion it is the ideal image itself.
         """
         if self._maps is None:
             return ideal

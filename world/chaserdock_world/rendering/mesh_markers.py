@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Markers as meshes: thin plates whose white and black cells are triangles, so that their edges are
-as sharp as any other.
-"""
+"""Build markers as meshes: thin plates whose cells are triangles, as sharp as any other edge."""
 
 from __future__ import annotations
 
@@ -16,9 +14,9 @@ from chaserdock_models.targets import Marker, TargetModel
 from .textures import BLACK, WHITE, marker_cells
 
 ABOVE_M = 2e-4
-"""Height of a marker's front above its plane, so that the surface below does not hide it."""
+"""Height, m, of a marker's front above its plane, so that the surface below does not hide it."""
 _BELOW_M = 1e-3
-"""Depth of a marker's back below its plane, so that no gap is seen beside it on a curved surface.
+"""Depth, m, of a marker's back below its plane, so that no gap shows beside it on a curved surface.
 """
 _PAPER = {
     True: Material("white print", diffuse=WHITE),
@@ -34,8 +32,9 @@ def with_markers(mesh: TriangleMesh, model: TargetModel) -> TriangleMesh:
 
 
 def marker_parts(model: TargetModel, marker: Marker) -> tuple[MeshPart, MeshPart]:
-    """Return the white part, with border, sides and back, and the black part of a marker; together
-    they are closed.
+    """Return the two parts of a marker, which together are closed.
+
+    White: border, sides and back as well. Black: cells only.
     """
     cells = marker_cells(model.dictionary, marker.id) > 0
     edges = np.linspace(-0.5, 0.5, len(cells) + 1) * marker.side_m
@@ -44,11 +43,13 @@ def marker_parts(model: TargetModel, marker: Marker) -> tuple[MeshPart, MeshPart
         reach = marker.side_m / 2.0 + model.white_margin_m
         edges = np.concatenate([[-reach], edges, [reach]])
         white = np.pad(white, 1, constant_values=True)
+
     n = len(edges)
     y, x = np.meshgrid(edges, edges, indexing="ij")
     front = np.stack([x, y, np.full_like(x, ABOVE_M)], axis=-1).reshape(-1, 3)
     vertices = np.concatenate([front, front - [0.0, 0.0, ABOVE_M + _BELOW_M]])
     at = rotations.rotate(marker.q_trf_marker_wxyz, vertices) + np.array(marker.position_trf_m)
+
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     quads = np.stack([corner, corner + 1, corner + n + 1, corner + n], axis=1)
     rim = np.concatenate(
@@ -62,6 +63,7 @@ def marker_parts(model: TargetModel, marker: Marker) -> tuple[MeshPart, MeshPart
     ahead = np.roll(rim, -1)
     sides = np.stack([ahead, rim, rim + n * n, ahead + n * n], axis=1)
     back = quads[:, ::-1] + n * n
+
     name = f"marker_{marker.id}"
     return (
         MeshPart(

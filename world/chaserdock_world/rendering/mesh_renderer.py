@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renderer of triangle meshes: z-buffer with eight samples per pixel, shadow maps, specular
-reflection, textures.
+"""Render triangle meshes: z-buffer with eight samples per pixel, shadow maps, highlights, textures.
 
 The arithmetic is in C (native/mesh.c). Every body casts shadows from the sun onto every other one
 and onto itself. The lamp is at the lens, which sees none of the shadows that it casts. Each body in
@@ -36,10 +35,10 @@ DAYLIGHT = Light()
 
 _TEXTURES = {"": 0.0, "insulation": 1.0, "cells": 2.0}  # native/mesh.c
 _MAP_TEXELS = 2_000_000
-"""Texels of a shadow map, at which its resolution is limited: 8 MB a body."""
+"""Most texels of a shadow map, which limit its resolution: 8 MB a body."""
 _TEXEL_PX = 0.7
-"""Width of a texel in pixels at the nearest point of a body: with it shadow edges are displaced by
-0.2 px (docs/evidence/cameras.md).
+"""Width of a texel, px at the nearest point of a body. Shadow edges are displaced by 0.2 px with it
+(docs/evidence/cameras.md).
 """
 _BAND_ROWS, _SAMPLES, _GROUP = 8, 8, 32  # native/mesh.c
 _WRINKLES = 256
@@ -66,8 +65,10 @@ _POSE_BYTES, _TRIANGLE_BYTES = 96, 156
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A mesh as arrays: ``corners`` and ``normals`` (m, 3, 3), ``uv`` (m, 3, 2), ``surface`` (m,)
-    rows of ``surfaces`` (k, 4).
+    """A mesh of m triangles as arrays, body axes.
+
+    ``corners`` and ``normals`` (m, 3, 3); ``uv`` (m, 3, 2): texture coordinates, m. ``surface``
+    (m,): rows of ``surfaces`` (k, 4), see ``Surface`` of native/mesh.c.
     """
 
     corners: Array
@@ -78,7 +79,7 @@ class _Body:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Corners (8, 3) of the cuboid around the body, body axes, and the centre (3,) of it."""
+        """Corners (8, 3) of the cuboid around the body, body axes, and its centre (3,)."""
         points = self.corners.reshape(-1, 3)
         low, high = points.min(axis=0), points.max(axis=0)
         corners = (
@@ -108,8 +109,9 @@ def _body_of(mesh: TriangleMesh) -> _Body:
 
 
 def _texture_coordinates(part: MeshPart) -> Array:
-    """Return coordinates (m, 3, 2) on the side that a triangle faces of the cuboid around the part,
-    m from the edges.
+    """Return texture coordinates (m, 3, 2), m from the edges of the cuboid around a part.
+
+    Each triangle has those of the side of the cuboid that it faces.
     """
     around = box_around(part)
     axes = rotations.to_matrix(around.q_wxyz)
@@ -124,7 +126,7 @@ def _texture_coordinates(part: MeshPart) -> Array:
 
 @lru_cache(maxsize=64)
 def _joined(bodies: tuple[_Body, ...]) -> tuple[_Body, IntArray]:
-    """Return all triangles of several bodies, and the first one (n + 1,) of each body."""
+    """Return all triangles of several bodies, and the index (n + 1,) of each body's first."""
     rows = np.cumsum([0, *(len(b.surfaces) for b in bodies[:-1])])
     corners, normals, uv, surfaces = (
         np.concatenate([getattr(b, key) for b in bodies])
@@ -168,7 +170,7 @@ def _wrinkles() -> NDArray[np.float32]:
 
 
 class MeshRenderer:
-    """Renders what ``camera`` sees of a target with a mesh and of other bodies.
+    """Render what ``camera`` sees of a target with a mesh and of other bodies.
 
     Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard
     deviation of a Gaussian. ``substitutes``: meshes that are drawn in place of boxes. Raises
@@ -261,8 +263,9 @@ class MeshRenderer:
         )  # fmt: skip
 
     def _memory(self, name: str, size: int) -> NDArray[np.uint8]:
-        """Return working memory of this thread of at least ``size`` bytes: fresh pages would cost
-        more than drawing.
+        """Return working memory of this thread of at least ``size`` bytes.
+
+        It is kept, as fresh pages would cost more than drawing.
         """
         held = self._threads.__dict__
         if name not in held or len(held[name]) < size:
@@ -288,9 +291,7 @@ class MeshRenderer:
     def _shadow_maps(
         self, illumination: NDArray[np.void], camera: Array, bodies: list[_Body], poses: Array
     ) -> tuple[NDArray[np.void], int]:
-        """Return the shadow map of every body, unused for those out of view, and the number of
-        texels of all.
-        """
+        """Return the shadow map of every body, unused for those out of view, and the texels of all."""
         maps = np.zeros(len(bodies), _SHADOW_MAP)
         across, along = illumination["across"][0], illumination["along"][0]
         offset = 0

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that see the pose of the target instead of a picture, for the perception ``statistical``;
-the range sensor of others.
+"""Make images that contain the pose of the target, for the perception ``statistical``.
+
+Also the range sensor of other perceptions.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from .cameras import Cameras, States
 
 
 class PoseSensor:
-    """The pose of the target in each chaser's camera, which has the mounting and focal length that
-    the world gives it.
+    """Measure the pose of the target in each chaser's true camera.
+
+    Mounting and focal length are those that the world gives the camera.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -37,7 +39,7 @@ class PoseSensor:
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
 
     def seen_pose(self, chaser: int, states: States) -> tuple[Array, Array]:
-        """Return the pose as `pose`; with a longer focal length than calibrated, the target seems
+        """Return the pose as seen: with a longer focal length than calibrated the target seems
         nearer.
         """
         position, q = self.pose(chaser, states)
@@ -59,11 +61,10 @@ class PoseSensor:
 
 
 class PoseCameras:
-    """Makes the images of all chasers of a scenario as ``Cameras`` does; an image depends on its
-    arguments only.
+    """Make the images of all chasers of a scenario as ``Cameras`` does.
 
-    Light, blur, noise of the sensor and what stands between camera and target are not in these
-    images.
+    An image depends on its arguments only. Light, blur, noise of the sensor and what stands between
+    camera and target have no effect.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -90,8 +91,8 @@ class PoseCameras:
 
 
 class RangingCameras:
-    """Makes rendered images as ``Cameras`` does, with the range and the sent attitude of
-    ``[ranging]`` at the same time.
+    """Make rendered images as ``Cameras`` does, with the measurements of ``[ranging]`` at the same
+    time.
     """
 
     def __init__(self, scenario: Scenario, ranging: Ranging) -> None:

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rasterizer of textured cuboids: each visible face is exactly projected, warped with OpenCV and
-supersampled.
+"""Rasterize textured cuboids: visible faces are exactly projected, warped and supersampled.
 
 The point spread acts on the samples, before pixels average them: on pixels it would shift edges by
 up to 0.03 px, depending on their place between pixels.
@@ -37,9 +36,8 @@ from .scene_geometry import (
     visible_faces,
 )
 
-# Samples per pixel along each axis: the largest number that keeps the samples of a patch below the
-# limit. (Textures are area averages, so even one sample per pixel places corners to within 0.03
-# px.)
+# Samples per pixel along each axis, and the most samples of a patch: the finest that fits is used.
+# Textures are area averages, so that even one sample per pixel places corners to within 0.03 px.
 _SAMPLES = ((4, 600_000), (2, 1_000_000))
 
 DAYLIGHT = Light()
@@ -47,8 +45,11 @@ DAYLIGHT = Light()
 
 @dataclass(frozen=True)
 class _Scene:
-    """A scene to be painted: the shape number of each visible box, the visible faces, and the grey
-    level of each face at reflectance 1."""
+    """A scene to be painted.
+
+    Number of the shape of each visible box; visible faces; grey level of each face at reflectance
+    1.
+    """
 
     shapes: Shapes
     box_shapes: list[int]
@@ -72,7 +73,7 @@ def halve(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class Renderer:
-    """Renders what ``camera`` sees of a target and of other bodies.
+    """Render what ``camera`` sees of a target and of other bodies.
 
     Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard
     deviation of a Gaussian. Raises ValueError if the camera's distortion is not invertible
@@ -89,8 +90,8 @@ class Renderer:
         self.camera = camera
         self.model = model
         self._point_spread_px = point_spread_px
-        # By box, face and the number of times its width and height are halved; coarser levels are
-        # made on demand.
+        # Textures by box, face, and how often width and height are halved; coarser ones are made on
+        # demand.
         self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {
             (index, face, 0, 0): textures.finest_texture(model, index, face)
             for index in range(len(model.boxes))
@@ -126,10 +127,12 @@ class Renderer:
         visible, faces = visible_faces(
             self._frustum, shapes, np.concatenate([position, q_w_irf]), poses
         )
+
         background = self._background.draw(q_w_irf, light)
         canvas = spread_points(background, self._point_spread_px)
         if not len(visible):
             return self._lens.distort(canvas)
+
         levels = [
             light.level(cosine, -centre, normal)
             for cosine, centre, normal in zip(
@@ -139,6 +142,7 @@ class Renderer:
         faces_of_box: list[list[int]] = [[] for _ in range(len(visible))]
         for k, box in enumerate(faces["box"].tolist()):
             faces_of_box[int(box)].append(k)
+
         order = paint_order(visible)
         scene = _Scene(shapes, visible["shape"].astype(int).tolist(), faces, levels)
         for patch, members in merge_overlapping(
@@ -149,7 +153,7 @@ class Renderer:
         return self._lens.distort(canvas)
 
     def _covered_pixels(self, low: Array, high: Array) -> list[Rectangle]:
-        """Return the pixels of the canvas that outlines between ``low`` and ``high`` (n, 2) can
+        """Return the rectangles of the canvas that outlines between ``low`` and ``high`` (n, 2) can
         touch.
         """
         margin = 1 + math.ceil(3.0 * self._point_spread_px)
@@ -165,8 +169,9 @@ class Renderer:
         scene: _Scene,
         faces: list[int],
     ) -> None:
-        """Paint faces, back to front, onto a supersampled ``patch`` of the background; average its
-        samples on the canvas.
+        """Paint faces, back to front, onto a patch of the background, and average it on the canvas.
+
+        The patch is supersampled.
         """
         x0, y0, x1, y1 = patch
         if x1 <= x0 or y1 <= y0:
@@ -204,8 +209,9 @@ class Renderer:
         at: tuple[int, int, int],
         outline: Array,
     ) -> None:
-        """Paint face ``k`` of the target's ``box`` onto a ``patch`` with ``at[0]`` samples per
-        pixel from pixel ``at[1:]`` on.
+        """Paint face ``k`` of the target's ``box`` onto a patch.
+
+        ``at``: samples per pixel of the patch, and its first pixel (x, y).
         """
         face, finest = scene.faces[k], self._texture(box, int(scene.faces["side"][k]), 0, 0)
         assert finest is not None
@@ -225,8 +231,7 @@ class Renderer:
             # A transparent border blends over half a texel on either side of the face's edge.
             cv2.warpPerspective(lit, homography, size, roi, flags, cv2.BORDER_TRANSPARENT)
             return
-        # Part of the face is behind the camera, where the homography mirrors it: paint the visible
-        # part only.
+        # The homography mirrors what is behind the camera: paint the visible part of the face only.
         warped = cv2.warpPerspective(lit, homography, size, None, flags, cv2.BORDER_REPLICATE)
         mask = np.zeros(roi.shape, dtype=np.uint8)
         cv2.fillConvexPoly(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scene geometry: visible faces of boxes, their outlines in the image, and their painting order.
+"""Compute visible faces of boxes, their outlines in the image, and their painting order.
 
 The arithmetic is in C (native/scene.c): an image shows about a dozen faces, too few to vectorize
 with NumPy.
@@ -24,7 +24,7 @@ from .native import LIBRARY, function
 from .textures import FINEST_TEXEL_M
 
 NEAR_M = 0.01
-"""Near plane: geometry nearer to the camera's plane is not drawn."""
+"""Distance of the near plane, m: geometry nearer to the camera's plane is not drawn."""
 
 Obstacle = tuple[Sequence[Box], ArrayLike, ArrayLike]
 """A body: its boxes in body axes, position (3,) in WRF and attitude (4,), body to WRF."""
@@ -38,8 +38,9 @@ Shape = np.dtype(
         ("radius", float),
     ]
 )
-"""native/scene.c: a box in its body's axes, metres; ``half`` edges, ``radius`` of the bounding
-sphere.
+"""Mirror ``Shape`` of native/scene.c: a box in its body's axes, m.
+
+``half``: half edges. ``radius``: of the bounding sphere.
 """
 
 VisibleBox = np.dtype(
@@ -48,8 +49,8 @@ VisibleBox = np.dtype(
         ("low_px", float, 2), ("high_px", float, 2),
     ]
 )  # fmt: skip
-"""native/scene.c: a visible box: number of its shape, pose in IRF, and the pixels that bound its
-outline.
+"""Mirror ``VisibleBox`` of native/scene.c: number of the box's shape, its pose in IRF, and the
+pixels that bound its outline.
 """
 
 VisibleFace = np.dtype(
@@ -60,8 +61,10 @@ VisibleFace = np.dtype(
         ("count", float), ("outline_px", float, (10, 2)),
     ]
 )  # fmt: skip
-"""native/scene.c: a visible face in IRF: index of its visible box, ``side`` of it, whether all of
-it is ``in_front`` of the camera, and its clipped outline, ``count`` points in pixels of the canvas.
+"""Mirror ``Face`` of native/scene.c: a visible face in IRF.
+
+``box``: index of its visible box. ``side``: of the box. ``in_front``: whether all of it is in front
+of the camera. Its clipped outline has ``count`` points in pixels of the canvas.
 """
 
 _FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in range(6)])
@@ -69,7 +72,7 @@ _FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in rang
 
 @LIBRARY.structure("Frustum")
 class _Frustum(Structure):
-    """`Frustum` of native/scene.c."""
+    """Mirror `Frustum` of native/scene.c."""
 
     _fields_ = [
         ("planes", c_double * 20), ("borders", c_double * 12),
@@ -79,8 +82,9 @@ class _Frustum(Structure):
 
 
 class Frustum:
-    """View frustum of a canvas: the image of ``camera`` from pixel ``origin_px`` (2,), ``size_px``
-    wide and high.
+    """View frustum of a canvas: the image of ``camera`` from pixel ``origin_px`` (2,) on.
+
+    ``size_px``: width and height.
     """
 
     def __init__(self, camera: Camera, origin_px: Array, size_px: Sequence[int]):
@@ -108,8 +112,10 @@ class Frustum:
 
 @dataclass(frozen=True)
 class Shapes:
-    """The boxes of several bodies: ``table`` (n,) of Shape, and for each box the number of its
-    body, its number within that body, and its reflectance."""
+    """The n boxes of several bodies.
+
+    ``table`` (n,) of Shape. For each box: number of its body, number within that body, reflectance.
+    """
 
     table: NDArray[np.void]
     bodies: list[int]
@@ -147,7 +153,7 @@ def visible_faces(
     """Return the visible boxes (b,) and their visible faces (f,), in the order of ``shapes`` and
     sides.
 
-    ``camera_pose`` (7,): position in WRF and attitude IRF to WRF; ``poses`` (bodies, 7): of the
+    ``camera_pose`` (7,): position in WRF and attitude IRF to WRF. ``poses`` (bodies, 7): of the
     bodies, body to WRF.
     """
     n = len(shapes.table)
@@ -165,8 +171,8 @@ def visible_faces(
 
 
 def paint_order(boxes: NDArray[np.void]) -> list[int]:
-    """Return the indices of ``boxes`` (n,) of VisibleBox in painting order: every box after those
-    that it occludes.
+    """Return the indices of ``boxes`` (n,) in painting order: every box after those that it
+    occludes.
 
     Boxes that occlude one another cyclically (long thin ones can) have no such order; the farthest
     is painted first.
@@ -184,14 +190,13 @@ def place_texture(
     patch: tuple[int, ...],
     finest: tuple[int, ...],
 ) -> tuple[list[int], list[int], Array] | None:
-    """Place the texture of ``face`` (1,) on a patch (rows, columns) of the canvas; None if they do
-    not overlap.
+    """Place the texture of ``face`` (1,) on a patch of the canvas; None if they do not overlap.
 
-    ``at``: samples per pixel of the patch, and its first pixel (x, y); ``finest`` (rows, columns):
-    size of the texture at textures.FINEST_TEXEL_M. Returns the region of the patch (left, top,
-    right, bottom); how often the texture's width and height are halved so that a texel is about a
-    sample at the centre of the outline; and the homography (3, 3) from the region's samples to
-    texels.
+    ``at``: samples per pixel of the patch, and its first pixel (x, y). ``patch`` (rows, columns).
+    ``finest`` (rows, columns): size of the texture at textures.FINEST_TEXEL_M. Returns the region
+    of the patch (left, top, right, bottom); how often the texture's width and height are halved so
+    that a texel is about a sample at the centre of the outline; and the homography (3, 3) from the
+    region's samples to texels.
     """
     sizes = np.array([patch[1], patch[0], finest[1], finest[0]], dtype=np.int64)
     out, matrix = np.empty(6, dtype=np.int64), np.empty((3, 3))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Textures of a target's faces: markers, exactly averaged over the area of each texel.
+"""Draw textures of a target's faces: markers, exactly averaged over the area of each texel.
 
 A texel's value is the mean over its area at every resolution, so that rendering from a coarser
 texture blurs a marker but does not shift its edges.
@@ -17,7 +17,7 @@ from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, fac
 from numpy.typing import NDArray
 
 FINEST_TEXEL_M = 0.00025
-"""Width of a texel of a face: half a pixel of the default camera at 0.5 m; nearer, texels are
+"""Width of the finest texel, m: half a pixel of the default camera at 0.5 m. Nearer, texels are
 interpolated.
 """
 # Reflectance of the printed white and black.
@@ -41,11 +41,11 @@ def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
 
 
 def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marker, Array, int]]:
-    """Return the markers on one face of a box, each with its centre (2,) in the face's axes (x
-    right, y up; metres) and the number of counter-clockwise quarter turns of its image.
+    """Return the markers on one face of a box, with their places and rotations.
 
-    Raises ValueError for a marker in the face's plane whose rotation is not a multiple of a quarter
-    turn.
+    Place: centre (2,) in the face's axes (x right, y up; m). Rotation: number of counter-clockwise
+    quarter turns of the marker's image. Raises ValueError for a marker in the face's plane whose
+    rotation is not a multiple of a quarter turn.
     """
     found = []
     q_box_face = face_rotation(face)
@@ -121,7 +121,7 @@ def _print(
 
 
 def _coverage(edges: Array, first: int, last: int) -> Array:
-    """Return the share (cells, texels) of each texel first..last - 1 between consecutive
+    """Return the share (cells, texels) of texels first..last - 1 that lies between consecutive
     ``edges``.
     """
     texels = np.arange(first, last, dtype=float)

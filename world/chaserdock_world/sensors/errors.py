@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor errors: cameras against their calibration, and noise, drift and bias of the chasers'
-odometry.
+"""Simulate sensor errors: cameras against their calibration; noise, drift and bias of odometry.
 
 Camera errors and biases are drawn once per chaser, noise and drift once per tick, from the
 scenario's seed, the chaser's number and the tick only.
@@ -28,8 +27,11 @@ _NO_DRIFT = np.zeros(6)
 
 @dataclass(frozen=True, eq=False)
 class CameraErrors:
-    """Errors of one camera against its calibration: rotation vector (3,) and shift (3,) in CRF,
-    relative focal length, principal point (2,) in pixels."""
+    """Errors of one camera against its calibration.
+
+    Rotation vector (3,) and shift (3,) in CRF; relative error of the focal length; principal point
+    (2,) in pixels.
+    """
 
     turn_rad: Array
     shift_m: Array
@@ -38,9 +40,7 @@ class CameraErrors:
 
 
 def camera_errors(scenario: Scenario, chaser: int) -> CameraErrors:
-    """Return the errors of a chaser's camera: those of ``[navigation]`` and those of
-    ``[truth.camera]``.
-    """
+    """Return the errors of a chaser's camera: those of ``[navigation]`` and of ``[truth.camera]``."""
     stated, unknown = scenario.navigation.errors(), scenario.truth.camera
     known = generator(scenario.seed, Stream.CALIBRATION, chaser).standard_normal(9)
     beyond = generator(scenario.seed, Stream.UNKNOWN_CALIBRATION, chaser).standard_normal(9)
@@ -76,9 +76,7 @@ def true_camera(scenario: Scenario, chaser: int) -> Camera:
 
 
 def white_covariances(errors: NavigationErrors) -> dict[str, Square3]:
-    """Return the covariance fields of ``Odometry``: what is new in every tick, without drift and
-    bias.
-    """
+    """Return the covariance fields of ``Odometry``: white noise only, without drift and bias."""
     cross, roll = errors.attitude_noise_rad, errors.attitude_roll_noise_rad
     sigmas = {
         "position_covariance_m2": np.full(3, errors.position_noise_m),
@@ -90,7 +88,7 @@ def white_covariances(errors: NavigationErrors) -> dict[str, Square3]:
 
 
 class OdometrySensor:
-    """Measures the chasers' states with the errors of ``[navigation]``."""
+    """Measure the chasers' states with the errors of ``[navigation]``."""
 
     def __init__(self, scenario: Scenario):
         seed, chasers = scenario.seed, range(len(scenario.chasers))
@@ -98,7 +96,7 @@ class OdometrySensor:
         self._exact = self._errors.exact_odometry
         self._noise_factor = scenario.truth.sensors.noise_factor
         self._bias = [generator(seed, Stream.BIAS, i).standard_normal(9) for i in chasers]
-        # In standard deviations: position (3), attitude (3).
+        # Drift in units of its standard deviations: position (3), attitude (3).
         times_s = np.repeat(
             [self._errors.position_drift_time_s, self._errors.attitude_drift_time_s], 3
         )

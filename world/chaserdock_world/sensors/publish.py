@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish the world's messages at the beginning of a tick: odometry, docking sensors and ground
-truth.
-"""
+"""Publish the world's messages at the beginning of a tick: odometry, docking sensors, ground truth."""
 
 from __future__ import annotations
 
@@ -83,8 +81,9 @@ def publish_truth(
     contacts: set[tuple[str, str]],
     latches: dict[str, ProbeLatch],
 ) -> None:
-    """Publish the ground truth of all bodies, and actuator outputs and touches since the last tick,
-    which this takes.
+    """Publish the ground truth of all bodies.
+
+    Takes, and so resets, actuator outputs and touches since the last tick.
     """
     time_ns = timing.tick_time_ns(tick)
     saturated, late = [], 0
@@ -103,10 +102,12 @@ def publish_truth(
             late += taken.late
             if taken.saturated:
                 saturated.append(int(name.partition("/")[2]))
+
         message = BodyTruth(
             tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **output
         )
         node.publish(topics.TRUTH_BODY, message, name)
+
     world = WorldTruth(
         tick=tick,
         sim_time_ns=time_ns,

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the target in an image: from markers (ArUco detection, edge-fitted corners, PnP with
-covariance) or from its shape.
+"""Estimate the pose of the target in an image, from markers or from its shape.
+
+Markers: ArUco detection, corners by fitted edges, PnP with covariance.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .statistical import StatisticalPerception
 
 
 class PerceptionMethod(Protocol):
-    """Interface of a perception; see `Perception.estimate`."""
+    """Estimate the pose of the target in an image; see `Perception.estimate`."""
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
@@ -29,8 +30,8 @@ class PerceptionMethod(Protocol):
 
 
 class FarPerception:
-    """A perception by markers that measures a target too far for these by its bearing, at a
-    measured range.
+    """Measure a near target by its markers, and one too far for these by bearing and measured
+    range.
     """
 
     def __init__(self, by_markers: Perception, by_bearing: BearingFinder) -> None:
@@ -39,16 +40,17 @@ class FarPerception:
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:
-        """Return what is measured by markers."""
+        """Return what markers show; the caller adds the range."""
         return self.by_markers.estimate(image, predicted)
 
 
 def make_perception(scenario: FlightScenario, single_images: bool = False) -> PerceptionMethod:
-    """Return the perception that the scenario names: a built-in one, or an installed
-    ``chaserdock.perceptions`` entry point, a function of (camera: Camera, target: TargetModel).
+    """Return the perception that the scenario names.
 
-    ``single_images``: images do not follow each other, so that an acquisition ends in the image in
-    which it begins. Raises PluginError for a perception that is not installed.
+    It is built in, or an installed ``chaserdock.perceptions`` entry point, which is a function of
+    (camera: Camera, target: TargetModel). ``single_images``: images do not follow each other, so
+    that an acquisition ends in the image in which it begins. Raises PluginError for a perception
+    that is not installed.
     """
     camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:
@@ -71,7 +73,7 @@ def make_perception(scenario: FlightScenario, single_images: bool = False) -> Pe
 
 
 def tracker_mesh(target: FlightTarget) -> TrackerMesh:
-    """Return what flight software knows of a target's shape: its mesh, or its cuboids."""
+    """Return what the flight software knows of a target's shape: its mesh, or its cuboids."""
     mesh, knowledge = target.known_mesh(), target.knowledge
     if mesh is None:
         return TrackerMesh.of_boxes(target.shape().boxes)

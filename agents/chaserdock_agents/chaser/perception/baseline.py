@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The perception of the paper, as a baseline: undistort the image, ArUco, EPnP on all corners.
+"""Run the perception of the paper as a baseline: undistort the image, ArUco, EPnP on all corners.
 
 Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC
 2023, sec. 4. Corners by OpenCV's sub-pixel refinement. EPnP is OpenCV's and fails on about half of
@@ -43,10 +43,10 @@ def detect(
 def solve(
     camera: Camera, points_trf_m: Array, corners_ideal_px: Array, iterative: bool = False
 ) -> tuple[pnp.TargetPose, ...]:
-    """Solve EPnP, or iterative PnP, with all corners (n, 4, 2), ideal pixels, of markers with
-    corners ``points_trf_m`` (n, 4, 3).
+    """Estimate the pose by EPnP or iterative PnP from the corners of all markers.
 
-    Returns one pose, or none if it is not finite or behind the camera; its covariance is
+    ``corners_ideal_px`` (n, 4, 2): ideal pixels. ``points_trf_m`` (n, 4, 3): the same corners in
+    TRF. Returns one pose, or none if it is not finite or behind the camera; its covariance is
     first-order, from its residuals.
     """
     if not len(points_trf_m):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Position of a target too far for markers: its bearing in the image, at a measured range and a
-known attitude.
+"""Measure the position of a target too far for markers, from its bearing in the image.
 
-The target is the spot that has the size of the known shape at that range. The centre of the body is
-where the silhouette's centroid is that of the spot.
+Range and attitude are measured otherwise. The target is the spot that has the size of the known
+shape at that range. Its centre is placed so that the centroid of the projected shape is that of the
+spot.
 """
 
 from __future__ import annotations
@@ -23,55 +23,59 @@ from numpy.typing import ArrayLike, NDArray
 from .pnp import TargetPose
 
 POINT_SPREAD_PX = 0.65
-"""Standard deviation per axis of the image of a point."""
+"""Standard deviation per axis (px) of the image of a point."""
 
 
 @dataclass(frozen=True)
 class BearingParameters:
-    """Numbers of the search for a spot, measured by benchmarks/perception.py (markers-bearing)."""
+    """Parameters of the search for a spot, measured by benchmarks/perception.py (markers-bearing)."""
 
-    # A spot is brighter than the background by so many grey levels
+    # Least brightness of a spot above the background, grey levels.
     levels: float = 6.0
-    # and standard deviations of the noise: 1 pixel in 3.5 million without a spot.
+    # The same in standard deviations of the noise: 1 pixel in 3.5 million exceeds it without a
+    # spot.
     sigmas: float = 5.0
-    # Pixels around a spot that belong to it: three standard deviations of the point spread.
+    # Margin of a spot, px, whose pixels belong to it: three standard deviations of the point
+    # spread.
     margin_px: int = 2
-    # Grey levels count up to a share of the spot's brightness: this, divided by the radius,
+    # A pixel's grey level counts up to a share of the spot's brightness, so that differently lit
+    # faces of a large spot count alike, and pixels of a small one in proportion to what they show
+    # of the target. The share is this number over the spot's radius,
     saturation_px: float = 0.6
-    # within this share
+    # at least this share,
     saturation_min: float = 0.1
-    # and this one;
+    # at most this share,
     saturation_max: float = 0.8
-    # at least so many. So differently lit faces of a large spot count alike, and pixels of a small
-    # one in proportion to what they show of the target.
+    # and at least this many grey levels.
     saturation_levels: float = 8.0
-    # Standard deviation of the centroid by pixel grid and compression (at a radius of 1 px; falls
-    # with its square root),
+    # Error of the centroid by pixel grid and compression, px at a radius of 1 px; it falls with the
+    # root of the radius. Measured.
     grid_share_px: float = 0.2
-    # and by markers and light (as a share of the radius). Both measured.
+    # Error of the centroid by markers and light, as a share of the radius. Measured.
     light_share: float = 0.013
-    # A spot's radius may differ from the expected one by this share,
+    # Largest error of a spot's radius, as a share of the expected one,
     size_share: float = 0.25
-    # and so many standard deviations by noise.
+    # plus this many standard deviations by noise.
     size_sigmas: float = 5.0
-    # Least grey level of the target above the background, on an average over its silhouette,
+    # Least brightness of the target above the background, grey levels averaged over its silhouette.
     level_min: float = 10.0
-    # and greatest: that of the sensor.
+    # Largest brightness: that of the sensor.
     level_max: float = 255.0
     # Greatest distance of the target from the predicted place, px.
     near_px: float = 8.0
-    # Without a prediction, the target is the brightest spot of its size, by this ratio to the next
-    # one (docs/estimation.md).
+    # Without a prediction, the brightest spot is accepted if it exceeds the next by this factor
+    # (docs/estimation.md).
     clear_ratio: float = 1.5
-    # Below this expected radius, px, stars are as bright (the servicer beyond some 120 m),
+    # Expected radius, px, below which stars are as bright as the target: the servicer beyond some
+    # 120 m.
     star_px: float = 1.2
-    # and a first sighting must be within this angle of the optical axis.
+    # Such a small target is first accepted within this angle of the optical axis only.
     aim_rad: float = math.radians(2.0)
-    # Least range, in radii of the target: nearer, it does not look like a spot,
+    # Least range in radii of the target: nearer, it does not look like a spot.
     nearest: float = 2.0
-    # and greatest: farther, it is a fifth of a pixel wide.
+    # Largest range in radii: beyond, the target is less than a fifth of a pixel wide.
     farthest: float = 1e4
-    # Side of the raster that a silhouette is drawn on, px: its radius is exact to half a raster
+    # Side of the raster on which a silhouette is drawn, px. Its radius is exact to half a raster
     # pixel of some 100, far below ``size_share``.
     raster: int = 256
 
@@ -92,8 +96,12 @@ class Silhouette(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """A bright spot: centroid (2,), root mean square radius, sum of the grey levels above the
-    background; standard deviation of the centroid per axis by the noise of the image."""
+    """A bright spot.
+
+    ``centroid_px`` (2,). ``radius_px``: root mean square radius. ``flux``: sum of the grey levels
+    above the background. ``noise_px``: standard deviation of the centroid per axis by the noise of
+    the image.
+    """
 
     centroid_px: Array
     radius_px: float
@@ -102,8 +110,9 @@ class Spot(NamedTuple):
 
 
 class RangedTarget(NamedTuple):
-    """Range of the target with its standard deviation, and its attitude, TRF to IRF (4,), with
-    covariance (3, 3) in TRF axes.
+    """Measured range of the target, m, with standard deviation, and its attitude.
+
+    Attitude: TRF to IRF (4,), with covariance (3, 3) in TRF axes.
     """
 
     range_m: float
@@ -113,7 +122,7 @@ class RangedTarget(NamedTuple):
 
 
 class BearingFinder:
-    """Finds the target as a spot in images of a camera. Stateless.
+    """Find the target as a spot in images of a camera. Stateless.
 
     ``focal_share``: standard deviation of the relative error of the focal length. The range does
     not depend on it, while estimators expect depths as seen through the camera.
@@ -135,10 +144,10 @@ class BearingFinder:
         target: RangedTarget,
         predicted_irf_m: ArrayLike | None = None,
     ) -> TargetPose:
-        """Return the pose of the target in a grey image (h, w), ``predicted_irf_m`` (3,) near its
-        predicted position.
+        """Return the pose of the target in a grey image (h, w).
 
-        Raises BearingError if no spot is clearly the target.
+        ``predicted_irf_m`` (3,): predicted position, near which the spot is expected. Raises
+        BearingError if no spot is clearly the target.
         """
         if not _SPOT.nearest * self._reach_m < target.range_m < _SPOT.farthest * self._reach_m:
             raise BearingError(
@@ -191,14 +200,14 @@ class BearingFinder:
         return first
 
     def _off_axis(self, spot: Spot) -> float:
-        """Return the angle between a spot and the optical axis."""
+        """Return the angle between a spot and the optical axis, rad."""
         return math.acos(
             min(float(self._along(self._camera.undistort(spot.centroid_px), 1.0)[2]), 1.0)
         )
 
     def _shape_at(self, spot: Spot, target: RangedTarget) -> Silhouette | None:
-        """Return the silhouette expected at a spot, None if the spot does not have its size and
-        brightness.
+        """Return the silhouette expected at a spot; None if size or brightness of the spot differ
+        from it.
         """
         ideal = self._camera.undistort(spot.centroid_px)
         if not np.all(np.isfinite(ideal)):
@@ -221,12 +230,14 @@ class BearingFinder:
         return ray * (range_m / float(np.linalg.norm(ray)))
 
     def _pose(self, centre_px: Array, sigma_px: float, target: RangedTarget) -> TargetPose:
-        """Return the pose with its covariance: an error in pixels acts across the optical axis, one
-        of the range along the ray.
+        """Return the pose with its covariance.
+
+        An error in pixels moves the target across the line of sight, an error of the range along
+        it.
         """
         position = self._along(centre_px, target.range_m)
         c, along = self._camera, position / target.range_m
-        # d(ray) / d(pixel), without the part along the ray.
+        # Displacement of the target per pixel (3, 2), less its part along the line of sight.
         across = np.array([[1.0 / c.fx_px, 0.0], [0.0, 1.0 / c.fy_px], [0.0, 0.0]]) * position[2]
         across = across - np.outer(along, along @ across)
         range_sigma = math.hypot(target.range_sigma_m, self._focal_share * target.range_m)
@@ -239,8 +250,9 @@ class BearingFinder:
 
 
 def bias_px(radius_px: float) -> float:
-    """Return the standard deviation per axis of a spot's centroid by pixel grid, compression,
-    markers and light.
+    """Return the systematic error of a spot's centroid, px: its standard deviation per axis.
+
+    It is due to pixel grid and compression, and to markers and light.
     """
     return math.hypot(
         _SPOT.grid_share_px / math.sqrt(max(radius_px, 1.0)), _SPOT.light_share * radius_px
@@ -270,18 +282,22 @@ def silhouette(
 
 
 def find_spots(image: NDArray[np.uint8], radius_px: float) -> list[Spot]:
-    """Return the bright spots of an image (h, w) that do not touch its border and may have this
-    root mean square radius.
+    """Return the bright spots of an image (h, w) that may have a root mean square radius
+    ``radius_px``.
+
+    Spots that touch the border are left out.
     """
     # No shape extends beyond four times its radius; ``_shape_at`` decides.
     largest = 4.0 * _blurred(radius_px) + 2.0 * _SPOT.margin_px
     share = min(max(_SPOT.saturation_px / radius_px, _SPOT.saturation_min), _SPOT.saturation_max)
+
     level = float(np.median(image))
     sigma = max(1.4826 * float(np.median(np.abs(image - level))), 1.0)
     _, bright = cv2.threshold(
         image, level + max(_SPOT.levels, _SPOT.sigmas * sigma), 1, cv2.THRESH_BINARY
     )
     _, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+
     height, width = image.shape
     spots = []
     for label, (x, y, w, h, area) in enumerate(stats.tolist()):
@@ -304,8 +320,10 @@ def find_spots(image: NDArray[np.uint8], radius_px: float) -> list[Spot]:
 
 
 def _measure(above: Any, mask: NDArray[np.bool_], sigma: float, share: float) -> Spot:
-    """Return the spot of a mask in grey levels above the background (h, w), with noise ``sigma``;
-    ``share``: saturation.
+    """Return the spot that ``mask`` (h, w) covers.
+
+    ``above`` (h, w): grey levels above the background. ``sigma``: their noise. ``share``:
+    saturation, see ``BearingParameters.saturation_px``.
     """
     kernel = np.ones((2 * _SPOT.margin_px + 1, 2 * _SPOT.margin_px + 1), dtype=np.uint8)
     around = cv2.dilate(mask.astype(np.uint8), kernel)

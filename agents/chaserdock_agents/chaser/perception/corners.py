@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marker corners from lines fitted to the sides, in undistorted coordinates.
+"""Refine marker corners by lines fitted to the sides, in undistorted coordinates.
 
 Contours and corner filters bias the corners of a black square inwards. Here a coarse step moves
 each side to the centroids of the grey-level gradient across it. Then the grey levels of the pixels
@@ -29,41 +29,43 @@ from .native import LIBRARY, function
 
 @LIBRARY.structure("Settings")
 class _Settings(Structure):
-    """`Settings` of native/corners.c."""
+    """Mirror `Settings` of native/corners.c."""
 
     _fields_ = [
         (name, c_double) for name in (
-            # Length inwards across a side: at most this share of a cell, at least so many pixels.
+            # Both steps: length inwards across a side, as a share of a cell, and its least value in
+            # pixels.
             "reach_cells", "reach_least_px",
-            # Minimum contrast; minimum share of usable lines across a side; maximum correction of a
-            # corner.
+            # Both steps: least contrast, grey levels; least share of usable lines across a side;
+            # largest correction of a corner, px.
             "min_contrast", "min_rows_share", "max_move_px",
-            # Coarse step: the part of a side, lines across it, samples on each, length to either
-            # side, and as share of the border.
+            # Coarse step: used part of a side, from and to; lines across it; samples on each;
+            # length to either side, px, and as a share of the border.
             "first", "last", "rows", "taps", "coarse_reach_px", "border_share",
-            # Fit: lines of pixels across a side; its ends are excluded by so many pixels, at most
-            # this share.
+            # Fit: lines of pixels across a side; length left out at its ends, px, and at most as a
+            # share of the side.
             "columns", "end_px", "end_share",
-            # Length outwards across a side, at most to so much before a border's outer edge, or to
-            # so much beyond it.
+            # Fit: length outwards across a side, px. It ends this far before a border's outer edge
+            # if that is not fitted, and this far beyond it otherwise.
             "reach_px", "clear_px", "beyond_px",
-            # The outer edge is used of narrower borders (the second: of such that end at neighbours
-            # beside a part of the side), or if grey levels fall by this share of the rise at the
-            # side, and it agrees with the side to so many pixels.
+            # A border narrower than ``strip_px`` (``partial_px`` where it ends at neighbours beside
+            # a part of the side) is fitted with its outer edge at once. A wider one is so in the
+            # last round, if grey levels fall there by ``least_fall`` of the rise at the side, and
+            # both fits agree to ``agreement_px``.
             "strip_px", "partial_px", "least_fall", "agreement_px",
-            # Logarithm of an edge's sigma, pixels (pixel and lens together), and how well that is
-            # known, a standard deviation.
+            # Prior of an edge's blur (pixel and lens together): mean and standard deviation of the
+            # logarithm of its sigma in px.
             "log_edge_sigma", "edge_sigma_spread",
             "rounds", "iterations", "strip_iterations",
-            # Corners of markers with cells or borders of few pixels, and of such with little
-            # contrast, are less accurate: relative sigma sqrt(1 + (this / width)^2 + (this /
+            # Corners are less accurate at small cells or borders (px) and at low contrast (grey
+            # levels): relative sigma sqrt(1 + (uncertain_px / width)^2 + (uncertain_level /
             # contrast)^2), fitted to the errors in rendered images.
             "uncertain_px", "uncertain_level",
         )
     ]  # fmt: skip
 
 
-# Chosen by the corner errors in rendered images (benchmarks/perception.py, ``markers``).
+# Values by the least corner errors in rendered images (benchmarks/perception.py, ``markers``).
 SETTINGS = _Settings(
     0.45, 1.25,
     8.0, 0.4, 4.0,
@@ -82,9 +84,11 @@ _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 
 @dataclass(frozen=True)
 class Refined:
-    """``corners_px`` (n, 4, 2), ideal pixels; ``good`` (n,): markers with four good sides (corners
-    of the others are unchanged); ``relative_sigma`` (n,): uncertainty relative to a large marker of
-    high contrast, at least 1.
+    """Refined corners of n markers.
+
+    ``corners_px`` (n, 4, 2): ideal pixels; unchanged for markers that are not ``good``. ``good``
+    (n,): all four sides are usable. ``relative_sigma`` (n,): uncertainty relative to a large marker
+    of high contrast, at least 1.
     """
 
     corners_px: Array
@@ -107,8 +111,7 @@ class Refined:
 
 
 def inside_border(corners_px: Array, margin_share: Array) -> Array:
-    """Return the corners (n, 4, 2) of the black squares, given the outer corners of their white
-    borders.
+    """Return the corners (n, 4, 2) of black squares from the outer corners of their white borders.
 
     ``margin_share`` (n,): width of the border over the side of the square.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marker detection: OpenCV's ArUco detector with settings tuned by measurement."""
+"""Detect markers by OpenCV's ArUco detector, with settings tuned by measurement."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, cuboid_corners
 from numpy.typing import ArrayLike, NDArray
 
-# Minimum perimeter of a marker, pixels.
+# Least perimeter of a marker, px. Smaller: markers farther away, and more false candidates.
 _MIN_PERIMETER_PX = 40.0
-# Margin of a region of interest: share of its size, and pixels.
+# Margin around a predicted target: share of its size in the image, and px. Wider: a less accurate
+# prediction suffices; narrower: less time.
 _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
-# Images and regions with a shorter side are not halved.
+# Shorter side, px, below which images and regions are not halved. Smaller: less time; larger: fewer
+# small markers are lost at half size.
 _HALVED_PX = 300
-# A region with a larger share of the image is not used.
+# Share of the image above which a region is not used: it would hardly save time.
 _REGION_LIMIT = 0.7
 
 Region = tuple[int, int, int, int]
@@ -30,16 +32,20 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Detections:
-    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the image: top left, top right, bottom right,
-    bottom left of the upright marker. An id can occur more than once."""
+    """Markers found in an image; an id can occur more than once.
+
+    ``ids`` (n,). ``corners_px`` (n, 4, 2): top left, top right, bottom right, bottom left of the
+    upright marker.
+    """
 
     ids: NDArray[np.int64]
     corners_px: Array
 
 
 class _Windows(NamedTuple):
-    """Threshold windows, and the distance, over a marker's perimeter, within which two candidates
-    are one.
+    """Sizes of the threshold windows: least, largest and step, px.
+
+    ``distance_rate``: distance below which two candidates are one, over a marker's perimeter.
     """
 
     least_px: int
@@ -50,9 +56,9 @@ class _Windows(NamedTuple):
 
 # OpenCV's own distance is 0.125.
 _WINDOWS = (_Windows(7, 7, 16, 0.125), _Windows(7, 23, 16, 0.125))
-# A second look, where nothing was found, at twice the cost (9.5 instead of 4.4 ms at 1280 x 960): a
-# window of 3 px for small markers, and candidates inside of each other, such as outer edges of
-# white borders, kept apart.
+# Settings of a second look, where nothing was found, at twice the cost (9.5 instead of 4.4 ms at
+# 1280 x 960). A window of 3 px finds small markers; the small distance keeps candidates inside each
+# other apart, such as the outer edge of a white border.
 _THOROUGH = _Windows(3, 23, 10, 0.01)
 
 NOTHING = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
@@ -73,9 +79,10 @@ def detect(
     thorough: bool = False,
     enough: int | None = None,
 ) -> Detections:
-    """Detect markers of ``dictionary`` in a grey image or its ``region`` (left, top, right, bottom;
-    pixels, right and bottom excluded). Corners are those of OpenCV's contours, accurate to about a
-    pixel.
+    """Detect markers of ``dictionary`` in a grey image or its ``region``.
+
+    ``region``: left, top, right, bottom, px; right and bottom excluded. Corners are those of
+    OpenCV's contours, accurate to about a pixel.
 
     A threshold window of 7 px detects nearly as many markers as 7 and 23 px together, in half the
     time; the second is used if the first detects fewer than two. ``thorough`` uses 3, 13 and 23 px
@@ -139,7 +146,7 @@ def region_of(
     """
     turn = rotations.to_matrix(q_irf_trf_wxyz)
     points = cuboid_corners(model.size_m) @ turn.T + np.asarray(position_irf_m)
-    # The sum is not finite if any coordinate is not.
+    # The sum is finite only if every coordinate is.
     if not math.isfinite(float(points.sum())) or min(points[:, 2].tolist()) < 0.02:
         return None
     x_px, y_px = camera.project(points).T.tolist()
@@ -155,8 +162,8 @@ def region_of(
 
 
 def _grown(px: list[float], end: int) -> tuple[int, int] | None:
-    """Return the interval of these coordinates with margins on an axis of ``end`` pixels; None if
-    not finite.
+    """Return the interval of these pixels with margins, on an axis of ``end`` pixels; None if not
+    finite.
     """
     low, high = min(px), max(px)
     grow = _REGION_SHARE * (high - low) + _REGION_MARGIN_PX

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Perception pipeline from an image to the pose of the target; the entry point of this package."""
+"""Estimate the pose of the target from an image; entry point of the perception by markers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from . import corners, detect, pnp
 from .pnp import TargetPose
 
 _ENOUGH = 6
-"""Number of markers beyond which further ones hardly improve the pose."""
+"""Markers in one image beyond which further ones hardly improve the pose."""
 
 Method = Literal["default", "paper", "paper_iterative"]
 
@@ -26,9 +26,9 @@ Method = Literal["default", "paper", "paper_iterative"]
 class GeometryInformation:
     """Information of one image about the k errors of the geometry, in their standard deviations.
 
-    ``matrix`` (k, k) and ``vector`` (k,), the matrix times the estimate: whatever the pose; empty
-    for an image without a new view. ``position_m`` (3,), IRF: of a target whose geometry has no
-    errors; ``position_by_errors`` (3, k): its change by the errors; ``position_covariance`` (3, 3),
+    ``matrix`` (k, k) and ``vector`` (k,), matrix times estimate: for an unknown pose; empty for an
+    image without a new view. ``position_m`` (3,), IRF: of the target if its geometry has no errors.
+    ``position_by_errors`` (3, k): derivative of that by the errors. ``position_covariance`` (3, 3),
     m²: for known errors.
     """
 
@@ -43,12 +43,12 @@ class GeometryInformation:
 class PerceptionResult:
     """Result for one image.
 
-    ``solutions``: best first; empty without a trustworthy pose, two if a plane's tilt is ambiguous.
-    ``marker_ids`` (n,) and ``corners_px`` (n, 4, 2), distorted image: the used markers.
-    ``rejected_ids``: detected but not used, ascending: not on this target, duplicate, inconsistent
-    with the others, or with an unusable side. ``geometry``: what the image tells about the errors
-    of a known shape, by a perception that estimates them. ``acquiring``: work on an earlier image
-    has not ended.
+    ``solutions``: best first; empty without a trustworthy pose, two if the tilt of coplanar markers
+    is ambiguous. ``marker_ids`` (n,) and ``corners_px`` (n, 4, 2), distorted image: of the used
+    markers. ``rejected_ids``: detected but not used, ascending: not on this target, duplicate,
+    inconsistent with the others, or with an unusable side. ``geometry``: what the image tells about
+    the errors of a known shape, if the perception estimates them. ``acquiring``: whether work on an
+    earlier image goes on.
     """
 
     solutions: tuple[TargetPose, ...]
@@ -101,6 +101,7 @@ class Perception:
         image = np.ascontiguousarray(image)
         if self.method != "default":
             return self._estimate_paper(image)
+
         region = (
             None if predicted is None else detect.region_of(self.camera, self.model, *predicted)
         )
@@ -108,6 +109,7 @@ class Perception:
             sighting = self._estimate_in(image, region)
             if sighting.solutions:
                 return sighting
+
         sighting = self._estimate_in(image, None)
         rejected = sighting.rejected_ids
         if sighting.solutions or len(set(rejected)) < len(

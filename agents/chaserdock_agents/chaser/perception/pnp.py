@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of a target from the corners of its markers, in ideal (undistorted) pixels.
+"""Compute the pose of a target from the corners of its markers, in ideal (undistorted) pixels.
 
 Candidates from SQPnP (G. Terzakis, M. Lourakis, ECCV 2020) and IPPE (T. Collins, A. Bartoli, IJCV
 2014), a consensus over markers against false ids, Levenberg-Marquardt on the reprojection error,
@@ -27,37 +27,39 @@ from .views import count_visible_markers, marker_errors, squared_errors
 
 Indices = NDArray[np.intp]
 
-# Lower bound of the corner noise, pixels; a single marker leaves only two degrees of freedom.
+# Least corner noise, px: with several markers, and with one, which leaves only two degrees of
+# freedom.
 SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.015, 0.013
-# Residuals above this noise come from light, compression or the pixel grid, which move the four
-# corners of a marker together: with several markers, their variance averages out over markers, not
-# over corners.
+# Noise above the least comes from light, compression or the pixel grid, which move the four corners
+# of a marker together. So with several markers it averages out over markers, not over corners.
 COMMON_PER_MARKER = 4.0
-# A single marker at a more grazing angle determines its tilt poorly, with an optimistic covariance.
+# Least cosine of the viewing angle of a single marker: at a more grazing angle its tilt is poorly
+# determined, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
-# Largest corner error of an inlier of a coarse candidate, and of a refined pose.
+# Largest corner error, px, of an inlier of a coarse candidate, and of a refined pose.
 _COARSE_GATE_PX, _FINE_GATE_PX = 6.0, 1.5
-# The fine gate grows to so many medians of the markers' errors, as far as the coarse one: in a
+# The fine gate grows to this many medians of the markers' errors, up to the coarse gate: in a
 # blurred or noisy image all corners err alike.
 _FINE_GATE_SIGMAS = 5.0
-# A pose with a larger reprojection error is rejected, px: 50 times the error of a corner in a sharp
-# image, so that only wrong poses are.
+# Largest reprojection error of a pose, px: 50 times the error of a corner in a sharp image, so that
+# only wrong poses are rejected.
 MAX_RMS_PX = 2.0
-# The second solution of a plane is kept if its -2 log likelihood exceeds the first's by at most
-# this.
+# Excess of -2 log likelihood over the best, up to which the second pose of a plane is kept.
 _AMBIGUITY_LIMIT = 25.0
-# Poses are tried from all markers together and from so many of the largest; each costs a solution
-# by IPPE, and with six there is one right marker unless most are false.
+# Poses are tried from all markers together and from this many of the largest. Each costs a solution
+# by IPPE; with six there is one right marker unless most are false.
 _CANDIDATE_MARKERS = 6
-# A coarse pose of a plane with a larger error is rejected.
+# Largest error of a coarse pose of a plane, px.
 _PLANE_RMS_PX = 1.0
-# Of a plane's two coarse poses, one whose angle to the refined pose is this share of the other's is
-# the same pose.
+# Of a plane's two coarse poses, one counts as the refined pose if its angle to that is this share
+# of the other's.
 _SAME_POSE_SHARE = 0.25
-# A single marker is a false id if this many others should be as visible and none is detected.
+# A single marker counts as a false id if this many others should be as visible and none is
+# detected.
 _MAX_MISSING = 2
-# Markers nearer to the border of the image count as not visible, px (chosen): their white border,
-# which the detector needs, may be cut.
+# Distance from the image's border, px, within which a marker need not be visible: its white border,
+# which the detector needs, may be cut. Larger: fewer false ids are recognized; smaller: right ones
+# are rejected.
 _FRAME_MARGIN_PX = 8.0
 
 
@@ -79,9 +81,12 @@ class TargetPose:
 
 @dataclass(frozen=True)
 class MarkerTable:
-    """The m markers of a target as arrays: ``ids`` (m,), ``corners`` (m, 4, 3), ``origins`` (m, 3)
-    and ``rotations`` (m, 3, 3), marker -> TRF, in metres in TRF; ``margin_share`` (m,): white
-    border over side; ``outlined`` (m,): whether the border ends there on all sides."""
+    """The m markers of a target as arrays, in metres and TRF.
+
+    ``ids`` (m,); ``corners`` (m, 4, 3); ``origins`` (m, 3); ``rotations`` (m, 3, 3): marker to TRF.
+    ``margin_share`` (m,): width of the white border over the side. ``outlined`` (m,): whether the
+    border ends at that width on all sides.
+    """
 
     ids: NDArray[np.int64]
     corners: Array
@@ -121,8 +126,11 @@ class MarkerTable:
 
 @dataclass(frozen=True)
 class _DetectedMarkers:
-    """n detections: ``which`` marker of the table each is, ``points`` (n, 4, 3) in TRF, ``pixels``
-    (n, 4, 2) and ``sigma`` (n,), relative."""
+    """n detections with what is known of their markers.
+
+    ``which``: row of each in the marker table. ``points`` (n, 4, 3): corners in TRF. ``pixels`` (n,
+    4, 2): ideal. ``sigma`` (n,): relative uncertainty.
+    """
 
     camera: Camera
     table: MarkerTable
@@ -143,7 +151,9 @@ class _DetectedMarkers:
 
     @cached_property
     def plane_poses(self) -> list[PoseInCamera]:
-        """Cached `_plane_poses`: for a single marker both its candidates and its two poses."""
+        """Poses of `_plane_poses`, cached: a single marker needs them both as candidates and as
+        solutions.
+        """
         return _plane_poses(self)
 
     def part(self, of: list[int]) -> _DetectedMarkers:
@@ -166,14 +176,15 @@ def solve(
     corners_ideal_px: Array,
     relative_sigma: Array,
 ) -> tuple[tuple[TargetPose, ...], Indices]:
-    """Return the poses, best first, that explain the detected markers, and the indices of the
-    detections used.
+    """Return the poses, best first, that explain the detections, and the indices of those used.
 
-    ``which`` (n,): row of ``table`` of each detection, a row may occur more than once;
-    ``corners_ideal_px`` (n, 4, 2); ``relative_sigma`` (n,): uncertainty of a detection's corners,
-    relative to the best. No pose (and no indices) if nothing is explained well, if a single marker
-    is seen at a grazing angle or without others that its pose would show, or if two equally large
-    groups of detections contradict each other. Two poses if the markers are coplanar and their tilt
+    ``which`` (n,): row of ``table`` of each detection; a row may occur more than once.
+    ``corners_ideal_px`` (n, 4, 2). ``relative_sigma`` (n,): uncertainty of a detection's corners,
+    relative to the best.
+
+    Returns no pose and no indices if nothing is explained well, if a single marker is seen at a
+    grazing angle or without others that its pose would show, or if two equally large groups of
+    detections contradict each other. Returns two poses if the markers are coplanar and their tilt
     is ambiguous.
     """
     nothing: tuple[tuple[TargetPose, ...], Indices] = ((), np.zeros(0, dtype=np.intp))
@@ -222,13 +233,12 @@ def pose_covariance(
     sigma: Array,
     common: float = 1.0,
 ) -> tuple[Array, float] | None:
-    """Return the covariance (6, 6), as in `TargetPose`, and the weighted sum of squared residuals
-    of a pose.
+    """Return the covariance (6, 6) of a pose, as in `TargetPose`, and its weighted sum of squares.
 
     The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma``
-    (n,). It is s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of which the part
-    above the floor counts ``common`` times. None if the pose is not observable or has points behind
-    the camera.
+    (n,). The covariance is s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of
+    which the part above the floor counts ``common`` times. None if the pose is not observable or
+    has points behind the camera.
     """
     pose = PoseInCamera(position, rotation)
     found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
@@ -256,8 +266,8 @@ def pose_covariance(
 def reprojection_rms_px(
     camera: Camera, points_trf_m: Array, pixels: Array, position: Array, rotation: Array
 ) -> float:
-    """Return the root mean squared distance, ideal pixels, of projected points (n, 3) from
-    ``pixels`` (n, 2).
+    """Return the root mean squared distance (ideal px) of projected points (n, 3) from ``pixels``
+    (n, 2).
     """
     squares = squared_errors(camera, points_trf_m, pixels, PoseInCamera(position, rotation))
     return math.sqrt(float(squares.sum()) / len(squares))
@@ -279,9 +289,11 @@ def _consensus(seen: _DetectedMarkers) -> tuple[PoseInCamera, list[int]] | None:
             best = score, candidate, candidate_error
         if support == len(which) and max(candidate_error) < _FINE_GATE_PX:
             break  # all are inliers: no other candidate is needed
+
     if best is None:
         return None
     _, pose, error = best
+
     used = _one_of_each(which, error, _COARSE_GATE_PX)
     for _ in range(3):
         refined = _refined(seen.part(used), pose)
@@ -359,8 +371,9 @@ def _all_finite(values: Array) -> bool:
 
 
 def _other_than(pose: PoseInCamera, candidates: list[PoseInCamera]) -> list[PoseInCamera]:
-    """Return ``candidates`` without the one that converges to the refined ``pose``, if of two one
-    is several times nearer.
+    """Return ``candidates`` without the one that converges to the refined ``pose``.
+
+    Only if of two candidates one is several times nearer to it.
     """
     if len(candidates) != 2:
         return candidates
@@ -410,9 +423,7 @@ def _solutions(
 
 
 def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[int]:
-    """Return the indices, ascending, of the detections within the gate, for each marker that of
-    least error.
-    """
+    """Return the indices, ascending, of the best detection of each marker within the gate."""
     kept: dict[int, int] = {}
     for k in sorted(range(len(error)), key=error.__getitem__):
         if error[k] < gate_px:
@@ -427,8 +438,8 @@ def _marker_errors(seen: _DetectedMarkers, pose: PoseInCamera) -> list[float]:
 def _is_single_marker_valid(
     camera: Camera, table: MarkerTable, row: int, solution: TargetPose
 ) -> bool:
-    """Return whether the pose of a single marker is observable and consistent with no other marker
-    being detected.
+    """Return whether the pose of a single marker is observable, and explains that no other is
+    detected.
     """
     pose = PoseInCamera(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
     missing, cosine = count_visible_markers(camera, table.surface, row, pose, _FRAME_MARGIN_PX)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose refinement: Levenberg-Marquardt on the weighted reprojection error."""
+"""Refine a pose by Levenberg-Marquardt on the weighted reprojection error."""
 
 from __future__ import annotations
 
@@ -34,16 +34,17 @@ def rotation_matrix(rotation_vector: object) -> Array:
 def residual_of(
     matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
 ) -> tuple[Array, Array] | None:
-    """Return the weighted reprojection error (2n,) and its Jacobian (2n, 6) by a rotation phi in
-    camera axes and by position, R_true = exp([phi]x) R; None for points behind the camera.
+    """Return the weighted reprojection error (2n,) and its Jacobian (2n, 6); None behind the
+    camera.
 
+    The Jacobian is by a rotation phi in camera axes, R_true = exp([phi]x) R, and by position.
     ``matrix`` (3, 3) of the camera; ``points`` (n, 3) in TRF, metres; ``pixels`` (n, 2), ideal;
     ``weight`` (2n,): of each coordinate.
     """
     turned = points @ pose.rotation.T
     if not float(turned[:, 2].min()) + float(pose.position[2]) > 1e-6:
         return None
-    # With pre-rotated points OpenCV's derivative by the rotation vector at zero is that by phi.
+    # With rotated points, OpenCV's derivative by the rotation vector at zero is that by phi.
     projected, jacobian = cv2.projectPoints(turned, _ZERO, pose.position, matrix, None)
     return (np.ravel(projected) - pixels.ravel()) * weight, jacobian[:, :6] * weight[:, None]
 
@@ -51,8 +52,7 @@ def residual_of(
 def refine(
     matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
 ) -> PoseInCamera | None:
-    """Return the pose of minimum weighted squared error near ``pose``; None if points are behind
-    the camera.
+    """Return the pose of least weighted squared error near ``pose``; None behind the camera.
 
     Arguments as for `residual_of`; implemented in native/pose.c.
     """

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistical perception: draws the measured pose around the true one, with the errors that images
-of the pose have.
+"""Draw the measured pose around the true one, with the errors that rendered images have.
 
 Markers count as seen if they are large enough, face the camera and lie in the image. Corner noise
 of ``SIGMA_PX`` then gives the covariance of the pose, as in ``pnp``, and the error is drawn from
@@ -31,14 +30,16 @@ from .pnp import MIN_SINGLE_COSINE, MarkerTable, TargetPose
 SIGMA_PX = 0.042
 """Standard deviation of the coordinates of a corner of a large marker, pixels."""
 SMALL_SIDE_PX = 25.0
-"""Of markers with a shorter side, the standard deviation is larger in inverse proportion."""
+"""Side of a marker, px, below which the standard deviation of its corners grows inversely."""
 MIN_SIDE_PX = 14.0
-"""Shortest side of a marker that is detected, pixels."""
+"""Least side of a marker that is detected, px."""
 MIN_COSINE = 0.3
-"""Least cosine of the angle at which a marker is seen, above ``MIN_SINGLE_COSINE`` (chosen)."""
+"""Least cosine of the viewing angle of a detected marker; above ``MIN_SINGLE_COSINE``, so that a
+single detected marker always gives a pose.
+"""
 _MARGIN_PX = 2.0
-"""Least distance of a marker from the border of the image, pixels (chosen): as much of its white
-border must be in view.
+"""Least distance of a detected marker from the border of the image, px: part of its white border
+must be in view. Larger: the target is lost sooner at the border of the image.
 """
 _LIMITS = (c_double * 6)(
     SIGMA_PX, SMALL_SIDE_PX, MIN_SIDE_PX, MIN_COSINE, MIN_SINGLE_COSINE, _MARGIN_PX
@@ -48,7 +49,7 @@ _NOTHING = PerceptionResult((), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
 
 
 class StatisticalPerception:
-    """Measures the pose that an image of ``pose_image`` contains. Stateless, as `Perception`."""
+    """Measure the pose that an image of ``pose_image`` contains. Stateless, as `Perception`."""
 
     def __init__(self, camera: Camera, model: TargetModel, ranging: Ranging | None = None) -> None:
         self._camera, self._ranging = camera, ranging.errors() if ranging else None
@@ -65,14 +66,16 @@ class StatisticalPerception:
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:
-        """Return one solution, or none if too little of the target is in view. Raises ValueError
-        for a rendered image.
+        """Return one solution, or none if too little of the target is in view.
+
+        Raises ValueError for a rendered image.
         """
         position, q, seed = decode_pose(image)
         white = generator(seed).standard_normal(6)
         table = self._table
         m = len(table.ids)
         pose = np.concatenate([position, rotations.to_matrix(q).ravel()])
+
         seen, px, covariance, error = (
             np.empty(m, np.int64),
             np.empty((m, 4, 2)),
@@ -90,10 +93,12 @@ class StatisticalPerception:
             c_int64(m),
             *map(address, (pose, white, *outputs)),
         )
+
         if count < 0:
             return _NOTHING
         if count == 0:
             return self._by_range(position, q, white) or _NOTHING
+
         found = TargetPose(
             position + error[:3],
             rotations.multiply(q, rotations.exp(error[3:])),
@@ -104,8 +109,9 @@ class StatisticalPerception:
         return PerceptionResult((found,), table.ids[used], self._camera.distort(px[used]), ())
 
     def _by_range(self, position: Array, q: Array, white: Array) -> PerceptionResult | None:
-        """Return the pose from bearing, range and the attitude that the target sends; None out of
-        the image or of reach.
+        """Return the pose from bearing, range and the attitude that the target sends.
+
+        None out of the image or of reach.
         """
         found = (
             None

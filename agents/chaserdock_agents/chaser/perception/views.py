@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection of a target's markers for a pose, implemented in native/views.c.
+"""Project a target's markers for a pose, by native/views.c.
 
 For the few markers of a target C takes a third of NumPy's time, at up to seven poses per image.
 Points are rotated here by NumPy's matrix product, whose rounding the C code would not reproduce.
@@ -21,10 +21,10 @@ from .refine import PoseInCamera
 def marker_errors(
     camera: Camera, points_trf_m: Array, normals_trf: Array, pixels: Array, pose: PoseInCamera
 ) -> list[float]:
-    """Return the largest corner error (n,) of each marker, pixels; infinite if behind the camera or
-    facing away.
+    """Return the largest corner error (n,) of each marker, px.
 
-    ``points_trf_m`` (n, 4, 3): corners; ``normals_trf`` (n, 3); ``pixels`` (n, 4, 2): ideal.
+    Infinite for a marker behind the camera or facing away. ``points_trf_m`` (n, 4, 3): corners;
+    ``normals_trf`` (n, 3); ``pixels`` (n, 4, 2): ideal.
     """
     to_irf, n = pose.rotation.T, len(points_trf_m)
     at = points_trf_m.reshape(-1, 3) @ to_irf
@@ -38,8 +38,10 @@ def marker_errors(
 
 
 def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: PoseInCamera) -> Array:
-    """Return squared distances (n,), ideal pixels, of projected points (n, 3) from ``pixels`` (n,
-    2); NaN for points behind the camera."""
+    """Return squared distances (n,), ideal px, of projected points (n, 3) from ``pixels`` (n, 2).
+
+    NaN for points behind the camera.
+    """
     at, n = points_trf_m @ pose.rotation.T, len(points_trf_m)
     at += pose.position
     pixels, square = np.ascontiguousarray(pixels, dtype=float), np.empty(n)
@@ -52,12 +54,12 @@ def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: Pos
 def count_visible_markers(
     camera: Camera, surface_trf: Array, row: int, pose: PoseInCamera, frame_margin_px: float
 ) -> tuple[int, float]:
-    """Return how many markers other than ``row`` should be at least as visible if the pose is
-    right, and the cosine of the viewing angle of that marker: 1 face-on, negative from behind.
+    """Return how many other markers should be visible at a pose, and a marker's viewing cosine.
 
-    ``surface_trf`` (6 m, 3): 4 m corners, m centres and m normals of m markers. As visible: all
-    corners at least ``frame_margin_px`` inside the image, of about the same size, at about the same
-    viewing angle.
+    ``row``: the marker; its cosine is 1 face-on, negative from behind. Others count if they are at
+    least as visible: all corners at least ``frame_margin_px`` inside the image, of about the same
+    size, at about the same viewing angle. ``surface_trf`` (6 m, 3): 4 m corners, m centres and m
+    normals of m markers.
     """
     markers = len(surface_trf) // 6
     surface, position = surface_trf @ pose.rotation.T, np.array(pose.position, dtype=float)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster allocation: thrusts that produce a wrench (docs/thrusters.md).
+"""Allocate a wrench to thrusters (docs/thrusters.md).
 
 Feasible wrenches: of all thrusts in [0, max] that produce the wrench exactly, those with minimum
 sum, and of these the minimum norm. As an exact regularization of the linear program this is one
@@ -22,10 +22,12 @@ from chaserdock_protocol.scenario.bodies import Body
 from chaserdock_protocol.scenario.thrusters import Thruster, thrusts_max
 
 _REGULARIZATION = 1e-2
-"""Small enough for the minimum sum (measured to 1e-12), large enough for well-conditioned steps."""
+"""Weight of the norm beside the sum: small enough for the minimum sum (measured to 1e-12), large
+enough for well-conditioned steps.
+"""
 _SMALL = 1e-6
-"""Cost of thrusts where only the distance to the wrench counts (1 per axis): makes the solution
-unique, and changes the wrench by a millionth.
+"""Weight of the norm beside the distance to the wrench, 1 per axis. Makes the solution unique, and
+changes the wrench by a millionth.
 """
 # daqp's codes for an equality constraint and for success
 _EQUALITY, _SOLVED = 5, 1
@@ -33,8 +35,8 @@ _EQUALITY, _SOLVED = 5, 1
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """``thrusts_N`` (n,) within their limits; ``exact``: they produce the wrench, else they are the
-    closest.
+    """Thrusts (n,), N, within their limits; ``exact``: they produce the wrench, else the closest
+    one.
     """
 
     thrusts_N: Array
@@ -47,7 +49,7 @@ class Allocator:
     def __init__(self, thrusters: Sequence[Thruster], scale: Array) -> None:
         self.matrix = wrench_matrix(thrusters)
         self._full_N = thrusts_max(thrusters)
-        # Scaled by the units and full thrust, all numbers are near one.
+        # In units of the axes and of full thrust, all numbers are near one.
         self._rows = self.matrix * self._full_N / scale[:, None]
         self._scale = scale
         self._cost = self._full_N / self._full_N.max()
@@ -85,8 +87,9 @@ class Allocator:
 
 
 def _cheapest(rows: Array, cost: Array, target: Array, most: Array) -> tuple[Array, int]:
-    """Solve min cost . x + small |x|^2 with rows x = target, 0 <= x <= most; return daqp's solution
-    and flag.
+    """Solve min cost . x + small |x|^2 with rows x = target, 0 <= x <= most.
+
+    Return daqp's solution and flag.
     """
     n = len(most)
     upper, lower = np.concatenate([most, target]), np.concatenate([np.zeros(n), target])
@@ -96,8 +99,9 @@ def _cheapest(rows: Array, cost: Array, target: Array, most: Array) -> tuple[Arr
 
 
 def _closest(rows: Array, target: Array, most: Array) -> tuple[Array, int]:
-    """Solve min |slack|^2 + small |x|^2 with rows x + slack = target, 0 <= x <= most; return daqp's
-    solution and flag.
+    """Solve min |slack|^2 + small |x|^2 with rows x + slack = target, 0 <= x <= most.
+
+    Return daqp's solution and flag.
     """
     n = len(most)
     free = np.full(6, 1e30)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster controller of a chaser: wrench to thrusts to pulses, fault detection and capability
-report. No I/O.
+"""Control a chaser's thrusters: wrench to thrusts to pulses, fault detection, capability report.
+
+No I/O.
 """
 
 from __future__ import annotations
@@ -31,14 +32,15 @@ from .plume_avoidance import PlumeAvoidance
 
 _MIN_SCALE = 0.02
 """Share of the body's limits that is reported even if the remaining thrusters cannot produce every
-wrench.
+wrench. Smaller: the NMPC hardly moves such a chaser; larger: it plans what the thrusters cannot
+give.
 """
 _HISTORY_NS = 1_000_000_000
 """Time for which past pulses are kept, ns: more than the interval between two odometries, over
-which impulses are summed, and than the delay of a lock-step message.
+which impulses are summed, and more than the delay of a lock-step message.
 """
 _MAX_PERIOD_NS = 1_000_000_000
-"""Upper bound of a carrier period."""
+"""Upper bound of a carrier period, ns."""
 
 
 class ThrusterController:
@@ -136,7 +138,7 @@ class ThrusterController:
         effective_ns = self._timing.effective_ns(odometry.tick)
         isolated = self.health.isolated
         self._valves.set_shut(isolated, effective_ns)
-        # Pulses that extend beyond the effective time of the next command, less the part that
+        # Impulse of pulses that extend beyond the effective time of the next command, less what
         # belongs to that command.
         pulses_N_s = self._impulses(odometry.sim_time_ns, effective_ns + _MAX_PERIOD_NS)
         coming = self._matrix @ (pulses_N_s - self._modulator.advance_N_s(effective_ns))
@@ -178,8 +180,10 @@ class ThrusterController:
         self._monitor.apply_command(command)
 
     def avoid_plumes(self, target: TargetEstimate | None) -> None:
-        """Make the thrusters whose plume hits the target or another chaser dear from now on;
-        ``target``: an estimate of it and of the chasers' poses, None if unknown."""
+        """Raise the cost of thrusters whose plume hits the target or another chaser, from now on.
+
+        ``target``: estimate of the target and of the chasers' poses, None if unknown.
+        """
         self._cost_factors = None
         if self._avoidance is not None and target is not None and target.status != "none":
             self._cost_factors = self._avoidance.cost_factors(self._odometry, target)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test bed: reports planned thruster failures to a chaser when they happen, as its hardware
-would.
-"""
+"""Report planned thruster failures to a chaser when they happen, as its hardware would (test bed)."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from chaserdock_protocol.scenario.thrusters import FailureKind, ThrusterFailure
 
 
 class FailureReceiver(Protocol):
-    """What a report is delivered to."""
+    """Receive the report of a failure."""
 
     def report_failure(
         self, thruster: int, kind: FailureKind, factor: float, at_ns: int
@@ -20,8 +18,8 @@ class FailureReceiver(Protocol):
 
 
 class FailureReports:
-    """The reports of one chaser's hardware that are still to come. The flight software sees none
-    before its time.
+    """Hold the reports of one chaser's hardware until their time; the flight software sees none
+    before.
     """
 
     def __init__(self, failures: Iterable[ThrusterFailure] = ()) -> None:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thruster fault detection from the residual of commanded and observed impulse (docs/thrusters.md).
+"""Detect thruster faults from the difference of commanded and observed impulse (docs/thrusters.md).
 
-Two hypotheses are tested for every thruster, each with its signature: stuck on (constant full
-thrust: the residual is the part that was not commanded) and weak or stuck off (the residual is the
-negative of a share of what was commanded). A hypothesis is accepted if the residuals are much more
-likely under it than without a fault (likelihood ratio), are consistent with it (chi-square), and
-neither another thruster nor a loss of whole commands, which no thruster gave, explains them nearly
-as well. Single faults only. No I/O.
+Single faults only; no I/O. Two hypotheses are tested for every thruster, each with its signature:
+stuck on (constant full thrust: the residual is the part that was not commanded) and weak or stuck
+off (the residual is the negative of a share of what was commanded). A hypothesis is accepted if the
+residuals are much more likely under it than without a fault (likelihood ratio), are consistent with
+it (chi-square), and neither another thruster nor a loss of whole commands, which no thruster gave,
+explains them nearly as well.
 
 Mass properties and thrusts that differ from the model cause residuals too, the same ones at every
 tick. All likelihoods are those after integration over these constant differences with their prior,
@@ -37,16 +37,17 @@ class DetectionParameters:
     min_gain: float = 20.0
     # Minimum log-likelihood ratio to the second-best thruster: 1 in 3,000.
     min_margin: float = 8.0
-    # Numbers of consecutive ticks tested for a thruster stuck on; a single one may be a
-    # disturbance.
+    # Numbers of consecutive ticks that are tested for a thruster stuck on. At least two, as a
+    # single one may be a disturbance.
     on_windows: tuple[int, ...] = (2, 3, 4, 6, 8)
-    # Numbers of latest ticks with commanded thrust that are tested together: each about half as
-    # many again, as the information adds up.
+    # Numbers of latest ticks with commanded thrust that are tested together. Each is about half as
+    # large again as the one before, as the information adds up.
     off_windows: tuple[int, ...] = (2, 3, 4, 6, 9, 15, 30)
-    # Loss of thrust, relative, from which on a thruster counts as stuck off: two ``loss_sigma``
-    # below all of it;
+    # Relative loss of thrust from which a thruster counts as stuck off: two ``loss_sigma`` below
+    # all of it.
     stuck_off_loss: float = 0.85
-    # and as weak: four, so that scatter and mismatch are not taken for a loss.
+    # Relative loss from which it counts as weak: four ``loss_sigma``, so that scatter and mismatch
+    # are not taken for a loss.
     weak_loss: float = 0.3
     # Relative uncertainty of the failed thruster's thrust.
     own_scatter: float = 0.1
@@ -57,11 +58,13 @@ class DetectionParameters:
 _TEST = DetectionParameters()
 
 _MIN_ENERGY = 1.9 * _TEST.min_gain
-"""Energy r'r of whitened residuals below which no hypothesis is accepted: none gains more than half
-of it (Cauchy-Schwarz), and the mismatch only reduces it. 5 % are left for rounding."""
+"""Energy r'r of whitened residuals below which no hypothesis is accepted. None gains more than half
+of it (Cauchy-Schwarz), and the mismatch only reduces it; 5 % are left for rounding.
+"""
 SUFFICIENT_INFORMATION = 2.0 / _TEST.loss_sigma**2
 """Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known
-that well: half of it is lost to the uncertainty of the nominal thrust (5 %)."""
+to ``loss_sigma``. The factor 2: half of it is lost to the uncertainty of the nominal thrust (5 %).
+"""
 
 
 @dataclass(frozen=True)
@@ -74,9 +77,11 @@ class ThrusterFault:
 
 
 class _Evidence:
-    """Sums over ticks, as one vector each, of whitened quantities: residual r, signatures f (6, n)
-    of the hypotheses of all thrusters, and signatures m (6, q) of the mismatch per standard
-    deviation."""
+    """Sums over ticks of the whitened quantities of all hypotheses, as one vector each.
+
+    Residual r (6,), signatures f (6, n) of the hypotheses of all thrusters, and signatures m (6, q)
+    of the mismatch per standard deviation.
+    """
 
     def __init__(self, thrusters: int, differences: int) -> None:
         n, q = thrusters, differences
@@ -95,8 +100,10 @@ class _Evidence:
         )
 
     def marginal(self, total: Array) -> tuple[float, Array, Array]:
-        """Return energy r'r, f'r (n,) and f'f (n,) with the inverse covariance I - m (I + m'm)^-1
-        m' that the mismatch gives to the residuals."""
+        """Return energy r'r, f'r (n,) and f'f (n,) after integration over the mismatch.
+
+        It gives the residuals the inverse covariance I - m (I + m'm)^-1 m'.
+        """
         n = self._n
         parts = total[1 + 2 * n :].reshape(self._shape)
         information = parts[:, 1 + n :] + np.eye(len(parts))
@@ -108,11 +115,11 @@ class _Evidence:
 
 
 class ThrusterFaultDetector:
-    """Accumulates the residuals of the last ticks; ``matrix`` (6, n): see ``wrench_matrix``;
-    ``differences``: number of constant differences between plant and model.
+    """Test the residuals of the last ticks for a fault.
 
-    ``information`` (n,): inverse variance of every thruster's loss from the last update, for a
-    plant as modelled.
+    ``matrix`` (6, n): see ``wrench_matrix``. ``differences``: number of constant differences
+    between plant and model. ``information`` (n,): inverse variance of every thruster's loss from
+    the last update, for a plant as modelled.
     """
 
     def __init__(
@@ -120,7 +127,7 @@ class ThrusterFaultDetector:
     ) -> None:
         self._matrix, self._full_N, self._min_pulse_N_s = matrix, full_N, min_pulse_N_s
         self._on_evidence = _Evidence(len(full_N), differences)
-        # The last hypothesis: whole commands are lost.
+        # One more hypothesis after those of the thrusters: whole commands are lost.
         self._off_evidence = _Evidence(len(full_N) + 1, differences)
         self._on: deque[Array] = deque(maxlen=max(_TEST.on_windows))
         self._off: list[deque[Array]] = []
@@ -128,7 +135,7 @@ class ThrusterFaultDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the residuals: a change explains them."""
+        """Discard the residuals, as a change explains them."""
         self._on.clear()
         self._off = [deque(maxlen=max(_TEST.off_windows)) for _ in self._full_N]
 
@@ -205,8 +212,9 @@ class ThrusterFaultDetector:
 
 
 def _totals(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
-    """Yield the sums over the last ticks, for each of the ``windows`` that is full and has enough
-    energy for a fault.
+    """Yield the sums over the last ticks of each window that can hold a fault.
+
+    It must be full and have enough energy.
     """
     if sum([float(tick[0]) for tick in ticks]) < _MIN_ENERGY:
         return
@@ -229,10 +237,10 @@ def _is_distinct(gain: Array, best: int) -> bool:
 
 
 def is_consistent(energy: float, explained: float, squared: float, ticks: int) -> bool:
-    """Return whether the ``energy`` of the residuals less the share that the hypothesis explains is
-    noise.
+    """Return whether the residuals are noise under a hypothesis.
 
-    Chi-square test with 6 degrees of freedom per tick, five sigma.
+    ``energy`` less the share that it ``explained`` is tested by chi-square with 6 degrees of
+    freedom per tick, five sigma.
     """
     freedoms = 6.0 * ticks
     return (

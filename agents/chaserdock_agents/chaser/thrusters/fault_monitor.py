@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a chaser's motion tells of a failed thruster, and when a thruster is fired to find out."""
+"""Decide when a chaser's motion proves a failed thruster, and when a thruster is fired to find out."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from .impulse_residual import (
 from .self_test import ThrusterSelfTest
 
 _MAX_TEST_PULSES = 10
-"""Thrusters are tested if at most this many minimum pulses prove that one works."""
+"""Most minimum pulses that must prove that a thruster works; it is not tested if it takes more."""
 
 
 class FaultMonitor:
-    """Compares a chaser's motion with what its thrusters should have given, while it flies freely,
-    and schedules test pulses for those that have not been observed recently.
+    """Compare a freely flying chaser's motion with what its thrusters should have given.
+
+    Schedules test pulses for thrusters that have not been observed recently.
     """
 
     def __init__(self, scenario: FlightScenario, allocator: Allocator) -> None:
@@ -41,7 +42,8 @@ class FaultMonitor:
         self._noise = noise_of(scenario.navigation.errors())
         variance = quiescent_variance(self._noise, body)
         information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
-        # Neither pulses of whole periods nor pulses below the noise can test a single thruster.
+        # A single thruster cannot be tested by pulses of whole periods, nor by pulses below the
+        # noise.
         testable = (
             body.modulation.modulator == "pwm"
             and _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
@@ -56,7 +58,7 @@ class FaultMonitor:
         self._free_since_ns: int | None = 0
 
     def apply_command(self, command: WrenchCommand) -> None:
-        """Take note of whether the chaser flies freely."""
+        """Note whether the chaser flies freely."""
         # With an armed latch the chaser is about to touch and must not be disturbed.
         self._test_allowed = command.free and command.latch != "arm"
         if not command.free:
@@ -65,9 +67,7 @@ class FaultMonitor:
             self._free_since_ns = command.sim_time_ns
 
     def reset(self) -> None:
-        """Forget the motion so far: it is not due to the thrusters only, or to others than
-        known.
-        """
+        """Discard the motion so far, as more than the known thrusters caused it."""
         self._detector.reset()
 
     def detect(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which thrusters of a chaser work, as far as it knows. No I/O."""
+"""Track which thrusters of a chaser work, as far as it knows. No I/O."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .fault_detection import ThrusterFault
 class ThrusterHealth:
     """Failures found or reported, and the thrusters that the operator isolated or trusts.
 
-    ``full_N`` (n,): thrusts of healthy thrusters.
+    ``full_N`` (n,): thrusts of healthy thrusters, N.
     """
 
     def __init__(self, full_N: Array) -> None:
@@ -55,8 +55,9 @@ class ThrusterHealth:
         return available_N
 
     def suspects(self, shut: Iterable[int]) -> list[bool]:
-        """Return for every thruster whether its failure can be detected: it is not ``shut``, failed
-        or trusted by command.
+        """Return for every thruster whether a failure of it can be detected.
+
+        Not if it is ``shut``, known to have failed, or trusted by command.
         """
         excluded = {*self._failed, *shut, *self._trusted}
         return [thruster not in excluded for thruster in range(len(self._full_N))]

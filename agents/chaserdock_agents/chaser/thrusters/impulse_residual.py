@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observed impulse of a chaser and the covariance of its residual to the expected impulse. Pure
-functions.
+"""Compute the observed impulse of a chaser, and the covariance of its residual to the expected one.
+
+Pure functions.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from chaserdock_protocol.scenario.navigation import NavigationErrors
 
 @dataclass(frozen=True)
 class ImpulseNoise:
-    """Standard deviations of the difference between observed and expected motion of a healthy
-    chaser.
+    """Standard deviations of observed minus expected motion of a healthy chaser.
 
     ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of the odometry, per axis. ``scatter``: of
     a thruster's impulse, relative. ``floor_*``: of the prediction (attitude within a tick,
@@ -36,12 +36,11 @@ class ImpulseNoise:
 
 @dataclass(frozen=True)
 class PlantMismatch:
-    """Standard deviations of the constant differences between a chaser and its model, from which
-    residuals of a healthy chaser follow.
+    """Standard deviations of the constant differences between a chaser and its model.
 
-    ``mass``, ``inertia`` (per principal moment) and ``thrust`` (per thruster): relative.
-    ``centre_of_mass_m`` per axis; it also covers thrusters that are turned by a degree.
-    ``force_N``, ``torque_N_m``: external, per body axis.
+    They cause residuals of a healthy chaser. ``mass``, ``inertia`` (per principal moment) and
+    ``thrust`` (per thruster): relative. ``centre_of_mass_m`` per axis; it also covers thrusters
+    that are turned by a degree. ``force_N``, ``torque_N_m``: external, per body axis.
     """
 
     mass: float = 0.1
@@ -114,12 +113,11 @@ def mismatch_signatures(
     before: Odometry,
     after: Odometry,
 ) -> Array:
-    """Return the residuals (6, 13 + n) for one standard deviation of each part of ``mismatch``:
-    mass, three moments of inertia, centre of mass, force, torque, and the thrust of every thruster.
+    """Return the residuals (6, 13 + n) for one standard deviation of each part of ``mismatch``.
 
+    Parts: mass, three moments of inertia, centre of mass, force, torque, thrust of every thruster.
     To first order, with motion and forces at the origin of CRF and the centre of mass c: m (a +
-    omega' x c
-    + omega x (omega x c)) = F and I omega' + omega x I omega = tau - c x F.
+    omega' x c + omega x (omega x c)) = F and I omega' + omega x I omega = tau - c x F.
     """
     time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
     inertia, force = np.asarray(body.inertia), observed_impulse(before, after, body)[:3]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pulse modulation: thrusts to pulses, one carrier period after the other (docs/thrusters.md).
+"""Modulate thrusts to pulses, one carrier period after the other (docs/thrusters.md).
 
 Every thruster has an impulse deficit: what was commanded and not yet delivered. The pulse of a
 period delivers the deficit and the current thrust, held to the period's end; when the thrust
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 
 class Modulator:
-    """Modulates the thrusters of one chaser; the first carrier period begins when a command can
-    first take effect.
+    """Modulate the thrusters of one chaser.
 
-    ``deficit_N_s`` (n,): commanded minus delivered impulse.
+    The first carrier period begins when a command can first take effect. ``deficit_N_s`` (n,):
+    commanded minus delivered impulse.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Modulator:
         self.period_s = self._period_steps / timing.physics_hz
 
     def advance_N_s(self, now_ns: int) -> Array:
-        """Return the impulse (n,) that current pulses deliver in advance of thrust commanded after
+        """Return the impulse (n,) of current pulses that belongs to thrust commanded after
         ``now_ns``.
         """
         return self._period_thrust_N * (max(self._period_end_ns - now_ns, 0) * 1e-9)
@@ -132,8 +132,8 @@ class Modulator:
         exact = (wanted_s + self._lag_s) / resolution_s
         steps = np.floor(exact + 0.5)
         width_s = np.where(wanted_s > 0.0, steps * resolution_s, 0.0)
-        # Below the minimum rounded to the nearest as well, so that thrusters with small equal
-        # commands fire together.
+        # Widths below the minimum are also rounded to the nearest, so that thrusters with small
+        # equal commands fire together.
         nearest_s = np.where(
             wanted_s + self._lag_s >= 0.5 * self._shortest_s, self._shortest_s, 0.0
         )

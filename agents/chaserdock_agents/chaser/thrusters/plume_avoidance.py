@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of thrusters whose plume hits the target or another chaser. No I/O."""
+"""Raise the cost of thrusters whose plume hits the target or another chaser. No I/O."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from chaserdock_protocol.scenario.plume import PlumeSection
 
 
 class PlumeAvoidance:
-    """Cost factors of the thrusters of one chaser, from its pose and those of other chasers
-    relative to the target.
-    """
+    """Compute the cost factors of one chaser's thrusters from the poses relative to the target."""
 
     def __init__(self, scenario: FlightScenario, plume: PlumeSection) -> None:
         self._nozzles = np.array([t.position_m for t in scenario.chaser.thrusters])
@@ -30,11 +28,11 @@ class PlumeAvoidance:
         self._reach_m, self._factor = plume.reach_m, 1.0 + plume.avoid_factor
 
     def cost_factors(self, own: Odometry | None, target: TargetEstimate) -> Array | None:
-        """Return the factors (n,), above 1 for thrusters whose plume hits the target or the body of
-        a chaser whose pose ``target`` states; None without an own state, or with nothing within
-        reach.
+        """Return the cost factors (n,); above 1 for thrusters whose plume hits something.
 
-        The states may be those of different ticks, a fraction of a second apart.
+        Hits count on the target and on the bodies of chasers whose pose ``target`` states. None
+        without an own state, or with nothing within reach. The states may be those of different
+        ticks, a fraction of a second apart.
         """
         if own is None:
             return None
@@ -61,9 +59,7 @@ class PlumeAvoidance:
         return np.where(hits, self._factor, 1.0)
 
     def _near(self, nozzle: Array, force: Array, others: list[RelativeEstimate]) -> list[Box]:
-        """Return the bodies (TRF) of the chasers whose bounding sphere the plume of a thruster
-        meets.
-        """
+        """Return the bodies (TRF) of chasers whose bounding sphere the plume of a thruster meets."""
         near = []
         for r in others:
             centre = np.array(r.position_m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of thrusters that have not been observed recently (docs/thrusters.md).
+"""Test thrusters that have not been observed recently (docs/thrusters.md).
 
 A thruster that is rarely used would show a failure only when it is needed. A test burn fires it for
 one minimum pulse together with the cheapest other thrusters that cancel its wrench: healthy
@@ -19,17 +19,16 @@ from .fault_detection import Flags
 _MIN_OBSERVATIONS = 2
 """Observations after which a thruster counts as known: a single one may be a disturbance."""
 _INTERVAL_NS = 500_000_000
-"""Time between two burns, in which the first is executed and evaluated."""
+"""Time between two burns, ns, in which the first is executed and evaluated."""
 _MAX_DUTY = 0.9
 """Share of a carrier period that a burn and the commanded thrust may fill together."""
 
 
 class ThrusterSelfTest:
-    """Schedules test burns for thrusters with too little information within the last ``every_s``
-    (0: no tests).
+    """Schedule test burns for thrusters with too little information within the last ``every_s``.
 
-    ``sufficient``: information (see ``ThrusterFaultDetector.information``) from which on a
-    thruster's loss is known.
+    0: no tests. ``sufficient``: information (see ``ThrusterFaultDetector.information``) from which
+    a thruster's loss is known.
     """
 
     def __init__(
@@ -66,16 +65,16 @@ class ThrusterSelfTest:
     def schedule(
         self, now_ns: int, suspects: Flags, available_N: Array, commanded_N: Array, period_s: float
     ) -> Array | None:
-        """Return impulses (n,), N s, of a test burn in addition to thrusts ``commanded_N`` (n,);
-        None if no test is due.
+        """Return impulses (n,), N s, of a test burn to add to ``commanded_N`` (n,); None if none is
+        due.
 
-        ``suspects`` (n,): thrusters whose failure can be detected; ``available_N`` (n,): their
-        known thrust when open; ``period_s``: carrier period.
+        ``suspects`` (n,): thrusters whose failure can be detected. ``available_N`` (n,): their
+        known thrust when open. ``period_s``: carrier period.
         """
         if self._every_ns == 0 or now_ns < self._last_burn_ns + _INTERVAL_NS:
             return None
         due = np.flatnonzero(self.untested(now_ns) & suspects & (available_N > 0.0))
-        # In turn, so that a thruster that cannot be tested now does not block the others.
+        # In turn, as a thruster that cannot be tested now must not block the others.
         for thruster in sorted(due.tolist(), key=lambda j: (j - self._first) % len(available_N)):
             impulses = self._balanced(thruster, available_N * period_s)
             if impulses is not None and np.all(
@@ -86,8 +85,8 @@ class ThrusterSelfTest:
         return None
 
     def _balanced(self, thruster: int, max_N_s: Array) -> Array | None:
-        """Return a minimum pulse of ``thruster`` and the pulses that cancel it, (n,) N s; None if
-        that is not possible.
+        """Return a minimum pulse of ``thruster`` with the pulses that cancel it, (n,) N s; None if
+        impossible.
         """
         others = max_N_s.copy()
         others[thruster] = 0.0

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mass properties of the stack of a target and latched chasers, from their odometry and thruster
-pulses. No I/O.
+"""Extended Kalman filter that identifies the mass properties of a stack from odometry and thruster
+pulses of its latched chasers. No I/O.
 
-Extended Kalman filter in the parameters of the composite. Error state, with N chasers of n
-thrusters:
+Error state, with N chasers of n thrusters each:
 
-position and velocity of the centre of mass (WRF), attitude (TRF axes), rate (TRF); logarithm of the
-mass, centre of mass (TRF), inertia about it (TRF axes; xx, yy, zz, xy, xz, yz); position (TRF) and
-attitude (CRF) of every chaser; relative thrust error of every thruster that may fire; bias of every
-chaser's rate, if its sensor has one.
+- position and velocity of the centre of mass (WRF), attitude (TRF axes), rate (TRF);
+- logarithm of the mass, centre of mass (TRF), inertia about it (TRF axes; xx, yy, zz, xy, xz, yz);
+- position (TRF) and attitude (CRF) of every chaser;
+- relative thrust error of every thruster that may fire;
+- bias of every chaser's rate, if its sensor has one.
 
-A filter in the parameters of the target alone is not consistent: subtracting the chasers amplifies
-linearization errors.
+The parameters are those of the whole stack. A filter in those of the target alone is inconsistent:
+subtracting the chasers amplifies linearization errors.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from chaserdock_controller.interfaces import StackChaser
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 MASS, CENTRE, INERTIA = slice(12, 13), slice(13, 16), slice(16, 22)
 PROPERTIES = slice(12, 22)
-# First component of the mounts of the chasers, which follow the mass properties.
+# First component of the chasers' mounts, which follow the mass properties.
 _MOUNTS = 22
 _BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate(INERTIA_ROWS):
@@ -61,8 +61,8 @@ class IdentificationParameters:
 
 @dataclass(frozen=True, eq=False)
 class CompositeEstimate:
-    """Nominal state of the filter; ``thrusts``: relative errors (N n,) of all thrusters; ``biases``
-    (N, 3) of the rates.
+    """Nominal state of the filter. ``thrusts`` (N n,): relative thrust errors of all thrusters.
+    ``biases`` (N, 3): of the rates.
     """
 
     position_m: Array
@@ -78,8 +78,8 @@ class CompositeEstimate:
 
 @dataclass(frozen=True, eq=False)
 class CompositeFilterState:
-    """All that the filter knows after a tick: nominal state, covariance (size, size) of its error,
-    and number of updates.
+    """State of the filter after a tick, sufficient to continue it: nominal state, covariance (size,
+    size) of its error, and number of updates.
     """
 
     estimate: CompositeEstimate
@@ -89,9 +89,12 @@ class CompositeFilterState:
 
 @dataclass(frozen=True, eq=False)
 class StackPrediction:
-    """``transition`` of the error state; ``pushed`` (6, u): change of velocity (WRF) and rate (TRF)
-    by 1 N s of each thruster that may fire; ``impulses_N_s`` (u,) that they were to give in
-    ``step_s``."""
+    """Linearized prediction over ``step_s``.
+
+    ``transition``: of the error state. ``pushed`` (6, u): change of velocity (WRF) and rate (TRF)
+    per 1 N s of each thruster that may fire. ``impulses_N_s`` (u,): commanded impulses of these
+    thrusters.
+    """
 
     transition: Array
     pushed: Array
@@ -101,8 +104,8 @@ class StackPrediction:
 
 @dataclass(frozen=True, eq=False)
 class StackInnovation:
-    """``matrix`` (K, size) of the measurement, ``gain`` (size, K), ``residual`` (K,) and its
-    expected ``covariance`` (K, K).
+    """Innovation of an update: measurement ``matrix`` (K, size), ``gain`` (size, K), ``residual``
+    (K,) and its expected ``covariance`` (K, K).
     """
 
     matrix: Array
@@ -112,12 +115,12 @@ class StackInnovation:
 
 
 class CompositeIdentification:
-    """Filter for the stack of ``chasers``; call ``predict`` with the pulses since the last tick,
-    then ``update``.
+    """Identifies the stack of ``chasers``. Each tick, call ``predict`` with the pulses since the
+    last one, then ``update``.
 
-    ``prior``: mass properties of the stack, as from ``attach``. ``measured``: how many chasers, the
-    first ones, have a measured state; without it all. ``usable`` (n,) of every chaser: thrusters
-    that may fire; the scale of the others is not estimated.
+    ``prior``: mass properties of the stack, as ``attach`` returns them. ``measured``: the first so
+    many chasers have a measured state; all by default. ``usable`` (n,) for each chaser: thrusters
+    that may fire; only their thrust is estimated.
     """
 
     def __init__(
@@ -157,9 +160,7 @@ class CompositeIdentification:
         return CompositeFilterState(self._estimate, self.covariance.copy(), self.ticks)
 
     def load(self, state: CompositeFilterState) -> None:
-        """Replace the state by a saved one of a filter with the same chasers. Raises ValueError for
-        another one.
-        """
+        """Replace the state by a saved one. Raises ValueError if that belongs to other chasers."""
         if state.covariance.shape != self.covariance.shape:
             raise ValueError("the state is of another stack")
         self._estimate, self.covariance, self.ticks = (
@@ -214,11 +215,12 @@ class CompositeIdentification:
         step_s: float,
         unknown: Mapping[int, Array] | None = None,
     ) -> StackPrediction:
-        """Advance by ``step_s`` with the impulses (n,) that the thrusters of every chaser were to
-        give since the last tick.
+        """Advance by ``step_s`` with the impulses (n,), N s, expected of each chaser's thrusters
+        since the last tick.
 
-        Half of the impulse acts at the begin and half at the end. ``unknown`` (n,): standard
-        deviations of further impulses by chaser, whose thrusters were not reported.
+        Half of each impulse acts at the beginning of the step and half at the end. ``unknown``
+        (n,): standard deviations of further impulses, for chasers whose thrusters were not
+        reported.
         """
         x, p = self._estimate, self._parameters
         stated = self._of_all(impulses_N_s)
@@ -248,7 +250,7 @@ class CompositeIdentification:
         return StackPrediction(transition, pushed[:, self._usable], stated[self._usable], step_s)
 
     def _of_all(self, by_chaser: Mapping[int, Array]) -> Array:
-        """Return the figures of all thrusters (N n,), zero where a chaser has none."""
+        """Return per-chaser values as one array (N n,), zero for a chaser without any."""
         return np.concatenate([by_chaser.get(i, np.zeros(self._n)) for i in self.chasers])
 
     def _wrenches(self) -> Array:
@@ -296,8 +298,8 @@ class CompositeIdentification:
     def _by_pulses(
         self, rotation: Array, inverse: Array, stated: Array, impulses: Array
     ) -> tuple[Array, Array]:
-        """Return the matrices (3, size) of the changes of velocity (WRF) and rate (TRF) by pulses
-        over the error state.
+        """Return the Jacobians (3, size), by the error state, of the changes of velocity (WRF) and
+        rate (TRF) that pulses cause.
         """
         x, size = self._estimate, len(self.covariance)
         mass = x.body.mass_kg
@@ -332,8 +334,8 @@ class CompositeIdentification:
     # -- update ------------------------------------------------------------------------------------
 
     def update(self, states: Mapping[int, BodyState]) -> StackInnovation | None:
-        """Take the measured states of the chasers at this tick; return the innovation, None without
-        any state.
+        """Correct the state by the chasers' measured states at this tick. Returns the innovation,
+        or None without a measurement.
         """
         self.ticks += 1
         rows = [row for row, chaser in enumerate(self.chasers) if chaser in states]
@@ -356,14 +358,19 @@ class CompositeIdentification:
         return StackInnovation(h, gain, expected, residual)
 
     def disturb(self, velocity_m_s: float, omega_rad_s: float) -> None:
-        """Widen the motion by an unknown shock with these standard deviations per axis."""
+        """Add to the covariance an unknown shock: standard deviations per axis of changes of
+        velocity and rate.
+        """
         for part, sigma in ((VELOCITY, velocity_m_s), (RATE, omega_rad_s)):
             self.covariance[part, part] += sigma**2 * np.eye(3)
 
     def pulse_gains(self, impulse_N_s: float, noise: Array, scale: Array) -> Array:
-        """Return how much a pulse of each thruster that may fire reduces the variances of the mass
-        properties, in units of ``scale`` (10,), if the change of velocity and rate is then measured
-        with standard deviations ``noise`` (6,)."""
+        """Return, for each thruster that may fire, how much one pulse would reduce the variances of
+        the mass properties.
+
+        The variances are in units of ``scale`` (10,). Assumes that the change of velocity and rate
+        is then measured with standard deviations ``noise`` (6,).
+        """
         x = self._estimate
         rotation, inverse = rotations.to_matrix(x.q_wxyz), _inverse(x.body.inertia_kg_m2)
         rows = [*range(3, 6), *range(9, 12)]
@@ -391,7 +398,7 @@ class CompositeIdentification:
         return np.array(gains)
 
     def _measurement(self, row: int, measured: BodyState) -> tuple[Array, Array]:
-        """Return the matrix (12, size) of a chaser's odometry, and its residual: position,
+        """Return the Jacobian (12, size) and the residual of a chaser's odometry: position,
         velocity, attitude, rate.
         """
         x = self._estimate
@@ -454,7 +461,7 @@ class CompositeIdentification:
 
     @property
     def usable(self) -> list[tuple[int, int]]:
-        """Return chaser and number of the thrusters that may fire, in the order of
+        """Return (chaser, number) of the thrusters that may fire, in the order of
         ``StackPrediction``.
         """
         return [(self.chasers[k // self._n], int(k % self._n)) for k in self._usable]
@@ -470,7 +477,9 @@ class CompositeIdentification:
 
     @property
     def members(self) -> tuple[StackChaser, ...]:
-        """Return the estimated poses of the chasers in TRF, and how their thrusters thrust."""
+        """Return the estimated poses of the chasers in TRF, and their thrust relative to the stated
+        one.
+        """
         x = self._estimate
         factors = (1.0 + x.thrusts).reshape(len(self.chasers), -1)
         return tuple(
@@ -479,7 +488,9 @@ class CompositeIdentification:
         )
 
     def target(self, body: RigidBody) -> MassProperties:
-        """Return the mass properties of the target alone; ``body``: those of every chaser."""
+        """Return the mass properties of the target alone. ``body``: mass properties of each
+        chaser.
+        """
         return detach(self.stack, [c.mounting for c in self.members], body)
 
     @property
@@ -502,7 +513,7 @@ def _start(
     states: Sequence[BodyState],
     thrusters: int,
 ) -> CompositeEstimate:
-    """Return the state of the filter by the first measurements."""
+    """Return the filter's initial state, computed from the first measurements."""
     q = rotations.multiply(states[0].q_wxyz, rotations.conjugate(mounts_wxyz[0]))
     omega = np.mean(
         [rotations.rotate(m, s.omega_rad_s) for m, s in zip(mounts_wxyz, states, strict=False)],

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification that recovers from a failed thruster: the time from before the failure on is
-filtered again. No I/O.
+"""Identification that recovers from a failed thruster by filtering again from before the failure.
+No I/O.
 
-Until a failure is detected, the filter explains the impulse that is missing, or is too much, by
-mass properties and thrust errors. Widening their covariance afterwards does not undo that.
-Therefore the inputs of the last seconds are kept, with the filter's state once a second; after a
-detection the filter starts again from a state before the failure, with what the thruster really
-gave.
+Until a failure is detected, the filter attributes the missing or surplus impulse to mass properties
+and thrust errors. Widening their covariance afterwards does not undo that. Therefore the inputs of
+the last seconds are kept, with the filter's state once a second. After a detection the filter
+restarts from a state before the failure, with the impulses that the failed thruster really gave.
 """
 
 from __future__ import annotations
@@ -23,20 +22,21 @@ from .composite import CompositeFilterState, CompositeIdentification
 from .faults import DetectorState, StackFault, StackFaultDetector
 
 _KEPT_S = 15.0
-"""Time, s, for which inputs are kept: the earliest begin of a failure that can be corrected."""
+"""Time, s, for which inputs are kept. A failure can be corrected if it began within this time."""
 _SAVE_EVERY_S = 1.0
-"""Time, s, between two states that are kept. The filter repeats at most as much more than needed.
-"""
+"""Time, s, between two saved states. The filter repeats at most this much more than needed."""
 _UNCERTAIN_S = 2.0
-"""Time before the likeliest begin of a failure in which the thruster may have failed already."""
+"""Time, s, before the likeliest begin of a failure in which the thruster may already have
+failed.
+"""
 _CLOSING_S = 0.4
-"""Time after a detection in which the shut-off valve may still be open."""
+"""Time, s, after a detection in which the shut-off valve may still be open."""
 
 
 @dataclass(frozen=True, eq=False)
 class _TickRecord:
-    """Inputs of the filter in one tick; ``before``: its state before them, if it was saved. See
-    ``predict`` and ``update``.
+    """Inputs of the filter in one tick, named as in ``predict`` and ``update``. ``before``: the
+    filter's state before them, if it was saved.
     """
 
     before: CompositeFilterState | None
@@ -49,8 +49,8 @@ class _TickRecord:
 
 @dataclass(frozen=True, eq=False)
 class RecoveryState:
-    """State of filter and detection, for a standby controller. The inputs of the last seconds are
-    not part of it.
+    """State of filter and detection for a standby controller. It does not include the inputs of the
+    last seconds.
     """
 
     composite: CompositeFilterState
@@ -59,10 +59,10 @@ class RecoveryState:
 
 
 class FaultTolerantIdentification:
-    """``filter`` of the stack, and detection of thrusters that are stuck off or on. ``full_N``
-    (n,): full thrusts of a chaser.
+    """Identifies a stack with ``filter`` and detects thrusters that are stuck off or on.
 
-    Call ``predict`` and ``update`` once a tick.
+    ``full_N`` (n,): full thrusts of a chaser's thrusters. Call ``predict`` and ``update`` once a
+    tick.
     """
 
     def __init__(self, identification: CompositeIdentification, full_N: Array) -> None:
@@ -81,9 +81,11 @@ class FaultTolerantIdentification:
         unknown_N_s: Mapping[int, Array] | None = None,
         shock: tuple[float, float] | None = None,
     ) -> None:
-        """Advance by ``step_s``; impulses as in ``CompositeIdentification.predict``. ``shock``:
-        standard deviations per axis of an unknown change of velocity (m/s) and rate (rad/s) at the
-        end."""
+        """Advance by ``step_s``; impulses as in ``CompositeIdentification.predict``.
+
+        ``shock``: standard deviations per axis of an unknown change of velocity (m/s) and rate
+        (rad/s) at the end of the step.
+        """
         tick = _TickRecord(None, step_s, given_N_s, unknown_N_s or {}, shock)
         for fault in self._closing:
             tick = self._with_fault(tick, fault, certain=fault.kind == "stuck_off")
@@ -93,8 +95,11 @@ class FaultTolerantIdentification:
         self._predict(tick, self._detector)
 
     def update(self, states: Mapping[int, BodyState], suspects: BoolArray) -> StackFault | None:
-        """Take the measured states of the chasers; return a thruster whose failure they prove.
-        ``suspects`` (u,): thrusters in question."""
+        """Correct the filter by the chasers' measured states. Returns a thruster that is proven to
+        have failed, or None.
+
+        ``suspects`` (u,): thrusters that are tested.
+        """
         if self._records:
             self._records[-1] = replace(self._records[-1], states=states)
         innovation = self.filter.update(states)
@@ -105,7 +110,7 @@ class FaultTolerantIdentification:
         return found
 
     def restart_detection(self) -> None:
-        """Begin all tests for failures again."""
+        """Restart all failure tests."""
         self._detector.reset()
 
     def save(self) -> RecoveryState:
@@ -120,7 +125,7 @@ class FaultTolerantIdentification:
         self._closing = list(state.closing)
 
     def _predict(self, tick: _TickRecord, detector: StackFaultDetector | None = None) -> None:
-        """Advance the filter, and keep the tick."""
+        """Advance the filter and record the tick."""
         records = self._records
         every = max(1, round(_SAVE_EVERY_S / tick.step_s))
         saved = next((k for k, r in enumerate(reversed(records)) if r.before is not None), every)
@@ -134,7 +139,7 @@ class FaultTolerantIdentification:
             self.filter.disturb(*tick.shock)
 
     def _repeat(self, fault: StackFault) -> None:
-        """Filter again from before a failure on."""
+        """Restart the filter from before a failure and process the recorded ticks again."""
         ticks = list(self._records)
         begin = len(ticks) - fault.ticks
         early = begin - round(_UNCERTAIN_S / ticks[-1].step_s) if ticks else 0
@@ -150,8 +155,12 @@ class FaultTolerantIdentification:
             self.filter.update(tick.states)
 
     def _with_fault(self, tick: _TickRecord, fault: StackFault, certain: bool) -> _TickRecord:
-        """Return a tick's inputs with what a failed thruster gave: nothing or full thrust if it had
-        failed for ``certain``, else anything from that to what it should have given."""
+        """Return a tick's inputs with the impulses of a failed thruster corrected.
+
+        ``certain``: the thruster had certainly failed in this tick; it then gave nothing (stuck
+        off) or full thrust (stuck on). Otherwise its impulse is uncertain between that and the
+        commanded one.
+        """
         if fault.chaser not in tick.given_N_s:
             return tick
         given = tick.given_N_s[fault.chaser].copy()

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thrusters of latched chasers that are stuck off or on, detected on the motion of the whole stack.
-No I/O.
+"""Detection of stuck thrusters of latched chasers in the motion of the whole stack. No I/O.
 
-Generalized likelihood ratio on the innovations of the identification filter (A. S. Willsky and H.
-L. Jones, IEEE Trans. Automatic Control 21, 1976): for every thruster and kind of failure the
-signature of the failure in the filter's state is propagated, and the log-likelihood ratio to the
-fault-free hypothesis is summed. A sum that falls below zero starts again, as in a CUSUM test.
+Generalized likelihood ratio test on the innovations of the identification filter (A. S. Willsky and
+H. L. Jones, IEEE Trans. Automatic Control 21, 1976). For every thruster and kind of failure, the
+signature of the failure in the filter's state is propagated and the log-likelihood ratio to the
+fault-free hypothesis is summed. A sum that falls below zero restarts, as in a CUSUM test.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ _LEAST_MARGIN = 6.0
 
 @dataclass(frozen=True)
 class StackFault:
-    """A failed thruster of a latched chaser. ``ticks``: since when it has failed, at the
-    likeliest.
+    """A failed thruster of a latched chaser. ``ticks``: number of ticks since the likeliest begin
+    of the failure.
     """
 
     chaser: int
@@ -39,8 +38,8 @@ class StackFault:
 
 @dataclass(frozen=True, eq=False)
 class DetectorState:
-    """Signatures (size, 2 u), log-likelihood ratios (2 u,) and the ticks (2 u,) over which they
-    were summed.
+    """State of the tests: signatures (size, 2 u), log-likelihood ratios (2 u,) and numbers of ticks
+    (2 u,) over which they were summed.
     """
 
     signatures: Array
@@ -49,8 +48,10 @@ class DetectorState:
 
 
 class StackFaultDetector:
-    """Signatures (size, 2 u) and log-likelihood ratios (2 u,) of all thrusters that may fire: first
-    stuck off, then stuck on.
+    """Tests all thrusters that may fire, each for being stuck off and stuck on.
+
+    Signatures (size, 2 u) and log-likelihood ratios (2 u,): first those of stuck off, then those of
+    stuck on.
     """
 
     def __init__(self, thrusters: Sequence[tuple[int, int]], size: int, full_N: Array) -> None:
@@ -60,7 +61,7 @@ class StackFaultDetector:
         self._ticks = np.zeros(2 * len(self._thrusters), dtype=np.int64)
 
     def reset(self) -> None:
-        """Begin all tests again."""
+        """Restart all tests."""
         self._signatures[:], self.gains[:], self._ticks[:] = 0.0, 0.0, 0
 
     def save(self) -> DetectorState:
@@ -68,8 +69,8 @@ class StackFaultDetector:
         return DetectorState(self._signatures.copy(), self.gains.copy(), self._ticks.copy())
 
     def load(self, state: DetectorState) -> None:
-        """Replace the state by a saved one of a detector of the same thrusters. Raises ValueError
-        for another one.
+        """Replace the state by a saved one. Raises ValueError if that belongs to other
+        thrusters.
         """
         if state.signatures.shape != self._signatures.shape or not (
             len(state.gains) == len(state.ticks) == len(self.gains)
@@ -91,7 +92,9 @@ class StackFaultDetector:
         self._ticks = np.where(self._signatures.any(axis=0), self._ticks + 1, 0)
 
     def update(self, innovation: StackInnovation, suspects: BoolArray) -> StackFault | None:
-        """Return a failure that the innovations prove; ``suspects`` (u,): thrusters in question."""
+        """Add a tick's innovation to the tests. Returns a failure that they prove, or None.
+        ``suspects`` (u,): thrusters that are tested.
+        """
         shift = innovation.matrix @ self._signatures
         weighted = np.linalg.solve(innovation.covariance, shift)
         self.gains += innovation.residual @ weighted - 0.5 * np.sum(shift * weighted, axis=0)

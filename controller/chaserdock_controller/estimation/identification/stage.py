@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification in a mission: runs the filter of the stack while chasers are latched, and its
-fault detection.
+"""Identification during a mission: runs the filter of the stack, with fault detection, while
+chasers are latched.
 """
 
 from __future__ import annotations
@@ -35,25 +35,26 @@ from .faults import StackFault
 _SHOCK = (0.01, 0.02)
 """One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
 _SILENT_S, _SILENT_SHARE = 1.0, 0.02
-"""Thrusters of a chaser that reports none are unknown for this long, and later up to this share of
-their thrust.
+"""A chaser stops reporting its thrusters: for the first time (s) their impulses are unknown up to
+full thrust, later up to the second number, a share of full thrust.
 """
 _REFINE_S, _KNOWN_RATIO, _KNOWN_M = 2.0, 0.05, 0.02
-"""The estimator takes over the target's mass properties at this interval (s), once the standard
-deviations of the inertia's ratios and of the centre of mass (m) are below the other two. Chosen.
+"""The estimator adopts the target's mass properties at this interval (s), once the standard
+deviations of the inertia ratios and of the centre of mass (m) are below the other two. Larger:
+sooner, with less reliable properties; smaller: the estimator's prior is kept for longer.
 """
 _PULSE_S = 0.3
 """Length, s, of an identifying pulse (`guidance/detumble/control.py` fires them)."""
 _WATCH_S = 1.0
-"""Time over which a pulse's effect is thought to be measured when pulses are compared."""
+"""Time, s, over which the effect of a pulse is assumed to be measured when pulses are compared."""
 _GOOD = (0.02, 0.005, 0.05)
-"""Accuracy that is worth the same of mass (share), centre (m) and inertia (share of the largest
-moment).
+"""Accuracies of mass (share), centre of mass (m) and inertia (share of the largest moment) that
+count as equally valuable.
 """
 
 
 def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
-    """Return the filter's parameters."""
+    """Return the filter's parameters for a scenario."""
     s = scenario.detumble.identification
     return IdentificationParameters(
         thrust_share=s.thrust_share,
@@ -63,8 +64,8 @@ def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
 
 @dataclass(frozen=True, eq=False)
 class IdentificationState:
-    """What a standby controller takes over. ``composite``: the latched chasers in the filter's
-    order, and its state.
+    """State for a standby controller. ``composite``: the latched chasers in the filter's order, and
+    the filter's state; None while nothing is latched.
     """
 
     target: MassProperties
@@ -75,8 +76,10 @@ class IdentificationState:
 
 
 class StackIdentification:
-    """The filter of the stack that is latched now. ``target``: what is known of the target alone,
-    kept when chasers come and go. ``failed``: thrusters found stuck, as (chaser, number).
+    """Identifies the stack that is latched now.
+
+    ``target``: mass properties of the target alone, kept when chasers latch and leave. ``failed``:
+    thrusters found stuck, as (chaser, number).
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -91,11 +94,15 @@ class StackIdentification:
         self._events: list[LogEntry] = []
 
     def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
-        """Take a tick's odometry and pulses; return None while the target is unknown. While nothing
-        is latched, what the estimator finds of the freely tumbling target becomes the prior of the
-        stack."""
+        """Process a tick's odometry and pulses. Returns the identified stack, or None while the
+        target is unknown.
+
+        While nothing is latched, the properties that the estimator finds in the free tumble become
+        the prior of the next stack.
+        """
         latched = {c.chaser for c in estimation.chasers if c.latched}
         present = {c.chaser for c in estimation.chasers if c.own is not None}
+
         if not latched:
             self._composite = None
             if estimation.stack is not None:
@@ -104,6 +111,7 @@ class StackIdentification:
         if not estimation.known or not latched & present:
             self._composite = None
             return None
+
         states = {
             c.chaser: body_state(c.measured)
             for c in observation.chasers
@@ -116,9 +124,11 @@ class StackIdentification:
             composite = self._composite = self._begin(estimation, states)
         else:
             self._predict(composite, observation)
+
         fault = composite.update(states, self._suspects(composite.filter))
         if fault is not None:
             self._add_fault(fault)
+
         found = composite.filter
         self.target = found.target(self._scenario.chaser)
         return IdentifiedStack(
@@ -131,8 +141,8 @@ class StackIdentification:
         )
 
     def _suspects(self, found: CompositeIdentification) -> BoolArray:
-        """Return which thrusters (u,) may be found to have failed: those that have not, of chasers
-        that report their pulses.
+        """Return which thrusters (u,) are tested for failures: those not yet found failed, of
+        chasers that report their pulses.
         """
         return np.array(
             [
@@ -145,14 +155,15 @@ class StackIdentification:
     def identified(
         self, observation: Observation, estimation: TargetEstimation
     ) -> TargetEstimation:
-        """Return the estimation with the identified stack and its events."""
+        """Return the estimation completed by the identified stack and its events."""
         stack = self.run(observation, estimation)
         events, self._events = self._events, []
         return replace(estimation, stack=stack, events=(*estimation.events, *events))
 
     def refined_target(self, observation: Observation) -> MassProperties | None:
-        """Return the target's mass properties by the motion of the stack for the estimator of its
-        motion, now and then, once they are known well enough."""
+        """Return the target's mass properties for the estimator, at intervals and once they are
+        accurate enough; otherwise None.
+        """
         if self._composite is None or observation.tick % max(1, round(_REFINE_S / self._period_s)):
             return None
         ratios = math.sqrt(float(np.trace(inertia_ratios(self.target)[1])))
@@ -160,7 +171,7 @@ class StackIdentification:
         return self.target if ratios < _KNOWN_RATIO and centre_m < _KNOWN_M else None
 
     def save(self) -> IdentificationState:
-        """Return the state for a standby controller. What a free tumble has shown is kept in the
+        """Return the state for a standby controller. The result of a free tumble is part of the
         target's mass properties.
         """
         composite = None
@@ -175,8 +186,8 @@ class StackIdentification:
         )
 
     def load(self, state: IdentificationState) -> None:
-        """Replace the state by a saved one of the same scenario. Raises ValueError, without a
-        change, for another one.
+        """Replace the state by a saved one. Raises ValueError, and changes nothing, if that belongs
+        to another scenario.
         """
         composite = None
         if state.composite is not None:
@@ -205,7 +216,7 @@ class StackIdentification:
                     if c.own is None
                     else MountedChaser(*pose_in_target(estimation.target, c.own.state))
                 )
-        # The measured ones first: the filter starts from them.
+        # Measured chasers come first, because the filter starts from them.
         chasers = {i: chasers[i] for i in sorted(chasers, key=lambda i: (i not in states, i))}
         return self._filter_of(chasers, states, len(states))
 
@@ -238,7 +249,7 @@ class StackIdentification:
         unknown = {}
         for i in chasers:
             self._silent_ticks[i] = 0 if i in given else self._silent_ticks[i] + 1
-            # What was commanded before, or is fired without the controller, is not reported.
+            # A silent chaser may still execute earlier commands, or fire without the controller.
             if i not in given:
                 early = self._silent_ticks[i] * self._period_s <= _SILENT_S
                 unknown[i] = self._full_N * (
@@ -257,8 +268,8 @@ class StackIdentification:
         self._events.append(("warning", text))
 
     def _by_information(self, found: CompositeIdentification) -> tuple[tuple[int, int], ...]:
-        """Return the thrusters by the information of a pulse on the mass properties, the best
-        first.
+        """Return the thrusters in the order of the information that a pulse gives on the mass
+        properties, the most informative first.
         """
         errors, stack = self._scenario.navigation.errors(), found.stack
         count = len(found.chasers) * _WATCH_S / self._period_s

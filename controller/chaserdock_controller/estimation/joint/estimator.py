@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default estimator: one error-state Kalman filter of the target, the chasers, their sensors and
-their disturbances.
+"""Default estimator: one error-state Kalman filter of the target, the chasers, their sensor errors
+and disturbances.
 
-Mathematics: docs/estimation.md. Every tick is recorded with its inputs; a sighting that arrives
-late is inserted at its exposure, and the later ticks are processed again, so the state does not
-depend on the order of arrival.
+Mathematics: docs/estimation.md. Every tick is recorded with its inputs. A sighting that arrives
+late is inserted at its exposure, and the later ticks are processed again. The state therefore does
+not depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -58,10 +58,9 @@ _NO_DISTURBANCE = np.zeros(6)
 
 
 class JointEstimator(Estimator):
-    """Estimate the target and the chasers from odometry, sightings and commands.
+    """Estimates the target and the chasers from odometry, sightings and commands.
 
-    target: what is assumed of the target from now on. It is replaced when chasers are latched to it
-    or released.
+    ``target``: model of the target from now on. It is replaced when chasers latch or release.
     """
 
     def __init__(self, parameters: JointParameters, chasers: int) -> None:
@@ -84,13 +83,13 @@ class JointEstimator(Estimator):
 
     @property
     def reinitialisations(self) -> int:
-        """Return how often the target's pose was started again."""
+        """Return how often the estimate of the target's pose was restarted."""
         return self.newest.reinitialisations if self.newest else 0
 
     @property
     def shape(self) -> tuple[BodyShape, Array] | None:
-        """Return the shape of the body that the target is from now on, and its covariance (8, 8);
-        None if it is not estimated.
+        """Return the shape of the target's present body and its covariance (8, 8); None if it is
+        not estimated.
         """
         state = None if self.state is None else with_body(self.state, self.target)
         if state is None or state.shape is None:
@@ -98,7 +97,7 @@ class JointEstimator(Estimator):
         return state.shape, state.covariance[-SHAPE:, -SHAPE:]
 
     def update(self, inputs: EstimatorInputs) -> Estimate:
-        """Process a tick. Sightings and odometry of ticks that are not kept any more are
+        """Process a tick. Sightings and odometry of ticks that are no longer buffered are
         ignored.
         """
         records = self._buffer.records
@@ -128,9 +127,10 @@ class JointEstimator(Estimator):
         return Estimate(target, self._chasers(inputs), tuple(self._buffer.drain_events()))
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """Return the target's estimate for ``time_ns`` from the ticks up to then; changes no state.
+        """Return the target's estimate for ``time_ns`` from the ticks up to then. The state is
+        unchanged.
 
-        Raises ValueError for a time before the oldest state still held.
+        Raises ValueError for a time before the oldest buffered state.
         """
         state = self._buffer.state_at(time_ns)
         if state is None or not state.hypotheses[0].target_known:
@@ -151,7 +151,7 @@ class JointEstimator(Estimator):
         self._buffer.disturb(shock)
 
     def change_body(self, body: TargetBody, covariance: Array) -> None:
-        """Model the target from the newest tick on as a torque-free rigid body with other mass
+        """Treat the target from the newest tick on as a torque-free rigid body with other mass
         properties.
         """
         xx, yy, zz = body.inertia_kg_m2.tolist()
@@ -165,14 +165,14 @@ class JointEstimator(Estimator):
         )
 
     def without_drift(self, odometry: Odometry) -> Odometry:
-        """Return odometry without the drift of its position that is estimated up to now."""
+        """Return odometry less the drift of its position, as estimated up to now."""
         if self.state is None:
             return odometry
         position = np.array(odometry.position_m) - self.state.of(odometry.chaser, POSITION_DRIFT)
         return msgspec.structs.replace(odometry, position_m=vector(position))
 
     def _chasers(self, inputs: EstimatorInputs) -> tuple[ChaserMotion, ...]:
-        """Return the motions of the chasers whose state is known, after the newest tick."""
+        """Return the motions of the chasers with a known state, after the newest tick."""
         s = self.state
         if s is None:
             return ()
@@ -197,8 +197,8 @@ class JointEstimator(Estimator):
         )
 
     def relative_poses(self) -> dict[int, RelativePose]:
-        """Return the poses of the chasers relative to the target after the newest tick, by chaser,
-        if the target is known.
+        """Return the poses of the chasers relative to the target after the newest tick, by chaser;
+        empty while the target is unknown.
         """
         s = self.state
         if s is None or not s.target_known:
@@ -208,7 +208,7 @@ class JointEstimator(Estimator):
 
     def motion_covariance(self, chaser: int) -> Array | None:
         """Return the covariance (6, 6) of a chaser's position and velocity relative to the target,
-        WRF, if both are known.
+        WRF; None if either is unknown.
         """
         s = self.state
         if s is None or not s.target_known or not s.alive[chaser]:
@@ -237,8 +237,8 @@ class JointEstimator(Estimator):
         return p if target is p.target else dataclasses.replace(p, target=target)
 
     def _insert(self, sighting: Sighting) -> int:
-        """Add a sighting to the record of its exposure; return the record's index, or that of the
-        newest record.
+        """Add a sighting to the record of its exposure. Returns the index of that record, or of the
+        newest one if nothing was added.
         """
         newest = len(self._buffer.records) - 1
         i, record = self._buffer.find(sighting.sim_time_ns)
@@ -248,8 +248,8 @@ class JointEstimator(Estimator):
         return i
 
     def _insert_odometry(self, odometry: Odometry) -> int:
-        """Add odometry to the record of its tick, if that is known without it; return the record's
-        index, or that of the newest.
+        """Add odometry to the record of its tick unless that has one. Returns the index of that
+        record, or of the newest one if nothing was added.
         """
         i, record = self._buffer.find(odometry.sim_time_ns)
         k = odometry.chaser
@@ -269,7 +269,9 @@ class JointEstimator(Estimator):
 
 @lru_cache(maxsize=64)
 def _pose_rows(chasers: tuple[int, ...]) -> IntArray:
-    """Return the rows (n, 12) of a covariance with the poses of the target and of each chaser."""
+    """Return the rows (n, 12) of a covariance that hold the poses of the target and of each
+    chaser.
+    """
     ids = np.array(chasers, dtype=np.int64)
     poses = np.broadcast_to(POSE, (len(ids), 6))
     return np.concatenate([poses, TARGET + CHASER * ids[:, None] + POSE], axis=1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hypotheses of the target's state: rates, loss, shocks, choice, mixture. Pure functions.
+"""Hypotheses of the target's state: rates, loss, shocks, selection, mixture. Pure functions.
 
-Two hypotheses run in parallel after a start at an ambiguous view, until one is ruled out.
+After a start from an ambiguous view two hypotheses run in parallel until one is ruled out.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from .state import RATES, JointState
 class FilterState(Struct, frozen=True, eq=False):
     """State of the filter after the tick at ``time_ns``.
 
-    hypotheses: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is
-    unresolved. seen, rejected: chasers accepted and gated out at this time. accepted, gated,
-    reinitialisations: counts since the start. collective: ticks in a row in which most cameras were
-    rejected. overconfident, dropped: reported channels of odometry, by chaser and name.
+    ``hypotheses``: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is
+    unresolved. ``seen``, ``rejected``: chasers whose sightings were accepted and gated out at this
+    time. ``accepted``, ``gated``, ``reinitialisations``: counts since the start. ``collective``:
+    consecutive ticks in which most cameras were rejected. ``overconfident``, ``dropped``: channels
+    of odometry for which this was reported, by chaser and name.
     """
 
     time_ns: int
@@ -60,7 +61,7 @@ def rate_variances(velocity_m_s: float, omega_rad_s: float) -> Array:
 
 
 def unknown_rates(p: TargetParameters) -> TargetRates:
-    """Return the rates that are assumed before the first measurement."""
+    """Return the rates assumed before the first measurement."""
     variances = rate_variances(p.initial_velocity_m_s, p.initial_omega_rad_s)
     return TargetRates(np.zeros(3), np.zeros(3), np.diag(variances))
 
@@ -80,7 +81,7 @@ def widened(covariance: Array, variances: Array, first: int = 0) -> Array:
 
 
 def with_uncertain_rates(h: JointState, p: TargetParameters) -> JointState:
-    """Return the hypothesis with the additional variances of a re-initialization."""
+    """Return the hypothesis with its rates widened by the variances of a reinitialization."""
     added = rate_variances(p.reinitialised_velocity_m_s, p.reinitialised_omega_rad_s)
     return replace(h, covariance=widened(h.covariance, added))
 
@@ -105,7 +106,7 @@ def apply_shocks(state: FilterState, shocks: Sequence[Shock]) -> FilterState:
 
 
 def is_lost(covariance: Array, p: TargetParameters) -> bool:
-    """Test whether a pose with this covariance (12+, 12+) is too uncertain to use."""
+    """Test whether a pose with this covariance (12+, 12+) is too uncertain to be used."""
     v = covariance.diagonal().tolist()
     if v[0] + v[1] + v[2] <= p.lost_position_m**2 and v[6] + v[7] + v[8] <= p.lost_attitude_rad**2:
         return False  # no eigenvalue exceeds the trace
@@ -114,7 +115,7 @@ def is_lost(covariance: Array, p: TargetParameters) -> bool:
 
 
 def all_lost(state: FilterState, p: TargetParameters) -> bool:
-    """Test whether every hypothesis is too uncertain to use."""
+    """Test whether every hypothesis is too uncertain to be used."""
     return all(is_lost(h.covariance, p) for h in state.hypotheses)
 
 
@@ -126,10 +127,10 @@ def _weights(hypotheses: Sequence[JointState]) -> list[float]:
 
 
 def mixture_covariance(hypotheses: Sequence[JointState], covariances: Sequence[Array]) -> Array:
-    """Return the target's covariance (12, 12) about the first hypothesis, including the spread
-    between hypotheses.
+    """Return the target's covariance (12, 12) about the first hypothesis, with the spread between
+    hypotheses.
 
-    ``covariances`` (12, 12): of the target's state, one for each hypothesis.
+    ``covariances``: (12, 12) of the target's state, one per hypothesis.
     """
     if len(hypotheses) == 1:
         return covariances[0].copy()
@@ -155,7 +156,7 @@ def _target_difference(a: JointState, b: JointState) -> Array:
 def count_measurements(
     state: FilterState, accepted: Sequence[int], rejected: Sequence[int]
 ) -> FilterState:
-    """Return the state with the chasers whose measurements were accepted and rejected at its
+    """Return the state with the chasers whose measurements were accepted or rejected at its
     time.
     """
     return replace(
@@ -169,8 +170,8 @@ def count_measurements(
 
 
 def before_restart(state: FilterState) -> FilterState:
-    """Return the state in which the measurements of its time are not counted yet, and a
-    re-initialization is.
+    """Return the state before the measurements of its time are counted, with one more
+    reinitialization.
     """
     return replace(
         state,
@@ -183,8 +184,8 @@ def before_restart(state: FilterState) -> FilterState:
 
 
 def choose(state: FilterState, p: TargetParameters, events: list[EstimatorEvent]) -> FilterState:
-    """Sort the hypotheses by likelihood and drop those ruled out by log odds or timeout; append an
-    event for that.
+    """Sort the hypotheses by likelihood. Drop those ruled out by log odds or timeout, and append an
+    event for each.
     """
     if len(state.hypotheses) < 2:
         return state
@@ -209,8 +210,8 @@ def target_state(
     lost: bool,
     p: TargetParameters,
 ) -> TargetState:
-    """Return the estimate for ``time_ns``: ``best`` and ``covariance`` (12, 12) predicted from the
-    filter's ``state``.
+    """Return the published estimate for ``time_ns``. ``best``, ``covariance`` (12, 12): predicted
+    from the filter's ``state``.
     """
     status = "predicting"
     if lost:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array interface of the joint filter's compiled kernels (`native`), with the same names.
+"""Array interface of the joint filter's compiled kernels (`native`); names are the same.
 
-A mean is one array: position, velocity, attitude and rate of the target (13), and for each chaser
-the same and its additive states (44). Of a covariance within an update only the lower triangle is
-valid; ``complete`` fills the other one.
+A mean is one array: position, velocity, attitude and rate of the target (13), then for each chaser
+the same and its additive states (44). Within an update only the lower triangle of a covariance is
+valid; ``complete`` fills the upper one.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from .native import LIBRARY, function
 TARGET_MEAN, CHASER_MEAN = 13, 44
 MOST_ROWS = 18
 """Largest number of rows that a chaser measures in a tick: 6 of a sighting, 12 of odometry."""
-# Doubles of a sighting, and number of gated channels (`state.CHANNELS`).
+# Components of the error that a chaser's measurements depend on (see native/layout.h).
 _SEEN = 55
-# See above.
+# Number of gated channels (`state.CHANNELS`).
 _CHANNELS = 5
 
 
@@ -98,11 +98,11 @@ class _Innovation(Structure):
 
 
 class NativeMeasurement:
-    """Measurements of chaser ``i`` of ``n``, of which one may be None.
+    """Odometry and sighting of chaser ``i`` of ``n`` for the kernels; one of them may be None.
 
-    mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting:
-    pose (7,) in IRF, stated covariance (6, 6), covariance (6, 6) in whose units the view error is,
-    and the ratios of white noise and view error to them.
+    ``mounting``: lens (3,), camera axes (3, 3), attitude (4,). ``odometry``: (13,) and noise (12,
+    12). ``sighting``: pose (7,) in IRF; stated covariance (6, 6); covariance (6, 6) that defines
+    the unit of the view error; ratios of white noise and view error to them.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class NativeMeasurement:
     ) -> None:
         self.rows = (0 if odometry is None else 12) + (0 if sighting is None else 6)
         self.chaser, self.n = i, n
-        self._kept = mounting, odometry, sighting  # the kernels use the addresses of these arrays
+        self._kept = mounting, odometry, sighting  # the kernels hold addresses of these arrays
         state, noise = (None, None) if odometry is None else map(location, odometry)
         seen = (None, None, None, 0.0, 0.0)
         if sighting is not None:
@@ -124,7 +124,7 @@ class NativeMeasurement:
 
 
 class JointInnovation:
-    """Memory of the updates of a tick with the covariance (D, D) and a mean; see ``Innovation`` of
+    """Working memory of a tick's updates for a covariance (D, D) and a mean; `Innovation` of
     native/update.c.
     """
 
@@ -147,8 +147,8 @@ class JointInnovation:
         self._n = c_int64(n)
 
     def innovate(self, z: NativeMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
-        """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same
-        array or another one).
+        """Compute the innovation of measurements linearized at ``mean``, relative to ``prior`` (may
+        be the same array).
         """
         function("innovate")(
             ctypes.byref(z.native), address(mean), address(prior), address(covariance),
@@ -158,8 +158,8 @@ class JointInnovation:
     def correct(
         self, z: NativeMeasurement, used: NDArray[np.int64], prior: Array, mean: Array
     ) -> bool:
-        """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their
-        covariance is not positive.
+        """Write ``prior``, corrected by the rows ``used``, to ``mean``. Returns False if the
+        innovation covariance of these rows is not positive definite.
         """
         return bool(
             function("correct", c_int64)(
@@ -169,18 +169,18 @@ class JointInnovation:
         )  # fmt: skip
 
     def reduce(self, z: NativeMeasurement, rows: int, covariance: Array) -> None:
-        """Reduce the covariance by the last correction, of so many rows."""
+        """Reduce the covariance by the last correction, which used ``rows`` rows."""
         function("reduce")(c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
 
 def _error_size(n: int) -> int:
-    """Return the number of errors of a target without shape and ``n`` chasers."""
+    """Return the number of error components of a target without shape and ``n`` chasers."""
     return 12 + 43 * n
 
 
 def check_size(mean: Array, covariance: Array) -> int:
-    """Return the number of chasers of a state. Raises ValueError if its covariance has another
-    size, with or without a shape.
+    """Return the number of chasers of a state. Raises ValueError if the covariance does not match,
+    with or without a shape.
     """
     n, rest = divmod(mean.size - TARGET_MEAN, CHASER_MEAN)
     size = _error_size(n)
@@ -211,10 +211,11 @@ def predict(
     mean: Array,
     covariance: Array,
 ) -> Array:
-    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of
+    """Predict the chasers of ``mean`` in place and return the covariance (D, D); `predict` of
     native/covariance.c.
 
-    Raises ValueError if sizes contradict each other, as in a state from a checkpoint."""
+    Raises ValueError for sizes that contradict each other, as in a damaged checkpoint.
+    """
     n = check_size(mean, covariance)
     if any(len(a) != n for a in (given, orbital, fade_view, alive, latched)):
         raise ValueError(f"a state of {n} chasers with other numbers of chasers in its fields")
@@ -234,7 +235,8 @@ def wrench_at_origin(
     wrench: Array, centre_m: Array, omega_rad_s: Array, mass_kg: float, inertia: Array
 ) -> Array:
     """Return the wrench (6,) that moves a body with its centre of mass at the origin as ``wrench``
-    moves one with it at ``centre_m`` (3,); see native/motion.c."""
+    moves one with it at ``centre_m`` (3,); native/motion.c.
+    """
     out = np.empty(6)
     function("wrench_at_origin")(
         address(wrench), address(centre_m), address(omega_rad_s), c_double(mass_kg),
@@ -244,8 +246,8 @@ def wrench_at_origin(
 
 
 def linearize(z: NativeMeasurement, mean: Array) -> tuple[Array, Array, Array]:
-    """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k,
-    k).
+    """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise
+    covariance (k, k).
     """
     k = z.rows
     out = np.empty(k), np.empty((k, _SEEN)), np.empty((k, k))
@@ -256,8 +258,8 @@ def linearize(z: NativeMeasurement, mean: Array) -> tuple[Array, Array, Array]:
 def predict_sighting(
     mean: Array, i: int, mounting: tuple[Array, Array, Array]
 ) -> tuple[Array, Array]:
-    """Return the predicted pose (7,) of the target in IRF, and its Jacobian (6, 55) without the
-    view's error.
+    """Return the predicted pose (7,) of the target in IRF and its Jacobian (6, 55), without the
+    view error.
     """
     pose, jacobian = np.empty(7), np.empty((6, _SEEN))
     function("predict_sighting")(

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement models of the joint filter: odometry, and a sighting in the frame of the camera
+"""Measurement models of the joint filter: odometry, and a sighting in the camera frame
 (native/measurements.c).
 
-Residuals are to first order r = H e + n, with e the error vector of ``state`` and n white noise.
-With the chaser at p_i, C_i, the lens at l (CRF), the nominal camera axes R (IRF to CRF) and E = C_i
-R, a target at p, R_t is seen at S^-1 exp(-delta) (E' (p - p_i - C_i l) - b) with the attitude
-exp(-delta) E' R_t. The camera's errors, constant in IRF, are the rotation vector delta of its true
-axes, the shift b of its lens and the relative error s of its focal length; S = diag(1, 1, 1 + s): a
-longer focal length reduces the measured distance. An error of the principal point acts as a turn,
-to first order.
+To first order a residual is r = H e + n, with the error vector e of ``state`` and white noise n.
+
+Sighting. Chaser at p_i with attitude C_i, lens at l (CRF), nominal camera axes R (IRF to CRF), E =
+C_i R. A target at p with attitude R_t appears at S^-1 exp(-delta) (E' (p - p_i - C_i l) - b), with
+the attitude exp(-delta) E' R_t.
+
+Errors of the camera, constant in IRF: rotation vector delta of its true axes, shift b of its lens,
+relative error s of its focal length. S = diag(1, 1, 1 + s), as a longer focal length reduces the
+measured distance. To first order an error of the principal point acts as a rotation.
 """
 
 from __future__ import annotations
@@ -40,8 +42,10 @@ class CameraMounting(NamedTuple):
 
 
 class LinearizedMeasurement(NamedTuple):
-    """Residual (k,), its Jacobians by the errors of the target (k, 12) and of the chaser (k,
-    CHASER), and noise (k, k).
+    """Linearized measurement of k values.
+
+    Residual (k,); its Jacobians by the errors of the target (k, 12) and of the chaser (k, CHASER);
+    noise covariance (k, k).
     """
 
     residual: Array
@@ -66,9 +70,11 @@ def measurement(
     p: JointParameters,
     view: Array | None = None,
 ) -> kernels.NativeMeasurement:
-    """Return what chaser ``i`` of ``chasers`` measures in a tick, for the kernels: odometry, a
-    solution from ``markers`` markers, or both. ``view`` (6, 6): covariance in whose units the view
-    error is; the stated one by default."""
+    """Pack what chaser ``i`` of ``chasers`` measures in a tick for the kernels: odometry, a
+    solution from ``markers`` markers, or both.
+
+    ``view`` (6, 6): covariance that defines the unit of the view error; the stated one by default.
+    """
     measured = sighted = None
     if odometry is not None:
         o = odometry
@@ -89,14 +95,17 @@ def measurement(
 
 
 def linearize(state: JointState, z: kernels.NativeMeasurement) -> LinearizedMeasurement:
-    """Return the residual of a measurement, first the sighting: position in IRF, m, rotation in
-    TRF, rad; then odometry: position, velocity, attitude, rate."""
+    """Return the linearized measurement. Sighting first: position in IRF, m; rotation in TRF, rad.
+    Then odometry: position, velocity, attitude, rate.
+    """
     residual, jacobian, noise = kernels.linearize(z, packed(state))
     return LinearizedMeasurement(residual, jacobian[:, :TARGET], jacobian[:, TARGET:], noise)
 
 
 def odometry_noise(odometry: Odometry, p: JointParameters) -> Array:
-    """Return the covariance (12, 12) of the white noise of odometry: as stated, and the floor."""
+    """Return the covariance (12, 12) of the white noise of odometry: the stated one plus the
+    floor.
+    """
     floors = (p.floor_position_m, p.floor_velocity_m_s, p.floor_attitude_rad, p.floor_omega_rad_s)
     stated = (
         odometry.position_covariance_m2,
@@ -118,8 +127,9 @@ def _white_noise(stated: tuple[tuple[float, ...], ...], floors: tuple[float, ...
 
 
 class PredictedSighting(NamedTuple):
-    """Predicted pose of the target in IRF: position (3,) and attitude (4,), with Jacobians as in
-    ``LinearizedMeasurement``, without the columns of ``VIEW``."""
+    """Predicted pose of the target in IRF: position (3,) and attitude (4,). Jacobians as in
+    ``LinearizedMeasurement``, without the columns of ``VIEW``.
+    """
 
     position_m: Array
     q_wxyz: Array
@@ -134,7 +144,7 @@ def predict_sighting(state: JointState, i: int, mounting: CameraMounting) -> Pre
 
 
 def sighting_covariance(solution: PoseSolution, p: JointParameters) -> Array:
-    """Return the stated covariance (6, 6) of a sighting with the floor."""
+    """Return the covariance (6, 6) of a sighting: the stated one plus the floor."""
     covariance = np.array(solution.covariance)
     covariance[0:21:7] += p.floor_sighting_m**2
     covariance[21::7] += p.floor_sighting_rad**2

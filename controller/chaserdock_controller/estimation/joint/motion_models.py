@@ -58,8 +58,8 @@ def free_shape(
     spin, spin_after = so3.skew(omega), so3.skew(omega_after)
     centre_velocity = velocity + r @ (spin @ c)
     centre = position + r @ c + centre_velocity * dt_s
-    # Errors of TRF's origin to those of the centre of mass, transition, and back; the matrix of the
-    # way back is 2 - that there.
+    # Errors of TRF's origin are mapped to those of the centre of mass (there), and back. The
+    # inverse of such a matrix is 2 - itself.
     there, back = to_centre(q, omega, c), 2.0 * _EYE12 - to_centre(q_after, omega_after, c)
     by_centre = f[:, 0:3] @ r + f[:, 3:6] @ (r @ spin)
     by_centre[0:3] -= r_after
@@ -78,14 +78,16 @@ def free_shape(
 def _rotation(
     q_wxyz: Array, omega_rad_s: Array, dt_s: float, shape: BodyShape, mean_motion_rad_s: float
 ) -> tuple[Array, Array, Array]:
-    """Return attitude, rate and the transition (6, 11) of (dtheta, domega) by themselves and by the
-    ratios of the inertia.
+    """Return attitude, rate, and the transition (6, 11) of (dtheta, domega) by themselves and by
+    the inertia ratios.
 
-    With W the rate of WRF in TRF axes, which changes by W' = -omega x W, the body turns in space at
-    Omega = omega + W: I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, and T = 3 n^2 u
-    x I u with u away from the Earth. The change of T with an error (4e-6 1/s^2 at most) is left out
-    of the transition. Attitude and rate by RK4 in steps of at most 0.5 s and 0.1 rad; the
-    transition of a step to third order, with the derivatives in its middle.
+    W is the rate of WRF in TRF axes, with W' = -omega x W. The body turns in inertial space at
+    Omega = omega + W: I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, with the gravity
+    gradient T = 3 n^2 u x I u and u away from the Earth. The transition neglects the change of T
+    with an error (at most 4e-6 1/s^2).
+
+    Attitude and rate: RK4 in steps of at most 0.5 s and 0.1 rad. Transition of a step: third order,
+    with the derivatives in its middle.
     """
     steps = max(
         1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s))))

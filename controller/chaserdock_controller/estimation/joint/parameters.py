@@ -33,8 +33,9 @@ GATE_CHI_SQUARE_3 = 21.107513466160444
 SciPy).
 """
 TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-5, 1e-5)}
-"""Square roots of the spectral densities of the target's white acceleration (m/s²/√Hz) and angular
-acceleration (rad/s²/√Hz), by motion model. A free target has none; they bound the filter's memory.
+"""Process noise of the target by motion model: square roots of the spectral densities of white
+acceleration (m/s²/√Hz) and angular acceleration (rad/s²/√Hz). A free target has none; the
+values bound the filter's memory.
 """
 
 
@@ -42,29 +43,34 @@ class SightingNoise(NamedTuple):
     """Errors of sightings as ratios to the stated sigma."""
 
     white_ratio: float
-    """White noise with the same effect on an average over seconds as the true errors, half of which
-    are correlated over about 0.5 s."""
+    """White noise that has, averaged over seconds, the same effect as the true errors, half of
+    which are correlated over about 0.5 s.
+    """
     view_ratio: float
     """Error that persists while the view stays the same."""
     view_time_s: float
     """Time constant of the view."""
     units_time_s: float = 0.0
-    """The persistent error is a ratio to the mean of the stated covariances over so long; 0: to the
-    newest one."""
+    """Averaging time of the stated covariances that define the unit of the view error; 0: the
+    newest one defines it.
+    """
 
 
 SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
-"""Of several smaller markers, whose corners depend more on the pixel grid."""
+"""Sightings of several small markers, whose corners depend more on the pixel grid."""
 SHAPE = SightingNoise(white_ratio=1.0, view_ratio=1.6, view_time_s=30.0, units_time_s=15.0)
-"""Errors of geometry and shading change only with the view, and are alike in the images of several
-cameras (docs/markerless.md)."""
+"""Sightings by shape: errors of geometry and shading change only with the view and are alike in the
+images of several cameras (docs/markerless.md).
+"""
 RANGING = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
-"""Without images, range, bearing and attitude of `[ranging]` have white errors of the stated size.
+"""Sightings of `[ranging]`, without images: range, bearing and attitude have white errors of the
+stated size.
 """
 BEARING = SightingNoise(white_ratio=1.0, view_ratio=1.0, view_time_s=25.0)
-"""A bearing from an image: light, markers and the pixel grid shift the centroid as long as the view
-stays the same."""
+"""Bearings from images: light, markers and the pixel grid shift the centroid as long as the view
+stays the same.
+"""
 
 
 @dataclass(frozen=True)
@@ -90,25 +96,26 @@ class TargetParameters:
     single_marker_scale: float = 3.0
     """Factor on the sigma of a first pose from one marker, whose attitude is nearly ambiguous."""
     reinitialised_velocity_m_s: float = 0.03
-    """Sigma added to the velocity at a restart. It keeps its value: the pose jumped, not the rate.
+    """Sigma added to the velocity at a restart. Small, because the pose has jumped, not the
+    velocity.
     """
     reinitialised_omega_rad_s: float = 0.06
-    """The same of the rate."""
+    """Sigma added to the rate at a restart."""
     sustained_rejections: int = 10
-    """Ticks in a row in which most cameras are rejected, after which the pose is started again."""
+    """Consecutive ticks with most cameras rejected after which the pose is restarted."""
     ambiguity_log_odds: float = 10.0
     """Log odds at which the less likely of two hypotheses is dropped: wrong in 1 of 20,000 cases.
     """
     ambiguity_timeout_s: float = 5.0
-    """Time after which it is dropped anyway."""
+    """Time after which the less likely hypothesis is dropped in any case."""
     tracking_s: float = 0.25
     """Age of the last accepted sighting beyond which the status is "predicting": three images."""
     lost_position_m: float = 0.2
     """Largest standard deviation of the position beyond which the target is lost."""
     lost_attitude_rad: float = math.radians(15.0)
-    """The same of the attitude."""
+    """Largest standard deviation of the attitude beyond which the target is lost."""
     buffer_s: float = 1.0
-    """Sightings up to this much older than the newest tick count at their exposure."""
+    """Sightings at most this much older than the newest tick are processed at their exposure."""
 
     def __post_init__(self) -> None:
         if self.motion_model not in MODELS:
@@ -156,7 +163,8 @@ class JointParameters:
 
     control_force_share: float = 0.3
     """Sigma of a commanded impulse's effect, as a share of it. Errors of thrust, mass, inertia and
-    alignment are the same at every tick: as white noise they are larger."""
+    alignment repeat at every tick; modelled as white noise they need a larger sigma.
+    """
     control_torque_share: float = 0.5
     control_arm_m: float = 0.005
     """Offset of the commanded force from the centre of mass."""
@@ -164,7 +172,7 @@ class JointParameters:
     """Force on a chaser in its body axes: sigma at the start."""
     disturbance_torque_N_m: float = 0.001
     disturbance_force_N_sqrt_s: float = 1e-3
-    """The same: density of the random walk."""
+    """Density of the random walk of this force."""
     disturbance_torque_N_m_sqrt_s: float = 1e-4
     centre_of_mass_m: float = 0.005
     """Sigma of a chaser's centre of mass from the origin of CRF, per axis."""
@@ -184,8 +192,9 @@ class JointParameters:
     target_noise: Mapping[str, tuple[float, float]] = field(default_factory=lambda: TARGET_NOISE)
     """See ``TARGET_NOISE``."""
     stack_noise: tuple[float, float] = (1e-4, 2e-4)
-    """The same of the disturbances that latched chasers exert on the target. A constant one of
-    10 mN on 170 kg, which is to be followed within 3 s, is like white acceleration of 1e-4."""
+    """Process noise while chasers are latched: disturbances that they exert on the target.
+    Following a constant 10 mN on 170 kg within 3 s needs a white acceleration of 1e-4.
+    """
     ratio_memory: float = 1.0
     """Exponent by which measurements of the inertia of a torque-free target lose weight with time.
     """
@@ -196,36 +205,44 @@ class JointParameters:
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
     unexpected_velocity_m_s: float = 0.003
-    """Sigma of a change of a chaser's velocity within a tick that no command explains, as by a
+    """Sigma of a change of a chaser's velocity within a tick that no command explains, such as by a
     stuck thruster: a third of the greatest change under commands. It is assumed only where the
-    velocity does not fit otherwise."""
+    velocity does not fit otherwise.
+    """
     unexpected_omega_rad_s: float = 0.05
-    """The same of its rate: all of the greatest change, as the torque of a stuck thruster exceeds
-    that of commands."""
+    """The same of its rate. All of the greatest change, as a stuck thruster's torque exceeds
+    commanded ones.
+    """
     rejections_to_drop: int = 5
-    """A channel that is rejected this many times in a row is not used until it fits as often."""
+    """Consecutive rejections after which a channel is dropped, until it has fitted as often."""
     rejections_to_new_view: int = 3
-    """A chaser's sightings by shape that are rejected this many times in a row are taken for those
-    of a new view, whose error is unknown, if they then fit: where the tracker renders its view
-    again, its error can jump by several sigmas."""
+    """Consecutive rejections of a chaser's sightings by shape after which they count as sightings
+    of a new view with unknown error, if they then fit. The error can jump by several sigmas where
+    the tracker renders its view again.
+    """
     collective_rejections: int = 3
-    """Rejections in a row by most cameras after which the target's rates are widened."""
+    """Consecutive rejections by most cameras after which the target's rates are widened."""
     collective_cameras: int = 3
     """Cameras with a sighting from which on most of them can outvote the estimate of a chaser: with
     fewer, the error may as well be that of the only chaser that disagrees."""
     iterated_updates: int = 5
-    """The first updates after a start of the target are iterated, as they are far from linear."""
+    """Number of updates after a start of the target that are iterated, because they are far from
+    linear.
+    """
     iterations: int = 4
     overconfident_ticks: float = 30.0
-    """Odometry is reported as overconfident when its squared normalized innovation, averaged over
-    so many ticks, exceeds its expectation by ``overconfident_ratio``."""
+    """Number of ticks over which the squared normalized innovation of odometry is averaged. It is
+    reported as overconfident when the average exceeds its expectation by ``overconfident_ratio``.
+    """
     overconfident_ratio: float = 2.5
     restart_after_s: float = 1.0
-    """A chaser whose odometry was missing, or whose estimate no measurement supported, for so long
-    is started again from its odometry."""
+    """Time without odometry, or without a measurement that supports the estimate, after which a
+    chaser is restarted from its odometry.
+    """
     mean_motion_rad_s: float = 0.0
-    """Of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire; the target stays
-    at the origin of the Hill frame, where these forces vanish."""
+    """Mean motion of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire. The
+    target stays at the origin of the Hill frame, where these forces vanish.
+    """
     camera_turn_rad: float = field(init=False)
     """Prior of the camera's turn. An error of the principal point acts as a turn, to first order.
     """
@@ -236,7 +253,7 @@ class JointParameters:
         object.__setattr__(self, "camera_turn_rad", turn)
 
     def sighting_noise(self, markers: int) -> SightingNoise:
-        """Return the errors of a sighting of this many markers, 0 for one by shape or by
+        """Return the errors of a sighting with this many markers; 0: a sighting by shape or
         ranging.
         """
         if markers == 0:
@@ -276,8 +293,8 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
 
 
 def _target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]:
-    """Return the process noise of the target for each motion model: the default, or what the
-    scenario states.
+    """Return the process noise of the target by motion model: the scenario's, where it states one,
+    else the default.
     """
     stated = (estimator.target_acceleration_noise, estimator.target_angular_noise)
     return {
@@ -294,7 +311,7 @@ def _far_noise(scenario: FlightScenario) -> SightingNoise:
 
 
 def rows_of(matrix: Array) -> Matrix9:
-    """Return a matrix as rows, which can be compared and kept in parameters."""
+    """Return a matrix as rows of tuples, so that parameters can be compared and hashed."""
     return tuple(tuple(row) for row in matrix.tolist())
 
 

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of the target and the chasers between ticks, and the growth of the covariance
+"""Motion of the target and the chasers between ticks, and growth of the covariance
 (native/motion.c, covariance.c).
 
-A chaser is a rigid body under its commanded wrench and an unknown, slowly changing disturbance
-(F_d, T_d), both in body axes: I omega' = T + T_d - c x (F + F_d) - omega x I omega, v' = C ((F +
-F_d) / m - omega' x c - omega x (omega x c)), where the origin of CRF is at -c from the centre of
-mass. In an orbit, the forces and torques of the Hill frame act as well (relative_motion.py). Its
-sensor errors are Gauss-Markov processes or constants.
+A chaser is a rigid body under its commanded wrench (F, T) and an unknown, slowly changing
+disturbance (F_d, T_d), in body axes. The origin of CRF is at -c from the centre of mass:
+
+I omega' = T + T_d - c x (F + F_d) - omega x I omega,
+v' = C ((F + F_d) / m - omega' x c - omega x (omega x c)).
+
+In an orbit the forces and torques of the Hill frame are added (relative_motion.py). The errors of
+its sensors are Gauss-Markov processes or constants.
 """
 
 from __future__ import annotations
@@ -48,7 +51,7 @@ from .state import (
 )
 
 _YOUNG_S = 1.0
-"""Least age of a shape in the rate at which measurements of it fade, s."""
+"""Least age, s, of a shape in the rate at which its measurements lose weight."""
 
 
 def predict(
@@ -100,8 +103,8 @@ def predict(
 
 
 def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.MotionParameters:
-    """Return the parameters of a prediction over ``dt``, of which the command is unknown for
-    ``unknown_s``.
+    """Return the kernel's parameters for a prediction over ``dt``, of which the command is unknown
+    for ``unknown_s``.
     """
     n = p.navigation
     return kernels.MotionParameters(
@@ -125,8 +128,8 @@ def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.MotionPa
 
 
 def predict_target(state: JointState, time_ns: int, p: JointParameters) -> tuple[JointState, Array]:
-    """Return the state with the target's mean at ``time_ns``, and the target's covariance (12, 12)
-    then.
+    """Predict only the target: return the state with its mean at ``time_ns``, and its covariance
+    (12, 12) then.
     """
     dt = (time_ns - state.time_ns) * 1e-9
     if dt == 0.0:
@@ -147,8 +150,8 @@ def target_covariance(state: JointState) -> Array:
 
 
 def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[JointState, Array]:
-    """Return the state with the target after ``dt``, and the transition (12, 12), or (12, 20) if
-    its shape is estimated.
+    """Return the state with the target advanced by ``dt``, and the transition: (12, 12), or (12,
+    20) with a shape.
     """
     if not state.target_known:
         return state, np.eye(TARGET, TARGET if state.shape is None else TARGET + SHAPE)
@@ -164,8 +167,8 @@ def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[J
 
 
 def _target_noise(dt: float, p: JointParameters, is_stack: bool = False) -> Array:
-    """Return the process noise (12, 12) of the target. ``is_stack``: disturbances of latched
-    chasers act on it, too.
+    """Return the process noise (12, 12) of the target. ``is_stack``: include disturbances by
+    latched chasers.
     """
     linear, angular = p.target_noise[p.target.motion_model]
     if is_stack:
@@ -177,12 +180,12 @@ def _target_noise(dt: float, p: JointParameters, is_stack: bool = False) -> Arra
 
 
 _process_noise = lru_cache(maxsize=16)(process_noise)
-"""Process noise over the few durations that occur. No caller changes it."""
+"""Process noise, cached for the few durations that occur. Callers must not change the result."""
 
 
 def _couple_shape(covariance: Array, by_shape: Array) -> None:
-    """Add to a predicted covariance, in place, that the target moves by its shape; ``by_shape``
-    (12, 8): the transition.
+    """Add to a predicted covariance, in place, the effect of the uncertain shape on the target's
+    motion. ``by_shape`` (12, 8): the transition.
     """
     covariance[:TARGET] += by_shape @ covariance[-SHAPE:]
     covariance[:, :TARGET] += covariance[:, -SHAPE:] @ by_shape.T
@@ -191,12 +194,12 @@ def _couple_shape(covariance: Array, by_shape: Array) -> None:
 def _fade_ratios(
     covariance: Array, information: Array, dt: float, state: JointState, p: JointParameters
 ) -> None:
-    """Reduce, in place, the information of past measurements on the ratios of the inertia since the
-    shape started.
+    """Reduce, in place, the weight of past measurements of the inertia ratios since the shape was
+    started.
 
-    They were linearized at an earlier estimate, which was far from the truth at first: after the
-    time t, what was measured at the time s weighs (s / t)^``ratio_memory``. The ``information`` (5,
-    5) from before the measurements is kept.
+    They were linearized at earlier estimates, at first far from the truth. After a time t since the
+    start, what was measured at the time s weighs (s / t)^``ratio_memory``. The prior
+    ``information`` (5, 5) keeps its weight.
     """
     age = max((state.time_ns - state.shape_ns) * 1e-9, _YOUNG_S)
     share = p.ratio_memory * dt / (age + dt)
@@ -204,8 +207,9 @@ def _fade_ratios(
 
 
 def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) -> Array:
-    """Return the wrench (6,) that acts on chaser ``i``, as a body with its centre of mass at the
-    origin of CRF, in addition to the commanded ``wrench``."""
+    """Return the wrench (6,) that acts on chaser ``i`` in addition to the commanded ``wrench``, for
+    a body with its centre of mass at the origin of CRF.
+    """
     total, centre_m, omega = (
         wrench + state.extra[i, :6],
         state.of(i, CENTRE).copy(),
@@ -218,7 +222,7 @@ def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) ->
 
 
 def chaser_prior(p: JointParameters) -> Array:
-    """Return the prior variances (EXTRA,) of a chaser's additive states."""
+    """Return the initial variances (EXTRA,) of a chaser's additive states."""
     return _prior_of(
         p.navigation,
         p.disturbance_force_N,

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The newest ticks of the filter, which are processed again when a sighting of one of them arrives
-late, so that it counts at its exposure.
+"""Buffer of the newest ticks of the filter. They are processed again when a sighting of one of them
+arrives late.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ TickFunction = Callable[
 
 @dataclass(kw_only=True)
 class FilterTick:
-    """What the filter needs to process a tick again, and the state and the events that result.
+    """What the filter needs to process a tick again, with the state and the events that result.
 
-    ``parameters``, with the target's model, apply from the tick before to this one; ``shocks``
+    ``parameters``: with the target's model, valid from the tick before to this one. ``shocks``:
     change the rates after it. ``chasers``, ``covered_s``: as in ``EstimatorInputs``, without
-    outdated odometry. ``sightings``: those that were exposed at the tick, by chaser.
+    outdated odometry. ``sightings``: exposed at the tick, by chaser.
     """
 
     time_ns: int
@@ -48,10 +48,10 @@ class FilterTick:
 
 @dataclass
 class ReplayBuffer:
-    """Records in order of time.
+    """Records of ticks in order of time.
 
-    base: the state just before the records. pending: events of no record, not yet drained. drained:
-    events of records that are.
+    ``base``: the state just before the first record. ``pending``: events of dropped records that
+    were not drained. ``drained``: events of kept records that were.
     """
 
     records: list[FilterTick] = field(default_factory=list)
@@ -65,12 +65,14 @@ class ReplayBuffer:
         return self.records[-1].state if self.records else self.base
 
     def state_at(self, time_ns: int) -> FilterState | None:
-        """Return the state after the records up to ``time_ns``."""
+        """Return the state after the last record not later than ``time_ns``."""
         i = bisect_right(self.records, time_ns, key=lambda r: r.time_ns)
         return self.records[i - 1].state if i > 0 else self.base
 
     def find(self, time_ns: int) -> tuple[int, FilterTick | None]:
-        """Return the record of ``time_ns``, or None, and the index at which it is or belongs."""
+        """Return the index at which a record of ``time_ns`` is or belongs, and the record, None if
+        there is none.
+        """
         i = bisect_left(self.records, time_ns, key=lambda r: r.time_ns)
         found = i < len(self.records) and self.records[i].time_ns == time_ns
         return i, self.records[i] if found else None
@@ -91,8 +93,8 @@ class ReplayBuffer:
                 newest.state = apply_shocks(newest.state, [shock])
 
     def trim(self, duration_s: float) -> None:
-        """Drop the records that are older than the newest by more than ``duration_s``; keep their
-        events.
+        """Drop the records that are more than ``duration_s`` older than the newest; their events
+        stay pending.
         """
         horizon = self.records[-1].time_ns - round(duration_s * 1e9)
         while self.records[0].time_ns < horizon:
@@ -110,7 +112,7 @@ class ReplayBuffer:
         return events
 
     def with_newest_only(self) -> ReplayBuffer:
-        """Return the buffer with its newest record alone."""
+        """Return a buffer with the newest record only."""
         if len(self.records) < 2:
             return self
         newest, drained = (

@@ -39,41 +39,53 @@ CENTRE = slice(18, 21)
 MOTION = 21
 """Number of a chaser's components that its equations of motion couple."""
 POSITION_DRIFT, ATTITUDE_DRIFT, GYRO_BIAS = slice(21, 24), slice(24, 27), slice(27, 30)
-"""Errors of its odometry that do not average out: m (WRF), rad (CRF), rad/s (CRF)."""
+"""Errors of its odometry that do not average out: position drift, m (WRF); attitude drift, rad
+(CRF); gyro bias, rad/s (CRF).
+"""
 TURN, SHIFT, FOCAL = slice(30, 33), slice(33, 36), slice(36, 37)
-"""Errors of its camera: rotation vector and shift (IRF), relative focal length (see
-``measurements``).
+"""Errors of its camera (see ``measurements``): rotation vector and shift in IRF, relative error of
+the focal length.
 """
 VIEW = slice(37, 43)
 """Error of its sightings that persists with the view, in units of the stated sigmas."""
 CHASER = 43
 """Components of a chaser's error."""
 EXTRA = CHASER - 12
-"""Components that are added to the chaser's own state without a rotation."""
-# Place of sightings in `CHANNELS`.
+"""Number of a chaser's additive states: components of its error that are added without a
+rotation.
+"""
+# Index of sightings in `CHANNELS`.
 SIGHTING_CHANNEL = 0
 CHANNELS = ("sighting", "position", "velocity", "attitude", "rate")
 """Measurements that are gated separately."""
 
 
 class JointState(Struct, frozen=True, eq=False, kw_only=True):
-    """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``)
-    and of N chasers.
+    """State of the joint filter after the tick at ``time_ns``, for a target and N chasers.
 
-    position_m, velocity_m_s, q_wxyz, omega_rad_s: of the target, as in ``TargetState``.
-    positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4).
-    extra (N, EXTRA): their additive states. covariance (12 + CHASER N, 12 + CHASER N), or with
-    ``shape`` ``SHAPE`` more. alive (N,): chasers whose state is known. shape: of a torque-free
-    target. prior: knowledge that it started from at ``shape_ns``, with ``ratio_information`` (5,
-    5), the (pseudo-)inverse of the covariance of its ratios. odometry_ns (N,): time of the newest
-    odometry. measured_ns (N,): time of the newest measurement that was used. rejections (N,
-    len(CHANNELS)): counts that decide which channel is used. markers (N,): number of markers in the
-    newest sighting of each chaser; 1 before the first one. view_units (N, 6, 6), view_units_ns
-    (N,): mean of the stated covariances of sightings, and the time of the newest one, where the
-    view error is in units of such a mean; 0 before, and where it is in units of the newest one. nis
-    (N, 4): moving average of the normalized innovation squared of the odometry's channels. updates:
-    ticks with sightings since the start of the target. log_likelihood: of all measurements since
-    then.
+    Target (meaningless until ``target_known``):
+
+    position_m, velocity_m_s, q_wxyz, omega_rad_s: as in ``TargetState``.
+    shape: of a torque-free target, else None. It was started at ``shape_ns`` from ``prior``.
+    ratio_information (5, 5): (pseudo-)inverse of the prior covariance of the inertia ratios.
+    updates: ticks with sightings since the start of the target.
+    log_likelihood: of all measurements since then.
+
+    Chasers:
+
+    positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: (N, 3) or (N, 4).
+    extra (N, EXTRA): additive states.
+    alive (N,): chasers whose state is known.
+    odometry_ns (N,): time of the newest odometry.
+    measured_ns (N,): time of the newest measurement that was used.
+    rejections (N, len(CHANNELS)): counts that decide which channels are used.
+    markers (N,): markers in the newest sighting of each chaser; 1 before the first one.
+    view_units (N, 6, 6): mean of the stated covariances, where it defines the unit of the view
+        error; 0 before the first sighting, and where the newest covariance defines it.
+    view_units_ns (N,): time of the newest sighting in that mean.
+    nis (N, 4): moving averages of the normalized innovation squared of odometry's channels.
+
+    covariance: (12 + CHASER N, 12 + CHASER N), or ``SHAPE`` more with a ``shape``.
     """
 
     time_ns: int
@@ -109,7 +121,7 @@ class JointState(Struct, frozen=True, eq=False, kw_only=True):
         return len(self.positions_m)
 
     def of(self, chaser: int, part: slice) -> Array:
-        """Return additive states of a chaser; ``part``: their components in its error."""
+        """Return additive states of a chaser. ``part``: their components in its error."""
         return self.extra[chaser, part.start - 12 : part.stop - 12]
 
 
@@ -140,8 +152,8 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
 
 
 def with_body(state: JointState, p: TargetParameters) -> JointState:
-    """Return the state of a target that is the body of ``p`` from now on: the same, unless it was
-    another body until now.
+    """Return the state for a target that is the body of ``p`` from now on. The shape restarts if
+    that is another body.
     """
     if p.motion_model != "torque_free" or state.prior == p.body_prior:
         return state
@@ -149,7 +161,7 @@ def with_body(state: JointState, p: TargetParameters) -> JointState:
 
 
 def start_shape(state: JointState, p: TargetParameters) -> JointState:
-    """Return the state in which no more is known of the target's body than ``p`` states."""
+    """Return the state with the shape of the target restarted from the knowledge in ``p``."""
     inertia = np.array(p.inertia_ratios, dtype=float)
     own = TARGET + CHASER * state.chasers
     covariance = np.zeros((own + SHAPE, own + SHAPE))
@@ -174,7 +186,7 @@ def block(chaser: int) -> slice:
 
 
 def packed(state: JointState) -> Array:
-    """Return a new array of target and chasers as the kernels take them, see ``kernels``."""
+    """Return target and chasers as one new array, the layout of the kernels (see ``kernels``)."""
     mean = np.empty(TARGET_MEAN + CHASER_MEAN * state.chasers)
     mean[0:3], mean[3:6] = state.position_m, state.velocity_m_s
     mean[6:10], mean[10:13] = state.q_wxyz, state.omega_rad_s

@@ -46,18 +46,20 @@ from .state import (
 from .update import SightedPose, UpdateReport, sighted_pose, start_chaser, start_target, update
 
 FAR_LOST_SHARE = 2e-3
-"""Largest standard deviation of the position of a target beyond 100 m, as a share of its distance.
+"""Largest standard deviation of the position of a target beyond 100 m, as a share of its distance,
+before it is lost.
 """
 _BLAS = ThreadpoolController()
-"""Products of matrices are computed by one thread, as their last bits depend on the number of
-threads.
-"""
+"""Limits BLAS to one thread: the last bits of a matrix product depend on the number of threads."""
 
 
 def lost_limits(state: JointState, target: TargetParameters) -> TargetParameters:
-    """Return the parameters with the standard deviation of the target's position beyond which it is
-    lost: of a far target at least `FAR_LOST_SHARE` of its distance from the nearest chaser, as the
-    error of a camera's mounting grows with the distance."""
+    """Return the parameters with the standard deviation of position beyond which the target is
+    lost.
+
+    For a far target it is at least `FAR_LOST_SHARE` of the distance from the nearest chaser, as the
+    error of a camera's mounting grows with distance.
+    """
     at = state.position_m.tolist()
     places = zip(state.positions_m.tolist(), state.alive.tolist(), strict=True)
     limit_m = FAR_LOST_SHARE * min(
@@ -77,8 +79,9 @@ def process_tick(
     mounting: CameraMounting,
     p: JointParameters,
 ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
-    """Return the state after a tick, and the events. ``before``: after the previous tick, None at
-    the first.
+    """Process a tick: return the filter's state after it, and its events.
+
+    ``before``: the state after the previous tick; None at the first one.
     """
     events: list[EstimatorEvent] = []
     old = before
@@ -103,11 +106,11 @@ def process_tick(
 
 
 def _propagate(state: JointState, record: FilterTick, p: JointParameters) -> JointState:
-    """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured
-    for long.
+    """Predict a hypothesis to the time of a tick. Start chasers that are unknown, and restart those
+    that no measurement has supported for long.
 
-    A state that contradicts all of its measurements for long cannot recover by them, as none passes
-    its gate.
+    A state that contradicts all its measurements cannot recover by them, because none passes its
+    gate.
     """
     state = with_body(state, p.target)
     latched = frozenset(c.chaser for c in record.chasers if c.latched)
@@ -134,8 +137,8 @@ def _propagate(state: JointState, record: FilterTick, p: JointParameters) -> Joi
 def _with_unknown_command(
     covariance: Array, i: int, wrench: Array, period_s: float, p: JointParameters
 ) -> Array:
-    """Return the covariance with the rates of a chaser uncertain by a command as large as
-    ``wrench`` (6,) for a period.
+    """Return the covariance with a chaser's rates widened for an unknown command: as large as
+    ``wrench`` (6,), for one period.
     """
     velocity = float(np.linalg.norm(wrench[:3])) * period_s / p.body.mass_kg
     rate = float(np.linalg.norm(wrench[3:])) * period_s / min(p.inertia)
@@ -143,14 +146,14 @@ def _with_unknown_command(
 
 
 def _stale_ns(record: FilterTick, p: JointParameters) -> int:
-    """Return the time before which a measurement is too old for a chaser's state to rest on it."""
+    """Return the time (ns) before which a measurement no longer supports a chaser's state."""
     return record.time_ns - round(p.restart_after_s * 1e9)
 
 
 def _report_restarts(
     state: JointState, record: FilterTick, p: JointParameters, events: list[EstimatorEvent]
 ) -> None:
-    """Report chasers that are started again although their odometry has arrived."""
+    """Report chasers that are restarted although their odometry has arrived."""
     stale = _stale_ns(record, p)
     for i in record.odometry:
         if state.alive[i] and state.measured_ns[i] < stale <= state.odometry_ns[i]:
@@ -165,9 +168,7 @@ def _check_cameras(
     now: FilterState, before: JointState, report: UpdateReport, seen: Mapping[int, Sighting],
     mounting: CameraMounting, p: JointParameters, events: list[EstimatorEvent],
 ) -> FilterState:  # fmt: skip
-    """Report cameras that were dropped or are used again; react to the rejection of most
-    cameras.
-    """
+    """Report cameras that are dropped or used again, and react when most cameras are rejected."""
     best = max(now.hypotheses, key=lambda h: h.log_likelihood)
     limit, k = p.rejections_to_drop, SIGHTING_CHANNEL
     for i in sorted(seen):
@@ -198,8 +199,8 @@ def _start(
     now: FilterState, seen: Mapping[int, Sighting], rates: TargetRates,
     mounting: CameraMounting, p: JointParameters, action: str, events: list[EstimatorEvent],
 ) -> FilterState:  # fmt: skip
-    """Start the target at the sighting with which most others agree, and apply the others as
-    updates.
+    """Start the target from the sighting with which most others agree, then update by the
+    others.
     """
     s = now.hypotheses[0]
     with _BLAS.limit(limits=1, user_api="blas"):
@@ -229,13 +230,16 @@ def _start(
     supports = [support(first, pose) for pose in poses[first]]
     kept = [pose for pose, n in zip(poses[first], supports, strict=True) if n == max(supports)]
     scale = p.target.single_marker_scale**2 if len(seen[first].marker_ids) == 1 else 1.0
+
     others = {i: sighting for i, sighting in seen.items() if i != first}
     results = []
     for pose in kept:
         results.append(update(start_target(s, pose, rates, scale), {}, others, mounting, p))
+
     report = max(results, key=lambda r: r[0].log_likelihood)[1]
     ambiguous = ", ambiguous: two hypotheses" if len(kept) > 1 else ""
     events.append(EstimatorEvent(now.time_ns, "info", f"{action} by chaser {first}{ambiguous}"))
+
     started = tuple(r[0] for r in results)
     now = replace(now, hypotheses=started, ambiguous_since_ns=now.time_ns, collective=0)
     return count_measurements(now, (first, *report.accepted), report.rejected)
@@ -245,8 +249,8 @@ def _reacquire(
     now: FilterState, seen: Mapping[int, Sighting], mounting: CameraMounting, p: JointParameters,
     events: list[EstimatorEvent],
 ) -> FilterState:  # fmt: skip
-    """Reinitialize the target from the status "lost", keeping its rates; unless it would be lost
-    again.
+    """Reinitialize a target in status "lost" and keep its rates, unless it would be lost again at
+    once.
     """
     new_events: list[EstimatorEvent] = []
     fresh = _start(now, seen, rates_of(now.hypotheses[0]), mounting, p, "reacquired", new_events)
@@ -259,7 +263,7 @@ def _reacquire(
 def _report_odometry(
     now: FilterState, p: JointParameters, events: list[EstimatorEvent]
 ) -> FilterState:
-    """Report channels of odometry that are dropped, used again, or noisier than they state."""
+    """Report odometry channels that are dropped, used again, or noisier than stated."""
     s = now.hypotheses[0]
     dropped, overconfident = set(now.dropped), set(now.overconfident)
     for i, (alive, rejections, nis) in enumerate(

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Updates of the joint filter by a tick's odometry and sightings, with a gate for each channel.
-Pure functions.
+"""Updates of the joint filter by a tick's odometry and sightings, with one gate per channel. Pure
+functions.
 
-A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop``
-rejections in a row it is dropped until it has fitted as often: a jump or a constant error then
-changes nothing. A chaser whose estimate no measurement of translation, or none of rotation, has
-supported for ``restart_after_s`` is started again from its odometry: an estimate that contradicts
-all of them cannot recover otherwise. A velocity or rate that does not fit in two ticks in a row, by
-no more than the thrusters can cause within a tick, is followed. Noise that exceeds the gate in a
-single tick, which happens in about every flight, must not pass for a force. A sighting by shape
-that does not fit in ``rejections_to_new_view`` ticks in a row, by no more than a new view can
-cause, is followed as well, unless most cameras disagree with the estimate. When most cameras are
-rejected together, the target has moved in an unexpected way: its rates are widened, and if that
-does not help its pose is reinitialized.
+- A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop``
+  consecutive rejections it is dropped until it has fitted as often. A jump or a constant error
+  then changes nothing.
+- A chaser without support for ``restart_after_s``, by a measurement of translation and one of
+  rotation, is restarted from its odometry. An estimate that contradicts all measurements cannot
+  recover otherwise.
+- A velocity or rate that fails its gate in two consecutive ticks, by no more than thrusters can
+  cause within a tick, is followed. Noise exceeds the gate in a single tick in about every flight
+  and must not pass for a force.
+- A sighting by shape that fails its gate in ``rejections_to_new_view`` consecutive ticks, by no
+  more than a new view can cause, is followed, unless most cameras disagree with the estimate.
+- When most cameras are rejected together, the target has moved unexpectedly. Its rates are
+  widened; if that does not help, its pose is reinitialized.
 """
 
 from __future__ import annotations
@@ -89,8 +91,8 @@ class _Channel(NamedTuple):
 
 
 class _Gates(NamedTuple):
-    """Which channels are used, by number; a chaser's counts of rejections and normalized
-    innovations; the log likelihood.
+    """Result of the gates of one chaser: numbers of the channels to use, counts of rejections,
+    normalized innovations, and the log likelihood.
     """
 
     fits: dict[int, bool]
@@ -105,24 +107,29 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
     attitudes, omegas = state.attitudes_wxyz.copy(), state.omegas_rad_s.copy()
     positions[i], velocities[i] = odometry.position_m, odometry.velocity_m_s
     attitudes[i], omegas[i] = so3.normalize(np.array(odometry.q_wxyz)), odometry.omega_rad_s
+
     extra, alive = state.extra.copy(), state.alive.copy()
     extra[i], alive[i] = 0.0, True
     rejections, nis = state.rejections.copy(), state.nis.copy()
     rejections[i], nis[i] = 0, 3.0
     measured = state.measured_ns.copy()
     measured[i] = state.time_ns
+
+    # The other states keep their estimates, but are no longer correlated with this chaser.
     covariance = state.covariance.copy()
     covariance[block(i), :] = covariance[:, block(i)] = 0.0
     own = np.zeros((CHASER, CHASER))
     e = np.arange(12, CHASER)
     own[e, e] = chaser_prior(p)
     own[:12, :12] = odometry_noise(odometry, p)
+
     # The measured state is the true one plus its error, hence the negative correlation.
     for part, drift in ((POSITION, POSITION_DRIFT), (ATTITUDE, ATTITUDE_DRIFT), (RATE, GYRO_BIAS)):
         prior = own[drift, drift].copy()
         own[part, part] += prior
         own[part, drift] = own[drift, part] = -prior
     covariance[block(i), block(i)] = own
+
     return replace(
         state,
         positions_m=positions,
@@ -142,9 +149,9 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
 class SightedPose:
     """Pose of the target by one sighting and the chaser's estimated state.
 
-    position_m (3,): origin of TRF in WRF. q_wxyz (4,): TRF to WRF. covariance (6, 6): of (position
-    in WRF axes, dtheta in TRF axes), q_true = q (x) exp(dtheta). cross (6, D): covariance with the
-    error vector.
+    position_m (3,): origin of TRF in WRF. q_wxyz (4,): TRF to WRF. covariance (6, 6): of position
+    (WRF axes) and dtheta (TRF axes), q_true = q (x) exp(dtheta). cross (6, D): covariance of this
+    error with the error vector.
     """
 
     position_m: Array
@@ -153,7 +160,7 @@ class SightedPose:
     cross: Array
 
     def agrees(self, other: SightedPose, gate: float) -> bool:
-        """Test whether the difference from another pose at the same time is within the gate."""
+        """Test whether another pose at the same time differs by no more than the gate."""
         turn = so3.log(so3.inverse_multiply(other.q_wxyz, self.q_wxyz))
         d = np.concatenate([self.position_m - other.position_m, turn])
         return float(d @ np.linalg.solve(self.covariance + other.covariance, d)) <= gate
@@ -167,8 +174,8 @@ def sighted_pose(
     mounting: CameraMounting,
     p: JointParameters,
 ) -> SightedPose:
-    """Return the pose of the target by a solution of chaser ``i``, with the camera's errors as
-    estimated.
+    """Return the pose of the target by a solution of chaser ``i``, corrected by the estimated
+    camera errors.
     """
     c = so3.to_matrix(state.attitudes_wxyz[i])
     delta = state.of(i, TURN)
@@ -220,7 +227,7 @@ def start_target(
 
 
 class RunningUpdate:
-    """State during the updates of a tick, one chaser after the other; its arrays change, those of
+    """State while the chasers of a tick are processed one by one. Its arrays change; those of
     ``state`` do not.
 
     covariance (D, D): only the lower triangle is valid. rejections, nis, log_likelihood: as in
@@ -236,15 +243,17 @@ class RunningUpdate:
         self.innovation = kernels.JointInnovation(state.chasers, len(self.covariance))
 
     def values(self, z: kernels.NativeMeasurement) -> list[float]:
-        """Compute the innovation of a measurement; return the squared norm of each channel's
-        residual by its innovation covariance, then the determinant of the sighting's."""
+        """Compute the innovation of a measurement. Returns for each channel the squared normalized
+        residual, then the determinant of the sighting's innovation covariance.
+        """
         self.innovation.innovate(z, self.mean, self.mean, self.covariance)
         return self.innovation.values.tolist()
 
     def correct(
         self, z: kernels.NativeMeasurement, used: NDArray[np.int64], iterations: int
     ) -> None:
-        """Update with the rows ``used`` of the last innovation, linearized ``iterations`` times.
+        """Update by the rows ``used`` of the last innovation, relinearized up to ``iterations``
+        times.
 
         Raises numpy.linalg.LinAlgError for an innovation covariance that is not positive definite.
         """
@@ -278,10 +287,11 @@ class RunningUpdate:
 def with_view_units(
     state: JointState, sightings: Mapping[int, Sighting], p: JointParameters
 ) -> JointState:
-    """Return the state with the means of the stated covariances after these sightings.
+    """Return the state with the running means of stated covariances updated by these sightings.
 
-    A stated covariance changes from image to image with the points in use, the error that persists
-    does not: in units of the newest covariance it would seem observable by these changes.
+    A stated covariance changes from image to image with the points in use; the error that persists
+    with the view does not. In units of the newest covariance, these changes would make that error
+    seem observable.
     """
     stated = {
         i: sighting_covariance(s.solutions[0], p)
@@ -309,7 +319,7 @@ def _is_positive_definite(covariance: Array) -> bool:
 
 
 def _view_units(state: JointState, i: int, markers: int, p: JointParameters) -> Array | None:
-    """Return the covariance (6, 6) in whose units the view error of a sighting is; None for the
+    """Return the covariance (6, 6) that defines the unit of a sighting's view error; None for the
     stated one.
     """
     return state.view_units[i] if p.sighting_noise(markers).units_time_s else None
@@ -327,7 +337,7 @@ def update(
     rejected: list[int] = []
     state = with_view_units(state, sightings, p)
     running, measured = RunningUpdate(state), state.measured_ns.copy()
-    # Where most cameras disagree with the estimate, the target has moved.
+    # If most cameras disagree with the estimate, the target has moved.
     disagreeing = sum(bool(state.rejections[i, SIGHTING_CHANNEL]) for i in sightings)
     new_views = 2 * disagreeing <= len(sightings)
     for i in sorted(odometry.keys() | sightings.keys()):
@@ -349,10 +359,10 @@ def update(
 
 def _is_supported(fits: Mapping[int, bool], contradicted: bool) -> bool:
     """Return whether measurements support a chaser's estimate: a sighting, or odometry of
-    translation and rotation.
+    translation and of rotation.
 
-    Of each, one of two channels is enough, as the other may lie; while sightings ``contradicted``
-    the estimate, those of the pose must fit.
+    One of two channels each is enough, as the other may be wrong. While sightings ``contradicted``
+    the estimate, position and attitude must both fit.
     """
     if fits.get(SIGHTING_CHANNEL, False):
         return True
@@ -369,8 +379,9 @@ def _update_chaser(
     mounting: CameraMounting,
     p: JointParameters,
 ) -> dict[int, bool]:
-    """Update with the measurements of one chaser; return which channels were used. ``new_views``:
-    follow errors of views that jump.
+    """Update by the measurements of one chaser. Returns which channels were used.
+
+    ``new_views``: follow errors of views that jump.
     """
     chasers, markers = (
         running.state.chasers,
@@ -379,11 +390,13 @@ def _update_chaser(
     solution = _likeliest(running, i, sighting, mounting, p)
     if odometry is None and solution is None:
         return {}
+
     view = _view_units(running.state, i, markers, p)
     z = measurement(chasers, i, odometry, solution, markers, mounting, p, view)
     channels = _channels(
         odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry
     )
+
     gates = _gate(running, i, channels, running.values(z), p)
     if not all(gates.fits.values()) and any(
         not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES
@@ -391,14 +404,17 @@ def _update_chaser(
         gates = _follow(
             running, i, z, channels, gates, _unexpected_motion(i, running, p), _ODOMETRY, p
         )
+
     if (
         new_views
         and view is not None
         and p.rejections_to_new_view <= gates.rejections[SIGHTING_CHANNEL] <= p.rejections_to_drop
     ):
         gates = _follow(running, i, z, channels, gates, _new_view(i, running), _SIGHTING, p)
+
     running.rejections[i], running.nis[i] = gates.rejections, gates.nis
     running.log_likelihood = gates.log_likelihood
+
     used = _rows(tuple(c.rows for c in channels if gates.fits[c.number]))
     if len(used):
         nonlinear = (
@@ -418,10 +434,11 @@ def _follow(
     judged: frozenset[int],
     p: JointParameters,
 ) -> _Gates:
-    """Widen the covariance by the variances of an unexpected ``change``, if the channels ``judged``
-    then fit; return the gates.
+    """If the channels ``judged`` fit after an unexpected ``change`` (variances), widen the
+    covariance by it. Returns the gates.
 
-    The running innovation is afterwards that of the covariance."""
+    Afterwards the running innovation belongs to the widened covariance.
+    """
     diagonal = np.einsum("ii->i", running.covariance)
     before = diagonal.copy()
     diagonal += change
@@ -434,8 +451,8 @@ def _follow(
 
 
 def _unexpected_motion(i: int, running: RunningUpdate, p: JointParameters) -> Array:
-    """Return the variances (D,) that a force and a torque without a command add to chaser ``i``
-    within a tick.
+    """Return the variances (D,) that an uncommanded force and torque within a tick add to chaser
+    ``i``.
     """
     variances, own = np.zeros(len(running.covariance)), block(i).start
     for part, sigma in (
@@ -451,8 +468,8 @@ def _unexpected_motion(i: int, running: RunningUpdate, p: JointParameters) -> Ar
 
 
 def _new_view(i: int, running: RunningUpdate) -> Array:
-    """Return the variances (D,) that the error of the sightings of chaser ``i`` gains where it
-    changes at once to any other one.
+    """Return the variances (D,) to add to the view error of chaser ``i`` so that it is unknown
+    again.
     """
     variances, own = np.zeros(len(running.covariance)), block(i).start
     variances[own + VIEW.start : own + VIEW.stop] = 1.0
@@ -466,7 +483,7 @@ def _gate(
     values: Sequence[float],
     p: JointParameters,
 ) -> _Gates:
-    """Count which channels fit; ``values`` as ``RunningUpdate.values`` returns them."""
+    """Test which channels fit, and count. ``values``: as ``RunningUpdate.values`` returns them."""
     rejections, nis, likelihood = (
         running.rejections[i].tolist(),
         running.nis[i].tolist(),
@@ -491,7 +508,7 @@ def _likeliest(
     mounting: CameraMounting,
     p: JointParameters,
 ) -> PoseSolution | None:
-    """Return the likeliest solution of a sighting, the first one of equals; None without any."""
+    """Return the likeliest solution of a sighting, the first of equals; None without a sighting."""
     solutions = sighting.solutions if sighting is not None else ()
     if sighting is None or len(solutions) < 2:
         return solutions[0] if solutions else None
@@ -523,15 +540,15 @@ def _channels(
 
 @cache
 def _rows(parts: tuple[range, ...]) -> NDArray[np.int64]:
-    """Return the rows of channels. No caller changes them."""
+    """Return the rows of channels (cached: callers must not change them)."""
     return np.array([row for part in parts for row in part], dtype=np.int64)
 
 
 def _count(count: int, value: float, gate: float, p: JointParameters) -> tuple[int, bool]:
-    """Return the count of a channel's rejections after a squared residual ``value``, and whether
-    the channel is used.
+    """Return the new count of a channel's rejections after a squared residual ``value``, and
+    whether the channel is used.
     """
     limit = p.rejections_to_drop
-    if not value <= gate:  # rejects NaN as well
+    if not value <= gate:  # also rejects NaN
         return min(count + 1, 2 * limit), False
     return (count - 1 if count >= limit else 0), count < limit

@@ -18,7 +18,7 @@ from ..trajectories import move_to
 
 
 def docked_offset_m(chaser: ChaserMachine) -> Array:
-    """Return the centre (3,), TRF, of a chaser that is docked at a distance."""
+    """Return the centre (3,), TRF, of a chaser at its docking distance."""
     distance_m = chaser.scenario.approach.dock_distance_m
     return chaser.nominal_m / np.linalg.norm(chaser.nominal_m) * distance_m
 

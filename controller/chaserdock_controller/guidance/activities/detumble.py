@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify, detumble and stack_hold: move the target with the chasers whose latch holds it."""
+"""Identify, detumble and stack_hold: move the target by the chasers latched to it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from .docking import check_latch
 
 
 class DetumbleActivity(Activity):
-    """The stack is moved by all chasers in these phases together. ``control``: of its motion;
-    ``waits``: it coasts while a chaser backs out.
+    """Moves the stack by all chasers in these phases together.
+
+    ``control``: computes their thrusts. ``waits``: the stack coasts while a chaser backs out.
     """
 
     phases = (Phase.IDENTIFY, *DETUMBLING)
@@ -46,7 +47,7 @@ class DetumbleActivity(Activity):
         return self._refusal
 
     def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
-        """Back out when the latch opens; the rest is up to the stack."""
+        """Back out when the latch opens. All else is decided for the whole stack."""
         if chaser.seen is not None and (failed := check_latch(chaser, chaser.seen, known.now_s)):
             chaser.fire(failed[0], known.now_s, failed[1])
 
@@ -61,9 +62,7 @@ class DetumbleActivity(Activity):
         observation: Observation,
         estimation: TargetEstimation,
     ) -> None:
-        """Take the motion of the stack where it is needed: where chasers move it, or are to by
-        ``commands``.
-        """
+        """Estimate the stack's motion if chasers move it, or ``commands`` ask them to."""
         self._state = None
         if self._in(*self.phases) or any(c.command in self.commands for c in commands):
             self._state = self.with_trusted(self.control.state(observation, estimation))
@@ -72,9 +71,7 @@ class DetumbleActivity(Activity):
         self._refusal = self._why_not(able | self._in(*DETUMBLING)) if able else ""
 
     def conclude(self, observation: Observation) -> None:
-        """Advance the phases of chasers that move the stack by its motion, and set their
-        thrusts.
-        """
+        """Advance the phases of the chasers that move the stack, and compute their thrusts."""
         now_s = observation.time_s
         identify_s = self._fleet.scenario.detumble.identification.duration_s
         for chaser in self._fleet.chasers:
@@ -85,7 +82,9 @@ class DetumbleActivity(Activity):
         self._report_waiting()
 
     def with_trusted(self, state: StackState | None) -> StackState | None:
-        """Return the stack's state without failures of thrusters that an operator has restored."""
+        """Return the stack's state without the failures of thrusters that an operator has
+        restored.
+        """
         if state is None or not state.failed:
             return state
         chasers = self._fleet.chasers
@@ -93,15 +92,16 @@ class DetumbleActivity(Activity):
         return replace(state, failed=frozenset(failed))
 
     def _in(self, *phases: Phase) -> frozenset[int]:
-        """Return the numbers of the chasers in some phases."""
+        """Return the numbers of the chasers that are in one of these phases."""
         return frozenset(c.number for c in self._fleet.chasers if c.phase in phases)
 
     def _why_not(self, chasers: Set[int]) -> str:
         return self.control.why_not(self._state, chasers)
 
     def _follow_motion(self, observation: Observation) -> None:
-        """Close the thrusters if those that are left cannot stop the stack; otherwise let the
-        phases follow its mean motion, which is neither stopped nor moving in between.
+        """Advance the phases by the stack's mean motion, which may be neither stopped nor moving.
+
+        Fails, and closes the thrusters, if the remaining ones cannot stop the stack.
         """
         state, now_s, active = self._state, observation.time_s, self._in(*DETUMBLING)
         if not active or state is None:
@@ -117,7 +117,7 @@ class DetumbleActivity(Activity):
                 self._judge(chaser, now_s, stopped, moving)
 
     def _judge(self, chaser: ChaserMachine, now_s: float, stopped: bool, moving: bool) -> None:
-        """Advance the phase of a chaser that stops the stack, or keeps it at rest."""
+        """Advance the phase of a chaser that stops the stack or keeps it at rest."""
         state, holds = chaser.state, chaser.phase is Phase.STACK_HOLD
         in_phase_s, timeout_s = now_s - state.since_s, self._fleet.scenario.detumble.timeout_s
         moves_again = moving and in_phase_s >= GUIDANCE.stack_settling_s
@@ -130,8 +130,8 @@ class DetumbleActivity(Activity):
             chaser.fire(Trigger.DETUMBLE_FAILED, now_s, f"not stopped within {timeout_s:g} s")
 
     def _command_thrusters(self, observation: Observation) -> Mapping[int, DirectCommand]:
-        """Return the commands of chasers that move the stack, by chaser. Pulses that identify it
-        wait while it is stopped.
+        """Return the commands of the chasers that move the stack, by chaser. Identifying pulses
+        wait until the stack is stopped.
         """
         present = {c.chaser for c in observation.chasers if c.odometry is not None}
         detumbling = self._in(*DETUMBLING) & present
@@ -149,11 +149,11 @@ class DetumbleActivity(Activity):
         return self.control.commands(self._state, active, task, observation)
 
     def _leaving(self) -> list[ChaserMachine]:
-        """Return the chasers that back out: the stack must not turn under them by thrust."""
+        """Return the chasers that back out. Meanwhile no thrust may turn the stack under them."""
         return [chaser for chaser in self._fleet.chasers if _backs_out(chaser)]
 
     def _report_waiting(self) -> None:
-        """Log when the stack begins to wait for chasers that back out, or goes on."""
+        """Log when the stack begins to coast for chasers that back out, and when that ends."""
         leaving = self._leaving() if self._in(*self.phases) else []
         if self.waits == bool(leaving):
             return
@@ -165,13 +165,13 @@ class DetumbleActivity(Activity):
 
 
 def _backs_out(chaser: ChaserMachine) -> bool:
-    """Return whether a chaser is on its way out of its corridor."""
+    """Return whether a chaser is leaving its corridor."""
     leaves = chaser.phase in BACKING_OUT and not chaser.state.stuck
     return leaves and chaser.is_free() and chaser.in_corridor()
 
 
 def _may_stop_stack(chaser: ChaserMachine) -> bool:
-    """Return whether a chaser stops the stack already, or may be commanded to."""
+    """Return whether a chaser stops the stack, or may be commanded to."""
     begins = next_phase(chaser.phase, Trigger.COMMAND_DETUMBLE, chaser.by_capture)
     return chaser.phase in DETUMBLING or begins is not None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docking by capture: wait for a free corridor, align, fly in, touch, latch, and test the latch."""
+"""Docking by capture: wait for a free corridor, align, fly in, touch, latch, test the latch."""
 
 from __future__ import annotations
 
@@ -104,7 +104,9 @@ class DockingActivity(Activity):
 
 
 def pull_N(chaser: ChaserMachine, now_s: float) -> float:
-    """Return the force along -X (CRF) of the latch test: a pull, then an equally long push."""
+    """Return the force along -X (CRF), N, of the latch test: a pull, then a push of equal
+    duration.
+    """
     docking = chaser.scenario.docking
     into_s = now_s - chaser.state.since_s - docking.settle_s
     if into_s < 0.0 or into_s >= 2.0 * docking.pull_s:
@@ -123,17 +125,19 @@ def _seen(chaser: ChaserMachine) -> DockingObservation:
 
 
 def _way_in(dock: Dock, now_s: float) -> Glide:
-    """Return the motion from the entry into the port, slow from the final distance on."""
+    """Return the motion from the corridor's entry into the port; slow from the final distance
+    on.
+    """
     docking = dock.docking
     fast = (docking.entry_m - docking.final_m, docking.approach_speed_m_s)
     slow = (docking.final_m + docking.overdrive_m, docking.contact_speed_m_s)
     return glide(dock.entry(), -np.asarray(dock.port.axis), now_s, fast, slow)
 
 
-# -- what ends a phase -----------------------------------------------------------------------------
+# -- conditions that end a phase -------------------------------------------------------------------
 
 _Outcome = tuple[Trigger, str] | None
-"""What ends a phase, with the reason for the log; None to stay."""
+"""Trigger that ends a phase and the reason for the log; None to stay."""
 
 
 def _failed(reason: str) -> _Outcome:
@@ -203,7 +207,7 @@ def _check_latched(chaser: ChaserMachine, seen: DockingObservation, now_s: float
 
 
 def check_latch(chaser: ChaserMachine, seen: DockingObservation, now_s: float) -> _Outcome:
-    """Return the failure of a latch that is open, though the chaser is at its port."""
+    """Return a latch failure if the latch is open although the chaser is at its port, else None."""
     return None if seen.latched else _failed("the latch opened")
 
 

@@ -41,8 +41,8 @@ class GotoActivity(Activity):
         chaser.fire(Trigger.COMMAND_GOTO, now_s, place_m=np.asarray(command.offset_m))
 
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
-        """Go where the command says; a chaser that has searched comes to its nominal offset from
-        where it is, facing the target on the way.
+        """Begin the commanded move. A chaser that has searched flies from its present place to its
+        nominal offset and faces the target on the way.
         """
         moves, now_s = self._fleet.moves, cause.now_s
         assert cause.place_m is not None

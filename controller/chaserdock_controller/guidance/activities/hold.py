@@ -12,7 +12,9 @@ from ..trajectories import Move, stay, stop
 
 
 def rest(chaser: ChaserMachine, now_s: float) -> Move:
-    """Return the motion to rest: at once in a port's corridor, where there is no room to stop."""
+    """Return the motion that brings a chaser to rest; inside a port's corridor the reference stops
+    at once, as there is no room.
+    """
     if chaser.seen is not None and chaser.in_corridor():
         return stay(chaser.seen.offset_m, now_s)
     return stop(chaser.motion(now_s), now_s)

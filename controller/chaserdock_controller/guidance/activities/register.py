@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The activities of the chasers: a line for each."""
+"""Registry of the chasers' activities, one line each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .search import SearchActivity
 
 
 def activities_of(fleet: ChaserFleet) -> tuple[Activity, ...]:
-    """Return the activities that the chasers of a fleet have in common."""
+    """Return the activities, which all chasers of a fleet share."""
     return (
         HoldActivity(),
         SearchActivity(fleet.scenario),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Retreat and abort: back out to the nominal offset, or onto a coast that is passively safe."""
+"""Retreat and abort: back out to the nominal offset, or move onto a passively safe coast."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ class RetreatActivity(Activity):
         return self._moves.abort_m_s if phase is Phase.ABORT else self._moves.approach_m_s
 
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
-        """Move to the nominal offset; from inside a corridor first along its axis to the entry."""
+        """Begin the move to the nominal offset; from inside a corridor first along its axis to the
+        entry.
+        """
         now_s, aborts = cause.now_s, begun.phase is Phase.ABORT
         if chaser.in_corridor():
             then = NextMove.NOMINAL
@@ -49,9 +51,7 @@ class RetreatActivity(Activity):
             chaser.step(known, errors)  # the next attempt begins with this tick
 
     def conclude(self, observation: Observation) -> None:
-        """Compute the margins of the best aborts where passive safety is enforced, once a
-        second.
-        """
+        """Update the margins of the best aborts once a second, where passive safety is enforced."""
         escapes = self._moves.escapes
         renew = observation.tick % self._fleet.scenario.time.rate_hz == 0
         for chaser in self._fleet.chasers:
@@ -61,7 +61,7 @@ class RetreatActivity(Activity):
                 chaser.abort_margin = escapes.escape(chaser.relative, observation.time_s)[1]
 
     def _continue(self, chaser: ChaserMachine, now_s: float) -> None:
-        """Begin what follows the move that is complete."""
+        """Begin what follows a completed move."""
         state = chaser.state
         match state.then:
             case NextMove.ATTEMPT if chaser.failure is None:
@@ -76,14 +76,16 @@ class RetreatActivity(Activity):
                 chaser.fire(Trigger.MOVE_COMPLETE, now_s)
 
     def _way_out(self, chaser: ChaserMachine, phase: Phase, now_s: float) -> Move:
-        """Return the move along the axis of the port from where the chaser is to the entry."""
+        """Return the move along the port's axis from the present place to the entry."""
         assert chaser.dock is not None
         assert chaser.seen is not None
         here, entry = stay(chaser.seen.offset_m, now_s), chaser.dock.entry()
         return move_to(here, entry, now_s, self._speed_m_s(phase))
 
     def _escape(self, chaser: ChaserMachine, now_s: float) -> Escape | None:
-        """Return the abort onto a safe coast if passive safety is enforced; log its margin."""
+        """Return the abort onto a safe coast, and log its margin; None unless passive safety is
+        enforced.
+        """
         escapes, known = self._moves.escapes, chaser.relative
         if escapes is None or known is None:
             return None
@@ -95,7 +97,7 @@ class RetreatActivity(Activity):
         return move
 
     def _watch_latch(self, chaser: ChaserMachine, now_s: float) -> None:
-        """Begin the way out again in every tick, for as long as the latch does not open."""
+        """Restart the way out in every tick while the latch does not open."""
         state, seen = chaser.state, chaser.seen
         if seen is None:
             return
@@ -111,6 +113,6 @@ class RetreatActivity(Activity):
 
 
 def _may_try_again(chaser: ChaserMachine) -> bool:
-    """Return whether a failed attempt to dock is repeated: one that has not latched."""
+    """Return whether a failed docking attempt is repeated: only one that has not latched."""
     attempts = chaser.scenario.docking.attempts
     return chaser.state.attempt < attempts and chaser.phase not in ATTACHED

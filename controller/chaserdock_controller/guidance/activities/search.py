@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search: turn along the search pattern until the target is found and its motion known."""
+"""Search: turn along the search pattern until the target is found and its motion is known."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..chaser_state import ChaserTick
 from ..phases import Phase
 from ..pointing import SearchProgress, facing, search_wrench, turning_wrench
 
-# Largest sigmas of the target's rates with which a chaser leaves the search.
+# Largest sigmas of the target's rates at which a chaser leaves the search.
 _SETTLED_M_S, _SETTLED_RAD_S = 0.01, 0.02
 
 
@@ -26,8 +26,9 @@ class SearchActivity(Activity):
         self._body, self._camera = scenario.chaser, scenario.camera_model()
 
     def command(self, chaser: ChaserMachine, known: ChaserTick) -> DirectCommand | None:
-        """Turn along the search pattern, with pauses in which the target is acquired in an earlier
-        image, or to the target once its pose is known.
+        """Turn along the search pattern, or towards the target once its pose is known.
+
+        The pattern pauses while the target is being acquired in an earlier image.
         """
         own, target, state = known.own, known.target, chaser.state
         assert own is not None

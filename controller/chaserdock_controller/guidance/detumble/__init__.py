@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stopping the tumble of a target with the thrusters of the chasers whose latch holds it
+"""Stop the tumble of a target with the thrusters of the chasers latched to it
 (docs/detumble.md).
 """

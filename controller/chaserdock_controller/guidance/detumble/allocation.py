@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thrusts of all thrusters of a stack that stop it: exact in direction, as much as possible of the
+"""Allocates a wrench of the stack to its thrusters: exact in direction, with the largest possible
 magnitude. Pure functions.
 
-One linear programme: maximize the common scale s <= 1 of the wrench, then minimize the sum of
-thrusts, subject to B f = s w and 0 <= f <= f_max. It is solved as a strictly convex quadratic
-programme with the same solution (M. P. Friedlander and P. Tseng, SIAM J. Optim. 18, 2008), which
-makes the thrusts unique, by daqp, a deterministic dual active-set method.
+Linear programme: maximize the common scale s <= 1 of the wrench, then minimize the sum of thrusts,
+subject to B f = s w and 0 <= f <= f_max. It is solved as a strictly convex quadratic programme with
+the same solution (M. P. Friedlander and P. Tseng, SIAM J. Optim. 18, 2008), which makes the thrusts
+unique. Solver: daqp, a deterministic dual active-set method.
 """
 
 from __future__ import annotations
@@ -18,26 +18,28 @@ import numpy as np
 from chaserdock_models.arrays import Array
 
 _REGULARIZATION = 1e-2
-"""Quadratic cost of thrusts, against a linear cost of 1 for the largest thrust: makes the solution
-unique and continuous, and costs at most 1 % of the thrust.
+"""Quadratic cost of thrusts, relative to a linear cost of 1 for the largest thrust. It makes the
+solution unique and continuous and costs at most 1 % of the thrust.
 """
 _SCALE_FIRST = 1e3
-"""Weight of the scale over that of the thrusts. A gain in scale that costs more thrust than this is
-not taken (below 1e-3).
+"""Weight of the scale over that of the thrusts. A gain in scale that costs more thrust than this
+(gains below 1e-3) is not taken.
 """
 _EQUALITY = 5  # daqp's codes for an equality constraint and for success
 _SOLVED = 1  # see above
 _NOTHING = 1e-12
-"""Norm of a wrench (N, N m) that is rounding, not a request."""
+"""Norm of a wrench (N, N m) below which it is rounding, not a request."""
 _TOLERANCE = 1e-5
-"""Wrench (N, N m) that is within the tolerance of the solver: no more is given in a direction that
-cannot be served.
+"""Norm of a wrench (N, N m) that lies within the solver's tolerance. A smaller result in a
+direction that cannot be served counts as none.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class StackAllocation:
-    """``thrusts_N`` (n,) within their limits give ``scale`` times the wrench that was asked for."""
+    """Thrusts ``thrusts_N`` (n,) within their limits, which give ``scale`` times the requested
+    wrench.
+    """
 
     thrusts_N: Array
     scale: float
@@ -46,7 +48,7 @@ class StackAllocation:
 @dataclass(frozen=True)
 class MinimumTime:
     """Shortest time (s) in which thrusters can stop a momentum while the stack does not turn, and
-    the impulse (N s) that takes.
+    the sum of their impulses (N s).
     """
 
     time_s: float
@@ -54,8 +56,8 @@ class MinimumTime:
 
 
 def units_of(wrenches: Array, limits_N: Array) -> tuple[float, float]:
-    """Return a force and a torque typical of the thrusters, which make all numbers of the programme
-    near one.
+    """Return a force and a torque typical of the thrusters. Scaled by them, all numbers of the
+    programme are near one.
     """
     force_N = float((np.linalg.norm(wrenches[:3], axis=0) * limits_N).max(initial=0.0))
     torque_N_m = float((np.linalg.norm(wrenches[3:], axis=0) * limits_N).max(initial=0.0))
@@ -63,26 +65,30 @@ def units_of(wrenches: Array, limits_N: Array) -> tuple[float, float]:
 
 
 def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation:
-    """Return thrusts within ``limits_N`` (n,) that give the largest share of ``wrench`` (6,), at
-    the least sum.
+    """Return thrusts within ``limits_N`` (n,) that give the largest share of ``wrench`` (6,) at the
+    least sum.
 
-    ``wrenches`` (6, n): those of 1 N of each thruster. Raises ValueError for numbers that are not
+    ``wrenches`` (6, n): per 1 N of each thruster. Raises ValueError for numbers that are not
     finite, RuntimeError if the solver fails.
     """
     if not (
         np.isfinite(wrenches).all() and np.isfinite(wrench).all() and np.isfinite(limits_N).all()
     ):
         raise ValueError("wrenches and limits must be finite")
+
     thrusts = np.zeros(len(limits_N))
     able = limits_N > 0.0
     force, torque = units_of(wrenches[:, able], limits_N[able])
     units = np.array([force] * 3 + [torque] * 3)
+
     asked = wrench / units
     size = float(np.linalg.norm(asked))
     if size <= _NOTHING:
         return StackAllocation(thrusts, 1.0)
     if not able.any():
         return StackAllocation(thrusts, 0.0)
+
+    # Variables: each thrust over its limit, then the scale times the size of the request.
     rows = np.hstack(
         [wrenches[:, able] * limits_N[able] / units[:, None], -(asked / size)[:, None]]
     )
@@ -92,11 +98,13 @@ def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation
     upper = np.concatenate([np.ones(n - 1), [size], zeros])
     lower = np.concatenate([np.zeros(n), zeros])
     sense = np.array([0] * n + [_EQUALITY] * 6, dtype=np.int32)
+
     x, _, flag, _ = daqp.solve(
         _REGULARIZATION * np.eye(n), cost, np.ascontiguousarray(rows), upper, lower, sense
     )
     if flag != _SOLVED:
         raise RuntimeError(f"allocation of the stack's thrusters: daqp failed with flag {flag}")
+
     thrusts[able] = np.clip(x[:-1], 0.0, 1.0) * limits_N[able]
     return StackAllocation(thrusts, float(np.clip(x[-1] / size, 0.0, 1.0)))
 
@@ -104,8 +112,8 @@ def allocate(wrenches: Array, wrench: Array, limits_N: Array) -> StackAllocation
 def spans_all_directions(wrenches: Array, limits_N: Array) -> bool:
     """Return whether thrusts within ``limits_N`` (n,) can give force and torque in every direction.
 
-    They can if ``wrenches`` (6, n) has full rank and some thrusts, all of them positive, cancel:
-    then they cancel what any other combination has too little of.
+    They can if ``wrenches`` (6, n) has full rank and some strictly positive thrusts cancel: a
+    multiple of these makes the thrusts of any combination positive.
     """
     able = limits_N > 0.0
     b = wrenches[:, able] * limits_N[able]
@@ -113,7 +121,7 @@ def spans_all_directions(wrenches: Array, limits_N: Array) -> bool:
     b = b / np.array([force] * 3 + [torque] * 3)[:, None]
     if b.shape[1] < 7 or np.linalg.matrix_rank(b, tol=1e-6) < 6:
         return False
-    # All thrusters at a floor plus what cancels it.
+    # Put all thrusters at a floor, and add what cancels it.
     floor = -b.sum(axis=1)
     return (
         allocate(
@@ -127,7 +135,7 @@ def minimum_time(wrenches: Array, momentum: Array, limits_N: Array) -> MinimumTi
     """Return the shortest time to stop ``momentum`` (6,) by constant thrusts while the stack does
     not turn; None if impossible.
 
-    A linear programme: the thrusts that give the largest share of -momentum per second.
+    Linear programme for the thrusts that give the largest share of -momentum per second.
     """
     if not momentum.any():
         return MinimumTime(0.0, 0.0)
@@ -141,7 +149,7 @@ def minimum_time(wrenches: Array, momentum: Array, limits_N: Array) -> MinimumTi
 
 
 def feedback(wrenches: Array, momentum: Array, limits_N: Array, time_s: float) -> StackAllocation:
-    """Return the thrusts that stop ``momentum`` (6,) in ``time_s``, or as fast as they can in this
+    """Return thrusts that stop ``momentum`` (6,) in ``time_s``, or as fast as possible in this
     direction.
     """
     if not time_s > 0.0 or not math.isfinite(time_s):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detumbling control: the motion of the stack from the estimates, thrusts that stop it, and why it
-cannot be stopped.
+"""Detumbling control: motion of the stack from the estimates, thrusts that stop it, and reasons why
+it cannot be stopped.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from .stack import StackMotion, thruster_wrenches
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
 _STOPPED_SHARE = 0.4
-"""Share of the rest limits below which the stack counts as stopped: less than ``_MOVING_SHARE``, so
+"""Share of the rest limits below which the stack counts as stopped. Less than ``_MOVING_SHARE``, so
 that phases do not alternate.
 """
 _MOVING_SHARE = 0.5
@@ -52,7 +52,8 @@ every second. Until the thrusters act, the true rate rises by another quarter of
 fire down to ``_DEADBAND_SHARE``.
 """
 _MEAN_S = 0.5
-"""Time constant of the mean motion. In single ticks noise of `lab` odometry is half of the limits.
+"""Time constant, s, of the mean motion. In a single tick the noise of `lab` odometry is half of the
+limits.
 """
 _SLEW_SHARE = 20.0
 """Share of the rest limits beyond which a stack that turns to its commanded attitude counts as
@@ -60,15 +61,17 @@ moving.
 """
 _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
 _ATTITUDE_TIME_S = 5.0
-"""Time constant, s, with which the stack turns to a commanded attitude. Chosen."""
+"""Time constant, s, of the turn to a commanded attitude. Larger: slower near the end; smaller:
+noise of the attitude demands larger rates, and so more thrust.
+"""
 _PULSE_PERIOD_NS, _PULSE_NS = 600_000_000, 300_000_000
-"""Identifying pulses begin at this interval and last for half of it, ns, so that the rates before
-and after each are measured for as long.
+"""Interval between identifying pulses, and their length, ns. Pulses last for half of the interval,
+so that the rates before and after each are measured equally long.
 """
 
 
 class StackTask(Enum):
-    """What the thrusters of the stack are to do."""
+    """Task of the stack's thrusters."""
 
     STOP = auto()
     HOLD = auto()
@@ -78,14 +81,13 @@ class StackTask(Enum):
 
 @dataclass(frozen=True, eq=False)
 class StackState:
-    """The stack as estimated for the time at which the commands take effect; ``chasers``: those
-    latched, by number.
+    """State of the stack, predicted to the time at which the commands take effect.
 
-    ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if
-    estimated. ``isolated``, ``failed``: thrusters that chasers report as closed, and that were
-    found stuck, as (chaser, number). ``informative``: see ``IdentifiedStack``.
-    ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the odometry of the chasers alone:
-    with noise, but not late where disturbances act.
+    ``chasers``: the latched ones, by number. ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,):
+    estimated over stated thrust, by chaser, where estimated. ``isolated``: thrusters that chasers
+    report as closed; ``failed``: thrusters found stuck; both as (chaser, number). ``informative``:
+    see ``IdentifiedStack``. ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the chasers'
+    odometry alone: noisy, but without delay under disturbances.
     """
 
     body: TargetBody
@@ -107,8 +109,9 @@ class StackState:
 
 @dataclass(frozen=True, eq=False)
 class _Thrusters:
-    """Thrusters of the active ``chasers``: ``wrenches`` (6, n) of 1 N commanded and ``limits_N``
-    (n,); ``groups`` (n,): row of the chaser."""
+    """Thrusters of the active ``chasers``. ``wrenches`` (6, n): per commanded 1 N. ``limits_N``
+    (n,). ``groups`` (n,): index of the chaser.
+    """
 
     chasers: tuple[int, ...]
     wrenches: Array
@@ -117,10 +120,10 @@ class _Thrusters:
 
 
 class DetumbleControl:
-    """Control of the stack for a scenario; no thruster fires whose plume would hit something.
+    """Controls the stack of a scenario. No thruster fires whose plume would hit a body.
 
-    A plan of least propellant, if the scenario gives it time, and feedback on the momentum, which
-    needs no memory.
+    It flies a plan of least propellant if the scenario sets a time to stop in, else feedback on the
+    momentum, which has no memory.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -173,9 +176,7 @@ class DetumbleControl:
     def _identified_state(
         self, observation: Observation, identified: IdentifiedStack, known: Set[int]
     ) -> StackState:
-        """Return the state by the identified mass properties and the motion that was estimated with
-        them.
-        """
+        """Return the state from identified mass properties and the motion estimated with them."""
         body, motion = identified.stack.body, identified.motion
         members = [c for c in identified.chasers if c.chaser in known]
         chasers = {c.chaser: c.mounting for c in sorted(members, key=lambda c: c.chaser)}
@@ -205,8 +206,8 @@ class DetumbleControl:
         )
 
     def _variances(self, chasers: int) -> tuple[float, float]:
-        """Return the variances per axis of velocity and rate of the stack by the odometry of so
-        many chasers.
+        """Return the variances per axis of the stack's velocity and rate, as measured by the
+        odometry of so many chasers.
         """
         errors = self._scenario.navigation.errors()
         size_m = math.hypot(*self._target.size_m)
@@ -215,13 +216,13 @@ class DetumbleControl:
         return velocity / chasers + 1e-12, omega / chasers + errors.gyro_bias_rad_s**2 + 1e-12
 
     def reset(self) -> None:
-        """Forget plan, pulses that wait and mean motion: no chaser stops the stack."""
+        """Discard plan, pending pulses and averaged motion. Call when no chaser is detumbling."""
         self.planner.reset()
         self.sequencer.reset()
         self._mean_rates = None
 
     def follow(self, state: StackState) -> None:
-        """Take the motion of a tick into the mean by which the stack is judged to be at rest."""
+        """Add the motion of a tick to the mean that decides whether the stack is at rest."""
         measured = state.measured_omega_rad_s
         omega = state.omega_rad_s if measured is None else measured
         rates = np.concatenate([state.motion.linear_N_s / state.body.mass_kg, omega])
@@ -237,7 +238,7 @@ class DetumbleControl:
         task: StackTask,
         observation: Observation,
     ) -> dict[int, DirectCommand]:
-        """Return the commands of ``chasers`` for the task."""
+        """Return the commands of ``chasers`` for a task."""
         active = {i: state.chasers[i] for i in sorted(chasers & state.chasers.keys())}
         if not active:
             return {}
@@ -270,8 +271,8 @@ class DetumbleControl:
         return self._feedback(state.motion.momentum, thrusters)
 
     def _hold(self, state: StackState, thrusters: _Thrusters) -> Array:
-        """Return the thrusts that turn a stopped stack to the commanded attitude; none without one,
-        or close to it.
+        """Return thrusts that turn a stopped stack to the commanded attitude; zero without such an
+        attitude, or close to it.
         """
         none = np.zeros(len(thrusters.limits_N))
         reference = self._slew_rate(state)
@@ -283,8 +284,8 @@ class DetumbleControl:
         return self._feedback(state.motion.momentum - wanted, thrusters)
 
     def _informative(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
-        """Return a pulse of the most informative thruster for the mass properties, of those that
-        damp the motion.
+        """Return a pulse of the thruster that tells most about the mass properties, among those
+        that damp the motion.
         """
         thrusts = np.zeros(len(thrusters.limits_N))
         number = now_ns // _PULSE_PERIOD_NS
@@ -329,18 +330,21 @@ class DetumbleControl:
     # -- judgement ---------------------------------------------------------------------------------
 
     def share_of_limits(self, state: StackState, slewing: bool = False) -> float:
-        """Return the larger of speed and angular rate of the stack, as share of the rest limits.
-        ``slewing``: the rate counts from the one that turns the stack to its commanded attitude."""
+        """Return the larger of speed and angular rate of the stack, as shares of the rest limits.
+
+        ``slewing``: measure the rate from the one that turns the stack to its commanded attitude.
+        """
         velocity = state.motion.linear_N_s / state.body.mass_kg
         return self._share(state, np.concatenate([velocity, state.omega_rad_s]), slewing)
 
     def is_stopped(self, state: StackState) -> bool:
-        """Return whether the stack has stopped, by the mean motion until ``state``."""
+        """Return whether the stack has stopped, judged by its mean motion up to ``state``."""
         return self._mean_share_of_limits(state) < _STOPPED_SHARE
 
     def moves_again(self, state: StackState) -> bool:
-        """Return whether a stack at rest moves by its mean motion until ``state``, beside the turn
-        to its commanded attitude, so that it has to be stopped again."""
+        """Return whether a stack at rest has to be stopped again, judged by its mean motion up to
+        ``state``. The turn to its commanded attitude does not count.
+        """
         slews = self._slew_rate(state) is not None
         return self._mean_share_of_limits(state, slewing=True) > (
             _SLEW_SHARE if slews else _MOVING_SHARE
@@ -352,14 +356,16 @@ class DetumbleControl:
         return self._share(state, self._mean_rates, slewing)
 
     def _share(self, state: StackState, rates: Array, slewing: bool) -> float:
-        """Return velocity and angular rate ``rates`` (6,) as share of the rest limits."""
+        """Return velocity and angular rate ``rates`` (6,) as the larger share of the rest
+        limits.
+        """
         reference = self._slew_rate(state) if slewing else None
         omega = rates[3:] - (np.zeros(3) if reference is None else reference)
         speed, rate = float(np.linalg.norm(rates[:3])), float(np.linalg.norm(omega))
         return max(speed / self._settings.speed_m_s, rate / math.radians(self._settings.rate_deg_s))
 
     def why_not(self, state: StackState | None, chasers: Set[int]) -> str:
-        """Return why these chasers cannot stop the stack, or an empty string."""
+        """Return why these chasers cannot stop the stack; empty if they can."""
         if not self._thrusters or self._scenario.chaser.actuation != "thrusters":
             return 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
         if state is None:
@@ -390,7 +396,7 @@ class DetumbleControl:
     # -- models ------------------------------------------------------------------------------------
 
     def problem(self, state: StackState, chasers: Set[int]) -> StackProblem:
-        """Return what a plan for these chasers has to solve."""
+        """Return the problem that a plan for these chasers has to solve."""
         active = {i: state.chasers[i] for i in sorted(chasers)}
         return self._problem(state, self._thrusters_of(state, active))
 
@@ -410,8 +416,8 @@ class DetumbleControl:
         )
 
     def _thrusters_of(self, state: StackState, active: Mapping[int, MountedChaser]) -> _Thrusters:
-        """Return the thrusters of the active chasers: the limit is zero where a plume is not free
-        or the thruster is closed.
+        """Return the thrusters of the active chasers. The limit is zero if a plume is obstructed or
+        the thruster is closed.
         """
         latched, rows = frozenset(state.chasers), []
         for i in active:
@@ -445,7 +451,7 @@ class DetumbleControl:
 def _impulse_ahead(
     observation: Observation, chasers: Mapping[int, MountedChaser], body: TargetBody
 ) -> Array:
-    """Return the impulse (6,), TRF axes, of all that acts until the commands take effect."""
+    """Return the impulse (6,), TRF axes, that acts on the stack until the commands take effect."""
     ahead = np.zeros(6)
     for i, chaser in chasers.items():
         impulse = sum(
@@ -457,12 +463,12 @@ def _impulse_ahead(
 
 
 def _isolated(observation: Observation) -> frozenset[tuple[int, int]]:
-    """Return the thrusters (chaser, number) that chasers report as closed."""
+    """Return the thrusters that chasers report as closed, as (chaser, number)."""
     return frozenset((c.chaser, number) for c in observation.chasers for number in c.isolated)
 
 
 def _mean_omega(own: Sequence[Odometry], q_wxyz: Array) -> Array:
-    """Return the mean angular rate (3,) of chasers in the axes of a body with attitude
+    """Return the mean angular rate (3,) of chasers, in the axes of a body with attitude
     ``q_wxyz``.
     """
     omega_world = np.mean([rotations.rotate(o.q_wxyz, o.omega_rad_s) for o in own], axis=0)
@@ -478,9 +484,9 @@ def observed_motion(
     """Return the momentum of the stack, TRF axes, from the target's estimate and the states of
     latched chasers.
 
-    The chasers measure the stack's rates without delay, the target's estimate smooths them while
-    nothing fires; the two are weighted by their covariances. ``variances`` per axis: of the
-    chasers' mean velocity (m²/s²) and rate (rad²/s²).
+    The chasers measure the stack's rates without delay; the target's estimate smooths them while
+    nothing fires. Both are weighted by their covariances. ``variances`` per axis: of the chasers'
+    mean velocity (m²/s²) and rate (rad²/s²).
     """
     omega = _mean_omega(own, target.q_wxyz)
     omega_world = rotations.rotate(target.q_wxyz, omega)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flies a stack by a plan of least propellant, which is renewed from the estimates while it is
-flown.
+"""Flies a stack by a plan of least propellant and renews the plan from the estimates on the way.
 
-The programme of a plan has many local minima. Plans from several guesses are therefore improved by
-a few linear programmes in every tick, for the state that the stack will have when the next plan
-begins. Before the first plan the stack coasts meanwhile.
+A plan's programme has many local minima. Plans from several guesses are therefore improved by a few
+linear programmes in every tick, for the predicted state in which the next plan begins. Before the
+first plan the stack coasts.
 """
 
 from __future__ import annotations
@@ -18,42 +17,48 @@ from chaserdock_models.arrays import Array
 from .planning import StackPlan, StackProblem, flown, improve, predicted
 
 _STEP_S = 0.5
-"""Step of a plan, to whole ticks. It is renewed after every step."""
+"""Step of a plan, s, rounded to whole ticks. The plan is renewed after every step."""
 _FEEDBACK_S = 0.6
-"""The feedback takes over this long before the end of the plan."""
+"""Time, s, before the end of a plan at which the feedback takes over."""
 _RENEWAL_PROGRAMMES = 6
-"""Linear programmes that improve a plan when it is renewed: as many as compare first plans."""
+"""Linear programmes that improve a plan at its renewal: as many as a new guess gets before it is
+compared.
+"""
 _SEARCH_S, _SEARCH_SHARE = 0.5, 0.1
-"""The stack coasts for this long, but at most for this share of the planned time, until a first
-plan begins.
+"""Until a first plan begins, the stack coasts for this long (s), but at most for this share of the
+planned time.
 """
 _PROGRAMMES_PER_S = 90.0
-"""Linear programmes that a search solves, in equal parts in every tick; one takes about 6 ms."""
+"""Linear programmes per second that a search solves, spread over the ticks; one takes about 6
+ms.
+"""
 _FIRST_PROGRAMMES = 6
-"""Linear programmes after which plans from different guesses are compared. Fewer do not show which
-becomes the cheapest.
+"""Linear programmes after which plans from different guesses are compared. After fewer it is not
+clear which becomes the cheapest.
 """
 _FIRST_GUESSES = 5
-"""Guesses of a first plan: no thrust, and random ones. The worst minimum is 1.4 times as expensive
-as the best.
+"""Guesses of a first plan: no thrust, and random ones. The worst local minimum costs 1.4 times the
+best.
 """
 _NEXT_GUESSES = 2
-"""Other guesses that are tried at a renewal; each takes `_FIRST_PROGRAMMES` programmes."""
+"""Additional guesses at a renewal; each takes `_FIRST_PROGRAMMES` programmes."""
 _OTHER_GAIN = 0.05
-"""Share of the cost by which a plan from another guess must be cheaper to replace the present one.
-"""
+"""A plan from another guess replaces the present one if it is cheaper by this share of the cost."""
 _OTHER_UNTIL = 0.4
-"""Share of the planned time that must be left for other guesses to be tried."""
+"""Other guesses are tried while at least this share of the planned time is left."""
 _GUESS_DENSITY = 0.15
-"""Share of steps and thrusters that a random guess fires."""
+"""Share of steps and thrusters that fire in a random guess."""
 _LONGER = 0.6
-"""Share of the planned time that a plan lasts at least if thrusters are lost."""
+"""Least share of the planned time that a plan lasts after thrusters are lost."""
 
 
 @dataclass(frozen=True, eq=False)
 class ActivePlan:
-    """A plan made at ``begin_ns``, with steps of ``step_ns``, which is renewed at ``renewal_ns``;
-    ``limits_N`` (n,): of the thrusters it was made for."""
+    """A plan that began at ``begin_ns``, with steps of ``step_ns``; it is renewed at
+    ``renewal_ns``.
+
+    ``limits_N`` (n,): limits of the thrusters for which it was made.
+    """
 
     plan: StackPlan
     begin_ns: int
@@ -70,7 +75,7 @@ class ActivePlan:
         return self.plan.thrusts_N[min(self._step(time_ns), len(self.plan.thrusts_N) - 1)]
 
     def rest(self, from_ns: int) -> Array:
-        """Return the thrusts (K, n) from a time on."""
+        """Return the thrusts (K, n) that remain from a time on."""
         return self.plan.thrusts_N[self._step(from_ns) :]
 
     def _step(self, time_ns: int) -> int:
@@ -81,7 +86,7 @@ class ActivePlan:
 class PlanSearch:
     """Plans from several guesses for the state in which the stack is expected at ``begin_ns``.
 
-    ``tried``: how often one of them has been improved.
+    ``tried``: number of improvements so far.
     """
 
     problem: StackProblem
@@ -109,11 +114,11 @@ class PlanSearch:
 
 
 class StackPlanner:
-    """Keeps the plan of the stack, if it is ``enabled`` by a time to stop it in, and searches for
-    the next one.
+    """Keeps the stack's plan and searches for the next one. ``enabled``: the scenario sets a time
+    to stop in.
 
-    ``active`` is None before the first plan and after the last. ``search`` is for the next renewal
-    of the plan.
+    ``active``: None before the first plan and after the last. ``search``: for the next renewal of
+    the plan.
     """
 
     def __init__(self, plan_s: float | None, rate_hz: float) -> None:
@@ -123,14 +128,14 @@ class StackPlanner:
         self.active: ActivePlan | None = None
         self.search: PlanSearch | None = None
         if self.enabled:
-            import scipy.optimize  # noqa: F401  # takes longer than a tick: not in flight
+            import scipy.optimize  # noqa: F401  # loaded now: importing takes longer than a tick
 
     def reset(self) -> None:
-        """Forget the plan."""
+        """Discard the plan and the search."""
         self.active = self.search = None
 
     def thrusts(self, problem: StackProblem, now_ns: int) -> Array | None:
-        """Return the thrusts (n,) of the plan now; None if the feedback is to take over."""
+        """Return the planned thrusts (n,) now; None when the feedback has to take over."""
         active = self.active
         if active is None or len(active.limits_N) != len(problem.limits_N):
             active = self._begin(problem, now_ns, self._plan_s)
@@ -147,7 +152,7 @@ class StackPlanner:
         return np.minimum(active.thrusts_at(now_ns), problem.limits_N)
 
     def _begin(self, problem: StackProblem, now_ns: int, duration_s: float) -> ActivePlan:
-        """Return a plan that coasts, and begin to search for one that stops the stack at the same
+        """Return a plan that coasts. Start the search for one that stops the stack at the same
         time.
         """
         step_s = self._step_ns / 1e9
@@ -160,10 +165,10 @@ class StackPlanner:
         return active
 
     def _renew(self, problem: StackProblem, now_ns: int, last: ActivePlan) -> ActivePlan:
-        """Return a plan from the present state that ends with the ``last`` one, and begin to search
+        """Return a plan from the present state that ends with the ``last`` one. Start the search
         for the next.
 
-        It begins with the rest of the last plan, or with what the search has found, if that is
+        It starts from the rest of the last plan, or from the result of the search if that is
         cheaper.
         """
         thrusts_N, step_s, search = last.rest(now_ns), self._step_ns / 1e9, self.search
@@ -185,10 +190,10 @@ class StackPlanner:
     def _search(
         self, problem: StackProblem, active: ActivePlan, guesses: int, with_rest: bool
     ) -> PlanSearch:
-        """Return a search for the plan that follows the active one, begun with random guesses, and
-        its rest if ``with_rest``.
+        """Return a search for the plan that follows the active one, from random guesses and, if
+        ``with_rest``, the rest of the active one.
 
-        The guesses follow from the time for which they are made, so that every controller draws the
+        Guesses are seeded by the time for which they are made, so that every controller draws the
         same.
         """
         begin_ns, step_s = active.renewal_ns, self._step_ns / 1e9

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least-propellant plans that stop a stack within a time, while it turns. Pure functions.
+"""Plans of least propellant that stop a stack within a given time while it turns. Pure functions.
 
-States: momentum P, angular momentum H about the centre of mass (WRF) and attitude q; inputs:
-thrusts f >= 0 of all thrusters, constant over each step. P' = R F, H' = R T, q' = q (0, w) / 2 with
-w = I^-1 R' H, and (F, T) = B f in TRF axes. The sum of all impulses is minimized, with an exact
-penalty on P and H at the end. Sequential linear programming with a trust region (S l1 LP; Nocedal
-and Wright, "Numerical Optimization", section 18.5): each programme is linearized about the flight
-of the last thrusts. Its solutions are vertices: nearly all thrusters are off or fully on, as pulses
-need.
+States: momentum P, angular momentum H about the centre of mass (WRF), attitude q. Inputs: thrusts f
+>= 0 of all thrusters, constant over each step. P' = R F, H' = R T, q' = q (0, w) / 2 with w = I^-1
+R' H, and (F, T) = B f in TRF axes. The sum of all impulses is minimized, with an exact penalty on P
+and H at the end.
+
+Method: sequential linear programming with a trust region (S l1 LP; Nocedal and Wright, "Numerical
+Optimization", section 18.5). Each programme is linearized about the flight of the last thrusts. Its
+solutions are vertices: nearly all thrusters are off or fully on, which suits pulses.
 """
 
 from __future__ import annotations
@@ -23,20 +24,23 @@ from chaserdock_models.arrays import Array, IntArray
 from .allocation import units_of
 
 _PENALTY = 30.0
-"""Price of a remaining momentum over that of the impulse that would remove it in the thrusters'
-best direction.
+"""Price of remaining momentum, relative to the impulse that removes it in the thrusters' best
+direction.
 """
 _LEAST_RADIUS = 0.002
-"""Smallest trust region, as a share of a thruster's whole step; the search ends below it."""
+"""Smallest trust region, as a share of a thruster's full range; the search ends below it."""
 _ACCEPT = 0.05
-"""Share of a predicted improvement that must be real for a step to be taken."""
+"""Least ratio of actual to predicted improvement for a step to be accepted."""
 
 
 @dataclass(frozen=True, eq=False)
 class StackProblem:
-    """A stack to stop. ``momentum`` (6,): P and H, WRF axes. ``wrenches`` (6, n) of 1 N of each
-    thruster, TRF axes. ``groups``: for each thruster the number of its chaser; ``at_once``: how
-    many thrusters of a chaser may fire at the same time, or None."""
+    """A stack to stop.
+
+    ``momentum`` (6,): P and H, WRF axes. ``wrenches`` (6, n): per 1 N of each thruster, TRF axes.
+    ``groups``: number of each thruster's chaser. ``at_once``: thrusters of a chaser that may fire
+    at the same time, None for all.
+    """
 
     momentum: Array
     q_wxyz: Array
@@ -49,10 +53,13 @@ class StackProblem:
 
 @dataclass(frozen=True, eq=False)
 class StackPlan:
-    """``thrusts_N`` (K, n) for K steps of ``step_s``. ``remaining`` (6,): momentum at the end, WRF
-    axes, by the plan's own model; ``impulse_N_s`` of all thrusters; ``cost_N_s``: this impulse and
-    the penalty on the remaining momentum. ``radius``: of the trust region, as share of full thrust,
-    with which the next programme begins; 0 if none improves the plan."""
+    """Thrusts ``thrusts_N`` (K, n) over K steps of ``step_s``.
+
+    ``remaining`` (6,): momentum at the end, WRF axes, by the plan's own model. ``impulse_N_s``: of
+    all thrusters. ``cost_N_s``: that impulse plus the penalty on the remaining momentum.
+    ``radius``: trust region of the next programme, as a share of full thrust; 0 if no programme
+    improves the plan.
+    """
 
     thrusts_N: Array
     step_s: float
@@ -71,8 +78,11 @@ class StackPlan:
 
 @dataclass(frozen=True, eq=False)
 class _Flight:
-    """``end`` (6,): momentum at the end, and ``attitude`` there; at the middle of every step
-    rotation, rate and angular momentum (TRF axes)."""
+    """Simulated flight of a stack.
+
+    ``end`` (6,): momentum at the end; ``attitude``: there. At the middle of every step: rotation,
+    rate and angular momentum (TRF axes).
+    """
 
     end: Array
     attitude: Array
@@ -83,7 +93,7 @@ class _Flight:
 
 
 def plan_stop(problem: StackProblem, guess_N: Array, step_s: float, iterations: int) -> StackPlan:
-    """Return the plan after at most so many linear programmes, begun with ``guess_N`` (K, n).
+    """Return the plan after at most ``iterations`` linear programmes from ``guess_N`` (K, n).
 
     Raises ValueError for numbers that are not finite or a step that is not positive.
     """
@@ -91,7 +101,7 @@ def plan_stop(problem: StackProblem, guess_N: Array, step_s: float, iterations: 
 
 
 def flown(problem: StackProblem, thrusts_N: Array, step_s: float) -> StackPlan:
-    """Return the plan that fires these thrusts (K, n) within the limits. Raises ValueError as
+    """Evaluate thrusts (K, n), clipped to the limits, as a plan. Raises ValueError as
     ``plan_stop``.
     """
     if not (step_s > 0.0 and math.isfinite(step_s)):
@@ -107,7 +117,9 @@ def flown(problem: StackProblem, thrusts_N: Array, step_s: float) -> StackPlan:
 
 
 def improve(problem: StackProblem, plan: StackPlan, iterations: int) -> StackPlan:
-    """Return a plan for the same problem after at most so many more linear programmes."""
+    """Return a better plan for the same problem after at most ``iterations`` more linear
+    programmes.
+    """
     if plan.radius == 0.0 or not iterations:
         return plan
     able, step_s = np.flatnonzero(problem.limits_N > 0.0), plan.step_s
@@ -134,7 +146,7 @@ def improve(problem: StackProblem, plan: StackPlan, iterations: int) -> StackPla
 
 
 def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:
-    """Return the flight of a stack under thrusts (K, n), by the midpoint rule."""
+    """Simulate a stack under thrusts (K, n) by the midpoint rule."""
     inverse = np.linalg.inv(problem.inertia_kg_m2)
     bodies = thrusts_N @ problem.wrenches.T  # force and torque (K, 6), TRF axes
     p, h, q = problem.momentum[:3].copy(), problem.momentum[3:].copy(), problem.q_wxyz
@@ -160,15 +172,16 @@ def predicted(problem: StackProblem, thrusts_N: Array, step_s: float) -> StackPr
 
 
 def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: IntArray) -> Array:
-    """Return the matrix (6, K a) of the momentum at the end by the thrusts of the thrusters
-    ``able`` at every step.
+    """Return the Jacobian (6, K a) of the final momentum by the thrusts of the a thrusters ``able``
+    in every step.
     """
     inverse = np.linalg.inv(problem.inertia_kg_m2)
     own = problem.wrenches[:, able]
     count, half = len(flight.rates), step_s / 2.0
     rows = np.empty((count, 6, len(able)))
-    # Of the momentum at the end: by that at the begin of a step it is the same, by the attitude
-    # (TRF axes) ``by_turn`` and, through the rate, by the angular momentum ``by_spin``.
+    # Sensitivities of the final momentum, going backwards: by the momentum at the beginning of a
+    # step it is the identity; by the attitude (TRF axes) ``by_turn``; and, through the rate, by the
+    # angular momentum ``by_spin``.
     by_turn, by_spin = np.zeros((6, 3)), np.zeros((6, 3))
     for k in range(count - 1, -1, -1):
         r, omega, h = flight.rotations[k], flight.rates[k], flight.momenta[k]
@@ -176,7 +189,7 @@ def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Int
         pushed = np.concatenate([-r @ rotations.skew(force), -r @ rotations.skew(torque)]) * step_s
         total = np.zeros((6, 3))
         total[3:] = np.eye(3)
-        # By the attitude in the middle of the step, and by the rate in it.
+        # By the attitude in the middle of the step, and by the rate there.
         by_rate = step_s * by_turn
         middle = (
             pushed
@@ -193,7 +206,7 @@ def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Int
 
 
 def _price(problem: StackProblem, able: IntArray) -> Array:
-    """Return the penalty (6,) per N s and N m s of remaining momentum."""
+    """Return the penalty (6,) per N s and per N m s of remaining momentum."""
     force, torque = units_of(problem.wrenches[:, able], problem.limits_N[able])
     thrust = float(problem.limits_N[able].max())
     return _PENALTY * thrust / np.repeat([force, torque], 3)
@@ -212,8 +225,8 @@ def _linear_step(
     price: Array,
     radius: float,
 ) -> tuple[Array, float]:
-    """Return the change of the thrusts (K, n) that the linear programme gives, and the merit that
-    it predicts.
+    """Solve the linear programme within the trust region. Returns the change of the thrusts (K, n)
+    and the merit that it predicts.
     """
     from scipy.optimize import (
         linprog,
@@ -224,7 +237,7 @@ def _linear_step(
     now = thrusts_N[:, able].reshape(-1)
     limits = np.tile(problem.limits_N[able], count)
     lower, upper = np.maximum(0.0, now - radius * limits), np.minimum(limits, now + radius * limits)
-    # In shares of full thrust and of the price, all numbers are near one.
+    # As shares of full thrust and of the price, all numbers are near one.
     rows = jacobian * limits * price[:, None]
     right = price * (jacobian @ now - flight.end)
     cost = np.concatenate([step_s * limits, np.ones(12)])
@@ -250,8 +263,8 @@ def _linear_step(
 
 
 def _sequencing(problem: StackProblem, able: IntArray, count: int) -> tuple[Any, Array | None]:
-    """Return the rows (sparse) that let at most ``at_once`` thrusters of a chaser fire in a step;
-    None without a limit.
+    """Return the constraint rows (sparse) that let at most ``at_once`` thrusters of a chaser fire
+    in a step; None without a limit.
     """
     if problem.at_once is None:
         return None, None

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads that latched chasers exert on their ports, and which thrusters may fire together so that no
-load exceeds its limit.
+"""Loads of latched chasers on their ports, and selection of thrusters that may fire together within
+the load limits. Pure functions.
 
-Scaling the thrusts does not lower the peaks, because every pulse is fully on; only firing one after
-the other does. Pure functions.
+Scaling the thrusts does not lower peak loads, because every pulse is fully on. Only firing one
+thruster after the other does.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from chaserdock_models.rigid_body import RigidBody
 from chaserdock_controller.bodies.target_body import TargetBody
 
 _MARGIN = 0.9
-"""Share of the limits that is used: model errors and the joint's vibrations have the rest."""
+"""Share of the limits that is used; the rest is left for model errors and vibrations of the
+joint.
+"""
 
 
 def _directions(count: int) -> Array:
@@ -33,14 +35,16 @@ def _directions(count: int) -> Array:
 
 
 _DIRECTIONS = _directions(200)
-"""Directions in which loads are bounded. A load between them is at most 2 % larger."""
+"""Directions in which loads are bounded. A load between two of them is at most 2 % larger."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """Loads at P ports: ``constant`` (P, 6) plus ``by_thrust`` (P, 6, n) times the thrusts; force
-    and torque about the tip, TRF axes. ``limits`` (P, 2): of their magnitudes, infinite without
-    one."""
+    """Loads at P ports as a function of thrusts.
+
+    ``constant`` (P, 6) plus ``by_thrust`` (P, 6, n) times the thrusts: force and torque about the
+    tip, TRF axes. ``limits`` (P, 2): of their magnitudes, infinite if unlimited.
+    """
 
     constant: Array
     by_thrust: Array
@@ -57,11 +61,11 @@ def load_model(
     tips_m: Mapping[int, Array],
     limits: Mapping[int, tuple[float, float]],
 ) -> LoadModel:
-    """Return the loads at the ports of ``chasers``.
+    """Return the load model of the ports of ``chasers``.
 
-    ``wrenches`` (6, n) of 1 N of every thruster about the stack's centre of mass, TRF axes;
-    ``own``: which of them are a chaser's, and their wrenches about its centre in its axes.
-    ``tips_m``: points of the ports (TRF); ``limits``: force and torque.
+    ``wrenches`` (6, n): per 1 N of every thruster about the stack's centre of mass, TRF axes.
+    ``own``: slice of a chaser's thrusters, and their wrenches about its centre in its axes.
+    ``tips_m``: points of the ports (TRF). ``limits``: force and torque.
     """
     inverse = np.linalg.inv(body.inertia_kg_m2)
     free = -inverse @ rotations.cross(omega_rad_s, body.inertia_kg_m2 @ omega_rad_s)
@@ -72,7 +76,7 @@ def load_model(
         inertia = turn @ np.diag(chaser.inertia) @ turn.T
         arm = mounted.position_m - body.centre_trf_m
         at_tip = rotations.skew(mounted.position_m - tips_m[i])
-        # What the body's acceleration needs is not exerted on the port.
+        # The part of a chaser's thrust that accelerates the chaser itself does not load its port.
         linear = wrenches[:3] / body.mass_kg - rotations.skew(arm) @ inverse @ wrenches[3:]
         force = -chaser.mass_kg * linear
         torque = -inertia @ inverse @ wrenches[3:]
@@ -89,16 +93,15 @@ def load_model(
 
 
 def fire_in_turn(model: LoadModel, wanted: Array, full_N: Array) -> Array:
-    """Return which thrusters (n,) of those ``wanted`` (n,) may fire together, the most wanted
-    first, as a mask.
+    """Select thrusters that may fire together, the most wanted first, from those ``wanted`` (n,).
+    Returns a mask (n,).
 
-    Nor does any part of them exceed a limit: their pulses differ in width, and the rest of a load
-    that others have borne remains.
+    No subset of them exceeds a limit either: pulses differ in width, and when some end the others'
+    load remains.
     """
     chosen = np.zeros(len(wanted), dtype=bool)
     ports = len(model.constant)
-    # The largest component of the loads along each direction, over all parts of the chosen
-    # thrusters.
+    # Largest component of the loads along each direction, over all subsets of the chosen thrusters.
     along = model.constant.reshape(ports, 2, 3) @ _DIRECTIONS.T
     more = np.einsum("pckn,dk->pcdn", model.by_thrust.reshape(ports, 2, 3, -1), _DIRECTIONS)
     for k in np.argsort(-wanted, kind="stable"):

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fires the thrusters of a stack one after the other where together they would exceed the load
-limits of a port.
-"""
+"""Fires thrusters of a stack in turn where together they would exceed a port's load limits."""
 
 from __future__ import annotations
 
@@ -12,22 +10,22 @@ from chaserdock_protocol.scenario import FlightScenario
 from .port_loads import LoadModel, fire_in_turn
 
 _KEPT = 0.7
-"""Share of what a thruster could not give in a carrier period that it may still give later."""
+"""Share of an undelivered thrust that is carried over to the next carrier period."""
 _WIDEST = 0.94
-"""Longest pulse as a share of its carrier period: a pulse that scatters must not last into the next
-one, when others fire.
+"""Longest pulse as a share of its carrier period. A pulse that scatters must end before others fire
+in the next period.
 """
 
 
 class Sequencer:
-    """Chooses which thrusters fire in every carrier period of the modulation; the impulse of the
+    """Selects which thrusters fire in every carrier period of the modulation; the impulse of the
     others waits.
 
-    The modulation gives what was commanded and not yet given in later periods, when others fire.
-    Therefore the command changes only in ticks in which a period begins, and what it amounts to
-    until the next such tick fits into the pulses of these periods.
+    The modulation delivers undelivered impulse in later periods, when other thrusters fire.
+    Therefore the command changes only in ticks in which a period begins, and it fits into the
+    pulses of the periods up to the next such tick.
 
-    ``limits``: force and torque by chaser, infinite without a limit; ``tips_m``: the ports (TRF).
+    ``limits``: force and torque by chaser, infinite if unlimited. ``tips_m``: the ports (TRF).
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -43,12 +41,12 @@ class Sequencer:
         self._thrusts_N = np.zeros(0)
 
     def reset(self) -> None:
-        """Forget what waits."""
+        """Discard the waiting impulse."""
         self._pending_N_s, self._thrusts_N = np.zeros(0), np.zeros(0)
 
     def in_turn(self, model: LoadModel, wanted_N: Array, limits_N: Array, tick: int) -> Array:
-        """Return thrusts (n,) that keep the limits, of those wanted; the choice changes only when a
-        carrier period begins.
+        """Return thrusts (n,), chosen from those wanted, that keep the limits. The choice changes
+        only when a carrier period begins.
         """
         if len(self._pending_N_s) != len(wanted_N):
             self._pending_N_s = np.zeros(len(wanted_N))
@@ -66,8 +64,9 @@ class Sequencer:
         return np.minimum(self._thrusts_N, limits_N)
 
     def _span(self, tick: int) -> tuple[int, float]:
-        """Return how many carrier periods begin while a tick's command acts, and the time until
-        that of the next tick in which one begins; none and zero if none begins."""
+        """Return how many carrier periods begin while a tick's command acts, and the time (s) until
+        the next tick in which one begins; zeros if none begins.
+        """
         begun = self._begun(tick)
         periods, last = self._begun(tick + 1) - begun, tick + 1
         if not periods:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stack of a target and the chasers latched to it: its momentum, and the wrenches of all
-thrusters. Pure functions.
+"""The stack of a target and its latched chasers: momentum, and wrenches of all thrusters. Pure
+functions.
 
-Wrenches are force and torque about the centre of mass of the stack, in TRF axes.
+Wrenches are force and torque about the stack's centre of mass, in TRF axes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class StackMotion:
 
     @property
     def momentum(self) -> Array:
-        """Return both (6,)."""
+        """Return linear and angular momentum as one array (6,)."""
         return np.concatenate([self.linear_N_s, self.angular_N_m_s])
 
     def rates(self, body: TargetBody) -> tuple[float, float]:
@@ -41,8 +41,8 @@ class StackMotion:
 def thruster_wrenches(
     body: TargetBody, chasers: Mapping[int, MountedChaser], thrusters: Sequence[ThrusterMount]
 ) -> Array:
-    """Return the wrenches (6, N n) of 1 N of each of the ``n`` thrusters of every chaser, in the
-    order of the mapping.
+    """Return the wrenches (6, N n) per 1 N of the ``n`` thrusters of every chaser, in the order of
+    the mapping.
     """
     own = wrench_matrix(thrusters)
     return np.concatenate(

@@ -2,9 +2,9 @@
 /* Checks of a problem before it is solved. */
 #include "base.h"
 
-/* Normalize the quaternions in columns first..first+3 of array (K, width) in place. Return 1 for a
- * value that is not finite, 2 for a quaternion further off unit length than the tolerance, else
- * 0. */
+/* Normalize the quaternions in columns first..first+3 of array (K, width) in place. Return 1
+ * for a value that is not finite, 2 for a quaternion farther off unit length than the
+ * tolerance, else 0. */
 EXPORT int64_t NAME(normalize_rows)(double *array, int64_t rows, int64_t width, int64_t first,
                               double tolerance) {
     int64_t bad = 0;

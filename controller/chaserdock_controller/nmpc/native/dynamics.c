@@ -12,8 +12,8 @@
  */
 #include "base.h"
 
-/* Rates at y (7) = [q, omega]: q', omega', acceleration (WRF), and the intermediate R(q) / m (9)
- * and I omega (3). */
+/* Rates at y (7) = [q, omega]: q', omega', acceleration (WRF); and intermediate results R(q) /
+ * m (9) and I omega (3). */
 typedef struct {
     double q[4], omega[3], a[3], turn[9], momentum[3];
 } Rates;
@@ -47,8 +47,8 @@ static inline double normalize_quaternion(double *q) {
     return length;
 }
 
-/* One Runge-Kutta part: rates at x + c k (k: the previous part, unused if c is 0), added with
- * weight b to out. */
+/* One Runge-Kutta stage: evaluate the rates at x + c k (k: rates of the previous stage, unused
+ * if c is 0) and add them to out with weight b. */
 static inline void part(const Model *model, const double *x, const double *u, double b, double c,
                         double *y, Rates *k, double *out) {
     for (int i = 0; i < 3; i++) out[i] = madd(b, madd(c, k->a[i], x[3 + i]), out[i]);
@@ -70,7 +70,7 @@ static void step(const Model *model, const double *x, const double *u, double *o
     normalize_quaternion(out + 6);
 }
 
-/* A row of sensitivities to [omega, torque], and two spare. */
+/* A row of sensitivities to [omega, torque], and two spare elements. */
 typedef struct {
     v4 a, b;
 } Row;
@@ -81,12 +81,12 @@ static inline void add(Row *out, double f, Row r) {
 }
 static inline double entry(const Row *r, int i) { return i < 4 ? r->a[i] : r->b[i - 4]; }
 
-/* d[q', omega', a] by [omega, torque] at y, whose sensitivities are `here` (7); torque (3): I^-1 in
- * its columns.
+/* Compute the sensitivities of [q', omega', a] to [omega, torque] at y; those of y itself are
+ * `here` (7). torque (3): I^-1 in its columns.
  *
- * q' = 1/2 q (0, omega); omega' = I^-1 (tau - omega x I omega); a = (1 - |q|^2) F / m + q F q* / m,
- * so that m da = 2 [ s dv x F + (v . F) dv + v (F . dv) - 2 F (v . dv) + ds v x F ] for q = (s, v).
- */
+ * q' = 1/2 q (0, omega); omega' = I^-1 (tau - omega x I omega); a = (1 - |q|^2) F / m + q F q*
+ * / m. Hence m da = 2 [ s dv x F + (v . F) dv + v (F . dv) - 2 F (v . dv) + ds v x F ] for q =
+ * (s, v). */
 static inline void rate_rows(const Model *model, const double *y, const double *u, const Rates *k,
                              const Row *torque, const Row *here, Row *rate) {
     const double s = y[0], *v = y + 1, *o = y + 4, f = 2.0 * model->per_mass, along = dot3(v, u);
@@ -126,13 +126,12 @@ static inline void rate_rows(const Model *model, const double *y, const double *
     }
 }
 
-/* One step as in `step`, with its Jacobians m_mat = [C B] (12, 12); B by inputs in shares of
+/* Advance as `step` and compute the Jacobians m_mat = [C B] (12, 12), B by inputs in shares of
  * `limits` (6).
  *
- * The initial attitude needs no sensitivities: q' = 1/2 q (0, omega) commutes with a rotation from
- * the left, so dtheta propagates as R(q_0* q_1)' dtheta, and the acceleration q F q* rotates as a
- * whole.
- */
+ * The initial attitude needs no sensitivities: q' = 1/2 q (0, omega) commutes with a rotation
+ * from the left. Therefore dtheta propagates as R(q_0* q_1)' dtheta, and the acceleration q F
+ * q* rotates as a whole. */
 static void linearize(const Model *model, const double *x, const double *u, const double *limits,
                       double *out, double *m_mat) {
     const Row none = {{0}, {0}},
@@ -159,7 +158,8 @@ static void linearize(const Model *model, const double *x, const double *u, cons
         for (int i = 0; i < 3; i++) {
             add(&sum[i], bc, rate[7 + i]);
         }
-        /* the columns of the force and the rotating acceleration: of the previous part into p */
+        /* Columns of the force, and the rotating acceleration: those of the previous stage
+         * enter p ... */
         if (s > 0) {
             double excess = 1.0 - ((y[0] * y[0] + y[2] * y[2]) + (y[1] * y[1] + y[3] * y[3]));
             for (int i = 0; i < 9; i++) force_p[i] = madd(bc, k.turn[i], force_p[i]);
@@ -170,7 +170,7 @@ static void linearize(const Model *model, const double *x, const double *u, cons
         if (s == 0)
             for (int i = 0; i < 9; i++) turn_0[i] = model->mass_kg * k.turn[i];
         rate_rows(model, y, u, &k, torque, here, rate);
-        /* and of this one into v */
+        /* ... and those of this stage enter v. */
         double excess = 1.0 - ((y[0] * y[0] + y[2] * y[2]) + (y[1] * y[1] + y[3] * y[3]));
         for (int i = 0; i < 9; i++) force_v[i] = madd(b, k.turn[i], force_v[i]);
         for (int i = 0; i < 3; i++) {
@@ -181,8 +181,8 @@ static void linearize(const Model *model, const double *x, const double *u, cons
         for (int i = 0; i < 4; i++) add(&sum[6 + i], b, rate[i]);
     }
     const double scale = 2.0 / normalize_quaternion(out + 6), *q = out + 6;
-    /* dtheta_next = 2 vec(q_next* (x) dq) / |q|: the projection on the tangent space, normalization
-     * included */
+    /* dtheta_next = 2 vec(q_next* (x) dq) / |q|: projection on the tangent space, which
+     * includes the normalization. */
     Row turn[3];
     for (int i = 0; i < 3; i++) {
         int a = (i + 1) % 3, b = (i + 2) % 3;
@@ -228,7 +228,7 @@ static void linearize(const Model *model, const double *x, const double *u, cons
     }
 }
 
-/* Rolls u (N, D, 6) from x[:, 0] through x (N, D+1, 13). */
+/* Roll u (N, D, 6) out from x[:, 0] through x (N, D+1, 13). */
 EXPORT void NAME(roll)(const Model *model, int64_t n, int64_t stages, const double *u, double *x) {
     for (int64_t i = 0; i < n; i++)
         for (int64_t k = 0; k < stages; k++) {

@@ -1,53 +1,53 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Mehrotra's predictor-corrector interior point for one chaser's QP, on top of the Riccati sweeps.
+/* Interior point for the QP of one chaser: Mehrotra's predictor-corrector on the Riccati
+ * sweeps.
  *
- * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dr_k >= c (dr_k the changes of
- * position and velocity at stage k) is soft: with a slack s >= 0, priced w1 s + w2/2 s^2, and
- * z = a' dr - c + s >= 0, multipliers lam (of z) and pi (of s). Slack and multipliers are
- * eliminated row by row, so a row only adds a rank-one term to the block of position and velocity
- * of Q_k and the sparsity of the Riccati sweep stays. Method: S. Mehrotra, SIAM J. Optim. 2 (1992);
- * Nocedal and Wright, "Numerical Optimization", sec. 16.6.
+ * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dr_k >= c (dr_k: changes of
+ * position and velocity at stage k) is soft: it has a slack s >= 0, priced w1 s + w2/2 s^2, and
+ * z = a' dr - c + s >= 0, with multipliers lam (of z) and pi (of s). Slack and multipliers are
+ * eliminated row by row. A row then only adds a rank-one term to the position and velocity
+ * block of Q_k, and the sparsity of the Riccati sweep stays. Method: S. Mehrotra, SIAM J.
+ * Optim. 2 (1992); Nocedal and Wright, "Numerical Optimization", sec. 16.6.
  *
- * All positive quantities are stored in one vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w (6
- * D); its multipliers, in that order, in mul: lam, pi, and those of the box.
+ * All positive quantities are stored in one vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w
+ * (6 D). Their multipliers are in mul, in the same order: lam, pi, and those of the box.
  *
- * Most rows are far from the chaser. Only near rows are active. A solution that satisfies the
- * others as well solves the whole problem; otherwise the problem is solved again with the rows it
- * came near.
- */
+ * Most rows are far from the chaser, so only near rows are active. A solution that satisfies
+ * the other rows as well solves the whole problem. Otherwise the rows that it came near are
+ * activated and the problem is solved again. */
 #include "base.h"
 
-/* Numbers of the method. "Flights": seven closed loops, varied one number at a time
- * (docs/evidence/controller.md). */
+/* Tuned numbers of the method. "Flights" are seven closed loops, in which one number was varied
+ * at a time (docs/evidence/controller.md). */
 
-/* Complementarity at which to stop, in units of cost. 1e-2 to 1e-4 fly the same closed loop. */
+/* Complementarity at which to stop, in units of cost. 1e-2 to 1e-4 give the same closed loop. */
 #define MU_STOP 1e-3
-/* Complementarity at the start, relative to the largest slope there. With half or twice of it, a
- * plan in 150 of one flight ends at its limit of iterations. */
+/* Complementarity at the start, relative to the largest slope there. With half or twice, a plan
+ * in 150 of one flight ends at its iteration limit. */
 #define MU_START 0.1
-/* Upper end of the complementarity at the start, units of cost: without it, or with 1e3, a plan for
- * a reference 2 km away ends at its limit of iterations; with 1e5 it takes 17 iterations. */
+/* Upper bound of the complementarity at the start, in units of cost. Without it, or with 1e3, a
+ * plan for a reference 2 km away ends at its iteration limit; with 1e5 it takes 17 iterations. */
 #define MU_START_MAX 1e5
-/* Stationarity at which to stop, relative to the gradient at the start. Half takes up to 1 % more
- * iterations; with twice, one plan ends at its limit. */
+/* Stationarity at which to stop, relative to the gradient at the start. Half takes up to 1 %
+ * more iterations; with twice, one plan ends at its iteration limit. */
 #define GRADIENT_STOP 1e-6
-/* Share of the step to the boundary: below 1, so that all values stay positive. With 0.9 flights
- * take 20 to 45 % more iterations, with 0.999 up to 4 % fewer, but one plan ends at its limit. */
+/* Share of the step to the boundary, below 1 so that all values stay positive. With 0.9 flights
+ * take 20 to 45 % more iterations; with 0.999 up to 4 % fewer, but one plan ends at its limit. */
 #define STEP_TO_BOUNDARY 0.995
-/* Tolerance for rows and bounds of the unconstrained solution (m, or fraction of a limit): its
+/* Tolerance for rows and bounds of the unconstrained solution (m, or share of a limit): its
  * rounding. Half and twice change no bit of the flights. */
 #define FREE_TOLERANCE 1e-9
-/* Initial inputs are limited to this fraction of the box, away from the boundary. With 0.99 flights
- * take up to 56 % more iterations, with 0.8 up to 14 % fewer. */
+/* Initial inputs are limited to this share of the box, away from its boundary. With 0.99
+ * flights take up to 56 % more iterations, with 0.8 up to 14 % fewer. */
 #define START_WITHIN 0.9
-/* Rows with less margin than this are active, m. The solution does not depend on it, as rows that
- * come near are added; half and twice take up to 2 % more iterations. */
+/* Rows with less margin than this, m, are active. The solution does not depend on it, since
+ * rows that come near are added. Half and twice take up to 2 % more iterations. */
 #define NEAR_M 0.1
 
 enum { FREE, CONVERGED, LIMIT, BROKEN };
 
-/* One chaser's problem. mats (D, 12, 12) = [C B]; q, qx, r_diag, r, w_bar as in `Quadratic`; rows:
- * stage (R,), a (R, 6), c (R,). */
+/* The problem of one chaser. mats (D, 12, 12) = [C B]; q, qx, r_diag, r, w_bar: as in
+ * `Quadratic`. Rows: stage (R,), a (R, 6), c (R,). */
 typedef struct {
     int64_t stages, n_rows, max_iterations;
     double h, w1, w2;
@@ -57,14 +57,15 @@ typedef struct {
 } Qp;
 LAYOUT(Qp, stages, n_rows, max_iterations, h, w1, w2, mats, q, qx, r_diag, r, w_bar, stage, a, c)
 
-/* dx (D+1, 12), dw (D, 6), multipliers mul (2 R + 12 D), scaled stationarity, complementarity. */
+/* The solution: dx (D+1, 12), dw (D, 6), multipliers mul (2 R + 12 D), scaled stationarity,
+ * complementarity. */
 typedef struct {
     double *dx, *dw, *mul, residual, mu;
     int64_t iterations;
 } Answer;
 LAYOUT(Answer, dx, dw, mul, residual, mu, iterations)
 
-/* The active rows, and the working vectors of an iteration. */
+/* Active rows, and working vectors of an iteration. */
 typedef struct {
     int64_t count, n, *stage, *index;
     double *a, *c;
@@ -103,7 +104,7 @@ static inline double dot6(const double *a, const double *b) {
     return dot3(a, b) + dot3(a + 3, b + 3);
 }
 
-/* Of the cost: gx (D+1, 12) = Q dx + qx, gw (D, 6) = R dw + r. */
+/* Gradients of the cost: gx (D+1, 12) = Q dx + qx, gw (D, 6) = R dw + r. */
 static void gradients(const Qp *qp, const double *dx, const double *dw, double *gx, double *gw) {
     copy(qp->qx, gx, 12 * (qp->stages + 1));
     for (int64_t k = 0; k <= qp->stages; k++)
@@ -118,7 +119,7 @@ static inline double margin_of(const Qp *qp, const double *dx, int64_t j) {
     return dot6(qp->a + 6 * j, dx + 12 * qp->stage[j]) - qp->c[j];
 }
 
-/* Margin of the active row j. */
+/* Return the margin of the active row j. */
 static inline double active_margin(const Iterate *it, const double *dx, int64_t j) {
     return dot6(it->a + 6 * j, dx + 12 * it->stage[j]) - it->c[j];
 }
@@ -137,8 +138,8 @@ static int is_free(const Qp *qp, const double *dx, const double *w) {
     return 1;
 }
 
-/* Activate the rows that dx (D+1, 12) comes near, in addition to the active ones. `active` marks
- * each (R,). */
+/* Activate, in addition, the rows that dx (D+1, 12) comes near. `active` (R,): flags of all
+ * rows. */
 static void activate_rows(const Qp *qp, const double *dx, double *active, Iterate *it) {
     it->n = 0;
     for (int64_t j = 0; j < qp->n_rows; j++) {
@@ -159,7 +160,7 @@ static int violates_inactive(const Qp *qp, const double *dx, const double *activ
     return 0;
 }
 
-/* Curvature of the price of row j in z, d, and in s, e, with z's slope eliminated. */
+/* Curvature of the price of row j: d in z, e in s, after elimination of z's slope. */
 static inline void curvature(const Iterate *it, int64_t j, double w2, double *d, double *e) {
     *d = it->mul[j] * it->inverse[j];
     *e = madd(it->mul[it->n + j], it->inverse[it->n + j], w2);
@@ -179,9 +180,9 @@ static double set_start(const Qp *qp, Answer *answer, Iterate *it) {
     gradients(qp, answer->dx, answer->dw, it->gx, it->gw);
     double scale =
         max_of(1.0, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
-    /* Rows violated at the start contribute their full slack weight; a much smaller initial
-     * complementarity would start close to the boundary, where steps are short (27 to 40 iterations
-     * instead of 12). */
+    /* Rows that are violated at the start contribute their full slack weight. A much smaller
+     * initial complementarity would start close to the boundary, where steps are short (27 to
+     * 40 iterations instead of 12). */
     for (int64_t j = 0; j < it->n; j++)
         if (active_margin(it, answer->dx, j) < 0.0) add_row_force(it, it->gx, j, -qp->w1);
     double slope =
@@ -206,7 +207,7 @@ static double set_start(const Qp *qp, Answer *answer, Iterate *it) {
 
 static inline double sum4(v4 s) { return (s[0] + s[2]) + (s[1] + s[3]); }
 
-/* res = val mul, element by element; return the mean. */
+/* Set res to val mul, element by element; return the mean. */
 static double complementarity(const Iterate *it) {
     v4 sum = splat(0.0);
     for (int64_t j = 0; j < it->count; j += 4) {
@@ -217,7 +218,7 @@ static double complementarity(const Iterate *it) {
     return sum4(sum) / (double)it->count;
 }
 
-/* Factor the Newton system: curvatures of rows and box added to those of the cost. */
+/* Factor the Newton system: add the curvatures of rows and box to those of the cost. */
 static int factor_newton(const Qp *qp, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     copy(qp->q, it->q_eff, 72 * (qp->stages + 1));
@@ -235,8 +236,8 @@ static int factor_newton(const Qp *qp, Iterate *it) {
     return factor(qp->stages, qp->mats, qp->h, it->q_eff, it->r_eff, it->factors);
 }
 
-/* Compute the step that reduces the products val mul by res; return the largest fraction that keeps
- * all positive. */
+/* Compute the step that reduces the products val mul by res. Return the largest share of it
+ * that keeps all values positive. */
 static double newton_step(const Qp *qp, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     copy(it->gx, it->grad_x, 12 * (qp->stages + 1));
@@ -275,7 +276,7 @@ static double newton_step(const Qp *qp, Iterate *it) {
     return 1.0 / max_of(max_of(steepest[0], steepest[1]), max_of(steepest[2], steepest[3]));
 }
 
-/* Mean complementarity after a fraction alpha of the step. */
+/* Return the mean complementarity after a share alpha of the step. */
 static double after_step(const Iterate *it, double alpha) {
     v4 sum = splat(0.0);
     for (int64_t j = 0; j < it->count; j += 4)
@@ -306,7 +307,7 @@ static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
             store(it->inverse + j, splat(1.0) / load(it->val + j));
         if (!factor_newton(qp, it)) return BROKEN;
         double after = after_step(it, min_of(1.0, newton_step(qp, it)));
-        /* Not far below the stopping point: a smaller value degrades the conditioning. */
+        /* Not far below the stopping point: smaller values worsen the conditioning. */
         double centre = max_of(after * after * after / (mu * mu), 0.1 * MU_STOP);
         for (int64_t j = 0; j < it->count; j++) it->res[j] += it->d_val[j] * it->d_mul[j] - centre;
         double alpha = min_of(1.0, STEP_TO_BOUNDARY * newton_step(qp, it));
@@ -322,7 +323,7 @@ static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
     }
 }
 
-/* Multipliers of all rows; an inactive one has lam = 0 and pi = w1. */
+/* Write the multipliers of all rows. An inactive row has lam = 0 and pi = w1. */
 static void expand_multipliers(const Qp *qp, const Iterate *it, double *mul) {
     for (int64_t j = 0; j < qp->n_rows; j++) {
         mul[j] = 0.0;
@@ -335,9 +336,10 @@ static void expand_multipliers(const Qp *qp, const Iterate *it, double *mul) {
     copy(it->mul + 2 * it->n, mul + 2 * qp->n_rows, 12 * qp->stages);
 }
 
-/* |w_bar + dw| <= 1 always holds up to rounding, for FREE within FREE_TOLERANCE. With CONVERGED and
- * LIMIT the point lies strictly within the box; with LIMIT it is the best of max_iterations.
- * BROKEN: the solution would not be finite. Working memory: `ipm_workspace` doubles, and R more. */
+/* Solve the QP of one chaser. |w_bar + dw| <= 1 holds up to rounding; for FREE within
+ * FREE_TOLERANCE. CONVERGED and LIMIT: the point lies strictly within the box; LIMIT: it is the
+ * best of max_iterations. BROKEN: the solution would not be finite. work: `ipm_workspace`
+ * doubles, and R more. */
 static int solve_one(const Qp *qp, Answer *answer, double *work) {
     const int64_t inputs = 6 * qp->stages;
     double *active = allocate(&work, qp->n_rows);

@@ -1,41 +1,42 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Terms that restrict motion, as half-spaces about a rollout, so that the chasers' problems
- * separate.
+/* Terms that restrict motion, written as half-spaces about a rollout, so that the chasers'
+ * problems separate.
  *
- * Keep-out: the plane tangent to the ball about the target. Outer bound: the plane tangent to the
- * ball about the reference. Corridor: the plane tangent to the cone where the chaser is nearest.
- * Separation: a plane between two chasers at the midpoint, half the distance to each side; with
- * shapes, this distance is at least what they need along the line between the centres. Target's
- * shape: for each cuboid the plane that separates it from the chaser's shape, normal to the line
- * from its nearest point to the chaser's centre. Passive coasts: half-spaces of position and
- * velocity as they are given (nmpc/terms/coast.py).
+ * Keep-out: plane tangent to the ball about the target.
+ * Outer bound: plane tangent to the ball about the reference.
+ * Corridor: plane tangent to the cone where the chaser is nearest.
+ * Separation: plane midway between two chasers, half the distance to each side. With shapes,
+ *     this distance is at least what they need along the line between the centres.
+ * Target's shape: for each cuboid the plane that separates it from the chaser's shape, normal to
+ *     the line from its nearest point to the chaser's centre.
+ * Passive coasts: half-spaces of position and velocity as given (nmpc/terms/coast.py).
  *
- * A row of stage k reads a' dr_k >= c with dr_k the changes of the rolled position and velocity.
- */
+ * A row of stage k reads a' dr_k >= c, with dr_k the changes of the rolled position and
+ * velocity. */
 #include "base.h"
 
-/* Additional margin of the plan, m: linearization can lose 2 mm of a distance. */
+/* Additional margin of the plan, m. Linearization can lose 2 mm of a distance. */
 #define MARGIN_M 5e-3
-/* For a chaser that heads for the centre within 10 degrees (its cosine) the passing side is
- * undetermined. Half and twice the angle: a plan in 150 of one flight ends at its limit of
- * iterations. */
+/* Cosine of 10 degrees. For a chaser that heads for the centre within this angle the passing
+ * side is undetermined. With half and twice the angle a plan in 150 of one flight ends at its
+ * iteration limit. */
 #define COS_HEAD_ON 0.984807753012208
-/* Tangent by which the normal is tilted then; without it a symmetric approach goes straight
- * through. 0.1 and 0.4 pass obstacles as well. */
+/* Tangent of the angle by which the normal is then tilted. Without it a symmetric approach goes
+ * straight through. 0.1 and 0.4 pass obstacles as well. */
 #define TILT 0.2
-/* Closer than this fraction of the distance the rollout counts as inside and the last normal is
- * kept, so that a crossing rollout does not get the normal of the far side. 0.4 and 0.95 keep the
- * same distances. */
+/* Closer than this share of the distance, the rollout counts as inside and the last normal is
+ * kept: a crossing rollout must not get the normal of the far side. 0.4 and 0.95 keep the same
+ * distances. */
 #define INSIDE 0.8
 /* Bound for `out_of_reach`: a tilted normal sees 1 / sqrt(1 + TILT^2) = 0.9806 of the gap. */
 #define TILTED_SHARE 0.98
-/* Most by which the planes between chasers move in favour of one that cannot keep its own
- * distances, m: so much a neighbour comes nearer to the common plane, and no more than a small part
- * of the distance (0.35 m). Half and twice change no flight without shapes. */
+/* Largest shift, m, of the planes between chasers in favour of one that cannot keep its own
+ * distances. A neighbour comes closer by at most this, a small part of the distance (0.35 m).
+ * Half and twice change no flight without shapes. */
 #define RELIEF_MAX_M 0.02
 
-/* The rows of all chasers, capacity `width` each; reach (N, D+1): how far admissible inputs can
- * move a chaser from its rollout by each stage, m. */
+/* Rows of all chasers, with a capacity of `width` each. reach (N, D+1): distance, m, by which
+ * admissible inputs can move a chaser from its rollout by each stage. */
 typedef struct {
     int64_t width, nodes;
     const double *reach;
@@ -45,8 +46,8 @@ typedef struct {
 } Rows;
 LAYOUT(Rows, width, nodes, reach, stage, n_rows, a, c, relief)
 
-/* Tilt the unit normal n sideways by TILT. Odd in n: both chasers of a pair tilt the same plane.
- * The side is n x e, e the axis with the smallest component of n. */
+/* Tilt the unit normal n sideways by TILT. Odd in n, so that both chasers of a pair tilt the
+ * same plane. The side is n x e, with e the axis of the smallest component of n. */
 static void tilt(double *n) {
     int i = 0;
     for (int c = 1; c < 3; c++)
@@ -61,7 +62,7 @@ static void tilt(double *n) {
     normalize3(n);
 }
 
-/* Add the row sign n' dp_k >= -room of chaser i unless no admissible input can reach it. */
+/* Add the row sign n' dp_k >= -room of chaser i, unless no admissible input can reach it. */
 static inline void push(const Rows *rows, int64_t i, int64_t k, const double *n, double sign,
                         double room) {
     if (!(room <= rows->reach[i * rows->nodes + k])) return;
@@ -74,7 +75,8 @@ static inline void push(const Rows *rows, int64_t i, int64_t k, const double *n,
     rows->stage[m] = k;
 }
 
-/* Set the normal at stage 0: direction of the relative position, else of the relative reference. */
+/* Set the normal at stage 0: the direction of the relative position, or else of the relative
+ * reference. */
 static void first_side(const double *here, const double *there, const double *ref,
                        const double *ref_there, double *last) {
     subtract3(here, there, last);
@@ -83,9 +85,9 @@ static void first_side(const double *here, const double *there, const double *re
     if (normalize3(last) == 0.0) last[0] = 1.0;
 }
 
-/* Compute the normal n of a stage; last is that of the previous stage and is updated. `held`: the
- * rollout crosses the constraint and keeps the normal of its entry side. The displacement `want` is
- * normalized and its length returned. */
+/* Compute the normal n of a stage, and update that of the previous stage, `last`. `held`: the
+ * rollout crosses the constraint and keeps the normal of its entry side. Normalizes the
+ * displacement `want` and returns its length. */
 static double side(double *n, double *want, double d, int *held, double *last, double *gap,
                    double *heading) {
     *gap = normalize3(n);
@@ -101,9 +103,9 @@ static double side(double *n, double *want, double d, int *held, double *last, d
     return length;
 }
 
-/* Distance from the surface of the corridor's cone, m, positive inside; n (3) receives the inward
- * normal. r (3): position from the target; corridor (5): axis (unit), half angle, distance of the
- * apex from the target. */
+/* Return the distance, m, from the surface of the corridor's cone, positive inside; write the
+ * inward normal to n (3). r (3): position from the target. corridor (5): axis (unit), half
+ * angle, distance of the apex from the target. */
 static double corridor_room(const double *r, const double *corridor, double *n) {
     double s, c, along = dot3(r, corridor);
     sine_cosine(corridor[3], &s, &c);
@@ -117,8 +119,8 @@ static double corridor_room(const double *r, const double *corridor, double *n) 
     return madd(s, along - corridor[4], -(c * aside));
 }
 
-/* How far a chaser's shape reaches from its centre along sign n, n (3) in WRF, m; q (4): body to
- * WRF. 0 without a shape. */
+/* Return how far, m, a chaser's shape extends from its centre along sign n; 0 without a shape.
+ * n (3): WRF; q (4): body to WRF. */
 static double reach_along(const Problem *problem, const double *q, double sign, const double *n) {
     double t[3], u[3], local[3], furthest = 0.0;
     if (!problem->n_shape) return 0.0;
@@ -137,8 +139,8 @@ static double reach_along(const Problem *problem, const double *q, double sign, 
     return furthest;
 }
 
-/* Distance that the centres of two chasers in states x and y (13) keep along n (3), unit, from the
- * second to the first. */
+/* Return the distance, m, that the centres of two chasers in states x and y (13) must keep
+ * along n (3), a unit vector from the second to the first. */
 static double centre_distance(const Problem *problem, int64_t i, int64_t j, const double *x,
                               const double *y, const double *n) {
     const double d = problem->between[i * problem->n + j],
@@ -148,7 +150,7 @@ static double centre_distance(const Problem *problem, int64_t i, int64_t j, cons
                          reach_along(problem, y + 6, 1.0, n));
 }
 
-/* Largest `centre_distance` in any attitude. */
+/* Return the largest `centre_distance` over all attitudes. */
 static double largest_distance(const Problem *problem, int64_t i, int64_t j) {
     const double d = problem->between[i * problem->n + j],
                  apart = problem->apart[i * problem->n + j];
@@ -160,8 +162,8 @@ static double largest_distance(const Problem *problem, int64_t i, int64_t j) {
     return max_of(d, apart + 2.0 * radius);
 }
 
-/* Test whether two chasers stay so far apart over the whole rollout that no row between them could
- * be reached. */
+/* Test whether two chasers stay so far apart over the whole rollout that inputs can reach no
+ * row between them. */
 static int out_of_reach(const Rows *rows, const double *x, const double *y, const double *reach_x,
                         const double *reach_y, double d) {
     double last[3], now[3];
@@ -175,8 +177,8 @@ static int out_of_reach(const Rows *rows, const double *x, const double *y, cons
     return 1;
 }
 
-/* Rows of the separating planes of two chasers; `relief`: how far the planes move away from
- * i, m. */
+/* Add rows of the separating planes of two chasers. `relief`: shift of the planes away from i,
+ * m. */
 static void pair_rows(const Problem *problem, const Rows *rows, int64_t i, int64_t j,
                       const double *x, const double *y, double relief) {
     const int64_t nodes = rows->nodes;
@@ -204,8 +206,8 @@ static void pair_rows(const Problem *problem, const Rows *rows, int64_t i, int64
     }
 }
 
-/* Signed distance of a point (3) from a cuboid (15), m; n (3) receives its gradient
- * (chaserdock_models.shape_distance). */
+/* Return the signed distance, m, of a point (3) from a cuboid (15), and write its gradient to n
+ * (3) (chaserdock_models.shape_distance). */
 static double box_distance(const double *point, const double *box, double *n) {
     double r[3], local[3], off[3] = {0}, square = 0.0;
     subtract3(point, box, r);
@@ -229,15 +231,15 @@ static double box_distance(const double *point, const double *box, double *n) {
     return distance;
 }
 
-/* Signed distance of a chaser's shape from a cuboid along the gradient n (3) of its centre's; x
- * (13): its state. */
+/* Return the signed distance, m, of a chaser's shape from a cuboid, along the gradient n (3) of
+ * its centre's distance. x (13): the chaser's state. */
 static double shape_gap(const Problem *problem, const double *x, const double *box, double *n) {
     double distance = box_distance(x, box, n);
     return distance - reach_along(problem, x + 6, -1.0, n);
 }
 
-/* Distance of a point (3) from the plane with the unit normal n (3) that touches a cuboid (15) from
- * outside, m. */
+/* Return the distance, m, of a point (3) from the plane with unit normal n (3) that touches a
+ * cuboid (15) from outside. */
 static double plane_distance(const double *point, const double *box, const double *n) {
     double r[3], support = 0.0;
     subtract3(point, box, r);
@@ -247,8 +249,8 @@ static double plane_distance(const double *point, const double *box, const doubl
     return dot3(n, r) - support;
 }
 
-/* Rows of the separating planes of one cuboid. A rollout that crosses it keeps the normal of its
- * entry side. */
+/* Add rows of the separating planes of one cuboid. A rollout that crosses it keeps the normal
+ * of its entry side. */
 static void box_rows(const Problem *problem, const Rows *rows, int64_t i, int64_t box,
                      const double *x) {
     const double clearance = problem->clearance[i];
@@ -269,7 +271,7 @@ static void box_rows(const Problem *problem, const Rows *rows, int64_t i, int64_
     }
 }
 
-/* Rows of the coasts of one chaser, unless no admissible input can reach them. */
+/* Add rows of the coasts of one chaser, unless no admissible input can reach them. */
 static void coast_rows(const Problem *problem, const Rows *rows, int64_t i, const double *x) {
     for (int64_t k = 1; k < rows->nodes; k++)
         for (int64_t j = 0; j < problem->n_coasts; j++) {
@@ -287,9 +289,9 @@ static void coast_rows(const Problem *problem, const Rows *rows, int64_t i, cons
         }
 }
 
-/* How far a chaser's rollout violates its present rows, without their margin, m, up to
- * RELIEF_MAX_M. Its neighbours give way by so much: halves of the gaps between chasers alone could
- * hold one of them inside a keep-out. */
+/* Return how far, m, a chaser's rollout violates its present rows without their margin, at most
+ * RELIEF_MAX_M. Its neighbours give way by that much. Otherwise its half of the gaps between
+ * chasers could hold it inside a keep-out. */
 static double violation(const Rows *rows, int64_t i) {
     double worst = 0.0;
     for (int64_t m = rows->width * i; m < rows->width * i + rows->n_rows[i]; m++)
@@ -297,7 +299,7 @@ static double violation(const Rows *rows, int64_t i) {
     return min_of(worst, RELIEF_MAX_M);
 }
 
-/* Rows of the outer bound and of the corridor. */
+/* Add rows of the outer bound and of the corridor. */
 static void outer_and_corridor_rows(const Problem *problem, const Rows *rows, int64_t i,
                                     const double *x) {
     const int64_t nodes = rows->nodes;
@@ -316,7 +318,7 @@ static void outer_and_corridor_rows(const Problem *problem, const Rows *rows, in
     }
 }
 
-/* Rows of the keep-out. */
+/* Add rows of the keep-out. */
 static void keep_out_rows(const Problem *problem, const Rows *rows, int64_t i, const double *x) {
     const int64_t nodes = rows->nodes;
     const double *reference = problem->references + 7 * nodes * i;
@@ -338,9 +340,9 @@ static void keep_out_rows(const Problem *problem, const Rows *rows, int64_t i, c
     }
 }
 
-/* Write the rows of all terms about the rollouts x (N, D+1, 13): stage (N, M), a (N, M, 6), c (N,
- * M), n_rows (N,), with M at least D (N + 2 + n_boxes + n_coasts). None at stage 0, and none whose
- * distance is NaN. */
+/* Write the rows of all terms about the rollouts x (N, D+1, 13): stage (N, M), a (N, M, 6), c
+ * (N, M), n_rows (N,), with M at least D (N + 2 + n_boxes + n_coasts). Stage 0 has no rows; a
+ * distance of NaN gives none. */
 EXPORT void NAME(build_rows)(const Problem *problem, const double *x, const Rows *rows) {
     const int64_t n = problem->n, size = 13 * rows->nodes;
     for (int64_t i = 0; i < n; i++) {
@@ -360,8 +362,8 @@ EXPORT void NAME(build_rows)(const Problem *problem, const double *x, const Rows
                           rows->relief[i] - rows->relief[j]);
 }
 
-/* Write the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if
- * none. All stages 0..D count, without margin; NaN if a position is. */
+/* Write the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0
+ * without any. All stages 0..D count, without margin. NaN if a position is. */
 EXPORT void NAME(plan_violation)(const Problem *problem, const double *x, double *worst) {
     const int64_t nodes = problem->stages + 1;
     double r[3], n[3];

@@ -1,21 +1,21 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The problem of a tick, and the terms of its cost; the terms that restrict motion are in planes.c.
+/* The problem of a tick, and the terms of its cost. The terms that restrict motion are in
+ * planes.c.
  *
  * Each term is declared in nmpc/terms/NAME.py. A term of the cost has two functions here:
  * NAME_model adds its quadratic model at a stage, NAME_value returns its cost there.
- * `quadratic_model` and `plan_cost` are the sums of the terms.
- */
+ * `quadratic_model` and `plan_cost` sum the terms. */
 #include "base.h"
 
-/* Cosine of half of 150 degrees. An attitude error beyond is treated as one of this angle about the
- * same axis: the gradient of sin^2(angle / 2) vanishes at 180 degrees, where the cost would not
- * act. 120 and 165 degrees turn as fast. */
+/* Cosine of half of 150 degrees. A larger attitude error is treated as one of this angle about
+ * the same axis: the gradient of sin^2(angle / 2) vanishes at 180 degrees, where the cost would
+ * have no effect. With 120 and 165 degrees chasers turn as fast. */
 #define ETA_MIN 0.25881904510252074
 /* Sine of the same angle. */
 #define EPS_MAX 0.9659258262890683
 
-/* The problem of N chasers over D stages: what all terms use (as in `NmpcInput`, all expanded), and
- * the members of each term, in the order of the files in nmpc/terms. */
+/* The problem of N chasers over D stages: members that all terms use (as in `NmpcInput`, all
+ * expanded), then those of each term, in the order of the files in nmpc/terms. */
 typedef struct {
     int64_t n, stages;
     double step_s;
@@ -41,8 +41,9 @@ LAYOUT(Problem, n, stages, step_s, references, targets, u_ref, attitude, n_coast
        n_boxes, boxes, clearance)
 
 /* Quadratic model of one chaser's cost in changes of its state, [dp, dv, dtheta, domega], and
- * scaled inputs w = u / limits: q (D+1, 2, 6, 6), symmetric: blocks of [dp, dv] and [dtheta,
- * domega]; gradients qx (D+1, 12) and r (D, 6); r_diag (D, 6); w_bar (D, 6): the inputs. */
+ * scaled inputs w = u / limits. q (D+1, 2, 6, 6), symmetric: blocks of [dp, dv] and [dtheta,
+ * domega]. Gradients qx (D+1, 12) and r (D, 6). r_diag (D, 6). w_bar (D, 6): the present
+ * inputs. */
 typedef struct {
     double *q, *qx, *r_diag, *r, *w_bar;
 } Quadratic;
@@ -82,8 +83,8 @@ static inline double attitude_value(const Problem *problem, int64_t i, int64_t k
     return problem->attitude[k] * dot3(e + 1, e + 1);
 }
 
-/* With q_ref* (x) q = (eta, eps): gradient weight eta eps in dtheta, Hessian weight / 2 (I - eps
- * eps'). */
+/* With q_ref* (x) q = (eta, eps): gradient weight eta eps in dtheta; Hessian weight / 2 (I -
+ * eps eps'). */
 static inline void attitude_model(const Problem *problem, int64_t i, int64_t k, const double *x,
                                   const Quadratic *model) {
     const double weight = problem->attitude[k];
@@ -132,7 +133,7 @@ EXPORT void NAME(quadratic_model)(const Problem *problem, int64_t i, const doubl
     zero(qx, 12 * (d + 1));
     zero(r, 6 * d);
     for (int64_t m = 0; m < 6 * d; m++) {
-        /* an axis without authority has a zero column of B and stays at zero */
+        /* An axis without authority has a zero column of B and stays at zero. */
         const double top = problem->limits[6 * i + m % 6];
         w_bar[m] = top > 0.0 ? u[m] / top : 0.0;
         r_diag[m] = top > 0.0 ? 0.0 : 1.0;

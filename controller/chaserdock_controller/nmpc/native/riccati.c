@@ -11,16 +11,16 @@
  */
 #include "base.h"
 
-/* Factors of a stage from `factor`, with Rt = R + B'PB = L D L': -Rt^-1 B'PA, L (unit lower, row by
- * row), 1 / D. */
+/* Factors of a stage from `factor`, with Rt = R + B'PB = L D L': -Rt^-1 B'PA; L (unit lower,
+ * row by row); 1 / D. */
 typedef struct {
     double gain[6][12], low[15], inverse[6], spare[3];
 } Factor;
 
 #define LOW(i, j) low[(i) * ((i) - 1) / 2 + (j)]
 
-/* Rows first.. of out = left' right (12, 12), three rows and `width` vectors of columns at a
- * time. */
+/* Write rows first.. of left' right (12, 12) to out: three rows and `width` vectors of columns
+ * at a time. */
 static inline void gram_rows(const row12 *left, const row12 *right, row12 *out, int first,
                              int width) {
     v4 sum[3][3];
@@ -35,7 +35,7 @@ static inline void gram_rows(const row12 *left, const row12 *right, row12 *out, 
         for (int j = 0; j < width; j++) store(out[first + i] + 4 * j, sum[i][j]);
 }
 
-/* Rows first.. of out = left right (12, 12). */
+/* Write rows first.. of left right (12, 12) to out. */
 static inline void product_rows(const row12 *left, const row12 *right, row12 *out, int first,
                                 int width) {
     v4 sum[3][3];
@@ -50,7 +50,7 @@ static inline void product_rows(const row12 *left, const row12 *right, row12 *ou
         for (int j = 0; j < width; j++) store(out[first + i] + 4 * j, sum[i][j]);
 }
 
-/* L D L' = gram[6:, 6:] + diag(r); return 0 if not positive definite. */
+/* Factor L D L' = gram[6:, 6:] + diag(r); return 0 if that is not positive definite. */
 static inline int decompose(const row12 *gram, const double *r, double *low, double *inverse) {
     double scaled[6][6]; /* L D */
     for (int j = 0; j < 6; j++) {
@@ -68,9 +68,9 @@ static inline int decompose(const row12 *gram, const double *r, double *low, dou
     return 1;
 }
 
-/* Backward sweep over the matrices: q (D+1, 2, 6, 6), r_diag (D, 6). Only the lower triangles of q
- * count, and at the last stage the blocks on the diagonal. Return 0 if Rt is not positive
- * definite. */
+/* Backward sweep over the matrices q (D+1, 2, 6, 6) and r_diag (D, 6). Only the lower triangles
+ * of q are read, at the last stage those of the diagonal blocks. Return 0 if an Rt is not
+ * positive definite. */
 static int factor(int64_t stages, const double *mats, double h, const double *q,
                   const double *r_diag, Factor *factors) {
     row12 p[12], t[12], gram[12], y[6], scaled[6]; /* t = M'P, gram = M'PM, y = L^-1 B'PA */
@@ -142,7 +142,7 @@ static int factor(int64_t stages, const double *mats, double h, const double *q,
     return 1;
 }
 
-/* out (18) = [A B]' p + gx (12) for the states; below them B'p (6). */
+/* Write [A B]' p + gx (12) to out (18): 12 elements for the states, then B'p (6). */
 static inline void adjoint(const double *m_mat, double h, const double *p, double *out) {
     v4 s[3], t[3];
     for (int j = 0; j < 3; j++) {
@@ -161,7 +161,7 @@ static inline void adjoint(const double *m_mat, double h, const double *p, doubl
     for (int j = 0; j < 3; j++) store(out + 6 + 4 * j, s[j] + t[j]);
 }
 
-/* out (12) = A dx + B dw. */
+/* Write A dx + B dw to out (12). */
 static inline void forward(const double *m_mat, double h, const double *dx, const double *dw,
                            double *out) {
     double v[12], s[12];
@@ -185,8 +185,8 @@ static void advance(int64_t stages, const double *mats, double h, double *dx, co
         forward(mats + 144 * k, h, dx + 12 * k, dw + 6 * k, dx + 12 * (k + 1));
 }
 
-/* Solve with the result of `factor`: the minimizer dx (D+1, 12), dw (D, 6) for the gradients qx
- * (D+1, 12), r (D, 6). */
+/* Solve with the result of `factor`: write the minimizer dx (D+1, 12), dw (D, 6) for the
+ * gradients qx (D+1, 12), r (D, 6). */
 static void minimize(int64_t stages, const double *mats, double h, const Factor *factors,
                      const double *qx, const double *r, double *dx, double *dw) {
     double p[12], t[18];
@@ -216,8 +216,8 @@ static void minimize(int64_t stages, const double *mats, double h, const Factor 
     }
 }
 
-/* Gradient (D, 6) with respect to the inputs alone, states eliminated, for gradients qx and r.
- * Return its largest absolute value; NaN if any value is. */
+/* Compute the gradient (D, 6) by the inputs alone, states eliminated, from the gradients qx and
+ * r. Return its largest absolute value; NaN if any value is. */
 static double reduced_gradient(int64_t stages, const double *mats, double h, const double *qx,
                                const double *r, double *out) {
     double p[12], t[18], greatest = 0.0;

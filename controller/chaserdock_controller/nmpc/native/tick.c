@@ -1,13 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* One tick of the real-time iteration for all chasers: rollout and linearization, rows, then one QP
- * per chaser. */
+/* One tick of the real-time iteration for all chasers: rollout, linearization and rows, then
+ * one QP per chaser. */
 #include "base.h"
 
-/* inputs (N, D, 6): initial plan, replaced by the solution; states (N, 13); reach (D+1,):
- * displacement by each stage for 1 N on each axis, m; w1 (N,): slack weights. `budget`: total
- * iterations; each chaser may use an even share of the remaining ones, at most `most`. code
- * and iterations (N,) are outputs; a chaser whose inputs would not be finite keeps those given,
- * with code BROKEN. */
+/* Arguments of a tick. inputs (N, D, 6): initial plan, replaced by the solution. states (N,
+ * 13). reach (D+1,): displacement by each stage per 1 N on each axis, m. w1 (N,): slack
+ * weights. budget: total iterations; each chaser may use an even share of the remaining ones,
+ * at most `most`. code, iterations (N,): outputs. A chaser whose inputs would not be finite
+ * keeps the given ones and gets the code BROKEN. */
 typedef struct {
     const Model *model;
     const Problem *problem;
@@ -18,7 +18,7 @@ typedef struct {
 } Tick;
 LAYOUT(Tick, model, problem, states, reach, w1, inputs, w2, budget, most, code, iterations)
 
-/* Rows of a chaser; `extra`: cuboids and coasts. */
+/* Return the number of rows of a chaser. `extra`: number of cuboids and coasts. */
 static int64_t tick_width(int64_t n, int64_t d, int64_t extra) { return d * (n + 2 + extra); }
 
 EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d, int64_t extra) {

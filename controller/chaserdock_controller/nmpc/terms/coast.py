@@ -3,9 +3,9 @@
 outside the keep-out.
 
 The coast from a stage is linear in the state there (chaserdock_models/passive_safety.py). At the
-moments of its closest approaches the keep-out sphere, enlarged by the covariance, is replaced by
-its tangent plane across the line from the target: a condition that is linear in the state, and
-sufficient at that moment. Only chasers whose plans without these rows are not safe have them.
+times of its closest approaches the keep-out sphere, enlarged by the covariance, is replaced by its
+tangent plane across the line from the target. This condition is linear in the state and sufficient
+at that time. Only chasers whose plans are unsafe without these rows have them.
 """
 
 from __future__ import annotations
@@ -23,29 +23,31 @@ from chaserdock_controller.nmpc.term import Constraint, address_of, pointer
 from chaserdock_controller.nmpc.types import CoastSafety, NmpcInput
 
 COASTS = 3
-"""Number of approaches of a coast that are restricted."""
+"""Number of closest approaches per coast that are restricted."""
 SPARE_SHARE = 0.05
-"""Share of the required margin that plans keep in addition: the approaches, and with them the
-planes, move as a plan is bent.
+"""Share of the required margin that plans keep in addition, because approaches and planes move as a
+plan is bent.
 """
 
 
 @dataclass(frozen=True)
 class PassiveCoasts(Constraint):
-    """The coast from every stage stays outside of the keep-out, as half-spaces of position and
-    velocity that `rti` asks for where a plan without them is not safe. Only `rti` keeps it.
+    """Keeps the coast from every stage outside the keep-out, by half-spaces of position and
+    velocity.
+
+    `rti` adds them where a plan without them is unsafe; other back ends do not keep them.
     """
 
     MEMBERS = (("n_coasts", c_int64), pointer("coasts"))
 
     def native(self, problem: NmpcInput) -> Sequence[Any]:
-        """Return the number of coasts at a stage, and their address."""
+        """Return the number of coasts per stage, and their address."""
         coasts = problem.coasts
         return (0, None) if coasts is None else (coasts.shape[2], address_of(coasts))
 
 
 def certify(safety: CoastSafety, states: Array, targets: Array) -> dict[int, CoastCertificate]:
-    """Return the certificates of the restricted rows of plans ``states`` (N, D+1, 13); ``targets``
+    """Return the certificates of the restricted rows of plans ``states`` (N, D+1, 13). ``targets``:
     as in ``coast_rows``.
     """
     origin = _origin(safety, targets)
@@ -56,8 +58,8 @@ def certify(safety: CoastSafety, states: Array, targets: Array) -> dict[int, Coa
 
 
 def unsafe_rows(safety: CoastSafety, found: Mapping[int, CoastCertificate]) -> CoastSafety | None:
-    """Return the restriction of those rows whose certificates ``found`` lack the margin; None if
-    none does.
+    """Return the restriction of the rows whose certificates ``found`` lack the margin; None if none
+    does.
     """
     least = _planned_sigmas(safety)
     kept = {i: c for i, c in safety.covariances.items() if not found[i].margin_sigmas >= least}
@@ -69,16 +71,17 @@ def _planned_sigmas(safety: CoastSafety) -> float:
 
 
 def _origin(safety: CoastSafety, targets: Array) -> Array:
-    """Return the target's positions and velocities (K, 6) at its positions (K, 3)."""
+    """Return the target's positions and velocities (K, 6) for its positions (K, 3)."""
     return np.concatenate([targets, np.tile(safety.target_velocity_m_s, (len(targets), 1))], axis=1)
 
 
 def coast_rows(safety: CoastSafety, states: Array, targets: Array, horizon_s: float) -> Array:
-    """Return half-spaces (N, D+1, C, 7) as in `NmpcInput` about plans ``states`` (N, D+1, 13).
+    """Return half-spaces (N, D+1, C, 7) as in `NmpcInput`, linearized about plans ``states`` (N,
+    D+1, 13).
 
     ``targets`` (D+1, 3): positions of the target. Rows are scaled so that a displacement by 1 m, or
-    the change of velocity that makes it within the horizon, changes a row by at most about 1: they
-    are priced as the distances are.
+    the change of velocity that causes it within the horizon, changes a row by about 1 at most. They
+    are thus priced like the distances.
     """
     n, nodes, _ = states.shape
     rows = np.zeros((n, nodes, COASTS, 7))

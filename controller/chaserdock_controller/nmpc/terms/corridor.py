@@ -22,13 +22,18 @@ from chaserdock_controller.nmpc.term import (
 from chaserdock_controller.nmpc.types import NmpcInput
 
 _UNIT_TOLERANCE = 1e-6
-"""Largest deviation of an axis from unit length: guidance normalizes it, so more is an error."""
+"""Largest deviation of an axis from unit length. Guidance normalizes it, so that more is an
+error.
+"""
 
 
 @dataclass(frozen=True)
 class CorridorCone(ChaserConstraint):
-    """The distance from the surface of the cone, positive inside, is not negative. In C: the plane
-    that touches the cone where the chaser is nearest, `corridor_room` in native/planes.c.
+    """Keeps the chaser inside the cone: its distance from the surface, positive inside, is not
+    negative.
+
+    In C: the plane that touches the cone where the chaser is nearest, `corridor_room` in
+    native/planes.c.
     """
 
     MEMBERS = (pointer("corridors"),)
@@ -49,7 +54,7 @@ class CorridorCone(ChaserConstraint):
         return {"corridors": corridors}
 
     def of_lost(self, problem: NmpcInput, margins_m: Sequence[float]) -> Mapping[str, Array | None]:
-        """Return corridors with none for lost chasers."""
+        """Return the corridors extended by none for lost chasers."""
         corridors = problem.corridors
         if corridors is None:
             return {}

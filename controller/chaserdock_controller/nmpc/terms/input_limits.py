@@ -14,15 +14,15 @@ from chaserdock_controller.nmpc.term import Constraint, address_of, checked_arra
 from chaserdock_controller.nmpc.types import NmpcInput
 
 LIMIT_OF_LOST = 1e-3
-"""Input limit (N, N m) of a lost chaser's row: the solver needs some, and this much moves it by a
-millimetre.
+"""Input limit (N, N m) of a lost chaser's row. The solver needs a positive one; this moves the
+chaser by a millimetre.
 """
 
 
 @dataclass(frozen=True)
 class InputLimits(Constraint):
-    """|u| <= input_max on each axis: hard, and met to the last bit by every back end, as bounds of
-    its variables.
+    """Keeps |u| <= input_max on each axis. Hard: back ends treat it as bounds of their variables
+    and meet it to the last bit.
     """
 
     MEMBERS = (pointer("limits"),)

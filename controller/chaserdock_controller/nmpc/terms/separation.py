@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The distance between two chasers (paper, 4c), of their centres and of their shapes."""
+"""The distances between two chasers (paper, 4c): of their centres and of their shapes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from chaserdock_controller.nmpc.types import NmpcInput
 
 @dataclass(frozen=True)
 class Separation(PairConstraint):
-    """|p - p_other| >= min_distance_chasers_m, and where min_distance_shapes_m is positive, at
-    least what two shapes need for that distance along the line between the centres. In C: a plane
-    between the two, half the distance to each side, `pair_rows` in native/planes.c. Only `rti`
-    keeps the distance of shapes, which have no smooth distance.
+    """Keeps |p - p_other| >= min_distance_chasers_m. Where min_distance_shapes_m is positive, also
+    at least what two shapes need for that distance along the line between the centres.
+
+    In C: a plane between the two, half the distance to each side, `pair_rows` in native/planes.c.
+    Only `rti` keeps the distance of shapes, because that is not smooth.
     """
 
     MEMBERS = (pointer("between"), pointer("apart"), ("n_shape", c_int64), pointer("shape"))
@@ -46,8 +47,8 @@ class Separation(PairConstraint):
         return checked
 
     def of_lost(self, problem: NmpcInput, margins_m: Sequence[float]) -> Mapping[str, Array | None]:
-        """Return the distances with the largest of them and its margin for a lost chaser; lost ones
-        ignore each other.
+        """Return the distances extended by lost chasers: to others the largest of the distances
+        plus the margin, none between lost ones.
         """
         n, apart = len(problem.states), problem.min_distance_shapes_m
         return {

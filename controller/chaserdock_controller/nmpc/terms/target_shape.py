@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cuboids of the target's shape that chasers' shapes stay clear of."""
+"""The cuboids of the target's shape, from which chasers' shapes keep clear."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from chaserdock_controller.nmpc.types import NmpcInput
 
 @dataclass(frozen=True)
 class ShapeClearance(Constraint):
-    """The distance of a chaser's shape from each cuboid is at least box_clearance_m; 0 switches it
-    off. In C: a plane between both, normal to the line from the cuboid's nearest point to the
-    chaser's centre, `box_rows` in native/planes.c. Only `rti` keeps it: the distance is not smooth.
+    """Keeps a chaser's shape at least box_clearance_m from each cuboid; 0 switches it off.
+
+    In C: a plane between both, normal to the line from the cuboid's nearest point to the chaser's
+    centre, `box_rows` in native/planes.c. Only `rti` keeps it, because the distance is not smooth.
     """
 
     MEMBERS = (("n_boxes", c_int64), pointer("boxes"), pointer("clearance"))

@@ -254,12 +254,11 @@ typedef struct {
     float fx, fy, cx, cy, sun[3], across[3], along[3], sun_share, ambient, lamp, white;
 } Shading;
 
-/* Look of the textures (chosen): texels of the map of wrinkles per metre; pitch of solar cells, and
- * gap between two, m. */
+/* Texels of the map of wrinkles per metre of foil: wrinkles are some 12 mm wide. */
 #define WRINKLE_PER_M 640.0f
-/* See above. */
+/* Pitch of solar cells, m. Smaller: more lines that the known mesh of a target does not have. */
 #define CELL_M 0.04f
-/* See above. */
+/* Gap between two solar cells, m. Wider: stronger lines. */
 #define GAP_M 0.0016f
 
 /* Length of [a - h, a + h] that is within GAP_M / 2 of a multiple of CELL_M, over its length. */

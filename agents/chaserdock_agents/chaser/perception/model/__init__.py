@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the target from its shape alone: analysis by synthesis with a tracker mesh
-(docs/markerless.md).
+"""Estimate the pose of the target from its shape alone, by analysis by synthesis with a tracker
+mesh (docs/markerless.md).
 """

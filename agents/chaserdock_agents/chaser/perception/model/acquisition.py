@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the target's pose in an image without a prior.
 
-Silhouettes of the tracker mesh from attitudes spread over all rotations, normalized to one size,
-are compared with the image's region of the target; the best are compared by how well some light
-explains their grey levels, and refined by the tracker. That region stands out by its brightness or,
-in front of the Earth, by its sharp edges.
+The target's region in the image stands out by its brightness or, in front of the Earth, by its
+sharp edges. Silhouettes of the tracker mesh, from attitudes spread over all rotations and
+normalized to one size, are compared with it. The best are compared by how well some light explains
+their grey levels, and refined by the tracker.
 """
 
 from __future__ import annotations
@@ -31,92 +31,91 @@ from .tracking import is_valid, levels_of, pose_steps, rough_prior_steps, turn_b
 
 @dataclass(frozen=True)
 class AcquisitionParameters:
-    """Numbers of a search without a prior, chosen by benchmarks/perception.py (``shape``).
+    """Parameters of a search without a prior, tuned by benchmarks/perception.py (``shape``).
 
-    Half and twice: what happens to the five views of five that are acquired with these.
+    Five of five views are acquired with these; comments state what half and twice a value change.
     """
 
-    # Silhouettes at each distance, spread over all attitudes: about 17 degrees apart. Half, twice:
-    # 5 and 5 acquired; half takes twice the time, as more starts fail; twice takes 3.4 instead of
-    # 1.6 s to prepare.
+    # Silhouettes at each distance, about 17 degrees apart. Half: 5 acquired, in twice the time, as
+    # more starts fail; twice: 5, with 3.4 instead of 1.6 s to prepare.
     templates: int = 3000
     # Side of a silhouette, px. Half: 4 acquired; twice: 5, with twice the time to prepare.
     side_px: int = 40
-    # Root mean square distance of the pixels of a normalized silhouette from its centre: with it a
+    # Root mean square distance of a normalized silhouette's pixels from its centre, px: with it a
     # long one fits into ``side_px``.
     spread_px: float = 8.0
-    # Distances of the templates in radii of the target, far and near ones: perspective changes near
+    # Distances of the far and the near templates, in radii of the target: perspective changes near
     # silhouettes.
     distances_radii: tuple[float, float] = (6.0, 2.2)
-    # Distance in radii from which on the near ones are used: between both, on a logarithmic scale.
+    # Distance, in radii, below which near templates are used: the middle of both on a logarithmic
+    # scale.
     near_radii: float = 3.6
     # Attitudes kept by their silhouettes. Half and twice: the same poses.
     by_silhouette: int = 250
     # Of these, attitudes kept by how well light explains the grey levels. Half: the same poses;
-    # twice: half as much time again.
+    # twice: 1.5 times the time.
     by_light: int = 24
-    # Of these, most starts that are refined in full. Half and twice: the same poses.
+    # Most of these that are refined in full. Half and twice: the same poses.
     full: int = 6
-    # Points of a silhouette that directions of the sun are rated by. Half and twice: the same
+    # Points of a silhouette by which directions of the sun are rated. Half and twice: the same
     # poses.
     template_points: int = 100
-    # Directions of the sun that they are rated for: 20 degrees apart. Half and twice: the same
+    # Directions of the sun for which they are rated, 20 degrees apart. Half and twice: the same
     # poses.
     template_suns: int = 100
-    # Weight of the mean squared residual of grey levels against twice the share of the silhouette
-    # that differs. Half and twice: the same poses.
+    # Weight of the mean squared residual of grey levels; twice the share of the silhouette that
+    # differs is added to it. Half and twice: the same poses.
     by_light_weight: float = 0.1
-    # Finest level of the pyramid at which appearances are compared: half resolution, at which noise
+    # Finest level of the pyramid at which appearances are compared: half resolution, where noise
     # hardly counts.
     appearance_level: int = 1
-    # Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over
-    # bright parts of the Earth.
+    # Least slope of edges that clouds do not have, grey levels per pixel: over dark and over bright
+    # parts of the Earth.
     sharp_per_px: tuple[float, float] = (1.5, 4.0)
-    # Assumed places of a silhouette that leaves the image: shifts of its centre towards one of
-    # those sides, in rms radii of what is visible,
+    # Of a silhouette that leaves the image, assumed shifts of the centre towards the side where it
+    # leaves it, in rms radii of the visible part,
     cut_shifts: tuple[float, ...] = (0.3, 0.6)
-    # and ratios of its rms radius to that.
+    # and assumed rms radii, relative to the visible part's.
     cut_sizes: tuple[float, ...] = (1.0, 1.2, 1.4, 1.6)
-    # Common share of two regions of which only one is searched.
+    # Common share above which two regions are one, and only one is searched.
     same_region: float = 0.8
-    # Least area of a region, px: below it, silhouettes of ``side_px`` cannot be told apart. Half
-    # and twice: the same poses.
+    # Least area of a region, px: silhouettes of ``side_px`` cannot be told apart below it. Half and
+    # twice: the same poses.
     min_area_px: int = 60
-    # Grey levels by which a target is brighter than the median of the image: twice the noise of
+    # Least brightness of a target above the median of the image, grey levels: twice the noise of
     # dark pixels. Half and twice: 5 acquired.
     min_contrast: float = 5.0
-    # Poses whose scores differ by less explain the image about equally well. Half and twice: the
-    # same poses.
+    # Difference of scores below which poses explain the image about equally well. Half and twice:
+    # the same poses.
     ambiguous_score: float = 0.04
-    # Turn below which two poses are one: half the distance of the templates. Half and twice: the
-    # same poses.
+    # Rotation below which two poses are one: half the distance of the templates. Half and twice:
+    # the same poses.
     distinct_rad: float = math.radians(8.0)
-    # Once a pose has been found, coarse poses with a score lower than its own by this much are not
-    # refined.
+    # Once a pose has been found, coarse poses are not refined whose score is lower than its own by
+    # this.
     worse_start: float = 0.2
-    # Attitudes that are rated in one step, and places at which silhouettes are compared in one:
+    # Attitudes that are rated in one step: as many as its expected CPU time below allows.
     rated_at_once: int = 25
-    # they fill the CPU times below.
+    # Places at which silhouettes are compared in one step, likewise.
     fitted_at_once: int = 9
-    # Pixels of a region by which its place is computed; more change it by less than a pixel. Half
-    # and twice: 5 acquired, in the same time.
+    # Pixels by which a region's place is computed; more change it by less than a pixel. Half and
+    # twice: 5 acquired, in the same time.
     region_points: int = 10_000
-    # Expected CPU times of steps, ms, measured: to find the region of the target,
+    # Expected CPU time, ms, to find the region of the target. Measured, as the following three.
     region_ms: float = 10.0
-    # to compare it with the silhouettes at ``fitted_at_once`` places,
+    # Expected CPU time, ms, to compare the region with the silhouettes at ``fitted_at_once``
+    # places.
     silhouettes_ms: float = 20.0
-    # to rate suns for ``rated_at_once`` of them,
+    # Expected CPU time, ms, to rate suns for ``rated_at_once`` attitudes.
     rate_ms: float = 10.0
-    # to compare a synthetic view with the image.
+    # Expected CPU time, ms, to compare a synthetic view with the image.
     appearance_ms: float = 10.0
 
 
 _SEARCH = AcquisitionParameters()
 
 MIN_APPEARANCE = 0.85
-"""Gate of an acquisition: a smaller correlation of the synthetic view with the image rejects a
-pose.
-"""
+"""Gate of an acquisition: least correlation of the synthetic view with the image."""
 
 Found = tuple[Alignment, Lighting]
 """A pose that passes the gate, and its light."""
@@ -124,9 +123,12 @@ Found = tuple[Alignment, Lighting]
 
 @dataclass(frozen=True)
 class _Templates:
-    """n normalized views: ``rotations`` (n, 3, 3); ``masks`` (n, pixels) float32; ``owners`` (n,
-    pixels) triangles or -1; of each silhouette: ``spread`` (n,) rms radius and ``centre`` (n, 2),
-    in units of the tangent of the angle at the distance."""
+    """n views of the mesh, normalized to one size.
+
+    ``rotations`` (n, 3, 3): TRF to camera. ``masks`` (n, pixels): silhouettes, float32. ``owners``
+    (n, pixels): triangles, -1 for none. ``spread`` (n,): rms radius of each silhouette, and
+    ``centre`` (n, 2): its centre, in tangents of angles. ``distance_m``: of the views.
+    """
 
     rotations: Array
     masks: NDArray[np.float32]
@@ -138,9 +140,12 @@ class _Templates:
 
 @dataclass(frozen=True)
 class _SilhouetteFit:
-    """A region compared with n templates: its assumed centre ``middle`` (2,) and rms radius
-    ``spread``, tangents of angles; ``mask`` and ``grey`` (pixels,) on the grid of the templates;
-    ``overlap`` (n,): common share of both silhouettes, 0 to 1."""
+    """A region of the image compared with n templates.
+
+    ``middle`` (2,), ``spread``: assumed centre and rms radius, tangents of angles. ``mask``,
+    ``grey`` (pixels,): the region on the grid of the templates. ``overlap`` (n,): common share of
+    both silhouettes, 0 to 1.
+    """
 
     middle: Array
     spread: float
@@ -160,8 +165,9 @@ def spread_rotations(n: int) -> Array:
 
 
 class Acquisition:
-    """Searches for one target in the images of one camera. The templates are rendered when they are
-    first needed.
+    """Search for one target in the images of one camera.
+
+    The templates are rendered when they are first needed.
     """
 
     def __init__(self, camera: Camera, mesh: TrackerMesh) -> None:
@@ -176,15 +182,17 @@ class Acquisition:
         )
 
     def prepare(self) -> None:
-        """Render the templates, if that has not been done; takes about two seconds."""
+        """Render the templates unless that has been done; takes about two seconds."""
         if not self._templates:
             self._templates = tuple(
                 _make_templates(self._mesh, radii) for radii in _SEARCH.distances_radii
             )
 
     def find(self, image: NDArray[np.uint8]) -> tuple[Found, ...]:
-        """Return the alignments that pass the gate, and their light, best first; several if they
-        explain the image about equally well."""
+        """Return the alignments that pass the gate with their light, best first.
+
+        Several, if they explain the image about equally well.
+        """
         return result_of(self.search(Pyramid(image, self._camera)))
 
     def search(self, pyramid: Pyramid) -> Steps[tuple[Found, ...]]:
@@ -195,7 +203,7 @@ class Acquisition:
         bright = _brightest_region(level)
         if bright is None:
             return ()
-        # In front of the Earth the brightest region is the Earth, which leaves the image.
+        # In front of the Earth the brightest region is the Earth itself, which leaves the image.
         behind = _touches_border(bright)
         if not behind:
             found = yield from self._search_in(pyramid, bright)
@@ -220,6 +228,7 @@ class Acquisition:
         if region is None:
             return ()
         candidates = yield from self._candidates(pyramid, region)
+
         coarse: list[Alignment] = []
         for pose in candidates:
             levels = levels_of(pyramid, self._mesh, pose)
@@ -229,6 +238,7 @@ class Acquisition:
             if light is not None:
                 aligned = yield from pose_steps(pyramid, self._mesh, pose, light, levels[:1])
                 coarse += [aligned] if aligned is not None else []
+
         coarse.sort(key=lambda a: -a.score)
         fine: list[Found] = []
         tried: list[PoseInCamera] = []
@@ -248,6 +258,7 @@ class Acquisition:
             if self._looks_right(pyramid, *refined):
                 least = max(least, start.score - _SEARCH.worse_start)
                 fine.append(refined)
+
         fine.sort(key=lambda found: -found[0].score)
         return tuple(f for f in fine if f[0].score > fine[0][0].score - _SEARCH.ambiguous_score)
 
@@ -266,7 +277,7 @@ class Acquisition:
         px = camera.undistort(np.column_stack([x, y]).astype(float))
         ideal = (px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
         ideal = ideal[np.isfinite(ideal).all(axis=1)]
-        # In the axes of a camera that looks at the centre of the region.
+        # Work in the axes of a camera that looks at the centre of the region.
         centre = np.append(ideal.mean(axis=0), 1.0)
         towards = _look_at(centre)
         rays = np.column_stack([ideal, np.ones(len(ideal))]) @ towards.T
@@ -292,7 +303,8 @@ class Acquisition:
         poses = []
         for i in likely[np.argsort(errors)[: _SEARCH.by_light]]:
             fit = fits[chosen[i]]
-            # The same silhouette at another distance: sizes are inversely proportional to it.
+            # The same silhouette seen from another distance: sizes are inversely proportional to
+            # it.
             ratio = t.spread[i] / fit.spread
             aside = fit.middle - t.centre[i] / ratio
             position = t.distance_m * ratio * np.append(aside, 1.0)
@@ -308,8 +320,11 @@ class Acquisition:
     def _places(
         self, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
     ) -> list[tuple[Array, float]]:
-        """Return the centre and the rms radius of the silhouette that a region shows: several for
-        one that leaves the image.
+        """Return possible centres (2,) and rms radii of the target's silhouette that a region
+        shows.
+
+        One for a region within the image; several for one that leaves it, as the hidden part is
+        assumed.
         """
         if not _touches_border(region):
             return [(middle, spread)]
@@ -320,14 +335,16 @@ class Acquisition:
         return [(centre, size * spread) for centre in centres for size in _SEARCH.cut_sizes]
 
     def _fits(
-        self, t: _Templates, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, places: list[tuple[Array, float]]
+        self, t: _Templates, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array,
+        places: list[tuple[Array, float]],
     ) -> list[_SilhouetteFit]:  # fmt: skip
-        """Compare a region with the silhouettes, inside the image, for each centre and rms radius
-        in ``places``.
+        """Compare a region with the silhouettes, inside the image, for each of ``places``.
+
+        A place is the centre (2,) and the rms radius of the silhouette, tangents of angles.
         """
         seen = [self._normalized(pyramid, region, towards, *place) for place in places]
         masks = np.array([mask for mask, _, _ in seen])
-        # One product, as reading the templates takes the most time.
+        # One matrix product for all places, as reading the templates takes the most time.
         product = t.masks @ np.concatenate([masks, [visible for _, _, visible in seen]]).T
         common, inside = product[:, : len(places)].T, product[:, len(places) :].T
         overlaps = common / np.maximum(inside + masks.sum(axis=1, keepdims=True) - common, 1.0)
@@ -346,15 +363,16 @@ class Acquisition:
         middle: Array,
         spread: float,
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.float32]]:
-        """Return the region's mask, the image, and a mask of what is inside the image, each
-        (pixels,) on the grid of the templates.
+        """Return the region, the image and the inside of the image on the grid of the templates.
+
+        Each (pixels,): mask, grey levels, mask.
         """
         step = spread / _SEARCH.spread_px
         axis = (np.arange(_SEARCH.side_px) - (_SEARCH.side_px - 1) / 2.0) * step
         u, v = np.meshgrid(axis + middle[0], axis + middle[1])
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ towards
         px = self._camera.project(rays).astype(np.float32)
-        # Averaged over about the area of a pixel of the template.
+        # Use the level whose pixels have about the area of a pixel of the template.
         level = max(0, min(4, int(math.log2(max(step * self._camera.fx_px, 1.0)))))
         scale = 0.5**level
         at = (px + 0.5) * scale - 0.5
@@ -373,7 +391,7 @@ class Acquisition:
         )
 
     def _unexplained(self, t: _Templates, i: int, fit: _SilhouetteFit) -> float:
-        """Return the share of the grey levels that no light explains, plus that of the
+        """Return the error of a template: grey levels that no light explains, plus differing
         silhouette.
         """
         inside = np.flatnonzero((t.owners[i] >= 0) & (fit.mask > 0.0))
@@ -390,9 +408,7 @@ class Acquisition:
 
 
 def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
-    """Return the mask (h, w) of what is brighter than the background, in one connected region; None
-    without any.
-    """
+    """Return the mask (h, w) of the largest connected region brighter than the background, or None."""
     level = float(np.median(image)) + _SEARCH.min_contrast
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     bright = cv2.morphologyEx(
@@ -402,8 +418,9 @@ def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
 
 
 def _border_sides(region: NDArray[np.uint8]) -> list[tuple[float, float]]:
-    """Return the directions, right and down, of the sides of the image that a mask (h, w) reaches,
-    and of corners between two.
+    """Return the directions (right, down) of the image's sides that a mask (h, w) reaches.
+
+    Includes the corner between two reached sides.
     """
     edges = (region[:, 0], region[:, -1], region[0], region[-1])
     sides = ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
@@ -434,10 +451,10 @@ def _largest_region(mask: NDArray[Any]) -> NDArray[np.uint8] | None:
 
 
 def _sharp_region(image: NDArray[np.float32], slope: float) -> NDArray[np.uint8] | None:
-    """Return the mask (h, w) of the largest region within edges of at least ``slope`` grey levels
-    per pixel; None without any.
+    """Return the mask (h, w) of the largest region within sharp edges, or None.
 
-    The Earth has no sharp edges but its limb, which is a thin line.
+    ``slope``: least slope of an edge, grey levels per pixel. The Earth has no sharp edges but its
+    limb, which is a thin line.
     """
     smooth = cv2.GaussianBlur(image, (0, 0), 1.2)
     gx, gy = (
@@ -454,14 +471,12 @@ def _sharp_region(image: NDArray[np.float32], slope: float) -> NDArray[np.uint8]
     opened = cv2.morphologyEx(
         filled, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     )
-    # Edges are found up to a pixel outside.
+    # Edges are found up to a pixel outside of the target: shrink by one.
     return _largest_region(cv2.erode(opened, np.ones((3, 3), np.uint8)))
 
 
 def _look_at(ray: Array) -> Array:
-    """Return the rotation (3, 3) from IRF to axes whose z points along ``ray``, by the smallest
-    turn.
-    """
+    """Return the rotation (3, 3) from IRF to axes whose z points along ``ray``, of smallest angle."""
     z = ray / np.linalg.norm(ray)
     axis = np.cross(z, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
@@ -475,12 +490,14 @@ def _make_templates(mesh: TrackerMesh, radii: float) -> _Templates:
     light = Lighting(np.array([0.0, 0.0, -1.0]), shadows=False)
     masks = np.zeros((_SEARCH.templates, _SEARCH.side_px**2), dtype=np.float32)
     owners = np.full((_SEARCH.templates, _SEARCH.side_px**2), -1, dtype=np.int16)
+
     turns, spread, centre = (
         np.empty((_SEARCH.templates, 3, 3)),
         np.empty(_SEARCH.templates),
         np.empty((_SEARCH.templates, 2)),
     )
     middle, whole = (_SEARCH.side_px - 1) / 2.0, 0.45 * _SEARCH.side_px * math.sqrt(radii**2 - 1.0)
+
     for i, q in enumerate(quaternions):
         pose = PoseInCamera(np.array([0.0, 0.0, distance]), rotations.to_matrix(q))
         view = render(
@@ -493,6 +510,8 @@ def _make_templates(mesh: TrackerMesh, radii: float) -> _Templates:
         flat = np.column_stack([x - middle, y - middle]) / whole
         centre[i] = flat.mean(axis=0)
         spread[i] = math.sqrt(float(((flat - centre[i]) ** 2).sum(axis=1).mean()))
+
+        # Render the view again, centred and scaled to the common size.
         focal = _SEARCH.spread_px / spread[i]
         lens = (focal, focal, middle - focal * centre[i, 0], middle - focal * centre[i, 1])
         view = render(

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Align a synthetic view of the tracker mesh with an image: pose, covariance and the share of
-inliers.
+"""Align a synthetic view of the tracker mesh with an image: pose, covariance and share of inliers.
 
-Control points are gradient maxima of the synthetic view; their profiles are found in the image by
+Control points are gradient maxima of the synthetic view. Their profiles are found in the image by
 signed correlation and give the pose by robust least squares (native/align.c).
 """
 
@@ -29,72 +28,76 @@ from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 
 @dataclass(frozen=True)
 class AlignmentParameters:
-    """Numbers of the alignment of control points, chosen by benchmarks/perception.py (``shape``).
+    """Parameters of the alignment of control points, tuned by benchmarks/perception.py (``shape``).
 
-    Half and twice: median error of twelve views at 0.9 to 4 m from a prior 1 % and 1.5 degrees off,
-    0.106 % of the range with these.
+    The median error of twelve views at 0.9 to 4 m, from a prior 1 % and 1.5 degrees off, is 0.106 %
+    of the range with these. Comments state the error at half and at twice a value.
     """
 
-    # Samples of a profile, and most control points of a cell: PROFILE
+    # Samples of a profile: PROFILE in native/align.c.
     profile: int = 9
-    # and PER_CELL_MOST in native/align.c.
+    # Capacity for the control points of a cell: PER_CELL_MOST in native/align.c.
     per_cell_most: int = 4
-    # Control points are spread over cells of this side, px: about a profile. Half: 0.109; twice:
-    # 0.106 %.
+    # Side of the cells over which control points are spread, px: about a profile. Half: 0.109;
+    # twice: 0.106 %.
     cell_px: int = 8
-    # Most control points of a cell, so that two edges in it count. Half: 0.133; twice: 0.102 %.
+    # Most control points that a cell keeps: two, so that two edges in it count. Half: 0.133; twice:
+    # 0.102 %.
     per_cell: int = 2
-    # Least gradient of control points, grey levels per pixel, in light from everywhere and in
-    # estimated light. In a dim image, noise hides weaker edges, which would count as outliers.
+    # Least gradient of control points, grey levels per pixel, in even light and in estimated light.
+    # In a dim image, noise hides weaker edges, which would count as outliers.
     least_gradient: tuple[float, float] = (0.5, 1.5)
-    # Border of a window around the target, px: reach of the search and half a profile.
+    # Border of a window around the target, px: the largest search and half a profile.
     margin_px: int = 14
     # Least correlation of a profile with the image. Half: 0.107 %.
     min_correlation: float = 0.6
-    # Standard deviation of a grey level by noise and by texture that the mesh does not have.
+    # Standard deviation of a grey level by noise, and by texture that the mesh does not have.
     noise: float = 2.0
-    # The same as ``INLIER_PX`` while errors of the geometry are not estimated yet: they displace
-    # points by pixels. Half: 0.106 %; twice: the same.
+    # ``INLIER_PX`` while errors of the geometry are not estimated yet, as these displace points by
+    # pixels. Half: 0.106 %; twice: the same.
     displaced_inlier_px: float = 5.0
-    # Reach of the search, px, after they are: twice ``INLIER_PX``. A third: 0.101; twice: 0.103 %.
+    # Reach of the search once they are estimated, px: twice ``INLIER_PX``. A third: 0.101; twice:
+    # 0.103 %.
     refined_reach_px: int = 3
     # Distance from an edge, px, at which the surfaces beside it are looked up.
     beside_px: float = 3.0
-    # Number of neighbouring control points that err together, so that their information counts
-    # once: fitted to the errors of poses (NEES, docs/evidence/markerless.md).
+    # Number of neighbouring control points whose errors are equal, so that their information counts
+    # once. Fitted to the errors of poses (NEES, docs/evidence/markerless.md).
     correlated_points: float = 5.5
-    # Largest number of points that count: shading and facets that the mesh does not have do not
-    # become more accurate with more pixels.
+    # Most control points that count as independent: shading and facets that the mesh does not have
+    # do not become more accurate with more pixels.
     independent_most: float = 60.0
     # The same on a side in the shade, or with the sun behind the target, where it brightens rims,
-    # which move together;
+    # which are displaced together.
     independent_dim: float = 25.0
-    # and least z in IRF of the direction of such a sun.
+    # Least z in IRF of the direction to a sun that counts as behind the target.
     behind_z: float = 0.3
 
 
 _MATCH = AlignmentParameters()
 
 INLIER_PX = 1.5
-"""Largest distance of a match from the pose, pixels of the level, at which it counts (Tukey's
-cut-off): half the width of an edge with its spread. Of twelve views half loses two, twice errs by
-0.120 instead of 0.106 % of the range.
+"""Largest distance (px of the level) of a match from the pose at which it counts: Tukey's cut-off.
+
+Half the width of an edge with its spread. Of twelve views half loses two; twice errs by 0.120
+instead of 0.106 % of the range.
 """
 MIN_POINTS = 24
-"""Least number of control points, and of those that count: four for each unknown of a pose. Half
-and twice: the same poses.
+"""Least number of control points, of those in the image, and of those that count: four for each
+unknown of a pose. Half and twice: the same poses.
 """
 NEAR_PX = 1300.0
 """Diameter of the target in the image, in pixels of level 0, beyond which it shows texture that the
 mesh does not have.
 """
 _SPREAD_PX = {0: 0.6, 1: 0.45, -1: 1.2}
-"""Standard deviation, in pixels of a level, of the point spread that the synthetic view gets."""
+"""Point spread of the synthetic view by level: standard deviation in pixels of the level."""
 
 
 class Pyramid:
-    """Levels of one image (h, w), uint8: level k has 2**-k as many pixels along each axis; made
-    when first used.
+    """Levels of one image (h, w), uint8, which are made when first used.
+
+    Level k has 2**-k times as many pixels along each axis.
     """
 
     def __init__(self, image: NDArray[np.uint8], camera: Camera) -> None:
@@ -119,7 +122,7 @@ class Pyramid:
         return self._levels[k]
 
     def lens(self, k: int) -> tuple[float, float, float, float]:
-        """Return fx, fy, cx, cy of level ``k``."""
+        """Return the lens of level ``k``: fx, fy, cx, cy, px."""
         c, scale = self.camera, 0.5**k
         return (
             c.fx_px * scale,
@@ -131,11 +134,14 @@ class Pyramid:
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """n control points of a rendering: ``points_m`` (n, 3) and ``ahead_m`` (n, 3), a pixel further
-    along the gradient, in TRF; ``profiles`` (n, 9), grey levels; ``owners`` (n,): triangles;
-    ``level``; ``pose`` of the rendering; ``displaced_m`` (k, n, 3): displacements by the modes of
-    the mesh; ``border_m`` (n,): standard deviation of where each is seen; ``independent``: largest
-    number of them that count as independent."""
+    """n control points of a rendering.
+
+    ``points_m`` (n, 3): in TRF. ``ahead_m`` (n, 3): a pixel further along the gradient, in TRF.
+    ``profiles`` (n, 9): grey levels. ``owners`` (n,): triangles. ``level``, ``pose``: of the
+    rendering. ``displaced_m`` (k, n, 3): displacement by each mode of the mesh. ``border_m`` (n,):
+    standard deviation of where a point is seen. ``independent``: most of them that count as
+    independent.
+    """
 
     points_m: Array
     ahead_m: Array
@@ -150,10 +156,13 @@ class ControlPoints:
 
 @dataclass(frozen=True)
 class Alignment:
-    """An aligned pose: ``inlier_share`` of the points in the image, ``correlation``: mean of the
-    points in the image, -1 to 1; ``rms_px``: of the inliers, pixels of level 0; ``covariance`` (6,
-    6): as in `TargetPose`; ``modes`` (k,): estimated errors of the geometry in standard deviations;
-    ``geometry``: what the image alone tells about them."""
+    """Pose of the target aligned with an image.
+
+    ``inlier_share``: of the points in the image. ``correlation``: mean of the points in the image,
+    -1 to 1. ``rms_px``: residual of the inliers, pixels of level 0. ``covariance`` (6, 6): as in
+    `TargetPose`. ``modes`` (k,): estimated errors of the geometry in standard deviations.
+    ``geometry``: what the image alone tells about them.
+    """
 
     pose: PoseInCamera
     inlier_share: float
@@ -171,15 +180,16 @@ class Alignment:
 
 
 def diameter_px(camera: Camera, mesh: TrackerMesh, pose: PoseInCamera) -> float:
-    """Return the diameter of the target in the image."""
+    """Return the diameter of the target in the image, px of level 0."""
     return 2.0 * mesh.radius_m * camera.fx_px / float(np.linalg.norm(pose.position))
 
 
 def window_of(
     pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera
 ) -> tuple[PixelWindow, int, int] | None:
-    """Return the window of level ``k`` that the target can touch, and its first column and row;
-    None if it is out of view.
+    """Return the window of level ``k`` that the target can touch, and its first column and row.
+
+    None if the target is out of view.
     """
     at = mesh.vertices_m @ pose.rotation.T + pose.position
     at = at[at[:, 2] > 0.05]
@@ -203,7 +213,7 @@ def window_of(
 
 
 def area_px(pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera) -> float:
-    """Return the area of the window of level ``k``, 0 if the target is out of view."""
+    """Return the area, px, of the target's window of level ``k``; 0 if the target is out of view."""
     found = window_of(pyramid, k, mesh, pose)
     return float(found[0].height * found[0].width) if found else 0.0
 
@@ -219,6 +229,7 @@ def control_points(
     synthetic = render(mesh, pose, window, light)
     patch = image_window(pyramid, k, window, left, top)
     view, gain = in_grey_levels(synthetic, patch)
+
     spread = _SPREAD_PX.get(k, 0.4)
     view = np.asarray(cv2.GaussianBlur(view, (0, 0), spread), dtype=np.float32)
     h, w = view.shape
@@ -227,6 +238,7 @@ def control_points(
     points, ahead = np.empty((most, 3)), np.empty((most, 3))
     profiles, owners = np.empty((most, _MATCH.profile)), np.empty(most, dtype=np.int64)
     work = np.empty(h * w + cells * 5 * _MATCH.per_cell_most)
+
     vertices, triangles, _, _ = mesh.contiguous
     at = pose_array(pose)
     least = _MATCH.least_gradient[light.shadows]
@@ -234,9 +246,12 @@ def control_points(
     n = function("control_points", c_int64)(
         address(view), address(synthetic.nearest), address(synthetic.owner), c_int64(h), c_int64(w),
         (c_double * 4)(*window.lens), address(at), address(vertices), address(triangles),
-        (c_double * 3)(_MATCH.cell_px, _MATCH.per_cell, min(max(0.02 * gain * brightness, least), 4.0)),
+        (c_double * 3)(
+            _MATCH.cell_px, _MATCH.per_cell, min(max(0.02 * gain * brightness, least), 4.0)
+        ),
         address(points), address(ahead), address(profiles), address(owners), address(work),
     )  # fmt: skip
+
     if n < MIN_POINTS:
         return None
     points, owners = points[:n].copy(), owners[:n].copy()
@@ -245,6 +260,7 @@ def control_points(
     if used.sum() < MIN_POINTS:
         return None
     points, owners = points[used], owners[used]
+
     displaced, border = mesh.mode_displacements(owners, points), mesh.border_of(owners)
     behind = light.to_sun_irf is not None and light.to_sun_irf[2] > _MATCH.behind_z
     dim = behind or light.weak or (light.shadows and light.direct == 0.0)
@@ -263,10 +279,13 @@ def _on_textured(
     ahead: Array,
     near: bool,
 ) -> NDArray[np.bool_]:
-    """Return which points (n,) are edges between surfaces with the same pattern: the lines of a
-    grid of solar cells beside such an edge or, on a ``near`` target, wrinkles of foil, on which
-    shadows bend, move it to either side."""
-    # From farther away, shadows on foil help more than their bends hurt.
+    """Return which points (n,) are edges between surfaces with the same pattern, which displaces
+    them.
+
+    Beside such an edge, lines of a grid of solar cells move it to either side; on a ``near`` target
+    also wrinkles of foil, on which shadows bend.
+    """
+    # From farther away, shadows on foil give more information than their bends cost.
     patterns = (
         mesh.patterns if near else np.where(mesh.patterns == WRINKLES, NO_PATTERN, mesh.patterns)
     )
@@ -292,13 +311,13 @@ def image_window(
     image = pyramid.level(k)
     if not pyramid.camera.distortion:
         return image[top : top + window.height, left : left + window.width]
-    # The distortion is smooth: its map is computed on every eighth pixel.
+    # The distortion is smooth: map every eighth pixel only, and interpolate between them.
     rows, columns = -(-window.height // 8) + 1, -(-window.width // 8) + 1
     scale = 2.0**k
     v, u = np.mgrid[0:rows, 0:columns] * 8.0
     ideal = (np.stack([u + left, v + top], axis=-1) + 0.5) * scale - 0.5
     px = (pyramid.camera.distort(ideal) + 0.5) / scale - 0.5
-    # Of a linear interpolation, as corners of the coarse grid lie on pixels.
+    # Linear interpolation: corners of the coarse grid lie on pixels.
     to_coarse = np.array([[0.125, 0.0, 0.0], [0.0, 0.125, 0.0]])
     maps = cv2.warpAffine(
         px.astype(np.float32),
@@ -314,8 +333,7 @@ def image_window(
 def in_grey_levels(
     view: SyntheticView, patch: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], float]:
-    """Return a synthetic view (h, w) in grey levels of the image, with the image's background
-    behind it, and its gain.
+    """Return a synthetic view (h, w) in grey levels of the image, on its background, and its gain.
 
     ``patch`` (h, w): the image. The gain is the ratio of the means within the target. The
     background is a local mean of the image outside of the target and a border, so that it follows
@@ -350,11 +368,11 @@ def align(
     modes: Array | None = None,
     iterations: int = 6,
 ) -> Alignment | None:
-    """Align control points with an image, searching ``reach_px`` of their level around ``prior``;
-    None if that fails.
+    """Align control points with an image; None if that fails.
 
-    ``modes`` (k,): errors of the geometry as far as they are known. They are estimated with the
-    pose: points that they displace by more than the width of an edge would be outliers otherwise.
+    Searches within ``reach_px`` pixels of their level around ``prior``. ``modes`` (k,): errors of
+    the geometry as far as they are known. They are estimated with the pose: points that they
+    displace by more than the width of an edge would be outliers otherwise.
     """
     k = len(points.displaced_m)
     known = np.zeros(k) if modes is None or len(modes) != k else modes
@@ -373,8 +391,11 @@ def align(
 
 @dataclass(frozen=True)
 class _Matches:
-    """Result of align_points (native/align.c) for n points: ``pose``, ``inside``: number of points
-    in the image; ``residual`` (n,), ``weight`` (n,), ``correlation`` (n,), ``rows`` (n, 6)."""
+    """Matches of n points found by align_points (native/align.c).
+
+    ``pose``; ``inside``: number of points in the image; ``residual``, ``weight``, ``correlation``
+    (n,); ``rows`` (n, 6).
+    """
 
     pose: PoseInCamera
     inside: int
@@ -388,8 +409,9 @@ def _match(
     pyramid: Pyramid, points: ControlPoints, modes: Array, prior: PoseInCamera, reach_px: int,
     iterations: int, inlier_px: float
 ) -> _Matches | None:  # fmt: skip
-    """Match the profiles of control points, displaced by ``modes``, and fit the pose; None for too
-    few matches.
+    """Match the profiles of control points, displaced by ``modes``, and fit the pose.
+
+    None with too few matches.
     """
     image = pyramid.level(points.level)
     n = len(points.points_m)
@@ -415,14 +437,12 @@ def _match(
 def _alignment(
     pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Matches
 ) -> Alignment | None:
-    """Estimate pose and errors of the geometry together from matches; None for a pose that is not
-    observable.
-    """
+    """Estimate pose and errors of the geometry together from matches; None if not observable."""
     used = found.weight > 0.0
     residual, weight, moved = found.residual[used], found.weight[used], found.rows[used, 3:]
     pose = found.pose
-    # A rotation phi in camera axes is R dtheta; a displacement in TRF moves a point as that of the
-    # position in IRF axes.
+    # By dtheta: a rotation phi in camera axes is R dtheta. By modes: a displacement in TRF moves a
+    # point as the rotated displacement of the position in IRF does.
     jacobian = np.concatenate([moved, found.rows[used, :3] @ pose.rotation], axis=1)
     shifts = np.einsum("ni,kni->nk", moved @ pose.rotation, points.displaced_m[:, used])
     solved = _solve(_Fit(residual, weight, jacobian, shifts, points.independent), modes)
@@ -441,9 +461,12 @@ def _alignment(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Linearized fit of m used control points at a pose: ``residual`` (m,) pixels, ``weight`` (m,),
-    ``jacobian`` (m, 6): of the residual by position (IRF) and rotation (TRF); ``shifts`` (m, k): of
-    each point, pixels, by the k modes of the geometry; ``independent``: as in `ControlPoints`."""
+    """Least-squares fit of m control points, linearized at a pose.
+
+    ``residual`` (m,): pixels. ``weight`` (m,). ``jacobian`` (m, 6): derivative of the residual by
+    position (IRF) and rotation (TRF). ``shifts`` (m, k): displacement of each point, pixels, by the
+    k modes of the geometry. ``independent``: as in `ControlPoints`.
+    """
 
     residual: Array
     weight: Array
@@ -453,12 +476,11 @@ class _Fit:
 
 
 def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] | None:
-    """Return the step (6 + k,) of pose and modes, the covariance (6, 6) of the pose, and the
-    information about the modes; None for a pose that is not observable.
+    """Return the step (6 + k,), the pose's covariance (6, 6) and the information about the modes.
 
-    The errors of the geometry have their standard deviations, 1, as prior knowledge around 0;
-    ``modes`` (k,) is where the fit is linearized. Control points near to each other err together,
-    which divides their information.
+    The step is of pose and modes; None for a pose that is not observable. The errors of the
+    geometry have standard deviation 1 as prior around 0; ``modes`` (k,) is where the fit is
+    linearized. Control points near to each other err together, which divides their information.
     """
     rows = np.concatenate([fit.jacobian, fit.shifts], axis=1)
     chi_square = float(fit.residual**2 @ fit.weight) / max(len(fit.residual) - 6, 1)
@@ -479,9 +501,12 @@ def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] 
 
 
 def _without_pose(information: Array, right: Array, modes: Array) -> GeometryInformation:
-    """Return the information about the modes (k,) of a fit (6 + k, 6 + k) that is linearized at
-    ``modes``, its Schur complement, and how the position depends on them, as a displacement from
-    where the fit is linearized."""
+    """Return what a fit tells about the modes whatever the pose: its Schur complement.
+
+    ``information`` (6 + k, 6 + k), ``right`` (6 + k,): normal equations linearized at ``modes``
+    (k,). Also states how the position depends on the modes, as a displacement from where the fit is
+    linearized.
+    """
     of_pose = np.asarray(np.linalg.pinv(information[:6, :6], hermitian=True), dtype=float)
     gain = information[6:, :6] @ of_pose
     matrix = information[6:, 6:] - gain @ information[:6, 6:]

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimated errors of the geometry: correct the tracker mesh by them, and state what an image tells
-about them.
-"""
+"""Correct the tracker mesh by its estimated errors, and express what an image tells about them."""
 
 from __future__ import annotations
 
@@ -17,14 +15,16 @@ from .mesh import TrackerMesh
 
 @dataclass(frozen=True, eq=False)
 class GeometryCorrection:
-    """Estimated errors (k,) of a mesh in its standard deviations, and their covariance (k, k)."""
+    """Estimated errors (k,) of a mesh, in standard deviations of these, and their covariance (k,
+    k).
+    """
 
     mean: Array
     covariance: Array
 
     @cached_property
     def factor(self) -> Array:
-        """Lower Cholesky factor (k, k) of the covariance: its columns are the modes of the
+        """Lower Cholesky factor (k, k) of the covariance; its columns are the modes of the
         corrected mesh.
         """
         return np.asarray(np.linalg.cholesky(self.covariance), dtype=float)
@@ -34,12 +34,12 @@ class GeometryCorrection:
         return np.array_equal(self.mean, mean)
 
     def applied(self, mesh: TrackerMesh) -> TrackerMesh:
-        """Return the mesh, of which these are the errors, after the correction."""
+        """Return ``mesh``, which has these errors, after the correction."""
         return mesh.corrected(self.mean, self.covariance)
 
     def of_uncorrected(self, found: GeometryInformation) -> GeometryInformation:
-        """Return information about the errors of the corrected mesh as information about those of
-        the mesh before.
+        """Convert information about the corrected mesh's errors to information about the
+        original's.
 
         With e = mean + C x for errors x of the corrected mesh, information L about x is C^-T L C^-1
         about e.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate the light on the target from the image, so that sun, eclipse and lamp need no ephemeris.
+"""Estimate the light on the target from the image, without an ephemeris for sun, eclipse and lamp.
 
 Each of several hundred directions of the sun is rated by how well its light explains the grey
 levels of points on the target, with cast shadows and highlights (native/light.c). The best one is
@@ -29,44 +29,48 @@ from .steps import LIGHT_MS, LIKELY_MS, SUNS_MS, VIEWS_MS, Steps, compared_ms
 
 @dataclass(frozen=True)
 class LightParameters:
-    """Numbers of the search for the light, chosen by benchmarks/perception.py (``shape``)."""
+    """Parameters of the search for the light, tuned by benchmarks/perception.py (``shape``).
 
-    # Points by which the light is estimated: the time grows with them.
+    Comments state the median error of poses at half and at twice a value; 0.106 % of the range with
+    these.
+    """
+
+    # Most points by which the light is estimated: the time grows with them.
     most_points: int = 600
-    # A target with fewer points away from edges has no estimate of its light. Half and twice: the
-    # same poses.
+    # Fewest points away from edges by which the light is estimated. Half and twice: the same poses.
     fewest_points: int = 40
-    # One of so many points rates directions all around.
+    # Step between the points by which directions all around are rated.
     every_point: int = 3
     # Least ambient level as a share of the directed one.
     least_ambient: float = 0.02
-    # Standard deviation of a grey level by noise and by facets, beside the texture's. Half: poses
-    # err by 0.098, twice: by 0.114 instead of 0.106 % of the range.
+    # Standard deviation of a grey level by noise and facets, in addition to texture. Half: 0.098;
+    # twice: 0.114 %.
     grey_noise: float = 3.0
-    # A direction is refined among eight at these angles, rad: two thirds and a quarter of the
-    # distance of the directions all around. Half: 0.124; twice: 0.102 %.
+    # Angles, rad, at which eight neighbours of a direction are tried: two thirds and a quarter of
+    # the distance of the directions all around. Half: 0.124; twice: 0.102 %.
     neighbours_rad: tuple[float, ...] = (0.12, 0.05)
-    # Side of the shadow maps of these, texels. Half: 0.102; twice: 0.091 %.
+    # Side of these neighbours' shadow maps, texels. Half: 0.102; twice: 0.091 %.
     fine_texels: int = 96
-    # Number of directions that are compared by synthetic views,
+    # Number of likely directions that are compared by synthetic views,
     compared: int = 8
     # and their least distance, rad.
     distinct_rad: float = 0.35
-    # Increase of the mean squared residual, as a share of its least, at which a direction weighs
-    # 1/e in the mean of the likely ones.
+    # Increase of the mean squared residual, over its least value, at which the weight of a
+    # direction in the mean of the likely ones is 1/e.
     likely: float = 0.08
     # Mean squared residual, in standard deviations, below which light from everywhere explains the
     # points: of 40 sunlit views the least was 0.45, of views without sun on what is visible the
     # most 0.17.
     even_residual: float = 0.15
-    # Ratio of residuals below which a sun explains a view better.
+    # Ratio of residuals below which a sun explains a view clearly better than light from
+    # everywhere.
     clearly: float = 0.95
-    # Directions of which synthetic views are compared have a z in IRF above this one, behind the
-    # target,
+    # Synthetic views are compared for suns behind the target, whose direction has a larger z in IRF
+    # than this,
     least_behind: float = -0.1
-    # or below this one, as of a lamp beside the lens.
+    # and for a lamp beside the lens, with a smaller z than this.
     least_in_front: float = -0.9
-    # Number of these that are compared at a finer level.
+    # Number of these directions that are compared at a finer level.
     compared_finely: int = 3
 
 
@@ -75,8 +79,9 @@ _LIGHT = LightParameters()
 
 @dataclass(frozen=True)
 class LitPoints:
-    """n points as native/light.c takes them, ``rows`` (n, 14), seen at the attitude ``rotation``
-    (3, 3), TRF to IRF.
+    """n points of the target as native/light.c takes them.
+
+    ``rows`` (n, 14). ``rotation`` (3, 3): attitude at which they are seen, TRF to IRF.
     """
 
     rows: Array
@@ -91,12 +96,12 @@ def light_steps(
     previous: Lighting | None = None,
     by_view: bool = False,
 ) -> Steps[Lighting | None]:
-    """Return, in steps, the light, in grey levels, that the image shows on a target at ``pose``;
-    None if too little of it is in view.
+    """Return, in steps, the light on a target at ``pose`` in grey levels of the image.
 
-    With ``previous``, only directions near that light are tried. With ``by_view``, a synthetic view
-    in each of several likely lights decides: on few textured faces, directions far apart explain
-    the points about equally well, but not the shadows' edges.
+    None if too little of the target is in view. With ``previous``, only directions near that light
+    are tried. With ``by_view``, a synthetic view in each of several likely lights decides: on few
+    textured faces, directions far apart explain the points about equally well, but not the shadows'
+    edges.
     """
     yield LIGHT_MS
     points = lit_points(pyramid, mesh, pose, level)
@@ -113,17 +118,20 @@ def light_steps(
     found = fit_light(mesh, points, previous)
     if previous is None or not previous.weak:
         return found
-    # A sun that explains points in the shade a little better than light from everywhere can be one
-    # of noise.
+    # A sun that explains points in the shade little better than even light may only explain their
+    # noise.
     yield 2.0 * compared_ms(area_px(pyramid, level, mesh, pose))
     lights = [light for light in (found, previous) if light is not None]
     return max(lights, key=lambda light: appearance(pyramid, mesh, pose, level, light))
 
 
 def even_light(mesh: TrackerMesh, points: LitPoints) -> Lighting | None:
-    """Return light from everywhere if that alone explains the points within their noise and
-    texture, as of a target that shows its shaded side: a sun that explains them better would be one
-    of noise, and cast shadows that are not there."""
+    """Return light from everywhere if it alone explains the points within noise and texture, or
+    None.
+
+    This is so for a target that shows its shaded side. A sun that explains the points better would
+    explain noise, and cast shadows that are not there.
+    """
     rows = points.rows.copy()
     rows[:, 3:6] = 0.0  # without normals, the sun has no effect
     anywhere = ShadowMaps(np.eye(3)[:1], np.zeros((1, 12)), np.zeros((1, 0, 0), np.float32))
@@ -137,11 +145,11 @@ def _view_steps(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, even: Lighting,
     previous: Lighting | None
 ) -> Steps[Lighting]:  # fmt: skip
-    """Return, in steps, the light of a target whose points ``even`` explains, light from
-    everywhere: on a side in the shade a sun behind the target brightens no more than rims, which
-    are no points.
+    """Return, in steps, the light of a target whose points ``even``, light from everywhere,
+    explains.
 
-    Synthetic views in several directions of the sun, near that of ``previous`` if it has one, are
+    On a side in the shade a sun behind the target brightens only rims, which are no points. So
+    synthetic views in several directions of the sun, near that of ``previous`` if it has one, are
     compared with the image; the levels follow by least squares. Returns ``even`` if no sun explains
     the image clearly better.
     """
@@ -172,9 +180,12 @@ def _view_steps(
 
 @dataclass(frozen=True)
 class _ComparedView:
-    """A view of a target at ``pose`` and the image there: n pixels of it without the background,
-    ``grey`` (n,), and of the view in light from everywhere, ``ambient`` (n,); ``pixels`` (h, w):
-    which these are; ``residual``: mean square without a sun."""
+    """A view of a target at ``pose``, to be compared with the image in the light of several suns.
+
+    n pixels are compared. ``pixels`` (h, w): which these are. ``grey`` (n,): the image without the
+    background. ``ambient`` (n,): the view in light from everywhere. ``residual``: mean square
+    without a sun.
+    """
 
     mesh: TrackerMesh
     pose: PoseInCamera
@@ -206,14 +217,14 @@ class _ComparedView:
         return cls(mesh, pose, window, pixels, grey, ambient, residual)
 
     def rate(self, to_sun: Array) -> tuple[float, float, float]:
-        """Return the mean squared residual with a sun in the direction (3,), IRF, the ambient and
-        the direct level.
+        """Return mean squared residual, ambient and direct level with a sun in this direction (3,),
+        IRF.
         """
         return self._fit(render(self.mesh, self.pose, self.window, Lighting(to_sun, 1.0, 0.0)).grey)
 
     def _fit(self, sunlit: NDArray[Any]) -> tuple[float, float, float]:
-        """Return the mean squared residual with the view (h, w) in sunlight of level 1, the ambient
-        and the direct level.
+        """Return mean squared residual, ambient and direct level; ``sunlit`` (h, w): view in a sun
+        of level 1.
         """
         columns = np.column_stack([self.ambient, smooth(sunlit)[self.pixels]])
         levels = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), columns.T @ self.grey)
@@ -224,8 +235,8 @@ class _ComparedView:
         """Return the directions (n, 3), IRF, of the few suns that explain the image best, best
         first.
 
-        The view is drawn once: in each direction only light and shadow of its samples are computed,
-        two by two in a pixel.
+        The view is rendered once. For each direction only light and shadow of its samples are
+        computed, two by two in a pixel.
         """
         h, w = self.window.height, self.window.width
         fx, fy, cx, cy = self.window.lens
@@ -248,15 +259,15 @@ class _ComparedView:
 
 
 def smooth(grey: NDArray[Any]) -> Array:
-    """Return a view or image (h, w) without noise, as equally smooth as others, so that the lens'
-    point spread does not count.
+    """Smooth a view or image (h, w), so that neither noise nor the lens' point spread makes it
+    differ.
     """
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=float)
 
 
 def likely_lights(mesh: TrackerMesh, points: LitPoints) -> list[Lighting]:
-    """Return the light of the best directions that are at least ``distinct_rad`` apart, likely
-    ones first.
+    """Return the light of the likeliest directions, at least ``distinct_rad`` apart, likeliest
+    first.
     """
     rated, towards = rate_suns(points, mesh.suns), mesh.suns.to_sun_trf
     chosen: list[int] = []
@@ -278,8 +289,8 @@ def lit_points(
     level: int,
     most: int = _LIGHT.most_points,
 ) -> LitPoints | None:
-    """Return at most ``most`` points of the target with their grey levels, away from edges; None if
-    there are too few.
+    """Return points of the target away from edges with their grey levels, at most ``most``; None if
+    few.
     """
     found = window_of(pyramid, level, mesh, pose)
     if found is None:
@@ -290,7 +301,7 @@ def lit_points(
     view = render(mesh, pose, window, unlit, samples=1)
     covered = (view.coverage > 0.99).astype(np.uint8)
     for side in (5, 3, 1):
-        # Beside edges of the outline a slightly wrong pose mixes target and background.
+        # A slightly wrong pose mixes target and background beside edges of the outline.
         pixels = np.flatnonzero(cv2.erode(covered, np.ones((side, side), np.uint8)))
         if len(pixels) >= 4 * _LIGHT.fewest_points:
             break
@@ -305,9 +316,7 @@ def _points_in(
     pixels: NDArray[np.int64],
     grey: Array | float = 0.0,
 ) -> LitPoints:  # fmt: skip
-    """Return the points that n pixels (n,) of a view show, with their grey levels ``grey`` in the
-    image.
-    """
+    """Return the points of a view at ``pixels`` (n,), with their grey levels ``grey`` in the image."""
     row, column = np.divmod(pixels, window.width)
     fx, fy, cx, cy = window.lens
     rays = np.column_stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(pixels))])
@@ -327,8 +336,10 @@ def points_on(
     mesh: TrackerMesh, owners: NDArray[np.integer], at_trf: Array, to_camera_trf: Array,
     grey: Array | float, rotation: Array
 ) -> LitPoints:  # fmt: skip
-    """Return n points on the triangles ``owners`` (n,), with grey levels (n,), at (n, 3), seen in
-    directions (n, 3), all in TRF.
+    """Return n points on the mesh as ``LitPoints``.
+
+    ``owners`` (n,): triangles. ``at_trf`` (n, 3): positions, TRF. ``to_camera_trf`` (n, 3): unit
+    vectors to the camera, TRF. ``grey`` (n,): grey levels. ``rotation``: TRF to IRF.
     """
     rows = np.empty((len(owners), 14))
     rows[:, 0:3], rows[:, 3:6], rows[:, 6:9] = at_trf, mesh.mean_normals[owners], to_camera_trf
@@ -339,8 +350,8 @@ def points_on(
 
 
 def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
-    """Return, for each of k directions of the sun, (k, 3): mean squared residual (robust), ambient
-    and direct level.
+    """Return mean robust squared residual, ambient and direct level (k, 3) for k directions of the
+    sun.
     """
     k, n = len(maps.to_sun_trf), len(points.rows)
     out, work = np.empty((k, 3)), np.empty(2 * n)
@@ -353,9 +364,7 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
 
 
 def direct_light(points: LitPoints, maps: ShadowMaps, k: int) -> NDArray[np.float32]:
-    """Return the light (n,) that each of n points reflects of a sun of level 1 in the direction
-    ``k`` of ``maps``.
-    """
+    """Return the light (n,) that points reflect of a sun of level 1 in direction ``k`` of ``maps``."""
     out = np.empty(len(points.rows), np.float32)
     function("direct_light")(
         address(points.rows), c_int64(len(out)), (c_double * 3)(*maps.to_sun_trf[k]),
@@ -387,7 +396,7 @@ def fit_light(
 
 
 def _likely_direction(rated: Array, maps: ShadowMaps) -> Array:
-    """Return the mean, weighted by likelihood, of the directions near the best one."""
+    """Return the mean of the directions near the best one, weighted by likelihood."""
     k = int(np.argmin(rated[:, 0]))
     near = maps.to_sun_trf @ maps.to_sun_trf[k] > 0.9
     excess = (rated[near, 0] - rated[k, 0]) / max(float(rated[k, 0]), 1e-6)
@@ -409,8 +418,9 @@ def _around(direction: Array, angle_rad: float) -> Array:
 def appearance(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, light: Lighting
 ) -> float:
-    """Return the correlation, -1 to 1, of a synthetic view with the image, on the target and a
-    border of two pixels.
+    """Return the correlation, -1 to 1, of a synthetic view with the image.
+
+    It is taken on the target and a border of two pixels.
     """
     found = window_of(pyramid, level, mesh, pose)
     if found is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracker mesh: what flight software knows of a target's shape, and how uncertain it is."""
+"""Represent what the flight software knows of a target's shape, and how uncertain that is."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from numpy.typing import NDArray
 from ..native import function
 
 _CREASE_COSINE = 0.8
-"""Normals are smoothed over edges of a smaller angle, 37 degrees: facets of a cylinder, not the
-edges of a box.
+"""Cosine of the angle, 37 degrees, up to which edges are shaded smoothly: facets of a cylinder, not
+the edges of a box.
 """
 
 MAX_TRIANGLES = 200_000
-"""Ten times as many as a mesh file may have (``surface.MAX_TRIANGLES``): rejects what cannot be a
-mesh of a scenario; each rendering takes time for each triangle.
+"""Most triangles of a tracker mesh: ten times as many as a mesh file may have
+(``surface.MAX_TRIANGLES``). Rejects what cannot be the mesh of a scenario; each rendering takes
+time for each triangle.
 """
 
 SCALE_SIGMA = 0.003
-"""Standard deviation of the scale of a target's known shape."""
+"""Relative standard deviation of the scale of a target's known shape."""
 
 _PLAIN_TEXTURE, _FOIL_TEXTURE = 0.1, 0.3
 """Relative standard deviation of grey levels by texture that the mesh does not have: of plain
@@ -40,17 +41,20 @@ surfaces, and of wrinkled foil.
 _FOIL_SLOPE = 0.35
 """Standard deviation of the slopes of wrinkled foil, which widen its highlights."""
 _CELLS_BORDER_M = 0.0002
-"""Standard deviation of where points of the border of solar cells are seen, beside what all have in
-common (mode ``rim``): the known mesh does not have the grid."""
+"""Standard deviation (m) of where single points of the border of solar cells are seen. The error
+that they have in common is the mode ``rim``: the known mesh does not have the grid of cells.
+"""
 NO_PATTERN, CELLS, WRINKLES = 0, 1, 2
-"""Patterns of a surface that the known mesh does not have."""
+"""Patterns of surfaces, which the known mesh does not have."""
 _SUNS, _SUN_TEXELS = 400, 64
-"""Directions of the sun that points are rated for, 10 degrees apart, and side of their shadow maps:
-6.6 MB. Of twelve views half the directions err by 0.133, twice by 0.109, and half and twice the
-texels by 0.102 and 0.108 instead of 0.106 % of the range."""
+"""Number of directions of the sun for which points are rated, 10 degrees apart, and side of their
+shadow maps in texels: 6.6 MB. Of twelve views half the directions err by 0.133, twice by 0.109,
+half and twice the texels by 0.102 and 0.108 instead of 0.106 % of the range.
+"""
 _FEW_SUNS, _FEW_SUN_TEXELS = 60, 256
 """The same for whole views with a sun behind the target, 26 degrees apart: 16 MB. Half and twice
-change none of twelve views with a sun in front."""
+change none of twelve views with a sun in front.
+"""
 
 
 class MeshError(ValueError):
@@ -59,8 +63,10 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True)
 class ShadowMaps:
-    """Depth maps (k, size, size) of a mesh towards k directions (k, 3), unit vectors in TRF;
-    ``settings`` (k, 12): native/mesh.c.
+    """Depth maps of a mesh towards k directions of the sun.
+
+    ``to_sun_trf`` (k, 3): unit vectors in TRF. ``settings`` (k, 12): as in native/mesh.c.
+    ``depths`` (k, size, size).
     """
 
     to_sun_trf: Array
@@ -77,8 +83,9 @@ def spread_directions(n: int) -> Array:
 
 
 def _surface(material: Material) -> tuple[float, float, float, float]:
-    """Return reflectance, gloss, exponent and texture of a material. Wrinkles widen the highlights
-    of foil and weaken them.
+    """Return reflectance, gloss, exponent and texture of a material.
+
+    Wrinkles of foil widen its highlights and weaken them.
     """
     if material.texture != "insulation":
         return material.diffuse, material.specular, material.shininess, _PLAIN_TEXTURE
@@ -126,10 +133,12 @@ class TrackerMesh:
             )
         if triangles.min() < 0 or triangles.max() >= len(vertices):
             raise MeshError(f"triangles must index the {len(vertices)} vertices")
+
         if reflectance.shape != (len(triangles),) or not np.all(
             (reflectance >= 0.0) & (reflectance <= 1.0)
         ):
             raise MeshError(f"reflectance must be {len(triangles)} numbers from 0 to 1")
+
         for name, values, shape in (
             ("gloss", self.gloss, (len(triangles), 2)),
             ("texture", self.texture, (len(triangles),)),
@@ -146,8 +155,9 @@ class TrackerMesh:
 
     @classmethod
     def of_boxes(cls, boxes: Sequence[Box], scale_sigma: float = SCALE_SIGMA) -> TrackerMesh:
-        """Return the mesh of cuboids in TRF, eight vertices each; its mode is an error of the
-        scale, if not 0.
+        """Return the mesh of cuboids in TRF, eight vertices each.
+
+        Its only mode is an error of the scale; none if ``scale_sigma`` is 0.
         """
         vertices = np.concatenate(
             [
@@ -164,7 +174,7 @@ class TrackerMesh:
 
     @classmethod
     def of_mesh(cls, mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float) -> TrackerMesh:
-        """Return the tracker mesh of a body's mesh; modes: those of `error_modes`."""
+        """Return the tracker mesh of a body's mesh, with the modes of `error_modes`."""
         counts = np.cumsum([0, *(len(part.vertices_m) for part in mesh.parts)])
         triangles = np.concatenate(
             [p.triangles + first for p, first in zip(mesh.parts, counts[:-1], strict=True)]
@@ -192,11 +202,10 @@ class TrackerMesh:
         )
 
     def corrected(self, mean: Array, covariance: Array) -> TrackerMesh:
-        """Return the mesh after its modes have been estimated: ``mean`` (k,) and ``covariance`` (k,
-        k), standard deviations of now.
+        """Return the mesh corrected by the estimate of its modes.
 
-        Its modes are the columns of the lower Cholesky factor of the covariance. The coarse shadow
-        maps are kept.
+        ``mean`` (k,), ``covariance`` (k, k): in the present standard deviations. The new modes are
+        the columns of the lower Cholesky factor of the covariance. The coarse shadow maps are kept.
         """
         factor = np.linalg.cholesky(covariance)
         new = replace(
@@ -209,8 +218,10 @@ class TrackerMesh:
 
     @cached_property
     def contiguous(self) -> tuple[Array, NDArray[np.int64], Array, Array]:
-        """Vertices, triangles, corner normals (m, 3, 3) and surfaces (m, 3): reflectance, gloss,
-        exponent; as kernels take them.
+        """Mesh as kernels take it: vertices, triangles, corner normals (m, 3, 3) and surfaces (m,
+        3).
+
+        Surfaces: reflectance, gloss, exponent.
         """
         gloss = self.gloss if len(self.gloss) else np.zeros((len(self.triangles), 2))
         return (
@@ -226,8 +237,8 @@ class TrackerMesh:
         return self.texture if len(self.texture) else np.full(len(self.triangles), _PLAIN_TEXTURE)
 
     def border_of(self, owners: NDArray[np.int64]) -> Array:
-        """Return the standard deviation (n,), m, of where the borders of the triangles ``owners``
-        (n,) are seen.
+        """Return the standard deviation (n,), m, of where the borders of triangles ``owners`` (n,)
+        are seen.
         """
         return self.border_m[owners] if len(self.border_m) else np.zeros(len(owners))
 
@@ -285,8 +296,8 @@ class TrackerMesh:
         return float(np.linalg.norm(self.vertices_m, axis=1).max())
 
     def mode_displacements(self, owners: NDArray[np.int64], points_m: Array) -> Array:
-        """Return the displacements (k, n, 3) by each mode of points (n, 3) on the triangles
-        ``owners`` (n,).
+        """Return the displacements (k, n, 3), m, of points (n, 3) on triangles ``owners`` (n,) by
+        each mode.
         """
         if not len(self.modes_m):
             return np.zeros((0, len(points_m), 3))

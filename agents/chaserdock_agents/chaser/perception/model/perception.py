@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Perception `model`: acquire and track a target by its shape, and return to acquisition when the
-gate rejects it.
+"""Run the perception `model`: acquire the target by its shape and track it.
+
+It returns to acquisition when the gate rejects the pose.
 """
 
 from __future__ import annotations
@@ -37,38 +38,42 @@ from .tracking import (
 )
 
 _KEY_EVERY = 8
-"""A view is rendered at least at every eighth image; between, its control points are reused."""
+"""Images between two renderings of a view, at most: its control points are reused in between."""
 _KEY_TURN_RAD = 0.04
-"""Points of a view are not reused when the target has turned by more since."""
+"""Rotation (rad) of the target since a view was rendered, above which its points are not reused."""
 _STOPGAP_TURN_RAD = 0.08
-"""Where the gate rejects a new view, as in changing weak light, the points of the one before are
-reused up to this turn.
+"""Rotation (rad) up to which a view's points are reused where the gate rejects the next view, as in
+changing weak light.
 """
 _LOST_AFTER = 3
-"""Number of images in a row without a valid pose after which a track ends."""
+"""Images in a row without a valid pose after which a track ends."""
 _PER_IMAGE_MS = 30.0
-"""Expected CPU time per image, beyond which work is continued at the next one; a first step may
+"""Expected CPU time per image, ms, beyond which work continues at the next image; a single step may
 take longer.
 """
 _POINTS_MS = 6.0
-"""Expected CPU time to align the points of the last view, ms; measured in flights
-(docs/evidence/markerless.md: 3.9 ms an image at 3 m)."""
+"""Expected CPU time to align the points of the last view, ms; 3.9 ms an image at 3 m were measured
+in flights (docs/evidence/markerless.md).
+"""
 _MOST_WAITING = 120
-"""Number of images that wait until an acquisition has ended; beyond, it is given up for one of the
-newest image.
+"""Most images that wait for the end of an acquisition; beyond, it is replaced by an acquisition in
+the newest image. More: longer acquisitions succeed; fewer: a hopeless one ends sooner.
 """
 _MOST_WAITING_PREDICTED, _MOST_FAILED = 30, 15
-"""The same where a pose is predicted; number of images in a row in which a start from it fails
+"""The same where a pose is predicted; and number of images in a row in which a start from it fails
 before an acquisition is tried.
 """
 _WORSE = 0.1
-"""An ambiguous pose is dropped when its score falls this far below the best one's."""
+"""Score, below the best one's, at which an ambiguous pose is dropped."""
 
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """One hypothesis: last alignment and light, the pose before it, and the numbers of images since
-    its view and since it was valid."""
+    """One hypothesis of the target's pose.
+
+    ``last``, ``light``: last alignment and light. ``before``: the pose before it, if any. ``age``:
+    images since its view was rendered. ``missed``: images since it was valid.
+    """
 
     last: Alignment
     light: Lighting
@@ -77,7 +82,7 @@ class PoseTrack:
     missed: int = 0
 
     def predicted(self) -> PoseInCamera:
-        """Return the pose in the next image at a constant rate per image; the last pose after a
+        """Return the pose in the next image, at a constant rate per image; the last pose after a
         miss.
         """
         now = self.last.pose
@@ -90,8 +95,9 @@ class PoseTrack:
 
 @dataclass(frozen=True)
 class _WaitingImage:
-    """An image (h, w) and the pose that others predict in it, position (3,) and rotation (4,), if
-    any.
+    """An image (h, w) that waits, and the pose that others predict in it, if any.
+
+    Pose: position (3,) in IRF and rotation (4,), TRF to IRF.
     """
 
     image: NDArray[np.uint8]
@@ -99,16 +105,18 @@ class _WaitingImage:
 
 
 class ModelPerception:
-    """Estimates the pose of the target from its shape. Stateful: equal sequences of images give
-    equal results.
+    """Estimate the pose of the target from its shape.
+
+    Stateful: equal sequences of images give equal results. One instance belongs to one camera;
+    ``acquisition``, of the same camera and mesh, may be shared. ``solutions`` are ambiguous poses,
+    the best first, and without markers.
 
     Work that takes longer than the time of an image is spread over several: an acquisition, or
-    starts around a lost pose. Until it ends, images wait and give no solution; then the target is
+    starts around a lost pose. Until it ends, images wait and give no solution. Then the target is
     tracked through them, several at each new image, up to the newest one. Without a track, a pose
     that others predict is tried first; an acquisition follows when that has failed for about a
-    second. One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be
-    shared. With ``single_images``, which do not follow each other, an acquisition ends in the image
-    in which it begins. ``solutions`` are ambiguous poses, the best first, and without markers.
+    second. With ``single_images``, which do not follow each other, an acquisition ends in the image
+    in which it begins.
     """
 
     def __init__(
@@ -130,18 +138,19 @@ class ModelPerception:
         self._correction: GeometryCorrection | None = None
 
     def prepare(self) -> None:
-        """Compute what depends on the mesh alone; takes one to two seconds, which the first image
-        would take otherwise.
+        """Compute what depends on the mesh alone, which the first image would do otherwise.
+
+        Takes one to two seconds.
         """
         self._acquisition.prepare()
         _ = self.mesh.suns, self.mesh.few_suns
 
     def correct_geometry(self, mean: Array, covariance: Array) -> None:
-        """Correct the mesh by its estimated errors (k,) with covariance (k, k), in its standard
-        deviations; tracks go on.
+        """Correct the mesh by its estimated errors (k,) with covariance (k, k), in standard
+        deviations.
 
-        Raises ValueError for another number of errors than the mesh has, or a covariance that is
-        not positive definite.
+        Tracks continue. Raises ValueError for another number of errors than the mesh has, or a
+        covariance that is not positive definite.
         """
         k = len(self._uncorrected.modes_m)
         if (
@@ -201,8 +210,11 @@ class ModelPerception:
         )
 
     def _geometry(self) -> GeometryInformation | None:
-        """Return what the image tells about the errors of the mesh before corrections, if there is
-        one track; without information for any pose if its view is not new."""
+        """Return what the image tells about the errors of the uncorrected mesh; None unless one
+        track.
+
+        The part that is independent of the pose is empty if the track's view is not new.
+        """
         if len(self._tracks) != 1 or self._tracks[0].missed:
             return None
         found = self._tracks[0].last.geometry
@@ -213,7 +225,7 @@ class ModelPerception:
         return found if self._correction is None else self._correction.of_uncorrected(found)
 
     def _work_on(self) -> None:
-        """Take the next steps, as many as the time of one image allows, and at least one."""
+        """Take as many steps of the work as the time of one image allows, at least one."""
         spent_ms = 0.0
         while self._waiting:
             if self._work is None:
@@ -243,7 +255,7 @@ class ModelPerception:
         updated: list[PoseTrack] = []
         for track in self._tracks:
             updated.append((yield from advance(pyramid, self.mesh, track)))
-        # A predicted pose is a better start in the next image than a lost track's own.
+        # A predicted pose is a better start in the next image than that of a lost track.
         lost_after = _LOST_AFTER if waiting.predicted is None else 1
         self._tracks = _distinct([t for t in updated if t.missed < lost_after])
 
@@ -259,15 +271,17 @@ class ModelPerception:
 
 
 def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[PoseTrack]:
-    """Return a track after the next image: with the points of its view while they hold, else by a
-    new view, else with the old points once more, else from a rough prior; before it is lost, from
-    several starts."""
+    """Return a track after the next image.
+
+    Tries in this order: the points of its view, while they hold; a new view; the old points once
+    more; a rough prior; before the track is lost, several starts.
+    """
     prior, modes = track.predicted(), track.last.modes
     missed = replace(track, missed=track.missed + 1)
     fresh = (
         track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
     )
-    # The light of a new view is estimated in the image before, which leaves more time for the view.
+    # The light of a new view is estimated one image before, which leaves more time for the view.
     view_is_next = track.age + 2 == _KEY_EVERY
     if fresh and not track.missed:
         yield _POINTS_MS
@@ -276,6 +290,7 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
             near = _light_near(pyramid, mesh, found.pose, track.light)
             light = (yield from near) if view_is_next else None
             return PoseTrack(found, light or track.light, track.last.pose, track.age + 1)
+
     levels = levels_of(pyramid, mesh, prior)
     if not levels:
         return missed
@@ -286,11 +301,13 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
     found = yield from pose_steps(pyramid, mesh, prior, light, levels[-1:], modes=modes)
     if is_valid(found):
         return PoseTrack(found, light, track.last.pose)
+
     if not track.missed and turn_between(prior, track.last.points.pose) < _STOPGAP_TURN_RAD:
         yield _POINTS_MS
         found = track_points(pyramid, track.last.points, prior, modes)
         if is_valid(found):
             return PoseTrack(found, track.light, track.last.pose, track.age + 1)
+
     refined = yield from prior_steps(pyramid, mesh, prior, modes)
     if refined and is_valid(refined[0]):
         return PoseTrack(*refined)
@@ -305,16 +322,18 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
 def _light_near(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting
 ) -> Steps[Lighting | None]:
-    """Return, in steps, the light on a target at ``pose`` near a previous one; None if too little
-    of the target is in view.
+    """Return, in steps, the light on a target at ``pose``, searched near a previous one.
+
+    None if too little of the target is in view.
     """
     levels = levels_of(pyramid, mesh, pose)
     return (yield from light_steps(pyramid, mesh, pose, levels[0], light)) if levels else None
 
 
 def _distinct(tracks: list[PoseTrack]) -> tuple[PoseTrack, ...]:
-    """Return the tracks, best first, without those that have become equal to a better one or much
-    worse than the best.
+    """Return the tracks that differ from all better ones and are not much worse than the best.
+
+    The best comes first.
     """
     kept: list[PoseTrack] = []
     for track in sorted(tracks, key=lambda t: (t.missed > 0, -t.last.score)):

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that is spread over several images: generators that state the expected CPU time of each step
-before they take it.
-"""
+"""Spread work over several images: generators state the expected CPU time of each step before it."""
 
 from __future__ import annotations
 
@@ -11,22 +9,22 @@ from typing import TypeVar
 T = TypeVar("T")
 
 Steps = Generator[float, None, T]
-"""Yields the expected CPU time of the next step, ms, and returns a result. The time decides only
-how work is spread.
+"""Work in steps: yields the expected CPU time of the next step, ms, and returns a result. The time
+decides only how work is spread over images.
 """
 
 LIGHT_MS = 5.0
-"""Time to estimate the light by points."""
+"""CPU time to estimate the light by points, ms."""
 LIKELY_MS, VIEWS_MS = 6.0, 12.0
-"""Times to find likely lights, and to compare them by synthetic views."""
+"""CPU times, ms, to find likely lights, and to compare them by synthetic views."""
 SUNS_MS = 10.0
-"""Time to compare all directions of a sun behind the target."""
+"""CPU time to compare all directions of a sun behind the target, ms."""
 _LEVEL_MS, _MS_PER_PX = 3.0, 5.5e-5
-"""Time to render and align a level, and per pixel of its window: measured, as all here, on one core
-of the development machine. They decide only how work is spread over images.
+"""CPU time to render and align a level, ms, and per pixel of its window. Measured, as all here, on
+one core of the development machine; they decide only how work is spread over images.
 """
 _COMPARED_MS, _COMPARED_MS_PER_PX = 0.9, 1.4e-5
-"""Time to render a view and compare it with the image, and per pixel of its window."""
+"""CPU time to render a view and compare it with the image, ms, and per pixel of its window."""
 
 
 def result_of(steps: Steps[T]) -> T:
@@ -39,14 +37,14 @@ def result_of(steps: Steps[T]) -> T:
 
 
 def level_ms(area_px: float) -> float:
-    """Return the time to render a level on a window of ``area_px`` pixels and to align its control
+    """Return the CPU time, ms, to render a level on ``area_px`` pixels and align its control
     points.
     """
     return _LEVEL_MS + _MS_PER_PX * area_px
 
 
 def compared_ms(area_px: float) -> float:
-    """Return the time to render a view on a window of ``area_px`` pixels and to compare it with the
+    """Return the CPU time, ms, to render a view on ``area_px`` pixels and compare it with the
     image.
     """
     return _COMPARED_MS + _COMPARED_MS_PER_PX * area_px

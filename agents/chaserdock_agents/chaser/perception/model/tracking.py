@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Track a pose from a prior: coarse to fine alignment, validity gate, several starts. Pure
-functions.
+"""Track a pose from a prior: alignment from coarse to fine, validity gate, several starts.
+
+Pure functions.
 """
 
 from __future__ import annotations
@@ -32,47 +33,49 @@ from .rendering import Lighting
 from .steps import Steps, level_ms, result_of
 
 MIN_INLIER_SHARE = 0.66
-"""Gate: a smaller share of inliers rejects a pose."""
+"""Gate: least share of inliers of a pose."""
 MIN_SCORE = 0.56
-"""Gate: a smaller product of inlier share and mean correlation rejects a pose."""
+"""Gate: least product of inlier share and mean correlation."""
 MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
-"""Gate: a larger standard deviation in any direction, of position as a share of the range, rejects
-a pose.
+"""Gate: largest standard deviation of a pose in any direction; of position, as a share of the
+range.
 """
 
 
 @dataclass(frozen=True)
 class TrackingParameters:
-    """Numbers of the way from a prior to a pose, chosen by benchmarks/perception.py (``shape``)."""
+    """Parameters of the way from a prior to a pose, tuned by benchmarks/perception.py (``shape``).
 
-    # The finest level shows the target on at most so many pixels: 36 ms of CPU
-    # (``steps.level_ms``). Half: poses err by 0.111 instead of 0.106 % of the range; twice: the
-    # same.
+    Comments state the median error of poses at half and at twice a value; 0.106 % of the range with
+    these.
+    """
+
+    # Most pixels of the target at the finest level: 36 ms of CPU (``steps.level_ms``). Half: 0.111
+    # %; twice: the same.
     finest_area_px: int = 600_000
-    # The coarsest level shows it on at most so many, about 110 squared: the reach of a search is
-    # then a tenth of the target. Half: 0.106; twice: 0.097 %, in twice the time.
+    # Most pixels at the coarsest level, about 110 squared: the reach of a search is a tenth of the
+    # target there. Half: 0.106; twice: 0.097 %, in twice the time.
     coarsest_area_px: int = 12_000
-    # A target on fewer pixels of the image is aligned in one of twice the resolution, so that its
+    # Pixels of the target below which it is aligned at twice the image's resolution, so that its
     # profiles do not overlap. Half and twice: the same, at 0.9 to 4 m.
     upsampled_area_px: int = 24_000
-    # Largest diameter of the target at the finest level, in pixels of it: if that is the image's
-    # own, or a coarser one. Nearer targets are aligned at a coarser level: they show texture that
-    # the mesh does not have at the size of profiles, and a whole image of them takes the most time.
+    # Largest diameter of the target at the finest level, px of that level: of the image's own, and
+    # of a coarser one. Nearer targets are aligned at a coarser level, as they show texture that the
+    # mesh does not have at the size of profiles, and a whole image of them takes the most time.
     largest_px: tuple[float, float] = (NEAR_PX, 740.0)
-    # Reach of the search, px, at the first level,
+    # Reach of the search at the first level, px.
     first_reach_px: int = 10
-    # and at the next ones, whose prior is half as wrong.
+    # Reach at the next levels, px, whose prior is half as wrong.
     next_reach_px: int = 5
-    # Starts around a prior: moved by this share of the range,
+    # Displacement of starts around a prior, as a share of the range.
     start_share: float = 0.02
-    # and turned by this angle.
+    # Rotation of starts around a prior.
     start_rad: float = math.radians(3.0)
-    # A pose from a rough prior is settled within the turn below from the view that it comes from;
-    # light and view are repeated until it is: once for a smaller share of inliers than this,
+    # Share of inliers of a pose from a rough prior, below which light and view are repeated once.
     settled_share: float = 0.85
-    # with this turn,
+    # Rotation of a pose from the view that it comes from, above which they are repeated.
     settled_rad: float = math.radians(0.5)
-    # and at most so many times. One that still turns is rejected.
+    # Most repetitions. A pose that still turns is rejected.
     most_repeated: int = 3
 
 
@@ -83,8 +86,8 @@ _EVEN_LIGHT = Lighting(None, 0.0, 1.0, shadows=False)
 
 
 def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
-    """Return whether an alignment passes the gate: enough inliers, well correlated, and a pose that
-    is observable.
+    """Return whether an alignment passes the gate: enough correlated inliers, and an observable
+    pose.
     """
     if (
         alignment is None
@@ -101,11 +104,11 @@ def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
 
 
 def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[int, ...]:
-    """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is
-    out of view.
+    """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if out of
+    view.
 
     The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded
-    time, and at most ``largest_px`` wide, of which it may show a part; small targets are upsampled
+    time, and at most ``largest_px`` wide, of which it may show a part. Small targets are upsampled
     twice.
     """
     found = window_of(pyramid, 0, mesh, pose)
@@ -134,8 +137,9 @@ def pose_steps(
     first_reach_px: int = _TRACK.first_reach_px,
     modes: Array | None = None,
 ) -> Steps[Alignment | None]:
-    """Align the mesh with an image from ``prior``, one level in each step; None without an
-    alignment at the last level.
+    """Align the mesh with an image from ``prior``, one level in each step.
+
+    None without an alignment at the last level.
     """
     pose, alignment = prior, None
     for number, k in enumerate(levels):
@@ -160,8 +164,9 @@ def pose_steps(
 def refine_from_prior(
     pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
 ) -> tuple[Alignment, Lighting] | None:
-    """Return the pose near ``prior`` and the light, neither of which needs to be known well; None
-    without an alignment.
+    """Return the pose near ``prior``, and the light; neither needs to be known well.
+
+    None without an alignment.
     """
     return result_of(prior_steps(pyramid, mesh, prior, modes))
 
@@ -171,9 +176,9 @@ def prior_steps(
 ) -> Steps[tuple[Alignment, Lighting] | None]:
     """Do what `refine_from_prior` does, in steps; None also for a pose that does not settle.
 
-    Starts from light from everywhere, for a prior that may be far off. If that explains the image
-    badly, as where sunlight only grazes the target, starts from the light at the prior as well, and
-    returns the better one.
+    Starts from even light, for a prior that may be far off. If that explains the image badly, as
+    where sunlight only grazes the target, it also starts from the light at the prior and returns
+    the better result.
     """
     found = yield from rough_prior_steps(pyramid, mesh, prior, modes)
     levels = levels_of(pyramid, mesh, prior)
@@ -189,11 +194,10 @@ def prior_steps(
 def rough_prior_steps(
     pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
 ) -> Steps[tuple[Alignment, Lighting] | None]:
-    """Return pose and light, starting from light from everywhere; None also for a pose that does
-    not settle.
+    """Return pose and light, starting from even light; None also for a pose that does not settle.
 
-    The outline and the borders of materials give a coarse pose; from it follows the light, which
-    improves the coarse pose, which improves the light.
+    The outline and the borders of materials give a coarse pose. From it follows the light, which
+    improves the pose, which improves the light.
     """
     levels = levels_of(pyramid, mesh, prior)
     if not levels:
@@ -213,24 +217,22 @@ def _settling_steps(
     pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting,
     levels: tuple[int, ...], modes: Array | None
 ) -> Steps[tuple[Alignment, Lighting] | None]:  # fmt: skip
-    """Align the two finest levels, and improve light and pose again until the pose settles; None if
-    it does not.
-    """
+    """Align the two finest levels, and repeat light and pose until the pose settles; else None."""
     fine = yield from pose_steps(
         pyramid, mesh, pose, light, levels[-2:], _TRACK.next_reach_px, modes
     )
     for number in range(_TRACK.most_repeated):
         if fine is None or _is_settled(fine, 0.0 if number else _TRACK.settled_share):
             break
-        # The light of a coarse pose that is wrong by degrees is wrong as well, and leaves the fine
-        # one between the two.
+        # The light of a coarse pose that is wrong by degrees is wrong as well, and draws the fine
+        # pose away from the truth.
         light = (yield from light_steps(pyramid, mesh, fine.pose, levels[0], by_view=True)) or light
         fine = yield from pose_steps(
             pyramid, mesh, fine.pose, light, levels[-2:], _TRACK.next_reach_px, fine.modes
         )
         if fine is not None and not _is_settled(fine):
-            # Of few points the coarser level turns a pose away by more than that, and the finest
-            # one back.
+            # With few points, the coarser level may turn a pose away by more than the limit, and
+            # the finest level turns it back.
             fine = yield from pose_steps(
                 pyramid, mesh, fine.pose, light, levels[-1:], _TRACK.next_reach_px, fine.modes
             )
@@ -238,8 +240,8 @@ def _settling_steps(
 
 
 def _is_settled(alignment: Alignment, least_share: float = 0.0) -> bool:
-    """Return whether a pose hardly turned from that of its view, and at least ``least_share`` of
-    the points agree with it.
+    """Return whether a pose hardly turned from its view's, with at least ``least_share`` of
+    inliers.
     """
     turned_rad = turn_between(alignment.pose, alignment.points.pose)
     return alignment.inlier_share >= least_share and turned_rad <= _TRACK.settled_rad
@@ -253,9 +255,7 @@ def track_points(
 
 
 def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
-    """Return twelve poses around ``prior``: turned by 3 degrees about each axis, moved by 2 % of
-    the range along each.
-    """
+    """Return twelve poses around ``prior``: rotated and displaced along each axis, either way."""
     starts, step_m = [], _TRACK.start_share * float(np.linalg.norm(prior.position))
     for axis, sign in itertools.product(range(3), (1.0, -1.0)):
         unit = sign * np.eye(3)[axis]
@@ -268,8 +268,9 @@ def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
 def start_steps(
     pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
 ) -> Steps[Alignment | None]:
-    """Return the best alignment from several starts, in steps: all at the coarsest level, the best
-    three at all levels.
+    """Return the best alignment from several starts, in steps.
+
+    All are aligned at the coarsest level, the best three at all levels.
     """
     coarse: list[Alignment] = []
     for start in starts:
@@ -288,7 +289,7 @@ def start_steps(
 
 
 def view_ms(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> float:
-    """Return the expected CPU time to align a view of one level."""
+    """Return the expected CPU time, ms, to align the view of one level."""
     return level_ms(area_px(pyramid, level, mesh, pose))
 
 
@@ -299,8 +300,6 @@ def turn_between(a: PoseInCamera, b: PoseInCamera) -> float:
 
 
 def pose_error(estimate: PoseInCamera, truth: PoseInCamera) -> Array:
-    """Return the error (6,) of a pose in the coordinates of its covariance: position in IRF,
-    rotation in TRF axes.
-    """
+    """Return the error (6,) of a pose as in its covariance: position in IRF, rotation in TRF axes."""
     turn = rotations.log(rotations.from_matrix(estimate.rotation.T @ truth.rotation))
     return np.concatenate([truth.position - estimate.position, turn])

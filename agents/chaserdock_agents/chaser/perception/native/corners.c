@@ -3,14 +3,13 @@
  * chaserdock_agents.chaser.perception.corners. */
 #include "base.h"
 
-/* Capacities: lines across a side and samples on each (settings: 8 and 11), lines of pixels across
- * a side (48), and pixels beside it: 48 lines of 42. */
+/* Capacity: lines across a side; the settings have 8. */
 #define ROWS_MOST 20
-/* See above. */
+/* Capacity: samples on a line; the settings have 11. */
 #define TAPS_MOST 15
-/* See above. */
+/* Capacity: lines of pixels across a side; the settings have 48. */
 #define COLUMNS_MOST 64
-/* See above. */
+/* Capacity: pixels beside a side: 48 lines of 42. */
 #define PIXELS_MOST 2048
 /* Tabulated normal distribution: steps of 1 / STEPS up to LAST sigma on either side. */
 #define STEPS 32
@@ -31,8 +30,9 @@ typedef struct {
     /* Coarse step. `first` and `last` exclude the ends of a side, where the gradient of the
      * adjacent side interferes. */
     double first, last, rows, taps, coarse_reach_px, border_share;
-    /* Fit to pixels: samples along a side, ends that are left out, looks across an edge, prior of
-     * the logarithm of the edge's sigma, rounds and iterations per round. */
+    /* Fit to pixels: lines along a side, lengths left out at its ends, reach across the edge, when
+     * the outer edge of a border is fitted; prior of the logarithm of the edge's sigma; rounds and
+     * iterations per round. See corners.py for each. */
     double columns, end_px, end_share, reach_px, clear_px, beyond_px, strip_px, partial_px,
         least_fall, agreement_px;
     double log_edge_sigma, edge_sigma_spread, rounds, iterations, strip_iterations;
@@ -282,15 +282,15 @@ typedef struct {
         level[PIXELS_MOST];
 } Band;
 
-/* How far outwards, pixels, the pixels at `at` pixels along a side are used: up to beyond the
- * border's outer edge, or not as far. */
+/* Return up to which offset from a side, pixels, its surroundings are used at `at` pixels along it:
+ * beyond the border's outer edge if that is fitted (`outer`), else clear of it. */
 static double outward_limit(const Settings *set, const Border *border, int outer, double at) {
     double edge = border->at + border->rise * at;
     return outer ? edge + set->beyond_px : min_of(set->reach_px, edge - set->clear_px);
 }
 
-/* Collects the pixels from `inner` pixels inside the side's line to those before the border's outer
- * edge, or about both. */
+/* Collects the pixels near a side, from `inner` pixels inside its line to `outward_limit`. Those
+ * between the side and a border's outer edge, far from both, are left out. */
 static void collect(const Image *p, const Settings *set, const Side *s, const Border *border,
                     int outer, double inner, Band *band) {
     double length = sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]);

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* How well light from each of many directions explains the grey levels of points on a mesh.
+/* Rate how well light from each of many directions explains the grey levels of points on a mesh.
  *
  * The grey level of a point is reflectance (a + d max(n's, 0) v) + gloss d v (n'h)^m: ambient level
  * a, level d of the sun in the direction s, visibility v from the sun, Blinn's half vector h. For a
@@ -7,7 +7,8 @@
  * Cauchy's weights. */
 #include "base.h"
 
-#define LIGHT_ROUNDS 3 /* rounds of reweighting (chosen): each costs as much as the first */
+/* Rounds of reweighting, each of which costs as much as the first. More: outliers weigh less. */
+#define LIGHT_ROUNDS 3
 #define POINT_DOUBLES 14 /* size of a LitPoint */
 
 /* A point: position, unit normal, unit vector to the camera, all in TRF; reflectance, gloss,

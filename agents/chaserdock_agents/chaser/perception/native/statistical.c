@@ -13,8 +13,7 @@ typedef struct {
 } MarkerLimits;
 
 /* Factorize the symmetric a (6, 6) in place: lower triangle of G, G G' = a. Return 0 unless each
- * pivot is larger than
- * ``least`` (false for NaN). */
+ * pivot is larger than ``least`` (false for NaN). */
 static int factorize6(double *a, double least) {
     for (int i = 0; i < 6; i++)
         for (int j = 0; j <= i; j++) {
@@ -90,9 +89,9 @@ static void add_information(const PinholeCamera *lens, const double *corners,
     }
 }
 
-/* ``corners`` (m, 4, 3), ``origins`` and ``normals`` (m, 3) of m markers in the target's axes;
- * ``pose``: position (3) and rotation (3, 3) of the target in the camera; ``white`` (6): standard
- * normal numbers. Writes which markers are seen (m), the ideal pixels of all corners (m, 4, 2),
+/* Measure a pose as an image would, by the markers that it shows. ``corners`` (m, 4, 3),
+ * ``origins`` and ``normals`` (m, 3): of m markers in the target's axes. ``pose``: position (3) and
+ * rotation (3, 3) of the target in the camera. ``white`` (6): standard normal numbers. Writes which markers are seen (m), the ideal pixels of all corners (m, 4, 2),
  * and, by position and rotation vector, the covariance (6, 6) of the pose and an error (6) drawn
  * from it. Returns the number of markers seen; 0 if none is or if they do not determine the pose;
  * -1 if a corner of any is behind the camera. */

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Projection of markers for a pose: distances from the detections, and which markers should be
+/* Project markers for a pose: distances from the detections, and which markers should be
  * visible. */
 #include "base.h"
 

@@ -2,8 +2,8 @@
 /* Cholesky factors of small matrices. */
 #include "layout.h"
 
-/* Replace the lower triangle of a symmetric matrix a (k, k) by its Cholesky factor, of which only
- * that triangle is set. Return 0 if a is not positive definite or not finite. */
+/* Replace the lower triangle of a symmetric matrix a (k, k) by its Cholesky factor; the upper
+ * one is untouched. Return 0 if a is not positive definite or not finite. */
 static int factorize(double *a, int k) {
     for (int j = 0; j < k; j++) {
         double d = a[k * j + j];
@@ -19,7 +19,7 @@ static int factorize(double *a, int k) {
     return 1;
 }
 
-/* b becomes L^-1 b, L the factor (k, k) of `factorize`. */
+/* Replace b by L^-1 b, where L is the factor (k, k) of `factorize`. */
 static void solve_factor(const double *factor, int k, double *b) {
     for (int i = 0; i < k; i++) {
         for (int m = 0; m < i; m++) b[i] -= factor[k * i + m] * b[m];

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The covariance (D, D) of the error vector: prediction, and its update by rows. */
+/* Covariance (D, D) of the error vector: prediction, and reduction by measured rows. */
 #include "layout.h"
 
 /* Copy the lower triangle of a (d, d) to its upper one. */
@@ -10,8 +10,8 @@ static void mirror(double *a, int64_t d) {
                 for (int64_t c = c0; c < c0 + 8 && c < r; c++) a[d * c + r] = a[d * r + c];
 }
 
-/* Rows 0 .. 11 of `out` (12 rows of length d) become the first `columns` (at least 12) elements of
- * F x, F' = `f` (k, 12) and x the k rows of `p`. */
+/* Write the first `columns` (at least 12) elements of F x to the rows 0 .. 11 of `out` (rows of
+ * length d). F' = `f` (k, 12); x: the k rows of `p`. */
 static void transform_rows(const double *f, int k, const double *p, int64_t d, int64_t columns,
                            double *out) {
     for (int64_t at = 0; at < columns; at += 4) {
@@ -26,7 +26,7 @@ static void transform_rows(const double *f, int k, const double *p, int64_t d, i
     }
 }
 
-/* out (12) = x F', F' = `f` (k, 12), x (k). */
+/* Write x F' to out (12). F' = `f` (k, 12), x (k). */
 static void transform_row(const double *f, int k, const double *x, double *out) {
     v4 a = splat(0.0), b = a, c = a;
     for (int m = 0; m < k; m++) {
@@ -38,10 +38,10 @@ static void transform_row(const double *f, int k, const double *x, double *out) 
     store(out, a), store(out + 4, b), store(out + 8, c);
 }
 
-/* Lower triangle of `out` becomes that of F P F', for P = `p` (d, d): F is block diagonal, with the
- * transposed `target` (12, 12), and for each chaser rows as `motion_transition` gives them, in
- * `motion` (n, MOTION, COUPLED), and factors `fade` (n, CHASER) of the components from MOTION on;
- * what follows the chasers is constant. `g`: working memory (d, d). */
+/* Write the lower triangle of F P F' to `out`, P = `p` (d, d). F is block diagonal: the
+ * transpose of `target` (12, 12); for each chaser its rows from `motion_transition`, in
+ * `motion` (n, MOTION, COUPLED), and factors `fade` (n, CHASER) of its components from MOTION
+ * on; identity for what follows the chasers. `g`: working memory (d, d). */
 static void propagate(int64_t n, int64_t d, const double *target, const double *motion,
                       const double *fade, const double *p, double *g, double *out) {
     const int64_t end = size_of(n);
@@ -95,7 +95,7 @@ static void add_noise(double *p, int64_t d, int64_t first, const double *magnitu
             const double more = m->torque_max * m->unknown_s;
             angular = (torque * torque + arm * arm + more * more) / (m->inertia[k] * m->inertia[k]);
         }
-        /* The impulse acts, on average, in the middle of the interval. */
+        /* On average an impulse acts in the middle of the interval. */
         add_element(p, d, first, VELOCITY + k, VELOCITY + k, linear);
         add_element(p, d, first, POSITION + k, POSITION + k, linear * dt * dt / 3.0);
         add_element(p, d, first, VELOCITY + k, POSITION + k, linear * dt / 2.0);
@@ -165,8 +165,8 @@ EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *t
     mirror(out, d);
 }
 
-/* Subtract W'W from the lower triangle of p (d, d), W the k rows of `w`, of length `stride` with
- * zeros from d on (stride a multiple of 8, at least d + 3). */
+/* Subtract W'W from the lower triangle of p (d, d). W: the k rows of `w`, of length `stride`,
+ * with zeros from d on (stride: a multiple of 8, at least d + 3). */
 static void subtract_square(const double *w, int k, int64_t stride, double *p, int64_t d) {
     for (int64_t r = 0; r < d; r += 4)
         for (int64_t c = 0; c <= r + 3 && c < d; c += 8) {
@@ -193,8 +193,8 @@ static void subtract_square(const double *w, int k, int64_t stride, double *p, i
         }
 }
 
-/* Make the rotation error at `first` relative to an attitude corrected by `correction` (3), in the
- * lower triangle of p (Sola eq. 287). */
+/* Refer the rotation error at `first` to an attitude that was corrected by `correction` (3):
+ * update the lower triangle of p (Sola eq. 287). */
 static void turn_error(double *p, int64_t d, int64_t first, const double *correction) {
     double reset[9], transposed[9];
     right_jacobian(correction, reset);

@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Layout of the error vector and of the mean, as in state.py.
  *
- * Error vector (D = TARGET + CHASER n, or more): the target's components, then those of each
- * chaser. Further ones are constant, no measurement depends on them, and the mean does not contain
- * them: the shape of a torque-free target. Mean (TARGET_MEAN + CHASER_MEAN n): position, velocity,
- * attitude, rate of the target; the same of each chaser, and its additive states, which are its
- * error's components from FORCE on.
- */
+ * Error vector (D = TARGET + CHASER n, or more): components of the target, then of each chaser.
+ * Further components are constant and no measurement depends on them; the mean does not contain
+ * them. They are the shape of a torque-free target.
+ *
+ * Mean (TARGET_MEAN + CHASER_MEAN n): position, velocity, attitude and rate of the target; the
+ * same of each chaser, then its additive states (its error components from FORCE on). */
 #ifndef CHASERDOCK_LAYOUT_H
 #define CHASERDOCK_LAYOUT_H
 
@@ -26,9 +26,11 @@ enum {
     FOCAL = 36,
     VIEW = 37
 };
-/* Of a mean: attitude and rate; place of an additive state less its component in the error. */
+/* Offsets in a mean: attitude, rate; ADDITIVE: offset of an additive state less that of its
+ * error component. */
 enum { QUATERNION = 6, OMEGA = 10, ADDITIVE = 1 };
-/* Rows of measurements, channels of a chaser's measurements, components that they depend on. */
+/* Rows of measurements, channels of a chaser's measurements, components that measurements
+ * depend on. */
 enum {
     SIGHTING_ROWS = 6,
     ODOMETRY_ROWS = 12,

@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Measurements of a chaser, linearized. Models: measurements.py. */
+/* Linearized measurements of a chaser. Models: measurements.py. */
 #include "layout.h"
 
 /* Measurements of chaser i of n. lens (3), axes (3, 3), camera (4): nominal mounting. odometry
  * (13): position, velocity, attitude, rate; noise (12, 12). sighting (7): position, attitude in
- * IRF; stated covariance (6, 6) with the floor. view (6, 6): covariance in whose units the view's
- * error is. odometry and sighting may be null, not both. */
+ * IRF; stated covariance (6, 6) with the floor. view (6, 6): covariance that defines the unit
+ * of the view error. Either odometry or sighting may be null. */
 typedef struct {
     int64_t n, i;
     const double *lens, *axes, *camera, *odometry, *odometry_noise, *sighting, *stated, *view;
@@ -18,8 +18,8 @@ static int rows_of(const Measurement *z) {
     return (z->sighting ? SIGHTING_ROWS : 0) + (z->odometry ? ODOMETRY_ROWS : 0);
 }
 
-/* Predict the sighting of the target (mean `t`) by a chaser (mean `x`): position, attitude (4) in
- * IRF, and Jacobian (6, SEEN) by the errors of target and chaser, without that by the view's
+/* Predict the sighting of the target (mean `t`) by a chaser (mean `x`): position and attitude
+ * (4) in IRF, and the Jacobian (6, SEEN) by the errors of target and chaser, without the view
  * error. */
 static void predict_pose(const double *t, const double *x, const double *lens,
                          const double *mounting, const double *camera, double *position,
@@ -76,7 +76,7 @@ static void predict_pose(const double *t, const double *x, const double *lens,
     relative_quaternion(q_camera, t + QUATERNION, attitude);
 }
 
-/* Rotation vector from the predicted attitude to the measured one. */
+/* Return in `turn` the rotation vector from the predicted to the measured attitude. */
 static void turn_between(const double *predicted, const double *measured, double *turn) {
     double q[4];
     relative_quaternion(predicted, measured, q);
@@ -84,8 +84,8 @@ static void turn_between(const double *predicted, const double *measured, double
     logarithmic_map(q, turn);
 }
 
-/* Residual (6), Jacobian (6, SEEN) and noise, in rows of length `k`. Without the view's error if a
- * covariance is not positive definite; the noise is then NaN. */
+/* Write residual (6), Jacobian (6, SEEN) and noise of a sighting, in rows of length `k`. If a
+ * covariance is not positive definite, the noise is NaN and the view error is left out. */
 static void linearize_sighting(const Measurement *z, const double *t, const double *x,
                                double *residual, double *h, double *noise, int k) {
     double position[3], attitude[4], factor[36], turn[3];
@@ -137,8 +137,8 @@ static void linearize_odometry(const Measurement *z, const double *x, double *re
     for (int i = 0; i < ODOMETRY_ROWS; i++) copy(z->odometry_noise + 12 * i, noise + k * i, 12);
 }
 
-/* Residual (k), Jacobian (k, SEEN) by the errors of target and chaser, and noise (k, k), the
- * sighting first. */
+/* Write residual (k), Jacobian (k, SEEN) by the errors of target and chaser, and noise (k, k).
+ * The sighting comes first. */
 EXPORT void NAME(linearize)(const Measurement *z, const double *mean, double *residual, double *h,
                             double *noise) {
     const double *x = chaser_of(mean, z->i);
@@ -149,7 +149,7 @@ EXPORT void NAME(linearize)(const Measurement *z, const double *mean, double *re
         linearize_odometry(z, x, residual + first, h + SEEN * first, noise + (k + 1) * first, k);
 }
 
-/* As the function above, of chaser i: pose (7) and Jacobian (6, SEEN). */
+/* Predict the sighting of chaser i as `predict_pose`: pose (7) and Jacobian (6, SEEN). */
 EXPORT void NAME(predict_sighting)(const double *mean, int64_t i, const double *lens,
                                    const double *axes, const double *camera, double *pose,
                                    double *h) {

@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Motion of a chaser: its mean, and the transition of its errors. Equations: prediction.py. */
+/* Motion of a chaser: mean, and transition of the errors. Equations: prediction.py. */
 #include "layout.h"
 
-/* Parameters of a prediction over dt. inertia: principal moments. fade_*: factors by which drifts
- * decay. unknown_s: time in which the command is unknown. Others: as in JointParameters. */
+/* Parameters of a prediction over dt. inertia: principal moments. fade_*: decay factors of
+ * drifts. unknown_s: time for which the command is unknown. Others: as in JointParameters. */
 typedef struct {
     double dt, mass, inertia[3], mean_motion, fade_position, fade_attitude, unknown_s;
     double control_force_share, control_torque_share, control_arm, force_max, torque_max,
@@ -34,14 +34,14 @@ static void shift_wrench(const double *wrench, const double *centre, const doubl
     for (int i = 0; i < 3; i++) out[i] = wrench[i] - mass * (tangential[i] + centripetal[i]);
 }
 
-/* Wrench (6) that moves a body with its centre of mass at the origin as `wrench` (6) moves one with
- * it at `centre` (3). */
+/* Compute the wrench (6) that moves a body with its centre of mass at the origin as `wrench`
+ * (6) moves one with it at `centre` (3). */
 EXPORT void NAME(wrench_at_origin)(const double *wrench, const double *centre, const double *omega,
                                    double mass, const double *inertia, double *out) {
     shift_wrench(wrench, centre, omega, mass, inertia, out);
 }
 
-/* Newton-Euler equations of a state (13) under a wrench (6) in body axes. */
+/* Evaluate the Newton-Euler equations for a state (13) under a wrench (6) in body axes. */
 static void state_rate(const double *y, const double *u, const Motion *p, double *out) {
     const double *q = y + QUATERNION, *omega = y + OMEGA;
     double t[3], force[3], cross[3];
@@ -57,7 +57,7 @@ static void state_rate(const double *y, const double *u, const Motion *p, double
     angular_acceleration(u + 3, omega, p->inertia, out + 10);
 }
 
-/* One step of the classical Runge-Kutta method, in place. */
+/* Advance by one step of the classical Runge-Kutta method, in place. */
 static void move(double *y, const double *u, const Motion *p) {
     double k[4][13], at[13];
     copy(y, at, 13);
@@ -147,7 +147,7 @@ static void motion_transition(const double *x, const double *wrench, const doubl
     multiply_matrices(c, m, n);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) velocity[MOTION * i + CENTRE + j] -= n[3 * i + j];
-    /* Clohessy-Wiltshire. */
+    /* Clohessy-Wiltshire accelerations. */
     const double w = p->mean_motion;
     velocity[POSITION] += 3.0 * w * w, velocity[2 * MOTION + POSITION + 2] -= w * w;
     velocity[VELOCITY + 1] += 2.0 * w, velocity[MOTION + VELOCITY] -= 2.0 * w;

@@ -3,10 +3,11 @@
  * docs/estimation.md. */
 #include "layout.h"
 
-/* Memory of an update: residual (18), jacobian (18, SEEN), noise, innovation covariance s (18, 18),
- * cross (18, stride) = H P, white (18, stride), correction (D). values: squared norm of each
- * channel's residual by its innovation covariance, then the determinant of the sighting's; NaN
- * where that is not positive definite. stride: D, rounded up to a multiple of 8. size: D. */
+/* Working memory of an update. residual (18), jacobian (18, SEEN), noise, innovation covariance
+ * s (18, 18), cross (18, stride) = H P, white (18, stride), correction (D). values: for each
+ * channel the squared residual normalized by its innovation covariance, then the determinant of
+ * the sighting's; NaN if that is not positive definite. size: D. stride: D, rounded up to a
+ * multiple of 8. */
 typedef struct {
     double *residual, *jacobian, *noise, *s, *cross, *white, *correction, *values;
     int64_t stride, size;
@@ -29,7 +30,7 @@ static void chaser_difference(const double *a, const double *b, double *error) {
     for (int k = FORCE; k < CHASER; k++) error[k] = b[ADDITIVE + k] - a[ADDITIVE + k];
 }
 
-/* Error (D) that takes the mean `a` to `b`. */
+/* Compute the error (D) that takes the mean `a` to `b`. */
 EXPORT void NAME(difference)(int64_t n, const double *a, const double *b, double *error) {
     body_difference(a, b, error);
     for (int64_t i = 0; i < n; i++)
@@ -48,7 +49,7 @@ static void inject_body(const double *x, const double *error, double *out) {
     normalize_quaternion(out + QUATERNION);
 }
 
-/* out: the mean corrected by an error (D); may be the mean itself. */
+/* Correct the mean by an error (D). `out` may be the mean itself. */
 EXPORT void NAME(inject)(int64_t n, const double *mean, const double *error, double *out) {
     inject_body(mean, error, out);
     for (int64_t i = 0; i < n; i++) {
@@ -59,8 +60,8 @@ EXPORT void NAME(inject)(int64_t n, const double *mean, const double *error, dou
     }
 }
 
-/* Rows of the covariance that belong to target and chaser i, (SEEN, d), from the lower triangle of
- * p. */
+/* Copy the rows of the covariance that belong to target and chaser i to `seen` (SEEN, d), from
+ * the lower triangle of p. */
 static void gather(const double *p, int64_t d, int64_t i, double *seen) {
     const int64_t first = first_of(i);
     for (int64_t r = 0; r < SEEN; r++) {
@@ -75,8 +76,8 @@ static void gather(const double *p, int64_t d, int64_t i, double *seen) {
     }
 }
 
-/* Squared norm of the residual of rows first .. first + k - 1 by their innovation covariance, and
- * its determinant. */
+/* Return the squared residual of the rows first .. first + k - 1, normalized by their
+ * innovation covariance, and write its determinant. */
 static double normalized_square(const double *s, int rows, const double *residual, int first, int k,
                                 double *determinant) {
     double factor[SIGHTING_ROWS * SIGHTING_ROWS], b[SIGHTING_ROWS], square = 0.0;
@@ -97,9 +98,9 @@ static double normalized_square(const double *s, int rows, const double *residua
 
 EXPORT int64_t NAME(innovate_workspace)(int64_t d) { return SEEN * d + TARGET + CHASER + 2 * 8; }
 
-/* Linearize the measurements at `mean` and compute the innovation by the lower triangle of
- * `covariance` (D, D). The residual is that of the prior mean `prior`, to first order, for an
- * iterated update; equal to `mean` in the first iteration. */
+/* Linearize the measurements at `mean` and compute the innovation with the lower triangle of
+ * `covariance` (D, D). In an iterated update the residual is, to first order, that of the prior
+ * mean `prior`; in the first iteration `prior` equals `mean`. */
 EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const double *prior,
                            const double *covariance, Innovation *out, double *work) {
     const int64_t d = out->size, first = first_of(z->i), stride = out->stride;
@@ -146,9 +147,9 @@ EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const doubl
             out->values[c] = normalized_square(s, k, out->residual, row, 3, &unused);
 }
 
-/* Correct the mean `prior` by the `used` rows (m) of the k rows of an innovation: white = L^-1 H P
- * and the correction in `z`, and `mean`. Return 0 and leave `mean` if their innovation covariance
- * is not positive definite. */
+/* Correct the mean `prior` by the `used` rows (m) of an innovation of k rows, and write the
+ * result to `mean`; keep white = L^-1 H P and the correction in `z`. Return 0, with `mean`
+ * unchanged, if their innovation covariance is not positive definite. */
 EXPORT int64_t NAME(correct)(int64_t n, int64_t k, const int64_t *used, int64_t m, Innovation *z,
                              const double *prior, double *mean) {
     double factor[MOST_ROWS * MOST_ROWS], y[MOST_ROWS];
@@ -175,8 +176,8 @@ EXPORT int64_t NAME(correct)(int64_t n, int64_t k, const int64_t *used, int64_t 
     return 1;
 }
 
-/* Subtract the information of the m rows of white from the lower triangle of `covariance`, and make
- * the rotation errors of target and chaser i relative to their corrected attitudes. */
+/* Reduce the lower triangle of `covariance` by the m rows of white, and refer the rotation
+ * errors of target and chaser i to their corrected attitudes. */
 EXPORT void NAME(reduce)(int64_t i, int64_t m, const Innovation *z, double *covariance) {
     const int64_t d = z->size, own = first_of(i) + ATTITUDE;
     subtract_square(z->white, (int)m, z->stride, covariance, d);
@@ -184,5 +185,5 @@ EXPORT void NAME(reduce)(int64_t i, int64_t m, const Innovation *z, double *cova
     turn_error(covariance, d, own, z->correction + own);
 }
 
-/* Make a covariance (D, D) symmetric by its lower triangle. */
+/* Fill the upper triangle of a covariance (D, D) from the lower one. */
 EXPORT void NAME(complete)(int64_t d, double *covariance) { mirror(covariance, d); }

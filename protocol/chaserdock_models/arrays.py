@@ -25,5 +25,7 @@ def length(vector: Array) -> float:
 
 
 def limited(values: Array, limits: Array) -> Array:
-    """Clip values (n,) to plus and minus ``limits`` (n,), in a third of the time of ``numpy.clip``."""
+    """Clip values (n,) to plus and minus ``limits`` (n,), in a third of the time of
+    ``numpy.clip``.
+    """
     return np.minimum(np.maximum(values, -limits), limits)

@@ -53,7 +53,9 @@ class RigidBody(Protocol):
 
 
 def rk4_step(derivative: Callable[[Array], Array], y: Array, step_s: float) -> Array:
-    """Return ``y`` after one step of the classical Runge-Kutta method for y' = ``derivative(y)``."""
+    """Return ``y`` after one step of the classical Runge-Kutta method for y' =
+    ``derivative(y)``.
+    """
     k1 = derivative(y)
     k2 = derivative(y + 0.5 * step_s * k1)
     k3 = derivative(y + 0.5 * step_s * k2)

@@ -20,7 +20,9 @@ Published = tuple[Topic, int | str | None, Message]
 
 
 class ReplayNode:
-    """Stand in for a ``Node``: deliver the messages that were put in, and collect published ones."""
+    """Stand in for a ``Node``: deliver the messages that were put in, and collect published
+    ones.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name

@@ -224,6 +224,7 @@ def uses_of_full_scenario(path: Path) -> set[str]:
     return ({name.rpartition(".")[2] for name in of_protocol} | used) & FULL_SCENARIO
 
 
+@pytest.mark.slow
 def test_flying_packages_do_not_load_the_full_scenario() -> None:
     """The recorder alone asks for it, and stores it in the log as text."""
     found = {short(p): names for p in FLYING_PACKAGES if (names := uses_of_full_scenario(p))}

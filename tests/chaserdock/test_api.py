@@ -94,9 +94,11 @@ def test_run_from_a_thread_prints_nothing(
 
 _INTERRUPTED = """
 import signal, sys, chaserdock as cd
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell starts programs with SIGINT ignored
+# A background shell starts programs with SIGINT ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 try:
-    cd.run("single", out=sys.argv[1], on_event=lambda event: print(type(event).__name__, flush=True))
+    show = lambda event: print(type(event).__name__, flush=True)
+    cd.run("single", out=sys.argv[1], on_event=show)
 except KeyboardInterrupt:
     print("interrupted")
 """

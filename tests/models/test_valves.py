@@ -125,6 +125,18 @@ def test_stuck_off_and_weak() -> None:
     np.testing.assert_allclose(given_N_s(valves), [0.2, 0.4], rtol=1e-12)
 
 
+def test_a_weak_thruster_is_weak_in_the_pulses_that_begin_with_its_failure_or_later() -> None:
+    fails_ns = 150 * MS + 7
+    begins_ns = (fails_ns - 1, fails_ns, fails_ns + 1)
+    valves = Valves([thruster(1.0, 3.0, thrust_N) for thrust_N in (1.5, 2.0, 2.5)])
+    for k, begin_ns in enumerate(begins_ns):
+        valves.fail(k, "weak", fails_ns, 0.25)
+        assert valves.pulse(k, begin_ns, begin_ns + 40 * MS)
+    # A pulse of 40 ms, and half of the fall less the rise.
+    expected_N_s = np.array([1.5, 0.25 * 2.0, 0.25 * 2.5]) * 0.041
+    np.testing.assert_allclose(given_N_s(valves), expected_N_s, rtol=1e-12)
+
+
 def test_stop_ends_pulses_but_not_what_is_stuck() -> None:
     valves = Valves([thruster(), thruster()])
     valves.pulse(0, 0, 500 * MS)

@@ -213,7 +213,8 @@ def test_markers_lie_on_shipped_and_own_meshes(servicer_file: Path) -> None:
         ('target.geometry={dictionary="DICT_4X4_50", markers=[]}', "cuboids: is empty"),
         ('target.geometry={mesh="nowhere.glb"}', r"nowhere\.glb: no such mesh file"),
         (
-            'target.geometry={dictionary="DICT_4X4_50", mesh="geo_servicer", markers=[{id=1, side_m=0.1, face="+x"}]}',
+            'target.geometry={dictionary="DICT_4X4_50", mesh="geo_servicer", '
+            'markers=[{id=1, side_m=0.1, face="+x"}]}',
             "no cuboid 0; give position_m and q_wxyz",
         ),
     ],

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check for packages that only some scenarios need of the world, and state what to do without them."""
+"""Check for packages that only some scenarios need of the world, and state what to do
+without them.
+"""
 
 from __future__ import annotations
 

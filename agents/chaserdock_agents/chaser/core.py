@@ -138,7 +138,9 @@ class ChaserCore:
             self._check_command_timeout(odometry)
 
     def _replace_lost(self, topic: Topic, lost: LostMessage) -> None:
-        """Handle the loss of a message in lock-step, so that the chaser still replies to the tick."""
+        """Handle the loss of a message in lock-step, so that the chaser still replies to
+        the tick.
+        """
         inbox = self.inbox
         if topic is topics.IMAGE:
             no_image = Sighting(

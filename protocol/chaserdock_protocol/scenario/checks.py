@@ -142,7 +142,9 @@ def _check_references(scenario: FlightScenario) -> None:
 
 
 def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> float:
-    """Return the distance (m) of a chaser at an offset (3,), TRF, from the cuboids of the target."""
+    """Return the distance (m) of a chaser at an offset (3,), TRF, from the cuboids of the
+    target.
+    """
     pose = _reference_pose(scenario, chaser, offset_m)
     return distance_from_cuboids(
         box_table(scenario.target_model().boxes), box_table(scenario.chaser.boxes()), *pose

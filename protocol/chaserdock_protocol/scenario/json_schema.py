@@ -74,7 +74,9 @@ def number_text(value: float) -> str:
 
 
 def range_text(node: SchemaNode, every: bool = False) -> str:
-    """Return the range of a number in words; ``every``: including the bound that all numbers have."""
+    """Return the range of a number in words; ``every``: including the bound that all
+    numbers have.
+    """
     bounds = {
         k: node[k]
         for k in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum")

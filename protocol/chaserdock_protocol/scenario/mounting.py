@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derive what holds for chasers at their ports: nominal poses, and thrusters whose plume is free."""
+"""Derive what holds for chasers at their ports: nominal poses, and thrusters whose plume is
+free.
+"""
 
 from __future__ import annotations
 

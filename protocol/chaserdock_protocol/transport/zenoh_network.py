@@ -175,7 +175,9 @@ class ZenohNetwork:
 
 
 class _ZenohConnection:
-    """Carry one node's messages over a Zenoh session; all declarations live as long as the session."""
+    """Carry one node's messages over a Zenoh session; all declarations live as long as the
+    session.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session

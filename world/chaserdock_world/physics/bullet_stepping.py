@@ -110,7 +110,9 @@ class BulletStepper:
 
 
 def make_stepper(bodies: Sequence[int], client: int, step_s: float) -> BulletStepper | None:
-    """Return a stepper for a PyBullet client; None if this build of PyBullet lacks what it needs."""
+    """Return a stepper for a PyBullet client; None if this build of PyBullet lacks what it
+    needs.
+    """
     functions = _addresses()
     if functions is None:
         return None

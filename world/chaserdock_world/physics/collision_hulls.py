@@ -171,7 +171,9 @@ def _clipped(corners: Array, axis: int, at: float, side: float) -> Array:
 
 
 def triangles_of(vertices: Array) -> IntArray:
-    """Return the triangles (m, 3) of the hull of ``vertices`` (n, 3); none for points in a plane."""
+    """Return the triangles (m, 3) of the hull of ``vertices`` (n, 3); none for points in a
+    plane.
+    """
     hull = _hull(vertices)
     return (
         np.zeros((0, 3), dtype=np.int64)

@@ -41,7 +41,9 @@ class SolidBox:
 
 @dataclass(frozen=True, eq=False)
 class SolidCapsule:
-    """A cylinder of ``length_m`` along z with round ends of ``radius_m``; posed as a ``SolidBox``."""
+    """A cylinder of ``length_m`` along z with round ends of ``radius_m``; posed as a
+    ``SolidBox``.
+    """
 
     radius_m: float
     length_m: float

@@ -156,7 +156,9 @@ class Latching:
         return None
 
     def _is_tip(self, name: str, point_m: Sequence[float]) -> bool:
-        """Return whether a point (3,), WRF, of a chaser's surface is on the round end of its probe."""
+        """Return whether a point (3,), WRF, of a chaser's surface is on the round end of
+        its probe.
+        """
         if name not in self.latches:
             return False
         s = self._bodies.state(name)

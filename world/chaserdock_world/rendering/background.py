@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the background of an image, space, stars and the Earth, and describe the light on the scene."""
+"""Draw the background of an image, space, stars and the Earth, and describe the light on
+the scene.
+"""
 
 from __future__ import annotations
 

@@ -89,7 +89,9 @@ class Cameras:
     def images(
         self, chasers: Sequence[int], number: int, tick: int, time_ns: int, states: States
     ) -> list[Image]:
-        """Return ``image`` of several chasers at one time, in their order, rendered on two threads."""
+        """Return ``image`` of several chasers at one time, in their order, rendered on two
+        threads.
+        """
         exposure = (number, tick, time_ns, states)
         futures = {i: self._second_thread.submit(self.image, i, *exposure) for i in chasers[1::2]}
         images = {i: self.image(i, *exposure) for i in chasers[::2]}

@@ -291,7 +291,9 @@ class MeshRenderer:
     def _shadow_maps(
         self, illumination: NDArray[np.void], camera: Array, bodies: list[_Body], poses: Array
     ) -> tuple[NDArray[np.void], int]:
-        """Return the shadow map of every body, unused for those out of view, and the texels of all."""
+        """Return the shadow map of every body, unused for those out of view, and the texels
+        of all.
+        """
         maps = np.zeros(len(bodies), _SHADOW_MAP)
         across, along = illumination["across"][0], illumination["along"][0]
         offset = 0

@@ -40,7 +40,9 @@ class CameraErrors:
 
 
 def camera_errors(scenario: Scenario, chaser: int) -> CameraErrors:
-    """Return the errors of a chaser's camera: those of ``[navigation]`` and of ``[truth.camera]``."""
+    """Return the errors of a chaser's camera: those of ``[navigation]`` and of
+    ``[truth.camera]``.
+    """
     stated, unknown = scenario.navigation.errors(), scenario.truth.camera
     known = generator(scenario.seed, Stream.CALIBRATION, chaser).standard_normal(9)
     beyond = generator(scenario.seed, Stream.UNKNOWN_CALIBRATION, chaser).standard_normal(9)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish the world's messages at the beginning of a tick: odometry, docking sensors, ground truth."""
+"""Publish the world's messages at the beginning of a tick: odometry, docking sensors,
+ground truth.
+"""
 
 from __future__ import annotations
 

@@ -28,7 +28,9 @@ POINT_SPREAD_PX = 0.65
 
 @dataclass(frozen=True)
 class BearingParameters:
-    """Parameters of the search for a spot, measured by benchmarks/perception.py (markers-bearing)."""
+    """Parameters of the search for a spot, measured by benchmarks/perception.py
+    (markers-bearing).
+    """
 
     # Least brightness of a spot above the background, grey levels.
     levels: float = 6.0

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report planned thruster failures to a chaser when they happen, as its hardware would (test bed)."""
+"""Report planned thruster failures to a chaser when they happen, as its hardware would
+(test bed).
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decide when a chaser's motion proves a failed thruster, and when a thruster is fired to find out."""
+"""Decide when a chaser's motion proves a failed thruster, and when a thruster is fired to
+find out.
+"""
 
 from __future__ import annotations
 

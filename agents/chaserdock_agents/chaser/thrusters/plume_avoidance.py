@@ -59,7 +59,9 @@ class PlumeAvoidance:
         return np.where(hits, self._factor, 1.0)
 
     def _near(self, nozzle: Array, force: Array, others: list[RelativeEstimate]) -> list[Box]:
-        """Return the bodies (TRF) of chasers whose bounding sphere the plume of a thruster meets."""
+        """Return the bodies (TRF) of chasers whose bounding sphere the plume of a thruster
+        meets.
+        """
         near = []
         for r in others:
             centre = np.array(r.position_m)

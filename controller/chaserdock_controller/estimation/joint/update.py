@@ -549,6 +549,6 @@ def _count(count: int, value: float, gate: float, p: JointParameters) -> tuple[i
     whether the channel is used.
     """
     limit = p.rejections_to_drop
-    if not value <= gate:  # also rejects NaN
+    if not value <= gate:  # rejects NaN as well
         return min(count + 1, 2 * limit), False
     return (count - 1 if count >= limit else 0), count < limit

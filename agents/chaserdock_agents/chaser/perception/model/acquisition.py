@@ -408,7 +408,9 @@ class Acquisition:
 
 
 def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
-    """Return the mask (h, w) of the largest connected region brighter than the background, or None."""
+    """Return the mask (h, w) of the largest connected region brighter than the background,
+    or None.
+    """
     level = float(np.median(image)) + _SEARCH.min_contrast
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     bright = cv2.morphologyEx(
@@ -476,7 +478,9 @@ def _sharp_region(image: NDArray[np.float32], slope: float) -> NDArray[np.uint8]
 
 
 def _look_at(ray: Array) -> Array:
-    """Return the rotation (3, 3) from IRF to axes whose z points along ``ray``, of smallest angle."""
+    """Return the rotation (3, 3) from IRF to axes whose z points along ``ray``, of smallest
+    angle.
+    """
     z = ray / np.linalg.norm(ray)
     axis = np.cross(z, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))

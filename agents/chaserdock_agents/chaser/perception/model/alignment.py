@@ -213,7 +213,9 @@ def window_of(
 
 
 def area_px(pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera) -> float:
-    """Return the area, px, of the target's window of level ``k``; 0 if the target is out of view."""
+    """Return the area, px, of the target's window of level ``k``; 0 if the target is out of
+    view.
+    """
     found = window_of(pyramid, k, mesh, pose)
     return float(found[0].height * found[0].width) if found else 0.0
 

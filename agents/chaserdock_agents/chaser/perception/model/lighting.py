@@ -316,7 +316,9 @@ def _points_in(
     pixels: NDArray[np.int64],
     grey: Array | float = 0.0,
 ) -> LitPoints:  # fmt: skip
-    """Return the points of a view at ``pixels`` (n,), with their grey levels ``grey`` in the image."""
+    """Return the points of a view at ``pixels`` (n,), with their grey levels ``grey`` in
+    the image.
+    """
     row, column = np.divmod(pixels, window.width)
     fx, fy, cx, cy = window.lens
     rays = np.column_stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(pixels))])
@@ -364,7 +366,9 @@ def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
 
 
 def direct_light(points: LitPoints, maps: ShadowMaps, k: int) -> NDArray[np.float32]:
-    """Return the light (n,) that points reflect of a sun of level 1 in direction ``k`` of ``maps``."""
+    """Return the light (n,) that points reflect of a sun of level 1 in direction ``k`` of
+    ``maps``.
+    """
     out = np.empty(len(points.rows), np.float32)
     function("direct_light")(
         address(points.rows), c_int64(len(out)), (c_double * 3)(*maps.to_sun_trf[k]),

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spread work over several images: generators state the expected CPU time of each step before it."""
+"""Spread work over several images: generators state the expected CPU time of each step
+before it.
+"""
 
 from __future__ import annotations
 

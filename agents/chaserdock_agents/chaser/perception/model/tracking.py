@@ -300,6 +300,8 @@ def turn_between(a: PoseInCamera, b: PoseInCamera) -> float:
 
 
 def pose_error(estimate: PoseInCamera, truth: PoseInCamera) -> Array:
-    """Return the error (6,) of a pose as in its covariance: position in IRF, rotation in TRF axes."""
+    """Return the error (6,) of a pose as in its covariance: position in IRF, rotation in
+    TRF axes.
+    """
     turn = rotations.log(rotations.from_matrix(estimate.rotation.T @ truth.rotation))
     return np.concatenate([truth.position - estimate.position, turn])

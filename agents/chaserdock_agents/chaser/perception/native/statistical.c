@@ -91,10 +91,11 @@ static void add_information(const PinholeCamera *lens, const double *corners,
 
 /* Measure a pose as an image would, by the markers that it shows. ``corners`` (m, 4, 3),
  * ``origins`` and ``normals`` (m, 3): of m markers in the target's axes. ``pose``: position (3) and
- * rotation (3, 3) of the target in the camera. ``white`` (6): standard normal numbers. Writes which markers are seen (m), the ideal pixels of all corners (m, 4, 2),
- * and, by position and rotation vector, the covariance (6, 6) of the pose and an error (6) drawn
- * from it. Returns the number of markers seen; 0 if none is or if they do not determine the pose;
- * -1 if a corner of any is behind the camera. */
+ * rotation (3, 3) of the target in the camera. ``white`` (6): standard normal numbers. Writes which
+ * markers are seen (m), the ideal pixels of all corners (m, 4, 2), and, by position and rotation
+ * vector, the covariance (6, 6) of the pose and an error (6) drawn from it. Returns the number of
+ * markers seen; 0 if none is or if they do not determine the pose; -1 if a corner of any is behind
+ * the camera. */
 EXPORT int64_t NAME(measure_pose)(const PinholeCamera *lens, const MarkerLimits *limits,
                                   const double *corners, const double *origins,
                                   const double *normals, int64_t m, const double *pose,

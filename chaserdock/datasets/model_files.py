@@ -62,7 +62,8 @@ def _info(shape: TargetShape) -> dict[str, Any]:
 
 def read_models(folder: Path) -> TargetShape:
     """Return the shape of the only model of a folder. Raises DatasetError."""
-    import trimesh
+    # Needs trimesh, which is slow to import.
+    from chaserdock_protocol.scenario.mesh_files import trimesh_scene
 
     info_file = folder / "models_info.json"
     infos = read_object(info_file)
@@ -75,8 +76,8 @@ def read_models(folder: Path) -> TargetShape:
         raise DatasetError(f"{info_file}: must map the number of an object to its properties")
     file = folder / f"obj_{int(key):06d}.ply"
     try:
-        mesh: Any = trimesh.load_mesh(str(file), process=False)
-        points = 1e-3 * np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
+        found = trimesh_scene(file).geometry.values()
+        points = 1e-3 * np.concatenate([np.asarray(g.vertices, dtype=float) for g in found])
     except Exception as error:  # trimesh raises what its readers raise
         raise DatasetError(f"{file}: not a PLY model: {error}") from None
     if len(points) < 4 or not np.isfinite(points).all():

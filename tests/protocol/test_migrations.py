@@ -266,6 +266,19 @@ def test_removed_keys_are_accepted_with_the_value_that_holds_now() -> None:
     }  # fmt: skip
 
 
+def test_parts_that_were_removed_are_named() -> None:
+    used = {"chaser": {"modulation": {"modulator": "schmitt", "carry_over": True}}, "plume": None}
+    values = json.loads(json.dumps(used))
+    drop_removed_keys(values)
+    assert old_keys(values) == [
+        "chaser.modulation.modulator: the Schmitt trigger was removed: with it errors were ten "
+        "times larger, and propellant three times; remove the key"
+    ]
+    assert json.loads(migrated(json.dumps({"format": FORMAT, **used})))["chaser"] == {
+        "modulation": {}
+    }
+
+
 def test_old_keys_are_named_with_their_present_names() -> None:
     assert old_keys(FORMAT_3) == []
     lines = old_keys(FORMAT_1)

@@ -185,9 +185,6 @@ class CameraSection(FlightCamera):
     ambient: Fraction = Field(
         default=0.35, description="Share of the light that comes from all directions."
     )
-    eclipse_ambient: Fraction = Field(
-        default=0.05, description="Share of `ambient` that remains in an eclipse."
-    )
     lamp: NotNegative = Field(
         default=0.0,
         description="Light of the camera's own lamp: grey level of a white surface at 1 m "

@@ -38,6 +38,9 @@ from .scene_geometry import Obstacle
 # samples.
 _BLUR_STEP_PX, _BLUR_SAMPLES_MAX = 0.5, 16
 
+_ECLIPSE_AMBIENT = 0.05
+"""Share of `camera.ambient` that remains in an eclipse: a scene that is all but black."""
+
 States = dict[str, BodyState]
 
 
@@ -80,7 +83,7 @@ class Cameras:
         self._day = Light(
             section.sun_direction, 1.0 - section.ambient, section.ambient, section.lamp
         )
-        night = section.ambient * section.eclipse_ambient
+        night = section.ambient * _ECLIPSE_AMBIENT
         self._night = Light(section.sun_direction, 0.0, night, section.lamp)
         # A chaser's own body is behind its lens, its probe is not.
         self._own, self._others = (probe,), (body, probe)
@@ -127,9 +130,7 @@ class Cameras:
             return self._night if dark else self._day
         share = orbit.sunlit_share(time_s)
         x, y, z = orbit.to_sun(time_s).tolist()
-        ambient = section.ambient * (
-            section.eclipse_ambient + (1.0 - section.eclipse_ambient) * share
-        )
+        ambient = section.ambient * (_ECLIPSE_AMBIENT + (1.0 - _ECLIPSE_AMBIENT) * share)
         return Light((x, y, z), (1.0 - section.ambient) * share, ambient, section.lamp)
 
     def render(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:

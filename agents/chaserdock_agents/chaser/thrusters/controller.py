@@ -62,9 +62,7 @@ class ThrusterController:
         self._valves = Valves(body.thrusters)  # the chaser's model of the real valves
         self.health = ThrusterHealth(thrusts_max(body.thrusters))
         self._monitor = FaultMonitor(scenario, self._allocator)
-        self._avoidance = (
-            None if scenario.plume is None else PlumeAvoidance(scenario, scenario.plume)
-        )
+        self._avoidance = None if scenario.plume is None else PlumeAvoidance(scenario)
         self._cost_factors: Array | None = None
         self._reports_each = scenario.detumble.identification.enabled
         self._odometry: Odometry | None = None

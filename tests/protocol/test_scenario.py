@@ -238,7 +238,6 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("controller.horizon_s", 0.04, "controller", "shorter than one step"),
     ("controller.dt_s", 0.001, "controller", "3000 stages; at most 500"),
     ("controller.dt_s", 0.0, "controller.dt_s", "greater than 0"),
-    ("controller.dt_s", 0.05, "controller", "shorter than a tick (time.rate_hz = 15)"),
     ("controller.falloff", 1.5, "controller.falloff", "a number from 0 to 1 (got 1.5)"),
     ("controller.weight_force", 0.0, "controller.weight_force", "greater than 0"),
     ("approach.max_speed_m_s", 0.0, "approach.max_speed_m_s", "greater than 0"),

@@ -155,8 +155,8 @@ class Controller(ControllerOptions):
     )
     dt_s: Positive = Field(
         default=0.1,
-        description="Step of the prediction, s: at least a tick, as long as a command is held. Not "
-        "set: 0.1, or a tick where that is longer.",
+        description="Step of the prediction, s. A command is held for a tick, so a shorter step is "
+        "lengthened to one.",
     )
     falloff: Fraction = Field(
         default=0.0,
@@ -200,18 +200,13 @@ class Controller(ControllerOptions):
         return self
 
     def at_rate(self, rate_hz: int) -> Controller:
-        """Return the controller for ticks at ``rate_hz``, with the step derived if it is not set.
+        """Return the controller for ticks at ``rate_hz``: its step is at least a tick, for which a
+        command is held.
 
-        Raises ValueError for a step shorter than a tick: its input would be held for longer than
-        planned.
+        Raises ValueError for a horizon shorter than a tick.
         """
         if self.dt_s * rate_hz >= 1.0 - 1e-9:
             return self
-        if "dt_s" in self.model_fields_set:
-            raise ValueError(
-                f"dt_s ({self.dt_s:g} s) is shorter than a tick (time.rate_hz = {rate_hz}), for "
-                f"which a command is held: at least {1.0 / rate_hz:g} s, or leave it out"
-            )
         if self.horizon_s < 1.0 / rate_hz:
             raise ValueError(f"horizon_s ({self.horizon_s:g} s) is shorter than a tick")
         return self.model_copy(update={"dt_s": 1.0 / rate_hz})

@@ -46,21 +46,21 @@ def test_documented_fields_equal_the_produced_fields() -> None:
 
 
 def test_estimate_is_judged_relative_to_each_chaser() -> None:
-    """A shift of one chaser's estimated pose by 5 mm is its error, and violates the criterion; a
+    """A shift of one chaser's estimated pose by 15 mm is its error, and violates the criterion; a
     common drift does not.
     """
     flight = load_flight(GOLDEN)
-    limits = flight.scenario.success.model_copy(update={"max_estimate_position_m": 0.003})
+    limits = flight.scenario.success.model_copy(update={"max_estimate_position_m": 0.005})
     scenario = flight.scenario.model_copy(update={"success": limits, "settling_s": 1.0})
     before = summary_of(replace(flight, scenario=scenario))
-    assert before["chasers"]["0"]["relative_estimate"]["max_position_error_m"] < 0.002
+    assert before["chasers"]["0"]["relative_estimate"]["max_position_error_m"] < 0.004
     assert not [f for f in before["failures"] if "estimated pose" in f]
 
     history = flight.relative[0]
-    shifted = replace(history, position_m=history.position_m + np.array([0.003, 0.0, 0.004]))
+    shifted = replace(history, position_m=history.position_m + np.array([0.009, 0.0, 0.012]))
     after = summary_of(replace(flight, scenario=scenario, relative={**flight.relative, 0: shifted}))
     error = after["chasers"]["0"]["relative_estimate"]
-    assert abs(error["position_rms_m"] - 0.005) < 0.002
+    assert abs(error["position_rms_m"] - 0.015) < 0.004
     assert error["nees_mean"] > 5.0 * before["chasers"]["0"]["relative_estimate"]["nees_mean"]
     (failure,) = [f for f in after["failures"] if "estimated pose" in f]
     assert failure.startswith(

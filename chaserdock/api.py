@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
@@ -38,6 +39,13 @@ class RunResult:
 
     summary: Summary
     dir: Path
+
+    def __repr__(self) -> str:
+        return f"{self.summary!r}\n  files: {self.dir}"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the verdict with all that qualifies it."""
+        return f"{self.summary._repr_html_()}<p>files: <code>{escape(str(self.dir))}</code></p>"
 
     @cached_property
     def log(self) -> Log:

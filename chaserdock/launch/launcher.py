@@ -483,11 +483,12 @@ def judge(
     fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter
 ) -> MissionOutcome:
     """Write summary.json from the log in ``folder``. Returns and reports the outcome."""
-    from chaserdock.analysis.summary import summarize
+    from chaserdock.analysis.flight import load_flight
+    from chaserdock.analysis.summary import SUMMARY_NAME, add_run_failure, summary_of
 
     stopped = failure == STOPPED_BY_OPERATOR
     try:
-        summary = summarize(folder / LOG_NAME)
+        summary = summary_of(load_flight(folder / LOG_NAME))
     except LogError as error:
         outcome = MissionOutcome(
             folder, STOPPED if stopped else FAILED, None, failure or str(error)
@@ -495,11 +496,10 @@ def judge(
         reporter.report(Failed(status=outcome.status, text=outcome.failure or ""))
         return outcome
     if failure is not None:
-        summary["failures"] = [failure, *summary["failures"]]
-        summary["success"] = False
+        add_run_failure(summary, failure)
     if fleet.children:  # processes on other machines are not measured
         summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    (folder / SUMMARY_NAME).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
     reporter.report(Result(status=status, folder=str(folder), summary=summary))
     return MissionOutcome(

@@ -365,6 +365,10 @@ def with_link_options(
     return decorate
 
 
+_JUDGED_BY_RIGHTS = ("operator", "viewer")
+"""Commands of these may have the keys of any process with the rights (``launch.reach``)."""
+
+
 def tls_of(keys: Path, process: str) -> Tls:
     """Return the TLS files of a process, in the mission's folder ``keys`` or in the folder of the
     process.
@@ -382,4 +386,8 @@ def tls_of(keys: Path, process: str) -> Tls:
                 f"make a mission's keys with `chaserdock deploy --keys {keys}`, and give {name} "
                 "its folder"
             )
+    if folder == keys and process not in _JUDGED_BY_RIGHTS:
+        from chaserdock.launch.reach import check_holder
+
+        check_holder(tls.certificate, process, [name])
     return tls

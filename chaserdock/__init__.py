@@ -13,13 +13,17 @@ printed, no signal handler is installed; the functions work in notebooks and in 
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ChaserdockError, MissingPackageError, ScenarioError
 
 from .api import RunResult, list_scenarios, load_scenario, open_log, run
 
 if TYPE_CHECKING:
+    from chaserdock_protocol.recording.scan import LogError
+
+    from .launch.launcher import RunError
     from .logs.reader import Log
     from .summary import ChaserSummary, Summary
 
@@ -27,7 +31,11 @@ __all__ = [
     "ChaserSummary",
     "ChaserdockError",
     "Log",
+    "LogError",
+    "MissingPackageError",
+    "RunError",
     "RunResult",
+    "ScenarioError",
     "Summary",
     "list_scenarios",
     "load_scenario",
@@ -36,14 +44,17 @@ __all__ = [
 ]
 
 
+_HEAVY = {
+    "ChaserSummary": "chaserdock.summary",
+    "Log": "chaserdock.logs.reader",
+    "LogError": "chaserdock_protocol.recording.scan",
+    "RunError": "chaserdock.launch.launcher",
+    "Summary": "chaserdock.summary",
+}
+
+
 def __getattr__(name: str) -> Any:
     """Import the types that need heavy modules on first use."""
-    if name == "Log":
-        from .logs.reader import Log
-
-        return Log
-    if name in ("ChaserSummary", "Summary"):
-        from . import summary
-
-        return getattr(summary, name)
+    if (module := _HEAVY.get(name)) is not None:
+        return getattr(import_module(module), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.shipped_scenarios import shipped_names
+from chaserdock_protocol.stall import SHORTEST_STALL_S
 
 from chaserdock.exit_codes import BAD_INPUT
 
@@ -100,7 +101,7 @@ StallOpt = Annotated[
     float,
     typer.Option(
         "--stall-s",
-        min=1.0,
+        min=SHORTEST_STALL_S,
         help="seconds without progress after which a lock-step mission ends, or without the "
         "world after which a process ends",
     ),

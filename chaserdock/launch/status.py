@@ -147,7 +147,7 @@ def observe(link: Link, seconds: float) -> MissionStatus:
         node.close()
     if not found:
         raise StatusError(
-            f"no process found within {time.monotonic() - begun_s:.0f} s; {why_silent(link)}"
+            f"no process found within {round(time.monotonic() - begun_s, 1):g} s; {why_silent(link)}"
         )
     return status
 

@@ -11,6 +11,10 @@ class ChaserdockError(Exception):
     """A request cannot be carried out. The text states what failed, where, and what is valid."""
 
 
+class ScenarioError(ChaserdockError):
+    """A scenario that is not valid; the text has one line per error."""
+
+
 class MissingPackageError(ChaserdockError, ImportError):
     """A package that this part of chaserdock needs is not installed. The text states how to install
     it.

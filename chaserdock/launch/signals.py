@@ -31,6 +31,32 @@ def stop_on_signals(notice: str = "") -> Generator[threading.Event]:
             signal.signal(number, handler)
 
 
+class Interrupt(KeyboardInterrupt):
+    """SIGINT or SIGTERM has arrived.
+
+    A class of its own: a plain KeyboardInterrupt that passes through code from a string, as in the
+    making of a dataclass, lets Python end by a signal instead of with the status, even if caught.
+    """
+
+
+@contextmanager
+def interrupts() -> Generator[None]:
+    """Raise ``Interrupt`` on SIGTERM, and on SIGINT unless it is ignored, in the main thread."""
+
+    def raise_interrupt(*_: object) -> None:
+        raise Interrupt
+
+    numbers = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        numbers.append(signal.SIGINT)
+    before = {number: signal.signal(number, raise_interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 @contextmanager
 def deferred_signals() -> Generator[None]:
     """Defer Python's handlers of SIGINT and SIGTERM, which may raise exceptions, to the end of the

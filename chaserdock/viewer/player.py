@@ -12,6 +12,7 @@ from chaserdock_protocol.recording.scan import LogError, LogSource
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of_run
+from chaserdock.exit_codes import STOPPED
 from chaserdock.verdict import Verdict, verdict_of
 
 from .address import page_token, url_of
@@ -24,7 +25,7 @@ from .server import page_server
 def view_log(
     source: LogSource, options: ViewOptions, at_s: float | None = None, watch_parent: bool = False
 ) -> int:
-    """Serve the page until stopped; return 0. Play from the start, or pause at ``at_s``.
+    """Serve the page until stopped; return ``STOPPED``. Play from the start, or pause at ``at_s``.
 
     Raise LogError, or ViewError if the page cannot be served.
     """
@@ -58,7 +59,7 @@ def view_log(
             before_s = begun_s
             took_s = time.monotonic() - begun_s
             time.sleep(max(PERIOD_S - took_s, 0.2 * took_s))
-    return 0
+    return STOPPED
 
 
 class Judgement:

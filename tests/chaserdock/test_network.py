@@ -290,7 +290,7 @@ def test_container_forwards_signals_and_leaves_no_process(tmp_path: Path) -> Non
     process = subprocess.Popen([sys.executable, "-m", "chaserdock.launch.container", *arguments])
     recorder = find_child(process, "chaserdock", "record", timeout_s=60.0)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(timeout=60) != 0
+    assert process.wait(timeout=60) == 130
     assert all_gone([recorder], timeout_s=60.0)
 
 

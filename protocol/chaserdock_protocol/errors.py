@@ -21,14 +21,19 @@ class MissingPackageError(ChaserdockError, ImportError):
     """
 
 
+def how_to_install(extra: str) -> str:
+    """Return how to install an extra of chaserdock. No package index has chaserdock yet."""
+    return f"in a clone of chaserdock, pip install -e '.[{extra}]'"
+
+
 def require_extra(package: str, extra: str) -> None:
     """Raise MissingPackageError unless ``package``, which chaserdock[extra] installs, can be
     imported.
     """
     if find_spec(package) is None:
         raise MissingPackageError(
-            f"{package} is not installed; install chaserdock[{extra}]: pip install "
-            f"'chaserdock[{extra}]'",
+            f"{package}, of the extra chaserdock[{extra}], is not installed; "
+            f"{how_to_install(extra)}",
             name=package,
         )
 

@@ -13,7 +13,6 @@ printed, no signal handler is installed; the functions work in notebooks and in 
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from chaserdock_protocol.errors import ChaserdockError, MissingPackageError, ScenarioError
@@ -44,17 +43,22 @@ __all__ = [
 ]
 
 
-_HEAVY = {
-    "ChaserSummary": "chaserdock.summary",
-    "Log": "chaserdock.logs.reader",
-    "LogError": "chaserdock_protocol.recording.scan",
-    "RunError": "chaserdock.launch.launcher",
-    "Summary": "chaserdock.summary",
-}
-
-
 def __getattr__(name: str) -> Any:
     """Import the types that need heavy modules on first use."""
-    if (module := _HEAVY.get(name)) is not None:
-        return getattr(import_module(module), name)
+    if name == "Log":
+        from .logs.reader import Log
+
+        return Log
+    if name == "LogError":
+        from chaserdock_protocol.recording.scan import LogError
+
+        return LogError
+    if name == "RunError":
+        from .launch.launcher import RunError
+
+        return RunError
+    if name in ("ChaserSummary", "Summary"):
+        from . import summary
+
+        return getattr(summary, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -41,15 +41,16 @@ class Interrupt(KeyboardInterrupt):
 
 @contextmanager
 def interrupts() -> Generator[None]:
-    """Raise ``Interrupt`` on SIGTERM, and on SIGINT unless it is ignored, in the main thread."""
+    """Raise ``Interrupt`` on SIGTERM and SIGINT, unless ignored, in the main thread."""
 
     def raise_interrupt(*_: object) -> None:
         raise Interrupt
 
-    numbers = [signal.SIGTERM]
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        numbers.append(signal.SIGINT)
-    before = {number: signal.signal(number, raise_interrupt) for number in numbers}
+    before = {
+        number: signal.signal(number, raise_interrupt)
+        for number in (signal.SIGTERM, signal.SIGINT)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
     try:
         yield
     finally:

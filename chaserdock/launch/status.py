@@ -146,9 +146,8 @@ def observe(link: Link, seconds: float) -> MissionStatus:
     finally:
         node.close()
     if not found:
-        raise StatusError(
-            f"no process found within {round(time.monotonic() - begun_s, 1):g} s; {why_silent(link)}"
-        )
+        waited_s = round(time.monotonic() - begun_s, 1)
+        raise StatusError(f"no process found within {waited_s:g} s; {why_silent(link)}")
     return status
 
 

@@ -77,8 +77,8 @@ class ViewOptions:
 
 
 def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> int:
-    """Serve the page until stopped; return ``STOPPED``. Raise ViewError or TransportError if it cannot
-    start.
+    """Serve the page until stopped; return ``STOPPED``. Raise ViewError, RightsError or
+    TransportError if it cannot start.
     """
     check_rights(link, "view", TO_VIEW)
     stop, token = StopSignal(watch_parent), page_token()

@@ -127,7 +127,7 @@ def share_in(message: str, parts: tuple[str | None, ...]) -> float:
 
 def is_current(message: str) -> bool:
     """Return whether a text of the sources says this message."""
-    message = message.removeprefix("chaserdock: ").removesuffix("...").strip()
+    message = message.removeprefix("chaserdock: ").removesuffix("...").removesuffix("…").strip()
     return any(share_in(message, parts) >= LEAST_SHARE for parts in texts())
 
 

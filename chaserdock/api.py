@@ -41,7 +41,8 @@ class RunResult:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the verdict with all that qualifies it."""
-        return f"{self.summary._repr_html_()}<p>files: <code>{escape(str(self.dir))}</code></p>"
+        shown = self.summary._repr_html_()  # pyright: ignore[reportPrivateUsage] (IPython's name)
+        return f"{shown}<p>files: <code>{escape(str(self.dir))}</code></p>"
 
     @cached_property
     def log(self) -> Log:

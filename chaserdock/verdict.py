@@ -15,8 +15,6 @@ NEES_BAND = (3.0, 12.0)
 wrong covariances pass; narrower: a short flight, whose errors are correlated, is remarked on.
 """
 
-RemarkKind = Literal["not met", "not judged", "doubtful"]
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -49,7 +47,7 @@ class Verdict:
         limits += ["NEES out of range"] if self.doubts else []
         return f"success, but {' and '.join(limits)}" if limits else "success"
 
-    def remarks(self) -> Iterator[tuple[RemarkKind, str]]:
+    def remarks(self) -> Iterator[tuple[str, str]]:
         """Yield what qualifies the verdict, each with its kind."""
         yield from (("not met", text) for text in self.not_met)
         yield from (("not judged", text) for text in self.not_judged)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from chaserdock.verdict import Verdict, verdict_of
 
@@ -159,9 +159,9 @@ def causes(rows: list[ResultRow]) -> list[tuple[str, int]]:
     )
 
 
-def remarks(rows: list[ResultRow], kind: Literal["not_judged", "doubts"]) -> list[tuple[str, int]]:
-    """Return what qualifies the flights' verdicts, numbers replaced by ``#``, with the numbers of
-    flights, most frequent first.
+def remarks(rows: list[ResultRow], kind: str) -> list[tuple[str, int]]:
+    """Return what qualifies the flights' verdicts (column ``kind``), numbers replaced by ``#``,
+    with the numbers of flights, most frequent first.
     """
     counted = Counter(text for r in rows for text in {cause_of(t) for t in json.loads(r[kind])})
     return sorted(counted.items(), key=lambda item: (-item[1], item[0]))

@@ -15,11 +15,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ChaserdockError, MissingPackageError, ScenarioError
 
 from .api import RunResult, list_scenarios, load_scenario, open_log, run
 
 if TYPE_CHECKING:
+    from chaserdock_protocol.recording.scan import LogError
+
+    from .launch.launcher import RunError
     from .logs.reader import Log
     from .summary import ChaserSummary, Summary
 
@@ -27,7 +30,11 @@ __all__ = [
     "ChaserSummary",
     "ChaserdockError",
     "Log",
+    "LogError",
+    "MissingPackageError",
+    "RunError",
     "RunResult",
+    "ScenarioError",
     "Summary",
     "list_scenarios",
     "load_scenario",
@@ -42,6 +49,14 @@ def __getattr__(name: str) -> Any:
         from .logs.reader import Log
 
         return Log
+    if name == "LogError":
+        from chaserdock_protocol.recording.scan import LogError
+
+        return LogError
+    if name == "RunError":
+        from .launch.launcher import RunError
+
+        return RunError
     if name in ("ChaserSummary", "Summary"):
         from . import summary
 

@@ -14,7 +14,8 @@ import typer
 from chaserdock_protocol.errors import ChaserdockError
 from typer.exceptions import TyperException
 
-from chaserdock.exit_codes import FAILED
+from chaserdock.exit_codes import FAILED, STOPPED
+from chaserdock.launch.signals import interrupts
 
 from .analysis import judge, report, video
 from .calibrate import calibrate
@@ -80,8 +81,25 @@ def program(
 
 
 def main() -> None:
-    """Run the program; report an error as one line, and a closed pipe (``| head``) not at all."""
+    """Run the program; report an error as one line, and a closed pipe (``| head``) not at all.
+
+    SIGTERM and Ctrl-C end it with status 130, unless a command handles them itself.
+    """
     gc.set_threshold(_GC_THRESHOLD)
+    try:
+        with interrupts():
+            _run()
+    except (KeyboardInterrupt, typer.Abort):
+        print("chaserdock: stopped", file=sys.stderr)
+        sys.exit(STOPPED)
+    finally:
+        _flush_output()
+        # Otherwise Python searches all modules for garbage once more before it exits, which takes a
+        # fifth of a short command's time.
+        gc.freeze()
+
+
+def _run() -> None:
     try:
         if notice := renamed(sys.argv[1:]):
             raise ChaserdockError(notice)
@@ -92,11 +110,6 @@ def main() -> None:
         sys.exit(_report_usage_error(error))
     except BrokenPipeError:
         sys.exit(FAILED)
-    finally:
-        _flush_output()
-        # Otherwise Python searches all modules for garbage once more before it exits, which takes a
-        # fifth of a short command's time.
-        gc.freeze()
 
 
 _PLAIN_TEXTS = {

@@ -73,6 +73,7 @@ def fly_alone(scenario: Scenario, alone: Alone | None = None) -> Mapping[str, An
         "seed": scenario.seed,
         "sim_time_s": scenario.duration_s,
         "failures": [],
+        "not_judged": ["success: the controller flew alone, against no criteria"],
         "chasers": chasers,
         "solver": {"solve_s": solve_s, "failures": flight.failed_solves},
     }

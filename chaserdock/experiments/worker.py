@@ -28,6 +28,8 @@ from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.scan import LOG_NAME
 from msgspec import Struct
 
+from chaserdock.verdict import verdict_of
+
 from .plan import ExperimentError, ExperimentPlan, PlannedFlight
 
 Keep = Literal["failures", "all", "none"]
@@ -239,7 +241,9 @@ class ExperimentProgress:
         if self._ended_before is None:
             self._ended_before = ended - 1
         each_s = (time.monotonic() - self._start_s) / (ended - self._ended_before)
-        verdict = "passed" if outcome.status == 0 else f"FAILED: {outcome.last_words}"
+        verdict = verdict_of(outcome.summary or {}).headline
+        if outcome.status != 0:
+            verdict = f"FAILED: {outcome.last_words}"
         left_min = each_s * (total - ended) / 60
         left = f", about {left_min:.0f} min left" if ended < total else ""
         varied = ", ".join(f"{name}={value}" for name, value in flight.varied.items())

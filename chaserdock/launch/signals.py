@@ -31,6 +31,33 @@ def stop_on_signals(notice: str = "") -> Generator[threading.Event]:
             signal.signal(number, handler)
 
 
+class Interrupt(KeyboardInterrupt):
+    """SIGINT or SIGTERM has arrived.
+
+    A class of its own: a plain KeyboardInterrupt that passes through code from a string, as in the
+    making of a dataclass, lets Python end by a signal instead of with the status, even if caught.
+    """
+
+
+@contextmanager
+def interrupts() -> Generator[None]:
+    """Raise ``Interrupt`` on SIGTERM and SIGINT, unless ignored, in the main thread."""
+
+    def raise_interrupt(*_: object) -> None:
+        raise Interrupt
+
+    before = {
+        number: signal.signal(number, raise_interrupt)
+        for number in (signal.SIGTERM, signal.SIGINT)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 @contextmanager
 def deferred_signals() -> Generator[None]:
     """Defer Python's handlers of SIGINT and SIGTERM, which may raise exceptions, to the end of the

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import tempfile
 import zlib
 from dataclasses import dataclass
@@ -50,14 +51,16 @@ def fly_case(
     """
     with contextlib.ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
-        path = (folder or scratch) / "scenario.toml"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = scratch / "scenario.toml"
         path.write_text(toml_document(case), encoding="utf-8")
         try:
             checks, fingerprint = FlightChecks(load_scenario(path)), 0
         except ScenarioError as error:
             # The text must not name the temporary file.
-            raise ScenarioError(str(error).replace(f"{scratch / path.name}: ", "")) from None
+            raise ScenarioError(str(error).replace(f"{path}: ", "")) from None
+        if folder is not None:  # only now: a refused case leaves no folder
+            folder.mkdir(parents=True, exist_ok=True)
+            path = Path(shutil.copy(path, folder))
 
         def tap(sender: str, raw: RawSample) -> None:
             nonlocal fingerprint

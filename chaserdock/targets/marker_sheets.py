@@ -53,8 +53,11 @@ def write_sheets(
     """Write one PDF, or one SVG per sheet (numbered if several). Returns the number of sheets, and
     the files.
 
-    Raise ValueError for a marker that does not fit on a sheet or is not in its dictionary.
+    Raise ValueError for a target without markers, and for a marker that does not fit on a sheet or
+    is not in its dictionary.
     """
+    if not model.markers:
+        raise ValueError("has no markers to print; it is seen by its shape (perception model)")
     sheets = lay_out(model, size_mm)
     written = []
     with matplotlib.rc_context(_STYLE):

@@ -11,10 +11,19 @@ class ChaserdockError(Exception):
     """A request cannot be carried out. The text states what failed, where, and what is valid."""
 
 
+class ScenarioError(ChaserdockError):
+    """A scenario that is not valid; the text has one line per error."""
+
+
 class MissingPackageError(ChaserdockError, ImportError):
     """A package that this part of chaserdock needs is not installed. The text states how to install
     it.
     """
+
+
+def how_to_install(extra: str) -> str:
+    """Return how to install an extra of chaserdock. No package index has chaserdock yet."""
+    return f"in a clone of chaserdock, pip install -e '.[{extra}]'"
 
 
 def require_extra(package: str, extra: str) -> None:
@@ -23,8 +32,8 @@ def require_extra(package: str, extra: str) -> None:
     """
     if find_spec(package) is None:
         raise MissingPackageError(
-            f"{package} is not installed; install chaserdock[{extra}]: pip install "
-            f"'chaserdock[{extra}]'",
+            f"{package}, of the extra chaserdock[{extra}], is not installed; "
+            f"{how_to_install(extra)}",
             name=package,
         )
 

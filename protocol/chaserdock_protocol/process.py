@@ -91,6 +91,14 @@ class ProcessOptions:
         return StopSignal(self.watch_parent, self.signals)
 
 
+_signalled = threading.Event()
+
+
+def stopped_by_signal() -> bool:
+    """Return whether a ``StopSignal`` of this process has received SIGINT or SIGTERM."""
+    return _signalled.is_set()
+
+
 class StopSignal:
     """Record that this process is to stop.
 
@@ -108,6 +116,7 @@ class StopSignal:
             threading.Thread(target=self._watch, name="parent", daemon=True).start()
 
     def _on_signal(self, *_: object) -> None:
+        _signalled.set()
         self._event.set()
 
     def _watch(self) -> None:

@@ -250,7 +250,7 @@ def test_run_refuses_a_port_in_use(tmp_path: Path) -> None:
             "run", "single", "--out", str(tmp_path / "run"), "--port", str(port)
         )
     assert status == 2
-    assert output == f"chaserdock: --port {port}: Address already in use; choose another port\n"
+    assert output == f"chaserdock: port {port}: Address already in use; choose another port\n"
     assert not (tmp_path / "run").exists()
 
 

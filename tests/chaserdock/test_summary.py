@@ -15,7 +15,7 @@ from chaserdock.analysis.summary import summarize, summary_of
 from chaserdock.summary import Summary
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
-RUN_ONLY = {"peak_memory_bytes", "cpu_s"}
+RUN_ONLY = {"peak_memory_bytes", "cpu_s", "run_failure"}
 DETUMBLING_ONLY = {"stack"}
 PLUMES_ONLY = {"plumes"}
 IN_SOME_FLIGHTS = {"capture", "passive_safety", "rendezvous"}

@@ -167,46 +167,63 @@ def check_fit(
 
 
 def _check(
-    value: Any, sizes: dict[str, int], arrays: dict[type, dict[str, tuple[Shape, ...]]], where: str
+    value: Any, sizes: dict[str, int], arrays: Mapping[type, dict[str, tuple[Shape, ...]]], at: str
 ) -> None:
+    """Check a value that stands at ``at``, and what it contains. ``sizes``: known by name."""
     if isinstance(value, dict):
         value = [*value.keys(), *value.values()]
-    if isinstance(value, list | tuple | set | frozenset) and not hasattr(value, "_fields"):
+    if _is_collection(value):
         for item in value:
-            _check(item, sizes, arrays, where)
+            _check(item, sizes, arrays, at)
         return
     if not (names := _names(value)):
         return
-    kind, sizes = type(value), dict(sizes)
-    where = f"{where}.{kind.__name__}" if where == "state" else where
-    if isinstance(value, JointState):
-        sizes["errors"] = TARGET + CHASER * sizes["chasers"] + SHAPE * (value.shape is not None)
-    if isinstance(value, PlanSearch):
-        sizes["stack"] = len(value.problem.limits_N)
-    if isinstance(value, Message):
-        try:
-            codec.check_numbers(value)
-        except codec.Rejected as error:
-            raise MisfitError(f"{where}: {error}") from None
-    chaser = getattr(value, "chaser", 0)
-    if not 0 <= chaser < sizes["chasers"]:
-        raise MisfitError(f"{where}: chaser {chaser} of {sizes['chasers']}")
-    for name, shape in LENGTHS.get(kind, {}).items():
+    sizes = sizes | _sizes_of(value, sizes["chasers"])
+    _check_chaser(value, sizes["chasers"], at)
+    for name, shape in LENGTHS.get(type(value), {}).items():
         items = getattr(value, name)
-        if items or (kind, name) not in MAY_BE_EMPTY:
-            _match(_lengths(items, len(shape)), shape, sizes, f"{where}.{name}")
+        if items or (type(value), name) not in MAY_BE_EMPTY:
+            _match(_lengths(items, len(shape)), shape, sizes, f"{at}.{name}")
+    if isinstance(value, Message):
+        _check_message(value, at)  # without arrays
+        return
+    known = arrays.get(type(value), {})
     for name in names:
-        found = getattr(value, name)
-        shapes = arrays.get(kind, {}).get(name)
         for array, shape in zip(
-            _arrays_in(found), itertools.cycle(shapes or [None]), strict=False
+            _arrays_in(getattr(value, name)), itertools.cycle(known.get(name, ())), strict=False
         ):
-            if shape is None:
-                raise TypeError(f"{kind.__name__}.{name} contains an array without a known shape")
-            _match(array.shape, shape, sizes, f"{where}.{name}")
-            _check_numbers(array, name, f"{where}.{name}")
+            _match(array.shape, shape, sizes, f"{at}.{name}")
+            _check_numbers(array, name, f"{at}.{name}")
     for name in names:
-        _check(getattr(value, name), sizes, arrays, f"{where}.{name}")
+        _check(getattr(value, name), sizes, arrays, f"{at}.{name}")
+
+
+def _is_collection(value: Any) -> bool:
+    """Return whether a value is a list, set or tuple without names."""
+    return isinstance(value, list | tuple | set | frozenset) and not hasattr(value, "_fields")
+
+
+def _sizes_of(value: Any, chasers: int) -> dict[str, int]:
+    """Return the sizes that an object determines itself."""
+    match value:
+        case JointState():
+            return {"errors": TARGET + CHASER * chasers + SHAPE * (value.shape is not None)}
+        case PlanSearch():
+            return {"stack": len(value.problem.limits_N)}
+    return {}
+
+
+def _check_chaser(value: Any, chasers: int, at: str) -> None:
+    chaser = getattr(value, "chaser", None)
+    if isinstance(chaser, int) and not 0 <= chaser < chasers:
+        raise MisfitError(f"{at}: chaser {chaser} of {chasers}")
+
+
+def _check_message(message: Message, at: str) -> None:
+    try:
+        codec.check_numbers(message)
+    except codec.Rejected as error:
+        raise MisfitError(f"{at}: {error}") from None
 
 
 def _check_numbers(array: np.ndarray, name: str, where: str) -> None:
@@ -234,7 +251,7 @@ def _arrays_in(value: Any) -> Iterator[np.ndarray]:
         yield value
     elif isinstance(value, dict):
         yield from _arrays_in(list(value.values()))
-    elif isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+    elif _is_collection(value):
         for item in value:
             yield from _arrays_in(item)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import sys
@@ -92,6 +93,10 @@ def main() -> None:
         sys.exit(_report_usage_error(error))
     except BrokenPipeError:
         sys.exit(FAILED)
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        sys.exit(fail(f"{error.filename or 'standard output'}: {error.strerror}").exit_code)
     finally:
         _flush_output()
         # Otherwise Python searches all modules for garbage once more before it exits, which takes a
@@ -99,6 +104,8 @@ def main() -> None:
         gc.freeze()
 
 
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""Errors of a disk on which nothing can be written."""
 _PLAIN_TEXTS = {
     "Value error, ": "",
     "Input should be a valid integer, unable to parse string as an integer": "must be a whole "
@@ -128,9 +135,14 @@ def _report_usage_error(error: Any) -> int:
 
 
 def _flush_output() -> None:
-    """Flush standard output; discard it when the reader has closed the pipe."""
+    """Flush standard output; discard it when the reader has closed the pipe, or the disk is full.
+
+    The latter ends the program with status 2.
+    """
     assert sys.__stdout__ is not None  # sys.stdout may be click's wrapper by now
     try:
         sys.__stdout__.flush()
-    except BrokenPipeError:
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())
+        if not isinstance(error, BrokenPipeError):
+            sys.exit(fail(f"standard output: {error.strerror}").exit_code)

@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from chaserdock_protocol.output_files import replaced
+
 from .plan import ExperimentPlan, PlannedFlight
 from .worker import FlightOutcome
 
@@ -170,6 +172,5 @@ def write_table(rows: list[ResultRow], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    temporary = path.with_suffix(".tmp")
-    pq.write_table(pa.Table.from_pylist(rows), temporary)
-    temporary.replace(path)
+    with replaced(path) as new:
+        pq.write_table(pa.Table.from_pylist(rows), new)

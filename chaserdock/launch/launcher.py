@@ -21,8 +21,9 @@ from typing import Any
 import psutil
 from chaserdock_agents.router.process import NAME as ROUTER
 from chaserdock_protocol import topics
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ChaserdockError, WriteError, errors_of_writing
 from chaserdock_protocol.messages import MissionEnd
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED, Mode
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.recording.scan import LOG_NAME
@@ -111,7 +112,9 @@ class Fleet:
         """
         output = folder / f"{name.replace('/', '-')}.txt"
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
-        with output.open("wb") as out, deferred_signals():
+        with errors_of_writing(output, RunError):
+            out = output.open("wb")
+        with out, deferred_signals():
             process = subprocess.Popen(
                 [sys.executable, "-m", "chaserdock", *arguments, "--watch-parent"],
                 stdin=subprocess.PIPE,
@@ -499,7 +502,11 @@ def judge(
         summary["success"] = False
     if fleet.children:  # processes on other machines are not measured
         summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    try:
+        write_atomically(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    except WriteError as error:
+        summary["failures"].append(str(error))
+        summary["success"] = False
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
     reporter.report(Result(status=status, folder=str(folder), summary=summary))
     return MissionOutcome(

@@ -62,6 +62,7 @@ def recover(log: Path, out: Path) -> Recovered:
                 try:
                     _copy(data, target, channels, schemas, found, str(log))
                 except OSError as error:
+                    out.unlink(missing_ok=True)
                     raise LogError(f"{out}: cannot be written: {error.strerror or error}") from None
     except FileExistsError:
         raise LogError(f"{out}: already exists; a log is never overwritten") from None

@@ -9,6 +9,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from chaserdock_protocol.transport import RawSample
 
@@ -52,7 +53,7 @@ def fly_case(
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
         path = (folder or scratch) / "scenario.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(toml_document(case), encoding="utf-8")
+        write_atomically(path, toml_document(case))
         try:
             checks, fingerprint = FlightChecks(load_scenario(path)), 0
         except ScenarioError as error:

@@ -19,6 +19,7 @@ from typing import cast
 
 import numpy as np
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
@@ -241,7 +242,7 @@ def write_case(result: SimulationResult, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{Path(result.case['extends']).stem}-seed-{result.seed}.toml"
     lines = [f"# {violation}" for violation in result.violations]
-    path.write_text("\n".join([*lines, toml_document(result.case)]), encoding="utf-8")
+    write_atomically(path, "\n".join([*lines, toml_document(result.case)]))
     return path
 
 

@@ -13,13 +13,13 @@ printed, no signal handler is installed; the functions work in notebooks and in 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-from chaserdock_protocol.errors import ChaserdockError
-
-from .api import RunResult, list_scenarios, load_scenario, open_log, run
-
+TYPE_CHECKING = False  # as type checkers know it; `typing` alone takes most of this import
 if TYPE_CHECKING:
+    from typing import Any
+
+    from chaserdock_protocol.errors import ChaserdockError
+
+    from .api import RunResult, list_scenarios, load_scenario, open_log, run
     from .logs.reader import Log
     from .summary import ChaserSummary, Summary
 
@@ -36,14 +36,21 @@ __all__ = [
 ]
 
 
+_MODULES = {
+    "ChaserdockError": "chaserdock_protocol.errors",
+    "Log": "chaserdock.logs.reader",
+    "ChaserSummary": "chaserdock.summary",
+    "Summary": "chaserdock.summary",
+}
+"""Modules of the names that ``chaserdock.api`` does not define."""
+
+
 def __getattr__(name: str) -> Any:
-    """Import the types that need heavy modules on first use."""
-    if name == "Log":
-        from .logs.reader import Log
+    """Import what is used on first use: the program's start must be quick, and stoppable."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
 
-        return Log
-    if name in ("ChaserSummary", "Summary"):
-        from . import summary
-
-        return getattr(summary, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(_MODULES.get(name, "chaserdock.api")), name)
+    globals()[name] = found
+    return found

@@ -15,7 +15,8 @@ import typer
 from chaserdock_protocol.errors import ChaserdockError
 from typer.exceptions import TyperException
 
-from chaserdock.exit_codes import FAILED
+from chaserdock.exit_codes import FAILED, STOPPED
+from chaserdock.launch.signals import interrupts
 
 from .analysis import judge, report, video
 from .calibrate import calibrate
@@ -81,8 +82,24 @@ def program(
 
 
 def main() -> None:
-    """Run the program; report an error as one line, and a closed pipe (``| head``) not at all."""
+    """Run the program; report an error and a stop as one line, a closed pipe (``| head``) not at
+    all.
+    """
     gc.set_threshold(_GC_THRESHOLD)
+    try:
+        with interrupts():
+            _run()
+    except KeyboardInterrupt:
+        print("chaserdock: stopped", file=sys.stderr)
+        sys.exit(STOPPED)
+    finally:
+        _flush_output()
+        # Otherwise Python searches all modules for garbage once more before it exits, which takes a
+        # fifth of a short command's time.
+        gc.freeze()
+
+
+def _run() -> None:
     try:
         if notice := renamed(sys.argv[1:]):
             raise ChaserdockError(notice)
@@ -91,17 +108,14 @@ def main() -> None:
         sys.exit(fail(str(error)).exit_code)
     except TyperException as error:
         sys.exit(_report_usage_error(error))
+    except typer.Abort:  # what click makes of KeyboardInterrupt
+        raise KeyboardInterrupt from None
     except BrokenPipeError:
         sys.exit(FAILED)
     except OSError as error:
         if error.errno not in _NO_ROOM:
             raise
         sys.exit(fail(f"{error.filename or 'standard output'}: {error.strerror}").exit_code)
-    finally:
-        _flush_output()
-        # Otherwise Python searches all modules for garbage once more before it exits, which takes a
-        # fifth of a short command's time.
-        gc.freeze()
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)

@@ -188,7 +188,10 @@ def _write_new(name: str) -> None:
     parse_scenario(example | {"name": path.stem}, name)
     if path.exists():
         raise fail(f"{path}: exists already")
-    write_atomically(path, _NEW.format(name=path.stem, file=path))
+    try:
+        write_atomically(path, _NEW.format(name=path.stem, file=path))
+    except OSError as error:
+        raise fail(str(error)) from None
     print(f"{path}: run it with: chaserdock run {path}")
 
 

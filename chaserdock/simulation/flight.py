@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
 import zlib
 from dataclasses import dataclass
@@ -50,7 +51,10 @@ def fly_case(
     ``folder``: keep the log there. ``to_violation``: end the flight at the first violation.
     """
     with contextlib.ExitStack() as stack:
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
+        in_memory = tempfile.TemporaryDirectory(
+            prefix=f"chaserdock-{os.getpid()}-", dir=memory_folder()
+        )
+        scratch = Path(stack.enter_context(in_memory))
         path = (folder or scratch) / "scenario.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, toml_document(case))

@@ -302,6 +302,8 @@ class Node:
             message: Any = self._connection.decode(topic.kind, raw)
             if place is not None and str(getattr(message, "chaser", place)) != place:
                 raise Rejected("chaser", f"message of chaser {message.chaser} on {raw.key}")
+            if place is not None and getattr(message, "process", place) != place:
+                raise Rejected("process", f"message of {message.process} on {raw.key}")
         except Rejected as refusal:
             self.counts.rejected[f"{topic.key}:{refusal.reason}"] += 1
             return None

@@ -110,7 +110,7 @@ class ControllerProcess:
         self.requests = OperatorRequests()
         self.standby = HotStandby(self.name, realtime, replaying)
         self.checkpoint = Checkpoint(core, [c.validation for c in self.inputs.chasers])
-        self._early = EarlyMessages(node.counts)
+        self._early = EarlyMessages(node)
         self._left_at = (-1, -1)
         self._last_result: tuple[Tick, TickOutputs, float] | None = None
         self._idle_receives = 0

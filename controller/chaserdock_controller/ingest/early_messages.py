@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 
 from chaserdock_protocol.messages import Lease, Sighting, ThrusterReport, Tick
-from chaserdock_protocol.transport import ReceivedMessage, TrafficCounters
+from chaserdock_protocol.transport import Node, ReceivedMessage
 
 _AHEAD_TICKS = 8
 """Most ticks by which a chaser may know of a tick earlier than this process: half a second at 15
@@ -21,12 +21,12 @@ _MOST_KEPT = 4096
 
 
 class EarlyMessages:
-    """Messages of ticks that have not begun, in the order of their arrival. ``counts``: where those
-    that are dropped are counted.
+    """Messages of ticks that have not begun, in the order of their arrival. ``node``: tells
+    which are forged, as it knows once the tick has begun, and counts those that are dropped.
     """
 
-    def __init__(self, counts: TrafficCounters) -> None:
-        self._counts = counts
+    def __init__(self, node: Node) -> None:
+        self._node = node
         self._tick = -1
         self._kept: deque[ReceivedMessage] = deque(maxlen=_MOST_KEPT)
 
@@ -39,11 +39,12 @@ class EarlyMessages:
             self._tick = max(self._tick, message.tick)
             waited, self._kept = self._kept, deque(maxlen=_MOST_KEPT)
             self._kept.extend(r for r in waited if r.message.tick > self._tick)
-            return [received, *(r for r in waited if r.message.tick <= self._tick)]
+            due = (r for r in waited if r.message.tick <= self._tick)
+            return [received, *(r for r in due if not self._node.is_forged(r))]
         if not isinstance(message, Lease | Sighting | ThrusterReport) or message.tick <= self._tick:
             return [received]
         if message.tick <= self._tick + _AHEAD_TICKS and len(self._kept) < _MOST_KEPT:
             self._kept.append(received)
         else:
-            self._counts.rejected[f"{received.topic.key}:early tick"] += 1
+            self._node.counts.rejected[f"{received.topic.key}:early tick"] += 1
         return []

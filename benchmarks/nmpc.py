@@ -166,8 +166,15 @@ def tracking(gain: float, duration_s: float) -> tuple[float, float]:
         PAPER.stages,
     )
     times = PAPER.dt_s * np.arange(d + 1)
-    wrench = feed_forward(w, np.tile(offset, (d, 1)), np.zeros((d, 3)), np.zeros((d, 3)), q_off, PAPER.mass_kg,
-                          PAPER.inertia_kg_m2)  # fmt: skip
+    wrench = feed_forward(
+        w,
+        np.tile(offset, (d, 1)),
+        np.zeros((d, 3)),
+        np.zeros((d, 3)),
+        q_off,
+        PAPER.mass_kg,
+        PAPER.inertia_kg_m2,
+    )
     states = reference_state(np.zeros(3), v, [1.0, 0, 0, 0], w, offset, np.zeros(3), q_off)[None]
     solver = make_solver("rti", PAPER, 1)
     errors = []

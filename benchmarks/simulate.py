@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -88,9 +89,12 @@ for duration in sys.argv[2:]:
 def instructions(_: Options) -> Figures:
     """Count the instructions of a tick in lock-step with statistical perception, by valgrind.
 
-    Those by which a second flight of 4 s exceeds one of 2 s, so that neither start nor imports
-    count; they do not depend on the load of the machine.
+    Those by which a second flight of 6 s exceeds one of 2 s, so that neither start nor imports
+    count; they do not depend on the load of the machine. Takes minutes, also with ``--quick``.
+    Raises SystemExit without valgrind.
     """
+    if shutil.which("valgrind") is None:
+        raise SystemExit("instructions needs valgrind (Debian: apt-get install valgrind)")
     short, long = (str(ticks / 10.0) for ticks in (_SHORT_TICKS, _SHORT_TICKS + _TICKS))
     return {"instructions_per_tick": (_count(short, long) - _count(short, short)) / _TICKS}
 

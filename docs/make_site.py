@@ -168,14 +168,20 @@ def configuration(stage: Path) -> str:
     wrong = [place for place in named if not (stage / place).is_file() or named.count(place) > 1]
     if wrong:
         raise SiteError(f"site.toml: nav: missing or listed twice: {', '.join(wrong)}")
+    places = {page.relative_to(DOCS).as_posix(): page for page in sorted(DOCS.rglob("*.md"))}
     more = [
-        f'    {{ "{page.read_text(encoding="utf-8").partition(chr(10))[0].lstrip("# ")}" = "{page.relative_to(DOCS).as_posix()}" }},'
-        for page in sorted(DOCS.rglob("*.md"))
-        if page.relative_to(DOCS).as_posix() not in named
+        f'    {{ "{_title(page)}" = "{place}" }},'
+        for place, page in places.items()
+        if place not in named
     ]
     if "# MORE" not in text:
         raise SiteError("site.toml: nav: the line # MORE is missing")
     return re.sub(r"^ *# MORE.*$", lambda _: "\n".join(more), text, flags=re.M)
+
+
+def _title(page: Path) -> str:
+    """Return the heading of a page, its first line."""
+    return page.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
 
 
 def version() -> str:
@@ -210,8 +216,10 @@ def build_releases(out: Path) -> list[str]:
                     raise SiteError(f"{tag}: {' '.join(command)}: {done.stdout}{done.stderr}")
     items = "".join(f'<li><a href="{tag}/index.html">{tag}</a></li>' for tag in tags)
     (out / "versions.html").write_text(
-        '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f'<title>chaserdock: versions</title><h1>chaserdock: versions</h1><ul><li><a href="index.html">{version()}</a>'
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        "<title>chaserdock: versions</title><h1>chaserdock: versions</h1>"
+        f'<ul><li><a href="index.html">{version()}</a>'
         f" (this build)</li>{items}</ul></html>\n",
         encoding="utf-8",
     )

@@ -10,11 +10,13 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from harness import DRILL, SHORT, run
+from hypothesis import settings
 
 Fly = Callable[..., Path]
 
@@ -28,16 +30,23 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# No verdict depends on the speed of the machine.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
+
 FAST_S = 1.0
 """Processor time (s) that a test without the mark `slow` may take; others are reported."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the files with the longest missions first: at the end, workers share short tests, and
-    none waits for another.
+    """Mark the tests that need a shared flight as slow, and run the files with the longest missions
+    first: at the end, workers share short tests, and none waits for another.
     """
     minutes: Counter[Path] = Counter()
     for item in items:
+        if "shared_flight" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
         if slow := item.get_closest_marker("slow"):
             minutes[item.path] += slow.kwargs.get("minutes", 0.25)
     items.sort(key=lambda item: -minutes[item.path])
@@ -49,9 +58,9 @@ def processor_s() -> float:
     return sum(u.ru_utime + u.ru_stime for u in used)
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
-    """Add a test's processor time to its report."""
+@contextmanager
+def timed(item: pytest.Item) -> Iterator[None]:
+    """Add the processor time of a part of a test to its report."""
     start_s = processor_s()
     try:
         yield
@@ -59,14 +68,28 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
         item.user_properties.append(("processor_s", processor_s() - start_s))
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
+    """Count the fixtures that a test is the first to need."""
+    with timed(item):
+        yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """Count the test itself."""
+    with timed(item):
+        yield
+
+
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """List the tests that should be marked `slow`, but are not."""
-    over = {
-        report.nodeid: used_s
+    used = {
+        report.nodeid: sum(s for name, s in report.user_properties if name == "processor_s")
         for report in terminalreporter.stats.get("passed", ())
-        for name, used_s in report.user_properties
-        if name == "processor_s" and used_s > FAST_S and "slow" not in report.keywords
+        if "slow" not in report.keywords
     }
+    over = {name: used_s for name, used_s in used.items() if used_s > FAST_S}
     if over:
         terminalreporter.section(f"not marked slow, more than {FAST_S:g} s of processor time")
     for name, used_s in sorted(over.items(), key=lambda item: -item[1]):

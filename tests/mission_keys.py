@@ -24,7 +24,7 @@ NAMESPACE = "rights"
 CHASERS = 3
 EVERYONE = identities(CHASERS)
 PUBLISHERS = {w.process: w for w in EVERYONE if w.role not in OBSERVERS}
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 _OWN = tuple(f"controller/{what}" for what in ("event", "health", "presence", "farewell"))
 
 

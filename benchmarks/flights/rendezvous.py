@@ -208,7 +208,8 @@ def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
     """Return the part of a scenario that begins with command ``index`` of its timeline and ends
     before the next command but one.
 
-    It starts at rest at the place before, and waits there for ``wait_s``.
+    It starts at rest at the place before, and waits there for ``wait_s``: longer than `HOLD_S`, as
+    the estimate is off at first.
     """
     timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
     begin_s, following = timeline[index].at_s - wait_s, timeline[index : index + 2]
@@ -227,13 +228,6 @@ def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
     )
 
 
-def last_leg(scenario: Scenario, wait_s: float = 20.0, images: bool = False) -> Scenario:
-    """Return the scenario from its last hold point on.
-
-    ``images``: with images and markers in place of statistical perception and ranging.
-    """
-    part = leg(scenario, len(scenario.timeline) - 1, wait_s)
-    if not images:
-        return part
-    perception = part.perception.model_copy(update={"name": "default"})
-    return part.model_copy(update={"perception": perception, "ranging": None})
+def last_leg(scenario: Scenario) -> Scenario:
+    """Return the scenario from its last hold point on."""
+    return leg(scenario, len(scenario.timeline) - 1)

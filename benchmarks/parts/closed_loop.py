@@ -94,23 +94,6 @@ def tracking(options: Options) -> Figures:
     return out
 
 
-def tracking_with_images(options: Options) -> Figures:
-    """Measure steady errors at the paper's tumble with images, of the worst chaser: servicer, two
-    chasers on the paper's target, stronger actuators.
-    """
-    duration_s, out = 60.0 if options.quick else 80.0, Figures()
-    length = f"duration_s={duration_s}"
-    servicer = load_shipped("single", "target.model='servicer'", length)
-    for name, scenario, gain in (
-        ("servicer", servicer, 1.0),
-        ("two_chasers_paper_target", load_shipped("two-chaser-tracking", length), 1.0),
-        ("servicer_actuators_5_percent_stronger", servicer, 1.05),
-    ):
-        flight = record_flight(scenario, RenderedImages(scenario), actuator_gain=gain)
-        add_errors(out, f"tracking_images_{name}", steady(flight))
-    return out
-
-
 _CLUTTER_STAY_S = 3.0
 """A flight in clutter ends once all chasers are at their goals for this long."""
 
@@ -132,11 +115,6 @@ def fly_swap(options: Options) -> Figures:
     is exactly head-on.
     """
     return variations("swap", seeds_of(options, 20, 2), swap, noisy)
-
-
-def fly_swap_images(options: Options) -> Figures:
-    """Fly the first two of them with rendered images."""
-    return variations("swap-images", seeds_of(options, 2, 1), swap, RenderedImages)
 
 
 def in_clutter(name: str, places_m: tuple[float, float, float], options: Options) -> Figures:
@@ -172,11 +150,9 @@ GROUP = Group(
     {
         "avoidance": fly_avoidance,
         "swap": fly_swap,
-        "swap-images": fly_swap_images,
         "clutter": fly_clutter,
         "clutter-dense": fly_dense_clutter,
         "tracking": tracking,
-        "tracking-images": tracking_with_images,
     },
     ("flights", "first"),
     add_options,

@@ -15,6 +15,7 @@ import json
 import os
 import re
 import subprocess
+import sys
 import tempfile
 import venv
 import zipfile
@@ -128,8 +129,21 @@ def mcap_reader(programs: Path, log: Path) -> CheckedFigures:
     return figures, without_schema == 0 and read == total > 0
 
 
+def has_vulkan() -> bool:
+    """Return whether the Vulkan loader finds a driver: on Linux a file in one of its folders, or
+    named by a variable; elsewhere true.
+    """
+    named = {"VK_DRIVER_FILES", "VK_ICD_FILENAMES"} & os.environ.keys()
+    folders = (
+        Path(root) / "vulkan" / "icd.d" for root in ("/usr/share", "/etc", "/usr/local/share")
+    )
+    return sys.platform != "linux" or bool(named) or any(any(f.glob("*.json")) for f in folders)
+
+
 def rerun(programs: Path, log: Path, image: Path) -> CheckedFigures:
-    """Draw the log with rerun."""
+    """Draw the log with rerun. Raise RuntimeError without a driver."""
+    if not has_vulkan():
+        raise RuntimeError("needs a Vulkan driver (Debian: apt-get install mesa-vulkan-drivers)")
     image.unlink(missing_ok=True)
     call(
         programs / "rerun", "--headless", "--renderer", "vulkan", log, "--screenshot-to", image,

@@ -57,29 +57,13 @@ def kernels(options: Options) -> Figures:
     """Call every kernel with a million random inputs (``--quick``: 50,000), NaN, infinities and
     denormals among them, and check what it promises (tests/native).
     """
-    require_compiler()
+    if not sanitizers.available():
+        raise SystemExit(f"needs {sanitizers.NEEDED}")
     inputs = options.inputs or (50_000 if options.quick else 1_000_000)
     figures, bad = fuzz_all(options.kernel, inputs, options.seed, options.first, options.jobs)
     if bad:
         raise BenchmarkFailed(f"{bad} kernels with a finding", figures)
     return figures
-
-
-def kernel_tests(_: Options) -> Figures:
-    """Run the Python tests that call the kernels with kernels under sanitizers."""
-    require_compiler()
-    run = sanitizers.run_tests()
-    print("\n".join(run.stdout.splitlines()[-5:]))
-    figures: Figures = {"tests_status": run.returncode}
-    if run.returncode:
-        raise BenchmarkFailed(f"{run.stdout[-3000:]}\n{run.stderr[-6000:]}", figures)
-    return figures
-
-
-def require_compiler() -> None:
-    """Raises SystemExit without gcc and its sanitizers."""
-    if not sanitizers.available():
-        raise SystemExit(f"needs {sanitizers.NEEDED}")
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -91,8 +75,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 GROUP = Group(
-    {"kernels": kernels, "kernel-tests": kernel_tests},
+    {"kernels": kernels},
     ("first", "jobs"),
     add_options,
-    on_request=("kernel-tests",),
 )

@@ -18,7 +18,6 @@ from chaserdock_models.satellites import satellite
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
 from common import Figures, Group, Options, percentiles
-from embree_images import compare
 from markerless_cases import random_view
 
 SATELLITES = ("geo_servicer", "cubesat_12u")
@@ -53,6 +52,8 @@ def measure_time(options: Options) -> Figures:
 
 def measure_accuracy(options: Options) -> Figures:
     """Compare grey levels, silhouettes and shadow edges with those of the ray tracer Embree."""
+    from embree_images import compare  # Embree is installed for tests only
+
     views = max(1, views_of(options) // 4)
     camera, rng = Camera.from_hfov(480, 270, np.deg2rad(60.0)), np.random.default_rng(3)
     greys, silhouettes, shadows = [], [], []

@@ -24,12 +24,11 @@ from chaserdock.experiments.perception import RenderedImages
 
 def fly(name: str, seed: int, options: Options) -> Figures:
     """Fly one scenario with one seed; return its figures."""
-    markers = ('perception.name="default"',) if options.markers else ()
-    scenario = load_shipped(name, f"seed={seed}", *markers, *options.set)
+    scenario = load_shipped(name, f"seed={seed}", *options.set)
     if options.leg is not None:
         scenario = leg(scenario, options.leg)
-    elif options.quick or options.images:
-        scenario = last_leg(scenario, images=options.images)
+    elif options.quick:
+        scenario = last_leg(scenario)
     begin_s, shown = time.process_time(), [0]
 
     def report(record: TickRecord, flight: InProcessMission) -> None:
@@ -102,10 +101,6 @@ def aborts(options: Options) -> Figures:
 
 
 def add_options(parser: ArgumentParser) -> None:
-    parser.add_argument("--images", action="store_true", help="only the last leg, with images")
-    parser.add_argument(
-        "--markers", action="store_true", help="rendered images, and ranging far away"
-    )
     parser.add_argument(
         "--leg",
         type=int,
@@ -116,7 +111,7 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--abort-scenario", default="v-bar", metavar="NAME", help="of aborts")
 
 
-SCENARIOS = ("v-bar", "r-bar", "v-bar-images")
+SCENARIOS = ("v-bar", "r-bar")
 GROUP = Group(
     {
         **{
@@ -127,5 +122,4 @@ GROUP = Group(
     },
     ("flights", "first", "set"),
     add_options,
-    on_request=("v-bar-images",),
 )

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 import psutil
+from chaserdock_agents.chaser.vision import Vision
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.rendering.cameras import Cameras
 from common import ROOT, Figures, Group, Options, chaserdock_command
 
-from chaserdock.experiments import perception
 from chaserdock.experiments.in_process import InProcessMission
 from chaserdock.experiments.perception import RenderedImages
 from chaserdock.logs import open_log
@@ -81,7 +81,7 @@ class Clock:
 def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
     """Return median seconds of processor time per tick by part, in one process."""
     clock = Clock()
-    kept = [(perception, "look"), (Cameras, "image")]
+    kept = [(Vision, "look"), (Cameras, "image")]
     before = [getattr(owner, name) for owner, name in kept]
     for (owner, name), part in zip(kept, ("perceive", "render"), strict=True):
         clock.wrap(owner, name, part)
@@ -146,15 +146,15 @@ def fly(n: int, duration_s: float) -> dict[str, float]:
     return figures
 
 
-def measure(n: int, ticks: int, duration_s: float | None) -> dict[str, float]:
+def measure(n: int, ticks: int, duration_s: float) -> dict[str, float]:
     """Return seconds per tick with ``n`` chasers by part; without lock-step mission if
-    ``duration_s`` is None.
+    ``duration_s`` is 0.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.toml"
         path.write_text(first(n), encoding="utf-8")
         out = parts_of(load_scenario(path), ticks)
-    if duration_s is None:
+    if not duration_s:
         return out | {"sum": sum(out.values())}
     flown = fly(n, duration_s)
     processes = flown["world"] + flown["chaser"] + flown["controller"]
@@ -165,16 +165,15 @@ def measure(n: int, ticks: int, duration_s: float | None) -> dict[str, float]:
     return out
 
 
-def scale(options: Options, in_lockstep: bool) -> Figures:
-    """Measure a tick for several numbers of chasers, and the ratio of sixteen to four."""
-    sizes = options.chasers or ([1, 2, 4] if options.quick else [1, 2, 4, 8, 16])
-    duration_s = options.seconds if in_lockstep else None
-    names = (*PARTS, *(("transport", "record", "cpu", "wall") if in_lockstep else ("sum",)))
+def scale(options: Options) -> Figures:
+    """Measure a tick with 1 to 16 chasers by part, and missions in lock-step."""
+    sizes = options.chasers or ([1, 4] if options.quick else [1, 2, 4, 8, 16])
+    names = (*PARTS, *(("transport", "record", "cpu", "wall") if options.seconds else ("sum",)))
     print("ms per tick; cpu: all processes; wall: in lock-step, on this machine")
     print(f"{'N':>3}" + "".join(f"{name:>11}" for name in names))
     figures: Figures = {}
     for n in sizes:
-        row = measure(n, options.ticks, duration_s)
+        row = measure(n, options.ticks, options.seconds)
         print(f"{n:3d}" + "".join(f"{1e3 * row[name]:11.2f}" for name in names), flush=True)
         figures |= {f"n{n}_{name}_s_per_tick": row[name] for name in names}
     if {4, 16} <= set(sizes):
@@ -184,16 +183,6 @@ def scale(options: Options, in_lockstep: bool) -> Figures:
             for name in names
         }
     return figures
-
-
-def whole(options: Options) -> Figures:
-    """Measure a tick with 1 to 16 chasers by part, and missions in lock-step."""
-    return scale(options, in_lockstep=True)
-
-
-def parts_only(options: Options) -> Figures:
-    """Measure the same without the missions in lock-step."""
-    return scale(options, in_lockstep=False)
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -207,12 +196,11 @@ def add_options(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--ticks", type=int, default=60, help="ticks that scale times")
     parser.add_argument(
-        "--seconds", type=float, default=12.0, help="simulated time of the missions of scale"
+        "--seconds",
+        type=float,
+        default=12.0,
+        help="simulated time of the missions of scale; 0: no missions",
     )
 
 
-GROUP = Group(
-    {"scale": whole, "scale-parts": parts_only},
-    add_options=add_options,
-    on_request=("scale-parts",),
-)
+GROUP = Group({"scale": scale}, add_options=add_options)

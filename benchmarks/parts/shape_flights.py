@@ -164,7 +164,9 @@ def correlation(a: Array, b: Array) -> float:
 
 
 def sighting_figures(errors: Array, images_per_s: float) -> Figures:
-    """Return the figures of the errors (chasers, images, 6) of one flight."""
+    """Return the figures of the errors (chasers, images, 6) of one flight; correlations at lags
+    shorter than half of it.
+    """
     figures: Figures = {}
     for kind, part in KINDS.items():
         of_kind = errors[:, :, part]
@@ -172,6 +174,8 @@ def sighting_figures(errors: Array, images_per_s: float) -> Figures:
         figures[f"{kind}_nees"] = float(np.nanmean(squares))
         for lag_s in LAGS_S:
             lag = max(1, round(lag_s * images_per_s))
+            if 2 * lag > len(of_kind[0]):
+                continue
             values = [correlation(e[:-lag], e[lag:]) for e in of_kind]
             figures[f"{kind}_correlation_{f'{lag_s:g}_s' if lag_s else 'next'}"] = float(
                 np.mean(values)
@@ -412,6 +416,7 @@ def fly_part(part: str, options: Options) -> Figures:
         **{
             f"{part}_sighting_{name}": float(np.mean([o.sightings[name] for o in outcomes]))
             for name in outcomes[0].sightings
+            if all(name in o.sightings for o in outcomes)
         },
     }
 

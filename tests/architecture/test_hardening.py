@@ -44,6 +44,7 @@ def unsafe_calls(tree: ast.Module) -> list[int]:
     return lines
 
 
+@pytest.mark.slow
 def test_nothing_is_unpickled_or_evaluated() -> None:
     paths = [path for _, path in MODULES]
     libraries = {

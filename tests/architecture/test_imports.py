@@ -232,6 +232,7 @@ def test_flight_software_can_subscribe_its_inputs(node: Node) -> None:
         node.advertise(topics.TICK)
 
 
+@pytest.mark.slow
 def test_processes_start_without_packages_that_only_some_flights_need() -> None:
     """Each import here is one of every process of every flight: SciPy alone was 40 % of the start
     of the world.

@@ -59,11 +59,32 @@ def test_python_tests_call_all_kernels_under_sanitizers() -> None:
 @pytest.mark.parametrize(
     ("folder", "kernel", "source", "right", "wrong", "finding"),
     [
-        (1, "draw_stars", "scene.c", "if (!(x > -1.0 && y > -1.0", "if ((x < -1.0 && y > -1.0", "outside the range"),
-        (2, "refine_corners", "corners.c", "if (row > p->height - 2)", "if (row > p->height)", "heap-buffer-overflow"),
-        (3, "plan_violation", "planes.c", "or_nan(worst[i], problem->to_target", "of(worst[i], problem->to_target", "violated: worst"),
+        (
+            1,
+            "draw_stars",
+            "scene.c",
+            "if (!(x > -1.0 && y > -1.0",
+            "if ((x < -1.0 && y > -1.0",
+            "outside the range",
+        ),
+        (
+            2,
+            "refine_corners",
+            "corners.c",
+            "if (row > p->height - 2)",
+            "if (row > p->height)",
+            "heap-buffer-overflow",
+        ),
+        (
+            3,
+            "plan_violation",
+            "planes.c",
+            "or_nan(worst[i], problem->to_target",
+            "of(worst[i], problem->to_target",
+            "violated: worst",
+        ),
     ],
-)  # fmt: skip
+)
 def test_planted_faults_are_found(
     folder: int, kernel: str, source: str, right: str, wrong: str, finding: str, tmp_path: Path
 ) -> None:

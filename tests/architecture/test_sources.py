@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from source_tree import MODULES, PACKAGES, ROOT, tree_of
 
 
@@ -43,6 +44,7 @@ def type_names(path: Path) -> Iterator[str]:
         )
 
 
+@pytest.mark.slow
 def test_no_name_of_a_class_or_type_is_used_for_two_things() -> None:
     """In the packages and the benchmarks, so that a search for a name finds one thing."""
     places: dict[str, list[str]] = defaultdict(list)

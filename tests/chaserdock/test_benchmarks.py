@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from chaserdock_protocol.scenario import load_scenario
 from common import (
     SHARED,
     BenchmarkFailed,
@@ -24,6 +25,7 @@ from common import (
     parts_of,
 )
 from harness import ROOT
+from parts import scale
 
 COMMANDS = sorted(
     path.stem
@@ -82,12 +84,18 @@ def test_commands_in_the_guides_exist() -> None:
 
 
 def test_evidence_names_commands_of_today_or_renamed_ones() -> None:
-    """Evidence names what was run at its commit; its index says what that is called today."""
+    """Evidence names what was run at its commit; its index says what that is called today. Where it
+    names a part alone, that exists.
+    """
     table = INDEX.read_text("utf-8").partition("## Commands of earlier")[2]
     renamed = re.findall(r"(\w+)\.py", "".join(re.findall(r"^\| ([^|]*) \|", table, re.M)))
+    every = [part for name in COMMANDS for part in parts_of(groups_of(name))]
     for page in EVIDENCE:
         for name in re.findall(r"benchmarks/([a-z]\w+)\.py", page.read_text("utf-8")):
             assert name in COMMANDS or name in renamed, (page.name, name)
+        for arguments in re.findall(r"`(--only [^`]+)`", page.read_text("utf-8")):
+            for wanted in parts_in(f" {arguments}"):
+                assert matching(wanted, every), (page.name, wanted)
 
 
 def parts_in(arguments: str) -> list[str]:
@@ -139,3 +147,12 @@ def test_a_part_below_its_bar_fails_the_command_after_the_others(
     figures = json.loads(path.read_text(encoding="utf-8"))
     assert figures["bad_s"] == 2.0
     assert figures["good_s"] == 1.0
+
+
+@pytest.mark.slow
+def test_every_part_of_a_tick_is_timed(tmp_path: Path) -> None:
+    """``mission.py --only scale`` wraps methods of the flight software by name."""
+    path = tmp_path / "scenario.toml"
+    path.write_text(scale.first(1), encoding="utf-8")
+    spent_s = scale.parts_of(load_scenario(path), 3)
+    assert all(spent_s[part] > 0.0 for part in scale.PARTS)

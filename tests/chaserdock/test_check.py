@@ -85,29 +85,98 @@ def changed(raw: RawSample, **fields: Any) -> RawSample:
 
 
 VIOLATIONS: list[tuple[str, Callable[[RawSample], list[RawSample]], str, str]] = [
-    ("controller/target", lambda r: [msgspec.structs.replace(r, encoding="application/msgpack")], "", "wrong encoding"),
-    ("controller/target", lambda r: [msgspec.structs.replace(r, payload=b"\xff")], "", "not of the message's type"),
-    ("controller/target", lambda r: [changed(r, position_m=(math.nan, 0.0, 0.0))], "", "not finite"),
-    ("controller/target", lambda r: [changed(r, q_wxyz=(1.0, 1.0, 0.0, 0.0))], "", "not of unit length"),
+    (
+        "controller/target",
+        lambda r: [msgspec.structs.replace(r, encoding="application/msgpack")],
+        "",
+        "wrong encoding",
+    ),
+    (
+        "controller/target",
+        lambda r: [msgspec.structs.replace(r, payload=b"\xff")],
+        "",
+        "not of the message's type",
+    ),
+    (
+        "controller/target",
+        lambda r: [changed(r, position_m=(math.nan, 0.0, 0.0))],
+        "",
+        "not finite",
+    ),
+    (
+        "controller/target",
+        lambda r: [changed(r, q_wxyz=(1.0, 1.0, 0.0, 0.0))],
+        "",
+        "not of unit length",
+    ),
     ("controller/target", lambda r: [], "", "no answer within"),
     ("controller/target", lambda r: [], "", "seq does not count"),
     ("controller/target", lambda r: [r, r], "", "second answer"),
     ("controller/solver", lambda r: [changed(r, tick=6)], "", "another tick than the open one"),
     ("controller/solver", lambda r: [changed(r, sim_time_ns=1)], "", "wrong sim_time_ns"),
-    ("controller/chaser/1/wrench", lambda r: [changed(r, effective_time_ns=1)], "", "wrong effective_time_ns"),
+    (
+        "controller/chaser/1/wrench",
+        lambda r: [changed(r, effective_time_ns=1)],
+        "",
+        "wrong effective_time_ns",
+    ),
     ("controller/chaser/1/wrench", lambda r: [changed(r, chaser=0)], "", "differs from the key's"),
-    ("controller/chaser/1/wrench", lambda r: [changed(r, force_N=(1e3, 0.0, 0.0))], "", "the chaser rejects"),
-    ("controller/chaser/1/wrench", lambda r: [changed(r, term=7)], "", "not the term of its leases"),
-    ("controller/chaser/1/wrench", lambda r: [changed(r, instance="another")], "", "not the term of its leases"),
-    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="chaser/0/actuators")], "chaser/0/actuators",
-     "must not write"),
-    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="truth/world")], "truth/world", "must not write"),
-    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="my/own")], "my/own", "not part of the protocol"),
-    ("controller/presence", lambda r: [changed(r, process="chaser/0")], "", "another process' presence"),
+    (
+        "controller/chaser/1/wrench",
+        lambda r: [changed(r, force_N=(1e3, 0.0, 0.0))],
+        "",
+        "the chaser rejects",
+    ),
+    (
+        "controller/chaser/1/wrench",
+        lambda r: [changed(r, term=7)],
+        "",
+        "not the term of its leases",
+    ),
+    (
+        "controller/chaser/1/wrench",
+        lambda r: [changed(r, instance="another")],
+        "",
+        "not the term of its leases",
+    ),
+    (
+        "controller/target",
+        lambda r: [r, msgspec.structs.replace(r, key="chaser/0/actuators")],
+        "chaser/0/actuators",
+        "must not write",
+    ),
+    (
+        "controller/target",
+        lambda r: [r, msgspec.structs.replace(r, key="truth/world")],
+        "truth/world",
+        "must not write",
+    ),
+    (
+        "controller/target",
+        lambda r: [r, msgspec.structs.replace(r, key="my/own")],
+        "my/own",
+        "not part of the protocol",
+    ),
+    (
+        "controller/presence",
+        lambda r: [changed(r, process="chaser/0")],
+        "",
+        "another process' presence",
+    ),
     ("controller/farewell", lambda r: [], "", "no farewell"),
-    ("controller/farewell", lambda r: [changed(r, published={})], "", "wrong number of published messages"),
-    ("controller/farewell", lambda r: [changed(r, process="world")], "", "another process' farewell"),
-]  # fmt: skip
+    (
+        "controller/farewell",
+        lambda r: [changed(r, published={})],
+        "",
+        "wrong number of published messages",
+    ),
+    (
+        "controller/farewell",
+        lambda r: [changed(r, process="world")],
+        "",
+        "another process' farewell",
+    ),
+]
 
 
 @pytest.mark.parametrize(("key", "violation", "where", "what"), VIOLATIONS)
@@ -172,16 +241,36 @@ def test_foreign_example_conforms(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "finding"),
     [
-        ('chaserdock.{kind}.v1"', "chaserdock.{kind}.v{1 + (kind == 'TargetEstimate')}" + '"', "wrong encoding"),
-        ("if tick is None or", 'if tick and tick["tick"] == 3 or tick is None or', "controller/target: no answer"),
+        (
+            'chaserdock.{kind}.v1"',
+            "chaserdock.{kind}.v{1 + (kind == 'TargetEstimate')}" + '"',
+            "wrong encoding",
+        ),
+        (
+            "if tick is None or",
+            'if tick and tick["tick"] == 3 or tick is None or',
+            "controller/target: no answer",
+        ),
         ("force_N=force,", 'force_N=[float("nan")] * 3,', "wrench: a number that is not finite"),
-        ('f"{NAME}/target"', '"chaser/0/sighting"', "chaser/0/sighting: a key that controller must not write"),
+        (
+            'f"{NAME}/target"',
+            '"chaser/0/sighting"',
+            "chaser/0/sighting: a key that controller must not write",
+        ),
         ('            if key == "world/end":\n                break', "", "does not end within"),
-        ('NAME, NAMESPACE = "controller"', 'NAME, NAMESPACE = "chaser/0"', "joins under another name"),
+        (
+            'NAME, NAMESPACE = "controller"',
+            'NAME, NAMESPACE = "chaser/0"',
+            "joins under another name",
+        ),
         ("self.session.liveliness().declare_token", "str", "live/controller: no liveliness token"),
-        ("self.heard[message", "self.inbox, self.seen = self.inbox, [message", "has not discovered its partners"),
+        (
+            "self.heard[message",
+            "self.inbox, self.seen = self.inbox, [message",
+            "has not discovered its partners",
+        ),
     ],
-)  # fmt: skip
+)
 def test_faulty_process_is_detected(old: str, new: str, finding: str, tmp_path: Path) -> None:
     status, out = foreign(tmp_path / "foreign.py", old, new)
     assert status == 1, out

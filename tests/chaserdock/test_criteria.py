@@ -155,10 +155,20 @@ def test_the_stack_is_at_rest_from_when_speed_and_rate_stay_below_the_limits() -
 @pytest.mark.parametrize(
     ("speed_m_s", "rate_deg_s", "text"),
     [
-        (0.0011, 0.01, "the stack moves at 1.10 mm/s and 0.010 degrees/s; at most 1 mm/s and 0.05 degrees/s allowed"),
-        (0.0002, 0.06, "the stack moves at 0.20 mm/s and 0.060 degrees/s; at most 1 mm/s and 0.05 degrees/s allowed"),
+        (
+            0.0011,
+            0.01,
+            "the stack moves at 1.10 mm/s and 0.010 degrees/s; "
+            "at most 1 mm/s and 0.05 degrees/s allowed",
+        ),
+        (
+            0.0002,
+            0.06,
+            "the stack moves at 0.20 mm/s and 0.060 degrees/s; "
+            "at most 1 mm/s and 0.05 degrees/s allowed",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_stack_that_moves_at_the_end_violates_the_criterion(
     speed_m_s: float, rate_deg_s: float, text: str
 ) -> None:
@@ -339,13 +349,22 @@ def test_arrival_is_not_judged_before_its_goto() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("success.arrival.chasers=[0, 3]", "success.arrival.chasers: there is no chaser 3; this mission has 0 to 2"),
+        (
+            "success.arrival.chasers=[0, 3]",
+            "success.arrival.chasers: there is no chaser 3; this mission has 0 to 2",
+        ),
         ("success.speed_limit.speed_m_s=0", "success.speed_limit.speed_m_s"),
-        ("success.approach_cone={half_angle_deg=30, axis=[0, 0, 0], within_m=10}", "axis: must not be 0"),
-        ("success.approach_cone={half_angle_deg=95, axis=[1, 0, 0], within_m=10}", "success.approach_cone.half_angle_deg"),
+        (
+            "success.approach_cone={half_angle_deg=30, axis=[0, 0, 0], within_m=10}",
+            "axis: must not be 0",
+        ),
+        (
+            "success.approach_cone={half_angle_deg=95, axis=[1, 0, 0], within_m=10}",
+            "success.approach_cone.half_angle_deg",
+        ),
         ("success.abort_clear_m=-1", "success.abort_clear_m"),
     ],
-)  # fmt: skip
+)
 def test_invalid_criteria_of_a_rendezvous_are_named(override: str, message: str) -> None:
     with pytest.raises(ScenarioError, match=message.replace(".", r"\.")) as caught:
         load_scenario(AFRL, (override,))

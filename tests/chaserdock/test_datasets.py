@@ -40,7 +40,8 @@ SETS = (
     'target.model="geo_servicer"',
 )
 DISTORTED = (
-    "camera.intrinsics={width_px=480, height_px=270, fx_px=415.0, fy_px=416.0, cx_px=240.5, cy_px=133.0, "
+    "camera.intrinsics={width_px=480, height_px=270, fx_px=415.0, fy_px=416.0, "
+    "cx_px=240.5, cy_px=133.0, "
     "distortion=[-0.25, 0.08, 0.001, -0.0005, 0.0]}"
 )
 LIMITS = ViewLimits((1.0, 3.0), 0.5, (20.0, 100.0))

@@ -91,6 +91,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_every_page_exists_and_loads_nothing_from_elsewhere(site: Path) -> None:
     for page in (*PAGES, *EVIDENCE):
         assert (site / page.relative_to(DOCS).with_suffix(".html")).is_file()
@@ -104,6 +105,7 @@ def test_every_page_exists_and_loads_nothing_from_elsewhere(site: Path) -> None:
                 assert (page.parent / url.partition("?")[0].partition("#")[0]).exists(), (page, url)
 
 
+@pytest.mark.slow
 def test_every_link_leads_to_a_page_and_a_heading_of_the_site(site: Path) -> None:
     pages: dict[Path, Requests] = {}
     for page in site.rglob("*.html"):
@@ -122,6 +124,7 @@ def test_every_link_leads_to_a_page_and_a_heading_of_the_site(site: Path) -> Non
     assert checked > 1000
 
 
+@pytest.mark.slow
 def test_mathematics_is_in_the_page_itself(site: Path) -> None:
     for name, least in (("controller", 8), ("estimation", 4)):
         seen = Requests()
@@ -131,6 +134,7 @@ def test_mathematics_is_in_the_page_itself(site: Path) -> None:
         assert "\\begin" not in re.sub(r"<annotation.*?</annotation>", "", text, flags=re.S)
 
 
+@pytest.mark.slow
 def test_the_site_shows_notebooks_names_its_version_and_can_be_searched(site: Path) -> None:
     page = (site / "source" / "examples" / "logs.ipynb.html").read_text(encoding="utf-8")
     assert "controller: initialised by chaser 1" in page  # a stored output

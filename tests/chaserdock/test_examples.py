@@ -38,16 +38,10 @@ def install(example: Path, folder: Path) -> dict[str, str]:
     project = tomllib.loads((example / "pyproject.toml").read_text())
     for name in project["tool"]["hatch"]["build"]["targets"]["wheel"]["include"]:
         (folder / name).write_text((example / name).read_text())
-    info = (
-        folder
-        / f"{project['project']['name'].replace('-', '_')}-{project['project']['version']}.dist-info"
-    )
+    name, version = project["project"]["name"], project["project"]["version"]
+    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
-    head = (
-        f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: "
-        f"{project['project']['version']}\n"
-    )
-    (info / "METADATA").write_text(head)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
     groups = project["project"]["entry-points"]
     lines = [
         line

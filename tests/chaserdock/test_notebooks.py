@@ -18,8 +18,6 @@ pytest.importorskip("nbclient")
 
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 executed: Any = runpy.run_path(str(ROOT / "docs" / "run_notebooks.py"))["executed"]
-# Those that fly more than one mission.
-_LONG = ("campaign", "faults", "own_controller", "own_perception", "own_target")
 
 
 def code_cells(notebook: Any) -> list[Any]:
@@ -52,11 +50,8 @@ def _shows_nothing(source: str) -> bool:
     return bool(re.match(r"(\S+(, \S+)* = |import |from |\)$)", last))
 
 
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, marks=[pytest.mark.slow] if p.stem in _LONG else []) for p in NOTEBOOKS],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_executes(path: Path, tmp_path: Path) -> None:
     (tmp_path / "tests").symlink_to(ROOT / "tests")
     folder = tmp_path / "work"

@@ -107,8 +107,12 @@ def test_perfect_landmarks_give_the_true_pose(
 
 
 def test_network_file_runs_in_the_command(
-    dataset: Path, example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:  # fmt: skip
+    dataset: Path,
+    example: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     written(example, tmp_path / "n.onnx", corners(dataset))
     monkeypatch.setenv("CHASERDOCK_ONNX", str(tmp_path / "n.onnx"))
     words = [

@@ -166,7 +166,8 @@ def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_pat
     [
         ("", True),
         (
-            '[[fault]]\nkind = "odometry_lie"\nat_s = 0.5\nduration_s = 1.0\nprocess = "chaser/0"\noffset_m = [1.0, 0.0, 0.0]\n',
+            '[[fault]]\nkind = "odometry_lie"\nat_s = 0.5\nduration_s = 1.0\n'
+            'process = "chaser/0"\noffset_m = [1.0, 0.0, 0.0]\n',
             False,
         ),
         ("[truth.chaser]\nforce_N = 0.005\n", False),

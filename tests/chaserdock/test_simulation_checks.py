@@ -167,12 +167,24 @@ def test_queues_grow_for_a_reader_that_falls_behind_only(
     ("keys", "found"),
     [
         ({}, ["bounded queues"]),
-        ({"simulation": {"slow": [{"process": "controller", "each_s": 0.02, **WHILE}]}}, ["bounded queues"]),
-        ({"simulation": {"slow": [{"process": "controller", "each_s": 0.02, "at_s": 7.9, "duration_s": 5.1}]}}, []),
+        (
+            {"simulation": {"slow": [{"process": "controller", "each_s": 0.02, **WHILE}]}},
+            ["bounded queues"],
+        ),
+        (
+            {
+                "simulation": {
+                    "slow": [
+                        {"process": "controller", "each_s": 0.02, "at_s": 7.9, "duration_s": 5.1}
+                    ]
+                }
+            },
+            [],
+        ),
         ({"fault": [{"kind": "freeze", "process": "world", "at_s": 1.0, "duration_s": 3.0}]}, []),
     ],
     ids=["nothing", "short", "slow", "frozen"],
-)  # fmt: skip
+)
 def test_queue_of_the_recorder_grows_while_a_process_catches_up(
     keys: dict[str, Any], found: list[str], tmp_path: Path
 ) -> None:
@@ -328,6 +340,7 @@ def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> N
 # -- invariants ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_documentation_is_that_of_the_checks() -> None:
     command = [sys.executable, str(ROOT / "docs" / "make_invariants.py"), "--print"]
     made = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -20,8 +20,13 @@ POSE = PoseSolution(
 
 @pytest.mark.parametrize(
     ("markers", "solutions", "text"),
-    [((), (), "not seen"), ((4,), (POSE,), "1 marker"), ((4, 5), (), "2 markers"), ((), (POSE,), "seen by its shape")],
-)  # fmt: skip
+    [
+        ((), (), "not seen"),
+        ((4,), (POSE,), "1 marker"),
+        ((4, 5), (), "2 markers"),
+        ((), (POSE,), "seen by its shape"),
+    ],
+)
 def test_text_states_by_what_the_target_was_found(
     markers: tuple[int, ...], solutions: tuple[PoseSolution, ...], text: str
 ) -> None:

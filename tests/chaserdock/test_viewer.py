@@ -583,13 +583,14 @@ def test_access_rights_give_ground_truth_to_viewers_only(tmp_path: Path) -> None
 
 def test_subscriber_gets_the_newest_and_never_blocks_the_publisher() -> None:
     """Of 5,000 unread messages the last four are kept; the publisher is not delayed."""
-    link = Link("follow", (), ("tcp/127.0.0.1:17999",))
+    endpoint = f"tcp/127.0.0.1:{free_port(DEFAULT_HOST, None)}"
+    link = Link("follow", (), (endpoint,))
     world, looker = Node("world", "world", link), None
     try:
-        looker = Node("viewer", "viewer", Link("follow", ("tcp/127.0.0.1:17999",), ()))
+        looker = Node("viewer", "viewer", Link("follow", (endpoint,), ()))
         take = looker.subscribe_newest(topics.TICK, 4)
         world.advertise(topics.TICK)
-        deadline, got = time.monotonic() + 30.0, []
+        deadline, got = time.monotonic() + 60.0, []
         while not got and time.monotonic() < deadline:  # until they know each other
             world.publish(topics.TICK, Tick(tick=0, images=False, chasers=()))
             time.sleep(0.05)

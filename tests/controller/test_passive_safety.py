@@ -89,9 +89,7 @@ def test_monitor_needs_the_joint_estimator() -> None:
         mission({"passive_safety": "monitor"}, estimator={"name": "paper"})
 
 
-def test_chaser_counts_once_it_was_safe_for_a_while_and_then_has_to_abort_when_it_is_not_for_a_second() -> (
-    None
-):
+def test_chaser_that_was_safe_for_a_while_aborts_when_it_is_not_for_a_second() -> None:
     monitor = PassiveSafetyMonitor(mission({"passive_safety": "enforce"}))
     second = 1_000_000_000
     for k in range(3):  # not yet converged

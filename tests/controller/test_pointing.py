@@ -79,9 +79,7 @@ def test_search_rings_grow_without_jumps_of_the_line_of_sight() -> None:
     assert largest[0] < largest[1] < largest[2] <= math.radians(170.0)
 
 
-def test_chaser_pauses_its_search_while_it_acquires_the_target_for_8_s_at_most_and_turns_2_s_between() -> (
-    None
-):
+def test_chaser_pauses_its_search_for_8_s_at_most_to_acquire_and_turns_2_s_between() -> None:
     def turned_s(acquiring: Callable[[float], bool | None]) -> float:
         progress = SearchProgress(np.array([1.0, 0.0, 0.0, 0.0]), 1.0)
         for k in range(15 * 20 + 1):

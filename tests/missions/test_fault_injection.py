@@ -34,11 +34,26 @@ def truth_of(flight: RecordedFlight) -> list[bytes]:
 
 
 MANY = (
-    'kind = "drop", at_s = 1.0, duration_s = 2.0, process = "chaser/0", topic = "wrench", share = 0.5',
-    'kind = "corrupt", at_s = 1.5, duration_s = 2.0, process = "controller", topic = "sighting", share = 0.5',
-    'kind = "delay", at_s = 2.0, duration_s = 1.0, process = "world", topic = "actuators", delay_s = 0.2',
-    'kind = "reorder", at_s = 2.0, duration_s = 1.0, process = "controller", topic = "odometry", share = 0.5',
-    'kind = "flood", at_s = 2.0, duration_s = 1.0, process = "chaser/1", topic = "sighting", copies = 20',
+    (
+        'kind = "drop", at_s = 1.0, duration_s = 2.0, '
+        'process = "chaser/0", topic = "wrench", share = 0.5'
+    ),
+    (
+        'kind = "corrupt", at_s = 1.5, duration_s = 2.0, '
+        'process = "controller", topic = "sighting", share = 0.5'
+    ),
+    (
+        'kind = "delay", at_s = 2.0, duration_s = 1.0, '
+        'process = "world", topic = "actuators", delay_s = 0.2'
+    ),
+    (
+        'kind = "reorder", at_s = 2.0, duration_s = 1.0, '
+        'process = "controller", topic = "odometry", share = 0.5'
+    ),
+    (
+        'kind = "flood", at_s = 2.0, duration_s = 1.0, '
+        'process = "chaser/1", topic = "sighting", copies = 20'
+    ),
     'kind = "cut", at_s = 3.0, duration_s = 1.0, process = "chaser/2"',
     'kind = "camera_off", at_s = 3.0, duration_s = 1.0, process = "chaser/3"',
     'kind = "kill", at_s = 4.5, process = "chaser/1"',

@@ -20,6 +20,7 @@ from harness import ROOT, SHORT
 from chaserdock.experiments.in_process import InProcessMission
 from chaserdock.experiments.perception import RenderedImages
 from chaserdock.logs import open_log
+from chaserdock.simulation.mission import simulate
 
 SMALL = (
     "camera.width_px=480",
@@ -44,12 +45,17 @@ ERRORS = (
 @pytest.mark.slow
 @pytest.mark.parametrize("overrides", [SHORT, ERRORS], ids=["ideal", "errors"])
 def test_truth_equals_lockstep_mission(
-    overrides: tuple[str, ...], shared_flight: Callable[..., Path]
+    overrides: tuple[str, ...], shared_flight: Callable[..., Path], tmp_path: Path
 ) -> None:
-    name = "two-chaser-tracking"
-    log = open_log(shared_flight("short" if overrides is SHORT else "errors", name, *overrides))
+    path = ROOT / "scenarios" / "two-chaser-tracking.toml"
+    if overrides is SHORT:
+        folder = shared_flight("short", path.stem, *overrides)
+    else:  # as separate processes fly it, bit for bit (test_simulation.py)
+        folder = tmp_path
+        simulate(path, folder, overrides)
+    log = open_log(folder)
     logged = {(m.body, m.tick): m for m in (r.message for r in log.records(topics.TRUTH_BODY))}
-    scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml", overrides)
+    scenario = load_scenario(path, overrides)
     assert len(logged) == 3 * (scenario.ticks + 1)
     with InProcessMission(scenario, RenderedImages(scenario)) as mission:
         for record in mission.ticks():

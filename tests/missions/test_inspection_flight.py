@@ -28,8 +28,14 @@ INSPECT = tuple(OperatorCommand(command="inspect", chaser=i) for i in (0, 1))
 def test_geometry_is_estimated_in_flight_and_corrects_the_trackers() -> None:
     scenario = load_scenario(
         ROOT / "scenarios/markerless-inspection.toml",
-        ("duration_s=27.0", "camera.width_px=640", "camera.height_px=360", "inspection.speed_m_s=0.35", "timeline=[]"),
-    )  # fmt: skip
+        (
+            "duration_s=27.0",
+            "camera.width_px=640",
+            "camera.height_px=360",
+            "inspection.speed_m_s=0.35",
+            "timeline=[]",
+        ),
+    )
     cameras, perceptions = (
         make_cameras(scenario),
         [make_perception(scenario) for _ in scenario.chasers],

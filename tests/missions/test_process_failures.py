@@ -140,17 +140,31 @@ def malformed_messages() -> list[tuple[str, bytes, str]]:
     shape = msgspec.to_builtins(wrench) | {"force_N": [1.0, 2.0]}
     return [
         (topics.ODOMETRY.key_of(0), codec.encode(odometry), encoding_of(Odometry)),
-        (topics.WRENCH.key_of(0), codec.encode(msgspec.structs.replace(wrench, force_N=(math.nan, 0.0, 0.0))),
-         encoding_of(WrenchCommand)),
-        (topics.SIGHTING.key_of(0), codec.encode(msgspec.structs.replace(sighting, solutions=(turned,))),
-         encoding_of(Sighting)),
+        (
+            topics.WRENCH.key_of(0),
+            codec.encode(msgspec.structs.replace(wrench, force_N=(math.nan, 0.0, 0.0))),
+            encoding_of(WrenchCommand),
+        ),
+        (
+            topics.SIGHTING.key_of(0),
+            codec.encode(msgspec.structs.replace(sighting, solutions=(turned,))),
+            encoding_of(Sighting),
+        ),
         (topics.WRENCH.key_of(0), msgspec.msgpack.encode(shape), encoding_of(WrenchCommand)),
-        (topics.WRENCH.key_of(0), codec.encode(wrench), "application/msgpack;chaserdock.WrenchCommand.v99"),
-        (topics.WRENCH.key_of(0), codec.encode(msgspec.structs.replace(wrench, chaser=1)), encoding_of(WrenchCommand)),
+        (
+            topics.WRENCH.key_of(0),
+            codec.encode(wrench),
+            "application/msgpack;chaserdock.WrenchCommand.v99",
+        ),
+        (
+            topics.WRENCH.key_of(0),
+            codec.encode(msgspec.structs.replace(wrench, chaser=1)),
+            encoding_of(WrenchCommand),
+        ),
         (topics.SIGHTING.key_of(0), codec.encode(sighting)[:-4], encoding_of(Sighting)),
         (topics.ACTUATORS.key_of(0), b"\xc1 junk", "text/plain"),
         (topics.TICK.key_of(), b"", "application/msgpack;chaserdock.Tick.v1"),
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.slow
@@ -213,23 +227,21 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
 
 @pytest.mark.slow
 def test_killed_recorder_leaves_readable_log(tmp_path: Path) -> None:
-    """SIGKILL of the recorder loses at most the last second; the flight completes."""
+    """After SIGKILL of the recorder the flight completes. Which messages are then on the disk:
+    tests/protocol/test_log_ends.py.
+    """
     mission = chaserdock(
         "run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*LONG, "duration_s=30.0")
     )
     log = tmp_path / "run" / "mission.mcap"
     try:
         wait_for_log(log, FLYING_BYTES)
-        recorder = find_child(mission, "record")
-        time.sleep(2.0)
-        killed_ns = time.time_ns()
-        recorder.kill()
+        find_child(mission, "record").kill()
         assert mission.wait(timeout=120) == 1
     finally:
         mission.kill()
         mission.wait()
-    last_ns = max(record.sent_ns for record in read_log(log))
-    assert killed_ns - last_ns < 1.2e9
+    assert any(record.key == topics.TICK.key_of() for record in read_log(log))
     assert "completed" in (tmp_path / "run" / "processes" / "world.txt").read_text()
     result = summary(tmp_path / "run")
     assert not result["success"]
@@ -286,58 +298,17 @@ def test_flight_continues_after_process_is_killed(
 
 
 @pytest.mark.slow
-def test_realtime_chaser_survives_frozen_controller(tmp_path: Path) -> None:
-    """The chaser enters fallback without commands, rejects stale ones and follows new ones."""
-    out = tmp_path / "run"
-    arguments = ("run", "single", "--mode", "realtime", "--out", str(out), "-q")
-    mission = chaserdock(*arguments, *sets(*SHORT, "duration_s=10.0"))
-    try:
-        wait_for_log(out / "mission.mcap", FLYING_BYTES)
-        controller = find_child(mission, "controller")
-        controller.suspend()
-        time.sleep(1.1)  # shorter than the lease, longer than a command is valid
-        controller.resume()
-        mission.wait(timeout=120)
-    finally:
-        mission.kill()
-        mission.wait()
-    records = list(read_log(out / "mission.mcap", ["chaser/0/actuators"]))
-    executed = [r.message for r in records]
-    fallback = [m.tick for m in executed if m.source != "command"]
-    assert 3 < len(fallback) < 60
-    assert max(m.tick for m in executed if m.source == "command") > max(fallback) + 15
-    result = summary(out)
-    events = [
-        e["what"].partition(": ")[2] for e in result["events"] if e["what"].startswith("chaser/0")
-    ]
-    assert [e for e in events if e.startswith("no command for")]
-    assert [e for e in events if e.startswith("fallback: plan")]
-    assert [e for e in events if e.startswith("fallback ends")]
-    # No stale command was executed: when a command was passed on, the newest odometry sent was at
-    # most 0.5 s (a command's lifetime) and 0.5 s (transport) later. Whether the resumed controller
-    # sends stale commands depends on load; tests/agents/test_command_gate.py tests their rejection.
-    known = [
-        (r.sent_ns, r.message.sim_time_ns)
-        for r in read_log(out / "mission.mcap", ["world/chaser/0/odometry"])
-    ]
-    for record in records:
-        if record.message.source == "command":
-            newest_ns = max(sim_ns for sent_ns, sim_ns in known if sent_ns <= record.sent_ns)
-            assert newest_ns - record.message.sim_time_ns < 0.5e9 + 0.5e9
-
-
-@pytest.mark.slow
 def test_frozen_chaser_that_was_replaced_ends_when_it_wakes(tmp_path: Path) -> None:
     """It commands no actuators beside its successor."""
-    hand, lease = ByHand.at_free_port("replaced"), ("--lease", "2")
+    hand, lease = ByHand.at_free_port("replaced"), ("--lease", "10")
     single = (
         "world",
         "single",
         "--mode",
         "realtime",
         "--rejoin-timeout",
-        "30",
-        *sets(*SHORT, "duration_s=20.0"),
+        "120",
+        *sets(*SHORT, "duration_s=40.0"),
     )
     try:
         world = hand.start("world", *single, *lease)
@@ -352,7 +323,7 @@ def test_frozen_chaser_that_was_replaced_ends_when_it_wakes(tmp_path: Path) -> N
         assert any(b"joined" in line for line in hand.processes["chaser"].stdout or ())
         time.sleep(2.0)
         frozen.send_signal(signal.SIGCONT)
-        status, text = hand.output_of("frozen", 30.0)
+        status, text = hand.output_of("frozen")
         assert status == 1
         assert "another chaser/0 has replaced this one, which was lost" in text
         assert hand.output_of("world")[0] == 0
@@ -450,4 +421,5 @@ def test_process_that_hangs_before_the_first_tick_ends_run(
     outcome = launcher.fly_mission(TWO, tmp_path / "run")
     assert outcome.status == 1
     assert outcome.failure is not None
-    assert outcome.failure.startswith("not connected within 20 s: chaser/1")
+    assert outcome.failure.startswith("not connected within 20 s: ")
+    assert "chaser/1" in outcome.failure  # on a busy machine others may be late, too

@@ -140,6 +140,40 @@ def test_chasers_fly_both_controllers_in_the_tick_in_which_the_commander_dies(
     assert apart_m == 0.0
 
 
+def test_a_chaser_falls_back_while_its_controller_is_frozen_in_real_time(tmp_path: Path) -> None:
+    """It plans on by itself without commands, refuses stale ones, and follows new ones again."""
+    changes = (
+        "duration_s=5.0",
+        "settling_s=1.0",
+        "perception.name='statistical'",
+        "simulation.mode='realtime'",
+        # Longer than a command is valid.
+        "fault=[{kind='freeze', at_s=2.0, duration_s=1.1, process='controller'}]",
+    )
+    flight = simulate(ROOT / "scenarios" / "single.toml", tmp_path, changes)
+    assert (flight.crashes, flight.stalled) == ({}, ())
+    log = tmp_path / "mission.mcap"
+    records = list(read_log(log, ["chaser/0/actuators"]))
+    executed = [r.message for r in records]
+    fallback = [m.tick for m in executed if m.source != "command"]
+    assert 8 < len(fallback) < 20
+    assert max(m.tick for m in executed if m.source == "command") > max(fallback) + 15
+    events = [e.what for e in load_flight(log).events if e.process == "chaser/0"]
+    assert events == [
+        "no command",
+        "fallback: plan",
+        "command refused",
+        "commands accepted again",
+        "fallback ends",
+    ]
+    # No stale command is executed: a command is valid for 0.5 s after its odometry.
+    known = [(r.sent_ns, r.message.sim_time_ns) for r in read_log(log, ["world/chaser/0/odometry"])]
+    for record in records:
+        if record.message.source == "command":
+            newest_ns = max(sim_ns for sent_ns, sim_ns in known if sent_ns <= record.sent_ns)
+            assert newest_ns - record.message.sim_time_ns < 0.6e9
+
+
 @pytest.mark.slow
 def test_four_chasers_dock_along_the_same_paths_on_another_simd_level(tmp_path: Path) -> None:
     """The complete drill: 5 s at a distance, then an approach to the docking distance."""

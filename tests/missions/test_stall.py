@@ -5,6 +5,7 @@ foreign publisher.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +24,7 @@ from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from chaserdock_protocol.transport.zenoh_network import zenoh_config
 from chaserdock_world.lockstep.membership import Membership
 from chaserdock_world.process import World
-from harness import ROOT, SHORT, ByHand, sets, wait_for_log
+from harness import ROOT, SHORT, ByHand, sets
 
 from chaserdock.launch.json_events import EventNotice, JsonLine
 from chaserdock.launch.launcher import Fleet, never, open_hub, watch
@@ -153,9 +154,11 @@ def world_and_intruder(endpoint: str) -> Iterator[tuple[Node, Node]]:
         intruder.close()
 
 
-def until(condition: Callable[[], Any], act: Callable[[], None] = lambda: None) -> None:
+def until(
+    condition: Callable[[], Any], act: Callable[[], None] = lambda: None, timeout_s: float = 120.0
+) -> None:
     """Wait until a condition holds, and call ``act`` ten times a second meanwhile."""
-    deadline = time.monotonic() + 30.0
+    deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline
         act()
@@ -228,30 +231,35 @@ def test_foreign_messages_are_ignored_and_their_publisher_is_named(tmp_path: Pat
     by_hand = ByHand.at_free_port("foreign")
     try:
         changes = (*SHORT, "duration_s=60.0", "perception.name='statistical'")
-        by_hand.start("world", "world", "two-chaser-tracking", *sets(*changes), "--stall-s", "20")
+        world = by_hand.start("world", "world", "two-chaser-tracking", *sets(*changes))
         by_hand.start("recorder", "record", "--by-run", "--out", str(tmp_path))
-        by_hand.start("judge", "judge", str(tmp_path), "--live", "--timeout", "60")
+        by_hand.start("judge", "judge", str(tmp_path), "--live", "--timeout", "120")
         by_hand.start("controller", "controller")
         until(lambda: list(tmp_path.glob("*/mission.mcap")))
         (log,) = tmp_path.glob("*/mission.mcap")
-        for i in range(2):
-            by_hand.start(f"chaser/{i}", "chaser", str(i))
-        wait_for_log(log, 100_000)
         link = Link(by_hand.namespace, (by_hand.endpoint,))
         with zenoh.open(zenoh_config(link)) as session:
-            intruder = str(session.zid())
-            for k in range(30):
+            intruder, number = str(session.zid()), itertools.count(5000)
+
+            def forge() -> None:
                 tick = Tick(
-                    tick=5000 + k,
+                    tick=next(number),
                     sim_time_ns=10**12,
                     images=True,
                     chasers=(0, 1),
                     controllers={"controller": "c"},
                 )
                 session.put(topics.TICK.key_of(), codec.encode(tick), encoding=encoding_of(Tick))
-                time.sleep(0.1)
-            session.put(topics.END.key_of(), codec.encode(FORGED), encoding=encoding_of(MissionEnd))
-            time.sleep(0.5)
+                if log.stat().st_size > 100_000:  # the mission flies
+                    end = codec.encode(FORGED)
+                    session.put(topics.END.key_of(), end, encoding=encoding_of(MissionEnd))
+
+            # Before the mission begins and until it is over: a busy machine may know the intruder
+            # late.
+            forge()
+            for i in range(2):
+                by_hand.start(f"chaser/{i}", "chaser", str(i))
+            until(lambda: world.poll() is not None, forge, 300.0)
         for name in ("world", "controller", "recorder", "chaser/0", "chaser/1", "judge"):
             status, output = by_hand.output_of(name)
             assert status == 0, f"{name}: {output}"
@@ -261,7 +269,8 @@ def test_foreign_messages_are_ignored_and_their_publisher_is_named(tmp_path: Pat
                     if name == "judge"
                     else f"{name}: foreign publisher: "
                 )
-                assert f"{own}session {intruder} publishes on world/tick" in output
+                # It is named once, by the key that was read first.
+                assert f"{own}session {intruder} publishes on world/" in output
     finally:
         by_hand.end()
     records = list(read_log(log))

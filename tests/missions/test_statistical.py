@@ -97,6 +97,7 @@ def test_statistical_perception_sees_the_target_where_images_show_it(
     assert np.mean(statistical.markers) == pytest.approx(np.mean(images.markers), rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["position_m", "angle_rad", "sigma_m"])
 def test_its_errors_and_covariances_are_those_of_images(
     quantity: str, both: tuple[Measured, Measured]
@@ -105,6 +106,7 @@ def test_its_errors_and_covariances_are_those_of_images(
     assert statistical == pytest.approx(images, rel=0.35)
 
 
+@pytest.mark.slow
 def test_its_errors_follow_its_covariance(both: tuple[Measured, Measured]) -> None:
     assert np.mean(both[1].nees) == pytest.approx(6.0, abs=1.0)
 

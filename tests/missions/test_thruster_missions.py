@@ -42,6 +42,7 @@ def test_stuck_thruster_is_detected_isolated_and_reported(stuck_flight: Path) ->
     assert chaser["thruster_impulse_N_s"] > 0.3
 
 
+@pytest.mark.slow
 def test_log_contains_valve_commands_and_force_limits(stuck_flight: Path) -> None:
     commands, reports, truths = [], [], []
     for record in read_log(stuck_flight / "mission.mcap"):

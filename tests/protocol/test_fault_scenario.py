@@ -21,7 +21,10 @@ GOOD = [
     'kind = "cut", process = "chaser/0", peer = "controller", duration_s = 2.0',
     'kind = "drop", process = "chaser/3", topic = "wrench", duration_s = 2.0, share = 0.5',
     'kind = "delay", process = "world", topic = "actuators", duration_s = 2.0, delay_s = 0.3',
-    'kind = "duplicate", process = "controller", topic = "sighting", duration_s = 2.0, peer = "chaser/1"',
+    (
+        'kind = "duplicate", process = "controller", topic = "sighting", duration_s = 2.0, '
+        'peer = "chaser/1"'
+    ),
     'kind = "reorder", process = "controller", topic = "odometry", duration_s = 2.0',
     'kind = "corrupt", process = "chaser/0", topic = "image", duration_s = 2.0',
     'kind = "flood", process = "world", topic = "image", duration_s = 2.0, copies = 10',

@@ -429,16 +429,31 @@ def test_euler_angles_are_intrinsic_z_y_x() -> None:
 @pytest.mark.parametrize(
     ("keys", "error"),
     [
-        ({"look_at": "target"}, "chasers.0: q_wxyz and look_at exclude each other; give one of them"),
+        (
+            {"look_at": "target"},
+            "chasers.0: q_wxyz and look_at exclude each other; give one of them",
+        ),
         ({"q_wxyz": None, "look_at": "moon"}, "chasers.0.look_at: must be target (got 'moon')"),
-        ({"q_wxyz": None, "attitude_deg": {"yow": 3}}, "unknown key chasers.0.attitude_deg.yow; did you mean"),
-        ({"q_wxyz": None, "attitude_deg": {"yaw": math.nan}}, "chasers.0.attitude_deg.yaw: must be a finite"),
+        (
+            {"q_wxyz": None, "attitude_deg": {"yow": 3}},
+            "unknown key chasers.0.attitude_deg.yow; did you mean",
+        ),
+        (
+            {"q_wxyz": None, "attitude_deg": {"yaw": math.nan}},
+            "chasers.0.attitude_deg.yaw: must be a finite",
+        ),
         ({"q_wxyz": None, "attitude_deg": 3}, "chasers.0.attitude_deg: must be a table (got 3)"),
         ({"q_wxyz": None}, "chasers.0.q_wxyz: is missing; give it, attitude_deg or look_at"),
-        ({"q_wxyz": None, "look_at": "target", "position_m": [0, 0, 0]}, "chasers.0: position_m must not be"),
-        ({"q_wxyz": None, "look_at": "target", "position_m": [0, 0]}, "chasers.0.position_m: must be an array of 3"),
+        (
+            {"q_wxyz": None, "look_at": "target", "position_m": [0, 0, 0]},
+            "chasers.0: position_m must not be",
+        ),
+        (
+            {"q_wxyz": None, "look_at": "target", "position_m": [0, 0]},
+            "chasers.0.position_m: must be an array of 3",
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_invalid_attitude_is_one_line(keys: dict[str, Any], error: str) -> None:
     values = good()
     values["chasers"][0] |= keys

@@ -93,18 +93,45 @@ def test_keys_override_the_predefined_body() -> None:
         ({"chaser": {"body": None}}, "thrusters needs thrusters"),
         ({"chaser": {"thrusters": [THRUSTER] * 12}}, "no 6-DoF control"),
         ({"chaser": {"force_max_N": 9.0}}, "at most 0.2"),
-        ({"chaser": {"thrusters": [{**THRUSTER, "direction": [0, 2, 0]}]}}, "chaser.thrusters.0.direction: must be of unit"),
+        (
+            {"chaser": {"thrusters": [{**THRUSTER, "direction": [0, 2, 0]}]}},
+            "chaser.thrusters.0.direction: must be of unit",
+        ),
         ({"chaser": {"thrusters": [{**THRUSTER, "thrust_N": -1}]}}, "chaser.thrusters.0.thrust_N"),
-        ({"chaser": {"thrusters": [{**THRUSTER, "min_on_s": 0.001}]}}, "min_on_s (0.001) must be at least rise_s"),
+        (
+            {"chaser": {"thrusters": [{**THRUSTER, "min_on_s": 0.001}]}},
+            "min_on_s (0.001) must be at least rise_s",
+        ),
         ({"chaser": {"thrusters": [THRUSTER] * 25}}, "chaser.thrusters"),
-        ({"chaser": {"modulation": {"carrier_hz": 7}}}, "multiple of chaser.modulation.carrier_hz (960, 7)"),
+        (
+            {"chaser": {"modulation": {"carrier_hz": 7}}},
+            "multiple of chaser.modulation.carrier_hz (960, 7)",
+        ),
         ({"chaser": {"modulation": {"carrier_hz": 120}}}, "shorter than the shortest pulse"),
-        ({"chaser": {"modulation": {"resolution_s": 0.2}}}, "at most half a carrier period"),
-        ({"thruster_failure": [{"chaser": 1, "thruster": 0, "at_s": 1, "kind": "stuck_on"}]}, "there is no chaser 1"),
-        ({"thruster_failure": [{"chaser": 0, "thruster": 12, "at_s": 1, "kind": "stuck_on"}]}, "there is no thruster 12"),
-        ({"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "weak"}]}, "factor goes with"),
-        ({"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "loud"}]}, "thruster_failure.0.kind"),
-        ({"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": t, "kind": "stuck_off"} for t in (1, 2)]}, "fails twice"),
+        (
+            {"thruster_failure": [{"chaser": 1, "thruster": 0, "at_s": 1, "kind": "stuck_on"}]},
+            "there is no chaser 1",
+        ),
+        (
+            {"thruster_failure": [{"chaser": 0, "thruster": 12, "at_s": 1, "kind": "stuck_on"}]},
+            "there is no thruster 12",
+        ),
+        (
+            {"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "weak"}]},
+            "factor goes with",
+        ),
+        (
+            {"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "loud"}]},
+            "thruster_failure.0.kind",
+        ),
+        (
+            {
+                "thruster_failure": [
+                    {"chaser": 0, "thruster": 0, "at_s": t, "kind": "stuck_off"} for t in (1, 2)
+                ]
+            },
+            "fails twice",
+        ),
         (
             {
                 "chaser": {"actuation": "ideal"},
@@ -113,9 +140,12 @@ def test_keys_override_the_predefined_body() -> None:
             "thrusters fail only with",
         ),
         ({"timeline": [{"at_s": 1, "command": "isolate", "chasers": [0]}]}, "thruster goes with"),
-        ({"timeline": [{"at_s": 1, "command": "hold", "chasers": [0], "thruster": 1}]}, "thruster goes with"),
+        (
+            {"timeline": [{"at_s": 1, "command": "hold", "chasers": [0], "thruster": 1}]},
+            "thruster goes with",
+        ),
     ],
-)  # fmt: skip
+)
 def test_invalid_thrusters_are_an_error(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ScenarioError) as error:
         mission(**changes)

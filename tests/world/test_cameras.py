@@ -116,7 +116,10 @@ def test_earth_is_drawn_at_its_direction():
 
 
 def test_calibration_errors_have_the_stated_sigma_per_chaser_and_seed():
-    error = "navigation={grade='exact', camera_focal_share=0.001, camera_centre_px=0.5, camera_turn_deg=0.3, camera_shift_m=0.002}"
+    error = (
+        "navigation={grade='exact', camera_focal_share=0.001, camera_centre_px=0.5, "
+        "camera_turn_deg=0.3, camera_shift_m=0.002}"
+    )
     drawn = []
     for seed in range(80):
         scenario = scenario_with(error, f"seed={seed}")
@@ -143,7 +146,8 @@ def test_calibration_errors_have_the_stated_sigma_per_chaser_and_seed():
 
 def test_odometry_has_the_stated_noise_and_bias():
     scenario = scenario_with(
-        "navigation={grade='exact', position_noise_m=0.002, attitude_noise_deg=0.1, attitude_roll_noise_deg=0.1, "
+        "navigation={grade='exact', position_noise_m=0.002, attitude_noise_deg=0.1, "
+        "attitude_roll_noise_deg=0.1, "
         "position_bias_m=0.01}"
     )
     state = states_of(scenario)["chaser/0"]
@@ -185,7 +189,8 @@ def test_camera_mounted_to_the_left_sees_the_target_on_the_right():
         ("camera.earth={direction=[0.0, 0.0, 0.0]}", "direction"),
         ("target.model=nowhere.toml", r"nowhere\.toml"),
         (
-            "camera.intrinsics={width_px=640,height_px=480,fx_px=1,fy_px=1,cx_px=1,cy_px=1,distortion=[1.0]}",
+            "camera.intrinsics={width_px=640,height_px=480,fx_px=1,fy_px=1,cx_px=1,cy_px=1,"
+            "distortion=[1.0]}",
             "distortion",
         ),
     ],
@@ -196,6 +201,9 @@ def test_invalid_camera_is_refused(change, message):
 
 
 def test_non_invertible_lens_is_refused():
-    lens = "{width_px=640,height_px=480,fx_px=400.0,fy_px=400.0,cx_px=320.0,cy_px=240.0,distortion=[-0.9,0.0,0.0,0.0]}"
+    lens = (
+        "{width_px=640,height_px=480,fx_px=400.0,fy_px=400.0,cx_px=320.0,cy_px=240.0,"
+        "distortion=[-0.9,0.0,0.0,0.0]}"
+    )
     with pytest.raises(ScenarioError, match="distortion"):
         Cameras(scenario_with(f"camera.intrinsics={lens}"))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -10,6 +11,9 @@ import numpy as np
 import pytest
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.docking_geometry import view_of
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_protocol.scenario.docking import Port
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import TARGET, Physics
 from docking_cases import CHASER_INERTIA, CHASER_KG, REACH_M, TARGET_INERTIA, TARGET_KG, scenario
@@ -43,6 +47,34 @@ def relative(physics: Physics) -> tuple[Array, Array]:
 
 def latch_of(physics: Physics) -> ProbeLatch:
     return physics.latches["chaser/0"]
+
+
+def test_a_view_states_how_the_tip_was_placed_before_an_oblique_port() -> None:
+    """Tip 60 mm before the port, 25 mm beside its axis, approaching, sliding and turning."""
+    axis = np.array([-2.0, 6.0, 3.0]) / 7.0
+    side, across = np.array([6.0, 3.0, -2.0]) / 7.0, np.array([-3.0, 2.0, -6.0]) / 7.0
+    port = Port(chaser=0, position_m=(0.21, -0.17, 0.13), axis=(axis[0], axis[1], axis[2]))
+    reach_m, q_off = 0.35, rotations.exp((0.4, -1.1, 0.7))
+    target = BodyState(
+        np.array([3.0, -2.0, 5.0]),
+        np.array([0.04, 0.07, -0.02]),
+        rotations.exp((-0.9, 0.5, 1.3)),
+        np.array([0.05, -0.08, 0.11]),
+    )
+    attitude = rotations.multiply(q_off, rotations.exp(0.06 * across))  # CRF to TRF
+    tip = np.asarray(port.position_m) + 0.06 * axis + 0.025 * side
+    tip_velocity = -0.012 * axis + 0.005 * across
+    turning = target.omega_rad_s + 0.03 * side  # TRF
+    arm = rotations.rotate(attitude, (reach_m, 0.0, 0.0))
+    velocity = np.cross(target.omega_rad_s, tip) + tip_velocity - np.cross(turning, arm)
+    chaser = BodyState(
+        target.position_m + rotations.rotate(target.q_wxyz, tip - arm),
+        target.velocity_m_s + rotations.rotate(target.q_wxyz, velocity),
+        rotations.multiply(target.q_wxyz, attitude),
+        rotations.rotate_inverse(attitude, turning),
+    )
+    view = view_of(port, reach_m, q_off, chaser, target)
+    assert dataclasses.astuple(view) == pytest.approx((0.06, 0.025, 0.06, 0.012, 0.005, 0.03))
 
 
 @both

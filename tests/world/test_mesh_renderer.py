@@ -87,8 +87,18 @@ def test_silhouette_is_exact_to_a_tenth_of_a_pixel(turn_deg: float) -> None:
 
 @pytest.mark.slow
 def test_no_background_shows_between_triangles() -> None:
-    ball = lathe("ball", GREY, [(0.0, -0.3), *[(0.3 * np.sin(a), -0.3 * np.cos(a)) for a in np.linspace(0.1, 3.0, 40)], (0.0, 0.3)],
-                 (0.0, 0.0, 0.0), (0.3, 0.2, 1.0), 1e-4)  # fmt: skip
+    ball = lathe(
+        "ball",
+        GREY,
+        [
+            (0.0, -0.3),
+            *[(0.3 * np.sin(a), -0.3 * np.cos(a)) for a in np.linspace(0.1, 3.0, 40)],
+            (0.0, 0.3),
+        ],
+        (0.0, 0.0, 0.0),
+        (0.3, 0.2, 1.0),
+        1e-4,
+    )
     light = Light((-1.0, 0.0, 0.0), 0.0, 1.0)
     for turn in np.linspace(0.0, 1.0, 5):
         image = draw(

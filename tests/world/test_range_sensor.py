@@ -65,9 +65,7 @@ def true_pose(flown: States) -> tuple[np.ndarray, np.ndarray]:
     return rotations.rotate_inverse(attitude, target.position_m - eye), q
 
 
-def test_images_have_a_range_and_an_attitude_with_the_stated_errors_where_the_target_is_in_reach_and_in_view() -> (
-    None
-):
+def test_images_within_reach_and_view_have_a_range_and_an_attitude_with_the_stated_errors() -> None:
     cameras, flown = make_cameras(scenario()), states((-150.0, 3.0, -2.0))
     assert isinstance(cameras, RangingCameras)
     errors, true_m, true_q = [], *true_pose(flown)

@@ -145,12 +145,13 @@ class ChaserFleet:
     def why_corridor_occupied(self, chaser: ChaserMachine) -> str:
         """Return which chaser blocks an approach to a port; empty if none does."""
         docking, active = self.scenario.docking, 0
+        clearance_m = self.scenario.limits.min_distance_chasers_m + GUIDANCE.corridor_margin_m
         assert chaser.dock is not None
         for other in self.others(chaser):
             aligning = other.phase is Phase.ALIGN
             if other.dock is None or not (aligning or other.in_corridor()):
                 continue
             active += other.phase not in ATTACHED
-            if corridors_apart(chaser.dock, other.dock) < docking.clearance_m:
+            if corridors_apart(chaser.dock, other.dock) < clearance_m:
                 return f"chaser {other.number} is in the way"
         return f"{active} are docking already" if active >= docking.at_once else ""

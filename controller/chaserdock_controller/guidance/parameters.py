@@ -30,8 +30,14 @@ class GuidanceParameters:
     """Time for which a chaser must keep the corridor's limits before it flies in."""
     in_line_m: float = 0.3
     """Greatest distance from its port's axis from which a chaser flies straight to its corridor."""
+    corridor_margin_m: float = 0.1
+    """A chaser waits if its corridor comes nearer to one in use, between body centres, than the
+    least distance between chasers and this: both may be 0.03 m off (`docking.corridor.lateral_m`),
+    and need some cm to brake."""
     release_s: float = 1.0
     """A latch still closed this long after the command to release it counts as stuck."""
+    identify_s: float = 10.0
+    """Length of the manoeuvre that shows the mass properties of a stack: 16 pulses of 0.6 s."""
     stack_rest_s: float = 0.5
     """Time for which a stack must be below its limits to count as stopped."""
     stack_moving_s: float = 0.2

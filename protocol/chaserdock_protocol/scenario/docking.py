@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from .fields import Index, NotNegative, Positive, Section, UnitVector, Vector
+from .fields import Index, Positive, Section, UnitVector, Vector
 
 
 class Port(Section):
@@ -163,11 +163,6 @@ class Docking(Section):
     )
     final: Final = Final()
     tolerances: Tolerances = Tolerances()
-    clearance_m: NotNegative = Field(
-        default=0.45,
-        description="A chaser waits if its corridor comes this near to one in use, between body "
-        "centres, m.",
-    )
     at_once: int = Field(
         default=2, ge=1, description="Most chasers on their way in at the same time; others wait."
     )

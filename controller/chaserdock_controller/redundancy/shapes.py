@@ -46,7 +46,7 @@ from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.guidance.pointing import SearchProgress
 from chaserdock_controller.guidance.trajectories import Circuit, Escape, Glide, Move, Part
 from chaserdock_controller.ingest.odometry_validation import Known
-from chaserdock_controller.interfaces import ChaserPlan
+from chaserdock_controller.interfaces import AppliedImpulse, ChaserPlan
 from chaserdock_controller.parameters import nmpc_parameters
 
 Size = int | str
@@ -105,7 +105,8 @@ ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {
         "baselines": (("parameters+1", "parameters+1"),),
         "lengths": (("parameters+1",),),
     },
-    MeasuredChaser: {"impulse": (_6,), "last_command": (_6,)},
+    AppliedImpulse: {"impulse": (_6,), "moment": (_6,), "magnitude": (_6,)},
+    MeasuredChaser: {"last_command": (_6,)},
     Shock: {"velocity_m_s": (_3,), "omega_rad_s": (_3,)},
     BodyShape: {"inertia": ((3, 3),), "centre_m": (_3,)},
     JointState: {
@@ -154,7 +155,8 @@ class MisfitError(ValueError):
 def check_fit(
     state: Any, scenario: FlightScenario, own: Mapping[type, dict[str, tuple[Shape, ...]]]
 ) -> None:
-    """Raise MisfitError unless all shapes, chaser numbers and messages in ``state`` fit the scenario.
+    """Raise MisfitError unless all shapes, chaser numbers and messages in ``state`` fit the
+    scenario.
 
     ``own``: shapes of the arrays in types that are declared elsewhere.
     """
@@ -265,7 +267,7 @@ def _lengths(items: Any, depth: int) -> tuple[int, ...]:
 
 
 def _match(found: tuple[int, ...], shape: Shape, sizes: dict[str, int], where: str) -> None:
-    """Raise MisfitError unless a shape is as declared. Sets the names in it that are not yet set."""
+    """Raise MisfitError unless a shape is as declared. Sets the names in it that are unknown."""
     wanted: list[Size] = list(shape)
     if len(found) == len(shape):
         for k, size in enumerate(shape):

@@ -36,21 +36,17 @@ __all__ = [
 ]
 
 
-_MODULES = {
-    "ChaserdockError": "chaserdock_protocol.errors",
-    "Log": "chaserdock.logs.reader",
-    "ChaserSummary": "chaserdock.summary",
-    "Summary": "chaserdock.summary",
-}
-"""Modules of the names that ``chaserdock.api`` does not define."""
-
-
 def __getattr__(name: str) -> Any:
     """Import what is used on first use: the program's start must be quick, and stoppable."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
-
-    found = getattr(import_module(_MODULES.get(name, "chaserdock.api")), name)
-    globals()[name] = found
+    if name == "ChaserdockError":
+        from chaserdock_protocol import errors as home
+    elif name == "Log":
+        from .logs import reader as home
+    elif name in ("ChaserSummary", "Summary"):
+        from . import summary as home
+    else:
+        from . import api as home
+    found = globals()[name] = getattr(home, name)
     return found

@@ -15,7 +15,7 @@ from msgspec import Struct
 Decoded = TypeVar("Decoded")
 
 _DTYPES = {"f": np.float64, "i": np.int64, "b": np.bool_}
-_WORDS = {"f": "numbers", "i": "integers", "b": "truth values"}
+_WORDS = {"f": "numbers", "i": "integers", "b": "booleans"}
 
 
 class EncodedArray(Struct, array_like=True, forbid_unknown_fields=True):

@@ -59,6 +59,7 @@ name stands for any length, the same everywhere in an object and the objects wit
 Shape = tuple[Size, ...]
 
 _3, _4, _6 = (3,), (4,), (6,)
+"""Shapes of a vector, a quaternion, and a wrench or two vectors: without unit, by definition."""
 _EACH: Shape = ("chasers",)
 
 ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {

@@ -15,7 +15,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import write_atomically
 
 from chaserdock.html_page import PAGE_FILES, html_page, table
 from chaserdock.verdict import verdict_of
@@ -40,8 +40,7 @@ def write_report(log: Path, out: Path | None = None) -> Path:
     """
     out = out or (log if log.is_dir() else log.parent) / "report.html"
     text = report_of(log)
-    with errors_of_writing(out):
-        out.write_text(text, encoding="utf-8")
+    write_atomically(out, text)
     return out
 
 

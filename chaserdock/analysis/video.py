@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
+from chaserdock_protocol.output_files import replaced
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import Background, Earth, Light
@@ -87,7 +88,7 @@ def write_video(
         raise LogError(f"{log}: holds no motion of the target; nothing to film")
 
     number = 0
-    with errors_of_writing(out), av.open(str(out), "w") as container:
+    with errors_of_writing(out), replaced(out) as new, av.open(str(new), "w") as container:
         stream: Any = container.add_stream(_CODECS[ending], rate=fps)
         stream.width, stream.height = width_px, height_px
         stream.pix_fmt = {".mp4": "yuv420p", ".webp": "yuv420p", ".gif": "rgb8"}[ending]
@@ -103,13 +104,10 @@ def write_video(
             image.pts = number
             container.mux(stream.encode(image))
             number += 1
-        if number:
-            container.mux(stream.encode())
-
-    if not number:
-        out.unlink(missing_ok=True)
-        after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
-        raise LogError(f"{log}: holds no image{after}; nothing to film")
+        if not number:
+            after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
+            raise LogError(f"{log}: holds no image{after}; nothing to film")
+        container.mux(stream.encode())
     return number
 
 

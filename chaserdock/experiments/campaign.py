@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import write_atomically
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from chaserdock.launch.signals import stop_on_signals
@@ -41,7 +42,7 @@ def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | Non
     rows = rows_of(plan, outcomes)
     table, report = folder / "results.parquet", folder / "report.html"
     write_table(rows, table)
-    report.write_text(html(plan.name, sections(plan, rows, folder)), encoding="utf-8")
+    write_atomically(report, html(plan.name, sections(plan, rows, folder)))
     passed = sum(bool(r["success"]) for r in rows)
     low, high = wilson(passed, len(rows))
     print(

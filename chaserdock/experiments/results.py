@@ -12,6 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from chaserdock_protocol.output_files import replaced
+
 from chaserdock.verdict import Verdict, verdict_of
 
 from .plan import ExperimentPlan, PlannedFlight
@@ -204,6 +206,5 @@ def write_table(rows: list[ResultRow], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    temporary = path.with_suffix(".tmp")
-    pq.write_table(pa.Table.from_pylist(rows), temporary)
-    temporary.replace(path)
+    with replaced(path) as new:
+        pq.write_table(pa.Table.from_pylist(rows), new)

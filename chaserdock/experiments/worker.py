@@ -24,6 +24,7 @@ from typing import Any, Literal
 
 import msgspec
 from chaserdock_protocol.errors import require_extra
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.scan import LOG_NAME
 from msgspec import Struct
@@ -117,12 +118,7 @@ def write_result(folder: Path, outcome: FlightOutcome) -> None:
         return
     path = result_path(folder, outcome.name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        file.write(msgspec.json.format(msgspec.json.encode(outcome)) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(outcome)) + b"\n")
 
 
 def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:

@@ -23,8 +23,9 @@ from typing import Any, get_args
 import psutil
 from chaserdock_agents.router.process import NAME as ROUTER
 from chaserdock_protocol import topics
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ChaserdockError, WriteError, errors_of_writing
 from chaserdock_protocol.messages import MissionEnd
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED, Mode
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.recording.scan import LOG_NAME
@@ -114,7 +115,9 @@ class Fleet:
         """
         output = folder / f"{name.replace('/', '-')}.txt"
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
-        with output.open("wb") as out, deferred_signals():
+        with errors_of_writing(output, RunError):
+            out = output.open("wb")
+        with out, deferred_signals():
             process = subprocess.Popen(
                 [sys.executable, "-m", "chaserdock", *arguments, "--watch-parent"],
                 stdin=subprocess.PIPE,
@@ -524,7 +527,10 @@ def judge(
         add_run_failure(summary, failure)
     if fleet.children:  # processes on other machines are not measured
         summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
-    (folder / SUMMARY_NAME).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    try:
+        write_atomically(folder / SUMMARY_NAME, json.dumps(summary, indent=2) + "\n")
+    except WriteError as error:
+        add_run_failure(summary, str(error))
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
     reporter.report(Result(status=status, folder=str(folder), summary=summary))
     return MissionOutcome(

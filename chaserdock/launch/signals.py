@@ -31,25 +31,31 @@ def stop_on_signals(notice: str = "") -> Generator[threading.Event]:
             signal.signal(number, handler)
 
 
-class Interrupt(KeyboardInterrupt):
+class StopRequested(KeyboardInterrupt):
     """SIGINT or SIGTERM has arrived.
 
-    A class of its own: a plain KeyboardInterrupt that passes through code from a string, as in the
-    making of a dataclass, lets Python end by a signal instead of with the status, even if caught.
+    Not KeyboardInterrupt itself: with that, Python ends the process by SIGINT where it has passed
+    through ``exec``, although it was handled.
     """
+
+
+def _request_stop(*_: object) -> None:
+    raise StopRequested
 
 
 @contextmanager
 def interrupts() -> Generator[None]:
-    """Raise ``Interrupt`` on SIGTERM and SIGINT, unless ignored, in the main thread."""
+    """Let SIGINT and SIGTERM raise StopRequested, so that all that is open is closed.
 
-    def raise_interrupt(*_: object) -> None:
-        raise Interrupt
-
+    Does nothing outside the main thread, and for a signal that is ignored.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     before = {
-        number: signal.signal(number, raise_interrupt)
-        for number in (signal.SIGTERM, signal.SIGINT)
-        if signal.getsignal(number) is not signal.SIG_IGN
+        number: signal.signal(number, _request_stop)
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) != signal.SIG_IGN
     }
     try:
         yield

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
+import os
 import tempfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from chaserdock_protocol.transport import RawSample
 
@@ -50,9 +51,12 @@ def fly_case(
     ``folder``: keep the log there. ``to_violation``: end the flight at the first violation.
     """
     with contextlib.ExitStack() as stack:
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
+        in_memory = tempfile.TemporaryDirectory(
+            prefix=f"chaserdock-{os.getpid()}-", dir=memory_folder()
+        )
+        scratch = Path(stack.enter_context(in_memory))
         path = scratch / "scenario.toml"
-        path.write_text(toml_document(case), encoding="utf-8")
+        write_atomically(path, toml_document(case))
         try:
             checks, fingerprint = FlightChecks(load_scenario(path)), 0
         except ScenarioError as error:
@@ -60,7 +64,8 @@ def fly_case(
             raise ScenarioError(str(error).replace(f"{path}: ", "")) from None
         if folder is not None:  # only now: a refused case leaves no folder
             folder.mkdir(parents=True, exist_ok=True)
-            path = Path(shutil.copy(path, folder))
+            path = folder / "scenario.toml"
+            write_atomically(path, toml_document(case))
 
         def tap(sender: str, raw: RawSample) -> None:
             nonlocal fingerprint

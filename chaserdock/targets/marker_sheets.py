@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from chaserdock_agents.chaser.perception.detect import dictionary_of
 from chaserdock_models.targets import Marker, TargetModel, clear_margin_m
+from chaserdock_protocol.output_files import replaced
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -62,13 +63,14 @@ def write_sheets(
     written = []
     with matplotlib.rc_context(_STYLE):
         if out.suffix.lower() == ".pdf":
-            with PdfPages(out) as pdf:
+            with replaced(out) as new, PdfPages(new) as pdf:
                 for sheet in sheets:
                     pdf.savefig(_figure_of(sheet))
             return len(sheets), [out]
         for number, sheet in enumerate(sheets, 1):
             path = out if len(sheets) == 1 else out.with_stem(f"{out.stem}-{number}")
-            _figure_of(sheet).savefig(path, format="svg", metadata={"Date": None})
+            with replaced(path) as new:
+                _figure_of(sheet).savefig(new, format="svg", metadata={"Date": None})
             written.append(path)
     return len(sheets), written
 

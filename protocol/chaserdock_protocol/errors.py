@@ -38,12 +38,26 @@ def require_extra(package: str, extra: str) -> None:
         )
 
 
+class WriteError(ChaserdockError, OSError):
+    """A file cannot be written. The text names it and the reason."""
+
+    def __init__(self, path: Path | str, reason: OSError) -> None:
+        super().__init__(reason.errno or 0, reason.strerror or str(reason), str(path))
+
+    def __str__(self) -> str:
+        return f"{self.filename}: cannot be written: {self.strerror}"
+
+
 @contextmanager
 def errors_of_writing(
     path: Path | str, kind: type[ChaserdockError] = ChaserdockError
 ) -> Iterator[None]:
-    """Raise an OSError as an error of this ``kind``, which names the path and the reason."""
+    """Raise an OSError as an error of this ``kind``, which names the file, or else the path, and
+    the reason.
+    """
     try:
         yield
+    except WriteError as error:
+        raise kind(str(error)) from None
     except OSError as error:
-        raise kind(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise kind(str(WriteError(path, error))) from None

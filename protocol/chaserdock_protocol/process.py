@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -132,5 +133,6 @@ class StopSignal:
 
 
 def print_status(process: str, text: str) -> None:
-    """Print one line to standard error."""
-    print(f"{process}: {text}", file=sys.stderr, flush=True)
+    """Print one line to standard error, if that can be written: a full disk ends no process."""
+    with suppress(OSError):
+        print(f"{process}: {text}", file=sys.stderr, flush=True)

@@ -119,6 +119,16 @@ def test_version() -> None:
     assert finished("--version") == (0, f"chaserdock {metadata.version('chaserdock')}\n")
 
 
+def test_a_full_disk_under_standard_output_is_one_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        process = chaserdock("scenario", stdout=full, stderr=subprocess.PIPE, text=True)
+        _, errors = process.communicate()
+    assert (process.returncode, errors) == (
+        2,
+        "chaserdock: standard output: No space left on device\n",
+    )
+
+
 def test_closed_pipe_is_no_error() -> None:
     golden = str(ROOT / "tests" / "golden" / "two-chasers.mcap")
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}

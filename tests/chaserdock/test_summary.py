@@ -3,15 +3,24 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+from chaserdock_protocol.errors import WriteError
+from chaserdock_protocol.recording.log import logged_scenario
 from harness import ROOT
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summarize, summary_of
+from chaserdock.launch import launcher
+from chaserdock.launch.progress import ProgressReporter, Show
 from chaserdock.summary import Summary
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
@@ -79,3 +88,19 @@ def test_estimate_without_relative_poses_is_judged_by_the_target() -> None:
     scenario = flight.scenario.model_copy(update={"success": limits, "settling_s": 1.0})
     failures = summary_of(replace(flight, scenario=scenario, relative={}))["failures"]
     assert any(f.startswith("largest position error of the estimate") for f in failures)
+
+
+def test_a_verdict_that_cannot_be_written_is_shown_and_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, _: str) -> None:
+        raise WriteError(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+
+    shutil.copy(GOLDEN, tmp_path / "mission.mcap")
+    monkeypatch.setattr(launcher, "write_atomically", full)
+    reporter = ProgressReporter(logged_scenario(GOLDEN)[0], Show.none)
+    outcome = launcher.judge(launcher.Fleet(), tmp_path, None, reporter)
+    assert outcome.status == 1
+    assert outcome.summary is not None
+    text = f"{tmp_path / 'summary.json'}: cannot be written: No space left on device"
+    assert text in outcome.summary["failures"]

@@ -10,7 +10,7 @@
 # pyarrow has no type stubs.
 # pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 # pyright: reportUnknownParameterType=false
-# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Log:
         table = TopicTable(exported or topic_named(name))
         for record in self.records(exported or name):
             table.add(record)
-        tables = dict(table.take_all())
+        tables: dict[str, pyarrow.Table] = dict(table.take_all())
         return tables[name] if exported and isinstance(name, str) else tables[table.name]
 
     def _keys(self, names: tuple[str | Topic, ...]) -> set[str]:

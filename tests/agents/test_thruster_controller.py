@@ -54,12 +54,12 @@ def test_a_report_states_impulse_moment_and_magnitude_of_the_pulses_since_the_la
     thrusters, valves = ThrusterController(s, 0), Valves(s.chaser.thrusters)
     matrix = wrench_matrix(s.chaser.thrusters)
     thrusts_N = np.linspace(0.2, 1.3, 12)
-    for tick in range(4):
-        odometry = at_rest(s, tick)
-        report = thrusters.observe(odometry)
+    for tick in range(3):
+        thrusters.observe(at_rest(s, tick))
         command = thrusters.add_pulses(passed_on(wrench(s, tick)), thrusts_N)
         for pulse in command.pulses:
             valves.pulse(pulse.thruster, pulse.open_ns, pulse.close_ns)
+    report = thrusters.observe(at_rest(s, 3))
     before_ns, now_ns = s.timing.tick_time_ns(2), s.timing.tick_time_ns(3)
     edges = np.linspace(before_ns, now_ns, 5001)
     given = valves.impulses(edges)

@@ -260,10 +260,8 @@ def test_a_partition_beyond_the_lease_ends_liveliness_and_its_end_restores_it() 
         cut = {"at_s": 1.0, "duration_s": 3.0, "processes": ["chaser/0"]}
         section = SimulationSection.model_validate({"mode": "realtime", "partition": [cut]})
         network = SimulatedNetwork(scheduler, section, 0, lockstep=False)
-        world, chaser = (
-            Node(name, role, Link(network=network))
-            for name, role in (("world", "world"), ("chaser/0", "chaser"))
-        )  # type: ignore[arg-type]
+        world = Node("world", "world", Link(network=network))
+        chaser = Node("chaser/0", "chaser", Link(network=network))
         world.watch_liveliness(lambda name, alive: changes.append((scheduler.now_s, name, alive)))
         chaser.declare_liveliness()
         scheduler.pause(1.0)

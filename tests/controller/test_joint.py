@@ -204,7 +204,12 @@ def test_a_prediction_takes_the_times_of_pulses_into_account(seed: int, period_s
             wrench + own, state.of(0, CENTRE), x[10:13], p.body.mass_kg, np.array(p.body.inertia)
         )
         x = propagate(x, total, p.body, h)
-    after = predict(state, state.time_ns + round(period_s * 1e9), [AppliedImpulse(*given)], p)
+    after = predict(
+        state,
+        state.time_ns + round(period_s * 1e9),
+        [AppliedImpulse(given[0], given[1], given[2])],
+        p,
+    )
     steady = AppliedImpulse(given[0], np.zeros(6), given[2])
     without = predict(state, state.time_ns + round(period_s * 1e9), [steady], p)
 

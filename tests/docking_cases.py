@@ -26,6 +26,12 @@ PORTS = (
     {"chaser": 3, "position_m": [0.0, 0.16, 0.0], "axis": [0.0, 1.0, 0.0]},
 )
 _HALF = float(np.sqrt(0.5))
+ONE_BY_ONE = [
+    {"at_s": 900.0, "command": "approach", "chasers": [0]},
+    {"at_s": 910.0, "command": "retreat", "chasers": [0]},
+    {"at_s": 920.0, "command": "approach", "chasers": [2]},
+]
+"""Timeline by which chasers 0 and 2, whose ports are near, never dock at the same time."""
 CHASERS = (
     {"position_m": [-1.0, 0.0, -0.05], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
     {"position_m": [1.0, 0.0, -0.05], "q_wxyz": [0.0, 0.0, 0.0, 1.0]},
@@ -55,6 +61,7 @@ def values(chasers: int = 1, **changes: Any) -> dict[str, Any]:
         "limits": {"min_distance_target_m": 0.75},
         "docking": {"kind": "capture", "ports": list(PORTS[:chasers])},
         "chasers": list(CHASERS[:chasers]),
+        "timeline": ONE_BY_ONE if chasers > 2 else [],
     }
     for key, value in changes.items():
         out[key] = {**out[key], **value} if isinstance(value, dict) and key in out else value

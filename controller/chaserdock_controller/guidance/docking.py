@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.docking_geometry import PortView, centre_offset, segments_apart
+from chaserdock_models.docking_geometry import PortView, centre_offset
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.docking import Docking, Port
 
@@ -70,12 +70,6 @@ def dock_of(scenario: FlightScenario, chaser: int) -> Dock | None:
     """Return the dock of a chaser; None if it does not dock by capture."""
     port = scenario.docking.port_of(chaser)
     return None if port is None else Dock(port, scenario.chaser.probe_reach_m, scenario.docking)
-
-
-def corridors_apart(a: Dock, b: Dock) -> float:
-    """Return the least distance (m) between the centre lines of two corridors."""
-    ends = [(d.offset(0.0), d.entry()) for d in (a, b)]
-    return segments_apart(*ends[0], *ends[1])
 
 
 @dataclass(frozen=True)

@@ -334,6 +334,13 @@ class Body(Section):
     def _check_consistent(self) -> Body:
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
+        front_m = self.size_m[0] / 2.0
+        if self.probe_reach_m <= front_m:
+            raise ValueError(
+                f"probe_reach_m: the probe's tip, {self.probe_reach_m:g} m from the centre, is "
+                f"within the body, whose front is at {front_m:g} m; make probe_reach_m longer than "
+                f"that, or size_m[0] shorter than {2.0 * self.probe_reach_m:g} m"
+            )
         if self.actuation == "thrusters":
             check_layout(self.thrusters, self.wrench_max)
         return self

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import PortView, centre_offset
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.docking import Docking, Port
+
+from chaserdock_controller.interfaces import RelativePose
 
 _ENTERED_M = 0.02
 """A chaser this far behind the entry counts as in the corridor. With less, errors of the estimate
@@ -76,8 +78,9 @@ def dock_of(scenario: FlightScenario, chaser: int) -> Dock | None:
 class DockingObservation:
     """Estimated geometry of a chaser at its port, and state of its docking sensor.
 
-    ``offset_m`` (3,), ``q_wxyz`` (4,): estimated centre and attitude in TRF. ``sensed``: the sensor
-    has reported in this tick; otherwise ``latched`` is its last report.
+    ``offset_m`` (3,), ``q_wxyz`` (4,): estimated centre and attitude in TRF. ``covariance`` (6, 6):
+    of both, as in ``RelativePose``; zero if the estimator provides none. ``sensed``: the sensor has
+    reported in this tick; otherwise ``latched`` is its last report.
     """
 
     view: PortView
@@ -86,3 +89,9 @@ class DockingObservation:
     offset_m: Array
     q_wxyz: Array
     sensed: bool = True
+    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def pose(self) -> RelativePose:
+        """Return the estimated pose of the chaser relative to the target."""
+        return RelativePose(self.offset_m, self.q_wxyz, self.covariance)

@@ -627,7 +627,9 @@ def _check_ports_apart(
     apart_m = math.dist(a.position_m, b.position_m)
     least_m = _least_port_distance_m(scenario, a, b) if apart_m > 0.0 else math.inf
     need = "" if math.isinf(least_m) else f", must be at least {least_m:g} m apart"
-    raise ValueError(f"docking.ports.{k} and docking.ports.{n}, {apart_m:.3g} m apart{need}: {fault}")
+    raise ValueError(
+        f"docking.ports.{k} and docking.ports.{n}, {apart_m:.3g} m apart{need}: {fault}"
+    )
 
 
 def _least_port_distance_m(scenario: FlightScenario, a: Port, b: Port) -> float:
@@ -656,18 +658,18 @@ def _least_port_distance_m(scenario: FlightScenario, a: Port, b: Port) -> float:
 def _ports_fault(scenario: FlightScenario, a: Port, b: Port) -> str:
     """Return how two chasers at their ports are too near to one another, or empty."""
     docking, reach_m = scenario.docking, scenario.chaser.probe_reach_m
-    body, bodies = box_table(scenario.chaser.boxes()), []
-    for port in (a, b):
-        q = np.array([scenario.chasers[port.chaser].q_wxyz])
-        bodies.append(moved(body, [centre_offset(port, reach_m, 0.0)], q)[0])
+    body = box_table(scenario.chaser.boxes())
+    places = [centre_offset(port, reach_m, 0.0) for port in (a, b)]
+    turns = [scenario.chasers[port.chaser].q_wxyz for port in (a, b)]
+    first, second = moved(body, places, turns)
     ways = [np.asarray(port.axis) * docking.entry_m for port in (a, b)]
     room_m = docking.corridor.lateral_m
     if docking.at_once > 1:
-        gap_m = swept_distance(*bodies, *ways)
+        gap_m = swept_distance(first, second, ways[0], ways[1])
     else:  # one is latched while the other comes
         gap_m = min(
-            swept_distance(*bodies, ways[0], np.zeros(3)),
-            swept_distance(*bodies, np.zeros(3), ways[1]),
+            swept_distance(first, second, ways[0], np.zeros(3)),
+            swept_distance(first, second, np.zeros(3), ways[1]),
         )
     who = f"chasers {a.chaser} and {b.chaser}"
     if gap_m < room_m:

@@ -51,14 +51,14 @@ def test_an_error_that_the_covariance_explains_is_not_held_against_the_latch() -
     """5.07 mm, as with a few markers in view; the same with a certain estimate is a slip."""
     moved = np.array([-3.0, 4.0, 0.837]) * 1e-3
     phase, event = outcome_of(lambda _: moved, covariance_of(1.0e-3, 0.1))
-    assert (phase, "moved 5.07 mm (at most 8.49)" in event) == ("verified", True), event
+    assert (phase, "moved 5.07 mm (at most 7.07)" in event) == ("verified", True), event
     phase, event = outcome_of(lambda _: moved, covariance_of(*SHIPPED))
     assert (phase, "moved 5.07 mm (at most 5.00)" in event) == ("retreat", True), event
 
 
-@pytest.mark.parametrize(("sigma_m", "found_m"), [(SHIPPED[0], 5.1e-3), (1e-3, 8.6e-3)])
+@pytest.mark.parametrize(("sigma_m", "found_m"), [(SHIPPED[0], 5.1e-3), (1e-3, 7.2e-3)])
 def test_a_latch_that_slips_slowly_is_found(sigma_m: float, found_m: float) -> None:
-    """At a constant speed, 5 or 8 mm in 2 s; a slip of the tolerance or of six sigmas is found."""
+    """At a constant speed, 5 or 7 mm in 2 s; a slip of the tolerance or of five sigmas is found."""
     for direction in np.eye(3):
         phase, event = outcome_of(
             lambda t, along=direction: along * found_m * min(1.0, t / 1.9),
@@ -69,7 +69,7 @@ def test_a_latch_that_slips_slowly_is_found(sigma_m: float, found_m: float) -> N
 
 
 def test_an_open_latch_is_found_or_the_test_says_that_it_cannot_tell() -> None:
-    """The body of `tetra12` moves by 28 mm; with sigmas of 4 mm, 34 mm may be an error."""
+    """The body of `tetra12` moves by 28 mm; with sigmas of 5 mm, 35 mm may be an error."""
     force_N, mass_kg = scenario().docking.pull_N, scenario().chaser.mass_kg
 
     def free(t: float) -> Array:
@@ -81,15 +81,15 @@ def test_an_open_latch_is_found_or_the_test_says_that_it_cannot_tell() -> None:
     for sigma_m in (0.5e-3, 1e-3, 2e-3, 3e-3):
         phase, event = outcome_of(free, covariance_of(sigma_m, 0.05))
         assert (phase, event.endswith("under the pull")) == ("retreat", True), event
-    wide = covariance_of(4e-3, 0.05)
+    wide = covariance_of(5e-3, 0.05)
     phase, event = outcome_of(lambda _: np.zeros(3), wide)
     assert phase == "retreat"
-    assert event.endswith("err by 33.94 mm along the pull, which moves an open latch by 28.09 mm")
+    assert event.endswith("err by 35.36 mm along the pull, which moves an open latch by 28.09 mm")
 
 
 def test_the_rate_of_false_alarms_is_the_stated_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors drawn from covariances of any shape exceed three sigmas no more often than a chi of
-    three degrees of freedom; at six sigmas that is less than 1e-4 for all changes of a test.
+    three degrees of freedom; at five sigmas that is one test of 1000.
     """
     draw, mission = np.random.default_rng(1), scenario()
     monkeypatch.setattr(latch_test, "GUIDANCE", replace(GUIDANCE, pull_sigmas=3.0))
@@ -106,4 +106,4 @@ def test_the_rate_of_false_alarms_is_the_stated_one(monkeypatch: pytest.MonkeyPa
         motion = motion_between(before, now, mission)
         alarms += motion.moved_m > motion.most_m
     assert 0.001 * count < alarms < (chi.sf(3.0, 3) + 0.006) * count
-    assert chi.sf(GUIDANCE.pull_sigmas, 3) * 2.0 * 480 < 1e-4
+    assert chi.sf(GUIDANCE.pull_sigmas, 3) * 2.0 * 30 < 1e-3

@@ -79,8 +79,8 @@ class DockingObservation:
     """Estimated geometry of a chaser at its port, and state of its docking sensor.
 
     ``offset_m`` (3,), ``q_wxyz`` (4,): estimated centre and attitude in TRF. ``covariance`` (6, 6):
-    of both, as in ``RelativePose``; zero if the estimator provides none. ``sensed``: the sensor has
-    reported in this tick; otherwise ``latched`` is its last report.
+    of their changes in one view (``RelativePose.random_covariance``); zero if it is unknown.
+    ``sensed``: the sensor has reported in this tick; otherwise ``latched`` is its last report.
     """
 
     view: PortView
@@ -93,5 +93,7 @@ class DockingObservation:
 
     @property
     def pose(self) -> RelativePose:
-        """Return the estimated pose of the chaser relative to the target."""
+        """Return the estimated pose of the chaser relative to the target, with the covariance of
+        its changes.
+        """
         return RelativePose(self.offset_m, self.q_wxyz, self.covariance)

@@ -41,8 +41,9 @@ class PullMotion(NamedTuple):
 def motion_between(before: RelativePose, now: RelativePose, scenario: FlightScenario) -> PullMotion:
     """Return the motion from one estimated pose to another, and what is allowed of it.
 
-    The change d (3,) of an estimate has at most the covariance S = P(before) + P(now), since errors
-    of a filter do not oscillate: their correlation over time is not negative. With u = d / |d|,
+    P is the covariance of each given the errors that persist with the view, which does not change
+    while a chaser is latched: these cancel. The change d (3,) then has at most the covariance
+    S = P(before) + P(now), as errors of a filter fade without oscillation. With u = d / |d|,
     |d| > g sqrt(u' S u) implies d' S^-1 d > g^2 (by Cauchy and Schwarz), which a chi-square law of
     three degrees of freedom gives to at most ``GUIDANCE.pull_sigmas`` = g. Smaller motions than the
     tolerances of the procedure are allowed, too.

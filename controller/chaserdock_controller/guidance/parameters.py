@@ -30,10 +30,11 @@ class GuidanceParameters:
     """Time for which a chaser must keep the corridor's limits before it flies in."""
     in_line_m: float = 0.3
     """Greatest distance from its port's axis from which a chaser flies straight to its corridor."""
-    pull_sigmas: float = 6.0
+    pull_sigmas: float = 5.0
     """Motion in the pull test, in sigmas of the estimate's change, that is held against the latch.
-    A chi of three degrees of freedom exceeds it with 7.5e-8: with two such changes in each of the
-    480 ticks of a test at 240 Hz, the largest rate, less than one latch of 10^4 is blamed.
+    A chi of three degrees of freedom exceeds it with 1.5e-5: of 60 changes, in position and
+    attitude over 2 s of 15 Hz, one does so in at most one test of 1000. At higher rates changes of
+    neighbouring ticks are nearly the same.
     """
     release_s: float = 1.0
     """A latch still closed this long after the command to release it counts as stuck."""

@@ -140,14 +140,14 @@ class GuidanceStage:
         view = view_of(dock.port, dock.reach_m, q_off, body_state(own), moving)
         contact = status is not None and status.contact
         pose = pose_in_target(target, own)
-        relative = estimate.relative
+        changes = None if estimate.relative is None else estimate.relative.random_covariance
         return DockingObservation(
             view,
             contact,
             estimate.latched,
             *pose,
             sensed=status is not None,
-            covariance=np.zeros((6, 6)) if relative is None else relative.covariance,
+            covariance=np.zeros((6, 6)) if changes is None else changes,
         )
 
     def _relative(self, estimate: ChaserEstimate, target: TargetState) -> RelativeState | None:

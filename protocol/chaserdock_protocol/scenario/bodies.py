@@ -17,6 +17,7 @@ from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
 
 from .fields import (
+    LARGEST,
     Name,
     NotNegative,
     Oriented,
@@ -277,7 +278,9 @@ class Body(Section):
         description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters) or "
         "`tetra12` (12 thrusters). Its values replace the defaults below.",
     )
-    mass_kg: Positive = Field(default=30.0, description="Mass, kg.")
+    mass_kg: float = Field(
+        default=30.0, ge=1e-3, le=LARGEST, allow_inf_nan=False, description="Mass, kg."
+    )
     size_m: PositiveVector = Field(
         default=(0.25, 0.25, 0.05), description="Edges of the body's cuboid (CRF), m."
     )

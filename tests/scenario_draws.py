@@ -10,6 +10,7 @@ from typing import Any
 
 from chaserdock_models.targets import target_names
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario.camera import REPLACED_BY_INTRINSICS
 from chaserdock_protocol.scenario.fields import LARGEST
 from chaserdock_protocol.scenario.json_schema import SchemaNode, item_of, node_at, schema_of
 from chaserdock_protocol.scenario.schema import ESTIMATORS, MARKER_PERCEPTIONS, PERCEPTIONS
@@ -70,6 +71,9 @@ def with_changes(name: str, changes: dict[KeyPath, Any]) -> dict[str, Any]:
     values["settling_s"], values["steady_until_s"] = 0.0, None
     if ("perception", "name") not in changes and values["perception"]["name"] in MARKER_PERCEPTIONS:
         values["perception"]["name"] = "statistical"  # others are drawn, too, but take longer
+    if values["camera"].get("intrinsics"):
+        for key in REPLACED_BY_INTRINSICS:
+            del values["camera"][key]
     return _without_none(values)
 
 

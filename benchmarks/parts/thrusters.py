@@ -30,11 +30,8 @@ PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.0
 VARIANTS: dict[str, dict[str, Any]] = {
     "untested": {"thruster_test_s": 0.0},
     "carrier_15_hz": {"modulation": {"carrier_hz": 15}},
-    "schmitt": {"modulation": {"modulator": "schmitt"}},
 }
-"""At 15 Hz: without test burns; one carrier period per tick; a Schmitt trigger instead of
-pulse-width modulation.
-"""
+"""At 15 Hz: without test burns; one carrier period per tick."""
 
 
 def scenario(

@@ -77,7 +77,7 @@ def _load_limits(s: Scenario, chaser: int) -> list[tuple[str, float, str]]:
 def overloads(result: dict[str, Any], s: Scenario) -> list[str]:
     """Return a message for each load limit that was exceeded, or cannot be judged."""
     out = []
-    for i, c in result["chasers"].items() if s.success.keep_load_limits else ():
+    for i, c in result["chasers"].items():
         for quantity, limit, unit in _load_limits(s, int(i)):
             load, what = c["capture"]["port_load"], quantity.split("_")[1]
             if load is None:

@@ -29,8 +29,9 @@ def target(
         str,
         typer.Argument(
             metavar="TARGET",
-            help="mesh file (.glb, .gltf, .obj, .stl or .ply), target file (.toml), shipped target "
-            "(paper, servicer) or satellite (geo_servicer, cubesat_12u, chaser_body)",
+            help="mesh file (.glb, .gltf, .obj, .stl, .ply, .off or .dae), target file (.toml), "
+            "shipped target (paper, servicer) or satellite (geo_servicer, cubesat_12u, "
+            "chaser_body)",
         ),
     ],
     scale: Annotated[
@@ -197,6 +198,8 @@ def _facts_of_mesh(mesh: TriangleMesh) -> dict[str, Any]:
                 "volume_dm3": 1e3 * volume_m3(p),
                 "material": p.material.name,
                 "diffuse": p.material.diffuse,
+                "specular": p.material.specular,
+                "shininess": p.material.shininess,
                 "joint": p.joint,
             }
             for p in mesh.parts

@@ -199,6 +199,13 @@ def open_edges(part: MeshPart) -> int:
     return int(np.abs(_edge_balance(part)[1]).sum())
 
 
+def unshared_edges(part: MeshPart) -> int:
+    """Return the number of edges of one triangle only: the rims of holes and sheets."""
+    ends = np.concatenate([part.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+    keys = ends.min(axis=1) * len(part.vertices_m) + ends.max(axis=1)
+    return int((np.unique(keys, return_counts=True)[1] == 1).sum())
+
+
 def hole_m(part: MeshPart) -> Array | None:
     """Return a point (3,), body axes, of the first hole, or None: the middle of an open edge.
 

@@ -22,6 +22,8 @@ from . import rotations
 from .arrays import Array
 from .targets import Box, cuboid_corners
 
+REACH_M = 10.0
+"""Distance up to which a plume acts, m. There 1 N of thrust gives some 20 mN/m^2 at most."""
 _CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 _EDGES = np.array(
     [
@@ -177,13 +179,12 @@ def plume_wrench(
     nozzles_m: Array,
     forces: Array,
     thrusts_N: Array,
-    reach_m: float,
 ) -> Array:
     """Return force and torque (6,) that the plumes of thrusters exert on panels.
 
     Torque is about the origin; axes are those of the panels. ``nozzles_m``, ``forces`` (n, 3):
     nozzles and unit directions of the thrusters' forces; the plumes go the opposite way. Each panel
-    that faces a nozzle within ``reach_m`` takes up the whole momentum of the flux through it;
+    that faces a nozzle within `REACH_M` takes up the whole momentum of the flux through it;
     panels do not shade others.
     """
     firing = thrusts_N > 0.0
@@ -195,7 +196,7 @@ def plume_wrench(
     facing = -np.einsum("npi,pi->np", along, panels.normals)
     cosines = -np.einsum("npi,ni->np", along, forces[firing])
     share = np.where(
-        (facing > 0.0) & (distance <= reach_m), flux.at(cosines) * facing / distance**2, 0.0
+        (facing > 0.0) & (distance <= REACH_M), flux.at(cosines) * facing / distance**2, 0.0
     )
     force = (thrusts_N[firing, None] * share * panels.areas_m2)[..., None] * along
     torque = np.cross(panels.centres_m, force)

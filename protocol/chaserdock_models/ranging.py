@@ -14,18 +14,20 @@ from . import rotations
 from .arrays import Array
 from .camera import Camera
 
+_BEARING_RAD = math.radians(0.005)
+"""Standard deviation of a bearing per axis without images, rad: about a tenth of a pixel."""
+
 
 @dataclass(frozen=True)
 class RangingErrors:
     """Standard deviations of the white errors of ``[ranging]``.
 
-    Range: an absolute part (m) and a share of the range. Bearing and attitude: per axis, rad.
+    Range: an absolute part (m) and a share of the range. Attitude: per axis, rad.
     ``reach_m``: greatest range that is measured.
     """
 
     range_m: float
     range_share: float
-    bearing_rad: float
     attitude_rad: float
     reach_m: float
 
@@ -65,7 +67,7 @@ def _in_view(errors: RangingErrors, camera: Camera, position_m: Array) -> bool:
     """Return whether a target is in reach and in the image."""
     if float(np.linalg.norm(position_m)) > errors.reach_m:
         return False
-    u, v = camera.project_ideal(position_m[None])[0]
+    u, v = camera.project(position_m[None])[0]
     return bool(0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0)
 
 
@@ -98,11 +100,11 @@ def ranged_pose(
     distance = float(np.linalg.norm(position_m))
     along = position_m / distance
     range_m = errors.range_sigma_m(distance)
-    across_m = errors.bearing_rad * distance
+    across_m = _BEARING_RAD * distance
     covariance = np.zeros((6, 6))
     line = np.outer(along, along)
     covariance[:3, :3] = range_m**2 * line + across_m**2 * (np.eye(3) - line)
     covariance[3:, 3:] = errors.attitude_rad**2 * np.eye(3)
     error = np.linalg.cholesky(covariance) @ white
     turned = rotations.multiply(q_wxyz, rotations.exp(error[3:]))
-    return RangedPose(position_m + error[:3], turned, covariance, errors.bearing_rad * camera.fx_px)
+    return RangedPose(position_m + error[:3], turned, covariance, _BEARING_RAD * camera.fx_px)

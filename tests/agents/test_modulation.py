@@ -165,13 +165,6 @@ def test_too_little_waits_until_it_is_worth_a_pulse() -> None:
     assert times == [4, 14, 24, 34]
 
 
-def test_without_carry_over_too_little_never_comes() -> None:
-    bench = Bench(10, carry_over=False)
-    for tick in range(40):
-        assert bench.tick(tick, bench.full * 0.04) == []
-        assert bench.modulator.deficit_N_s.max() <= 0.0
-
-
 def test_a_thruster_that_cannot_gets_no_pulses_and_is_owed_nothing() -> None:
     bench = Bench(10)
     can = bench.full.copy()
@@ -196,13 +189,6 @@ def test_a_thruster_asked_for_too_much_is_not_behind_for_ever() -> None:
         sum(p.close_ns - p.open_ns for p in bench.tick(20 + k, bench.full * 0.0)) for k in range(4)
     ]
     assert widths[-1] == 0
-
-
-def test_schmitt_trigger_opens_and_closes_for_whole_periods() -> None:
-    bench = Bench(10, modulator="schmitt", carry_over=False)
-    levels = [0.5, 0.7, 0.8, 0.5, 0.3, 0.2, 0.5]
-    opened = [bool(bench.tick(tick, bench.full * level)) for tick, level in enumerate(levels)]
-    assert opened == [False, False, True, True, True, False, False]
 
 
 def test_two_commands_for_one_tick_plan_a_period_once() -> None:

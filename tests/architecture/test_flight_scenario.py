@@ -55,7 +55,7 @@ FORBIDDEN_ANYWHERE = {
     "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad",
     "start_velocity_m_s",
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
-    "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
+    "sun_direction", "ambient", "lamp", "eclipses", "earth", "description",
 }  # fmt: skip
 FORBIDDEN_PATHS = {"target.position_m", "target.q_wxyz", "target.attitude_deg"}
 
@@ -144,7 +144,7 @@ TRUTH = {
     "fault": [
         {"kind": "drop", "process": "chaser/0", "topic": "image", "at_s": 1.0, "duration_s": 2.0}
     ],
-    "success": {"docked": [0], "max_collisions": 3},
+    "success": {"docked": [0], "keep_distances": False},
 }
 CHASER = {"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
 START = {

@@ -35,7 +35,6 @@ CAPTURE = ROOT / "tests" / "golden" / "capture.mcap"
 SMALL = {
     "camera": {"width_px": 480, "height_px": 270},
     "settling_s": 2.0,
-    "success": {"max_collisions": 0},
 }
 
 
@@ -252,7 +251,7 @@ def test_a_shortened_flight_is_judged_by_what_it_contains() -> None:
     scenario = load_scenario(path, ("duration_s=20.0", "settling_s=20.0"))
     judged, skipped = judged_criteria(scenario)
     assert judged.success.docked == ()
-    assert judged.success.max_collisions == scenario.success.max_collisions
+    assert judged.success.keep_distances == scenario.success.keep_distances
     assert sum("success.docked" in line for line in skipped) == len(scenario.success.docked) > 0
     longer, skipped = judged_criteria(load_scenario(path, ("settling_s=20.0",)))
     assert longer.success.docked == scenario.success.docked

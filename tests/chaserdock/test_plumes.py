@@ -112,7 +112,7 @@ def test_allocation_fires_thrusters_at_the_target_only_where_it_must() -> None:
         "covariance": eye,
     }
     target = TargetEstimate(status="tracking", accepted=(0,), rejected=(), **head)
-    factors = PlumeAvoidance(s, s.plume).cost_factors(own, target)
+    factors = PlumeAvoidance(s).cost_factors(own, target)
     assert factors is not None
     towards = np.flatnonzero(factors > 1.0)
     assert 0 < len(towards) < len(factors)
@@ -134,14 +134,14 @@ def test_allocation_fires_thrusters_at_the_target_only_where_it_must() -> None:
     far = Odometry(
         chaser=0, position_m=(-50.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero
     )
-    assert PlumeAvoidance(s, s.plume).cost_factors(far, target) is None
+    assert PlumeAvoidance(s).cost_factors(far, target) is None
 
 
 def test_allocation_spares_other_chasers_whose_poses_are_known() -> None:
     q, zero, eye = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), tuple(np.eye(12).ravel().tolist())
     s = flight_scenario(scenario())
     assert s.plume is not None
-    avoidance = PlumeAvoidance(s, s.plume)
+    avoidance = PlumeAvoidance(s)
     own = Odometry(
         chaser=0, position_m=(-40.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero
     )

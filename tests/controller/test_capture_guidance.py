@@ -291,6 +291,15 @@ def test_two_dock_at_once_and_a_chaser_in_the_way_waits() -> None:
     pilot.fly_to("align", 2, limit_s=120.0)
 
 
+@pytest.mark.parametrize(("distance_m", "phase"), [(0.35, "wait"), (0.05, "align")])
+def test_corridors_may_be_as_near_as_the_distance_between_chasers_allows(
+    distance_m: float, phase: str
+) -> None:
+    pilot = Pilot(chasers=4, limits={"min_distance_chasers_m": distance_m})
+    pilot.ask("approach", 0)
+    assert pilot.ask("approach", 2) == (True, f"phase {phase}")  # on the same face
+
+
 def test_corridor_replaces_the_keep_out_only_for_the_chaser_in_it() -> None:
     pilot = Pilot(chasers=2)
     limit = pilot.scenario.limits.min_distance_target_m

@@ -23,11 +23,13 @@ def side_by_side(apart_m: float, *commands: tuple[str, int], **docking: Any) -> 
     10 s.
     """
     second = PORTS[0] | {"chaser": 1, "position_m": [-0.2, 0.0, -0.05 + apart_m]}
-    changed: dict[str, Any] = values(2, docking={"ports": [PORTS[0], second], **docking})
-    changed["chasers"] = [CHASERS[0], CHASERS[0] | {"position_m": [-1.0, 0.0, 1.0]}]
-    if "q_wxyz" in docking:
-        turned = changed["docking"].pop("q_wxyz")
-        changed["chasers"] = [c | {"q_wxyz": turned} for c in changed["chasers"]]
+    limits = {"min_distance_chasers_m": docking.pop("least_m", 0.35)}
+    turned = docking.pop("q_wxyz", CHASERS[0]["q_wxyz"])
+    changed: dict[str, Any] = values(
+        2, docking={"ports": [PORTS[0], second], **docking}, limits=limits
+    )
+    chaser = CHASERS[0] | {"q_wxyz": turned}
+    changed["chasers"] = [chaser, chaser | {"position_m": [-1.0, 0.0, 1.0]}]
     changed["timeline"] = [
         {"at_s": 10.0 * (k + 1), "command": what, "chasers": [i]}
         for k, (what, i) in enumerate(commands)
@@ -41,10 +43,9 @@ def side_by_side(apart_m: float, *commands: tuple[str, int], **docking: Any) -> 
     [
         (0.18, {}, "the bodies of chasers 0 and 1 in their corridors overlap by"),
         (0.34, {}, "the bodies of chasers 0 and 1 in their corridors come within 0.01 m"),
-        (0.40, {}, "come within 0.4 m, nearer than docking.clearance_m (0.45 m) allows"),
-        (0.36, {"clearance_m": 0.3, "corridor": {"lateral_m": 0.001}}, None),
-        (0.40, {"clearance_m": 0.3, "q_wxyz": TURNED}, "overlap by"),
-        (0.34, {"clearance_m": 0.3, "corridor": {"lateral_m": 0.001}}, "min_distance_chasers_m"),
+        (0.40, {}, "come within 0.4 m, nearer than limits.min_distance_chasers_m (0.35 m) and 0.1"),
+        (0.36, {"least_m": 0.2, "corridor": {"lateral_m": 0.001}}, None),
+        (0.40, {"least_m": 0.2, "q_wxyz": TURNED}, "overlap by"),
     ],
 )
 def test_close_ports_are_refused_with_the_distance_that_fits(

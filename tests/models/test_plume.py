@@ -102,7 +102,7 @@ def test_plate_across_the_whole_cone_takes_up_the_thrust() -> None:
     for distance in (0.5, 2.0):
         plate = panels_of([Box((0.01, 4.0, 4.0), (distance + 0.005, 0.0, 0.0))], parts=160)
         wrench = plume_wrench(
-            flux, plate, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]), np.array([0.7]), 10.0
+            flux, plate, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]), np.array([0.7])
         )
         assert wrench[0] == pytest.approx(0.7, rel=5e-3)
         np.testing.assert_allclose(wrench[1:], 0.0, atol=1e-9)
@@ -112,14 +112,15 @@ def test_plume_pushes_what_it_faces_and_only_within_its_limits() -> None:
     flux = PlumeFlux(math.radians(40.0), 5.0)
     box = panels_of([Box((0.4, 0.4, 0.4))])
     at, force, thrust = np.array([[-1.0, 0.1, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.array([1.0])
-    wrench = plume_wrench(flux, box, at, force, thrust, 10.0)
+    wrench = plume_wrench(flux, box, at, force, thrust)
     assert 0.02 < wrench[0] < 0.7
     assert wrench[5] < 0.0  # above the middle: a torque about -Z
-    assert not plume_wrench(flux, box, at, -force, thrust, 10.0).any()
-    assert not plume_wrench(flux, box, at, force, 0.0 * thrust, 10.0).any()
-    assert not plume_wrench(flux, box, at, force, thrust, 0.7).any()
+    assert not plume_wrench(flux, box, at, -force, thrust).any()
+    assert not plume_wrench(flux, box, at, force, 0.0 * thrust).any()
+    assert plume_wrench(flux, box, at - np.array([8.5, 0.0, 0.0]), force, thrust).any()
+    assert not plume_wrench(flux, box, at - np.array([9.5, 0.0, 0.0]), force, thrust).any()
     beside = np.array([[-1.0, 1.4, 0.0]])  # 45 degrees off the nearest corner
-    assert not plume_wrench(flux, box, beside, force, thrust, 10.0).any()
+    assert not plume_wrench(flux, box, beside, force, thrust).any()
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)
@@ -132,15 +133,14 @@ def test_plume_wrench_turns_with_the_bodies(seed: int) -> None:
     turned = Panels(
         rotations.rotate(q, panels.centres_m), rotations.rotate(q, panels.normals), panels.areas_m2
     )
-    thrust, reach_m = np.array([1.0]), 20.0
-    plain = plume_wrench(flux, panels, nozzle[None], axis[None], thrust, reach_m)
+    thrust = np.array([1.0])
+    plain = plume_wrench(flux, panels, nozzle[None], axis[None], thrust)
     other = plume_wrench(
         flux,
         turned,
         rotations.rotate(q, nozzle)[None],
         rotations.rotate(q, axis)[None],
         thrust,
-        reach_m,
     )
     np.testing.assert_allclose(rotations.rotate(q, plain[:3]), other[:3], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(rotations.rotate(q, plain[3:]), other[3:], rtol=1e-7, atol=1e-9)

@@ -98,7 +98,7 @@ def test_defects_are_one_line(tmp_path: Path) -> None:
         ("text.glb", "not a GLB mesh: it does not begin with 'glTF'"),
         ("text.obj", "contains no triangles"),
         ("cut.glb", "not a GLB mesh"),
-        ("none.glb", "no such mesh file"),
+        ("none.glb", "no such file"),
         ("mesh.step", r"its name must end in \.glb, \.gltf, \.obj, \.stl, \.ply"),
     ):
         with pytest.raises(ScenarioError, match=message) as caught:
@@ -211,7 +211,7 @@ def test_markers_lie_on_shipped_and_own_meshes(servicer_file: Path) -> None:
             "dictionary: is missing",
         ),
         ('target.geometry={dictionary="DICT_4X4_50", markers=[]}', "cuboids: is empty"),
-        ('target.geometry={mesh="nowhere.glb"}', r"nowhere\.glb: no such mesh file"),
+        ('target.geometry={mesh="nowhere.glb"}', r"nowhere\.glb: no such file"),
         (
             'target.geometry={dictionary="DICT_4X4_50", mesh="geo_servicer", '
             'markers=[{id=1, side_m=0.1, face="+x"}]}',

@@ -108,7 +108,6 @@ def test_keys_override_the_predefined_body() -> None:
             "multiple of chaser.modulation.carrier_hz (960, 7)",
         ),
         ({"chaser": {"modulation": {"carrier_hz": 120}}}, "shorter than the shortest pulse"),
-        ({"chaser": {"modulation": {"resolution_s": 0.2}}}, "at most half a carrier period"),
         (
             {"thruster_failure": [{"chaser": 1, "thruster": 0, "at_s": 1, "kind": "stuck_on"}]},
             "there is no chaser 1",

@@ -214,7 +214,7 @@ class CommandsAreFlown(Check):
 
 @dataclass
 class ThrustersOpen(Check):
-    """With thrusters and `carry_over`, one of them opens before the force commanded since the last
+    """With thrusters, one of them opens before the force commanded since the last
     pulse gives more than all thrusters in one carrier period."""
 
     name = "commands are flown"
@@ -226,8 +226,7 @@ class ThrustersOpen(Check):
     @reads(ActuatorCommand)
     def judge(self, command: ActuatorCommand) -> None:
         body, i = self.scenario.chaser, command.chaser
-        carries_over = body.actuation == "thrusters" and body.modulation.carry_over
-        if command.pulses or command.isolated or not carries_over:
+        if command.pulses or command.isolated or body.actuation != "thrusters":
             self._waiting_N_s.pop(i, None)
             return
         counted, total_N_s = self._waiting_N_s.get(i, (-1, np.zeros(3)))

@@ -146,12 +146,13 @@ class ChaserFleet:
         """Return which chaser blocks an approach to a port; empty if none does."""
         docking, active = self.scenario.docking, 0
         corridor = self.scenario.chaser.probe_reach_m, docking.entry_m
+        clearance_m = docking.corridor_margin_m + self.scenario.limits.min_distance_chasers_m
         assert chaser.dock is not None
         for other in self.others(chaser):
             aligning = other.phase is Phase.ALIGN
             if other.dock is None or not (aligning or other.in_corridor()):
                 continue
             active += other.phase not in ATTACHED
-            if corridors_apart(chaser.dock.port, other.dock.port, *corridor) < docking.clearance_m:
+            if corridors_apart(chaser.dock.port, other.dock.port, *corridor) < clearance_m:
                 return f"chaser {other.number} is in the way"
         return f"{active} are docking already" if active >= docking.at_once else ""

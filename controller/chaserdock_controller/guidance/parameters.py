@@ -38,6 +38,8 @@ class GuidanceParameters:
     """
     release_s: float = 1.0
     """A latch still closed this long after the command to release it counts as stuck."""
+    identify_s: float = 10.0
+    """Length of the manoeuvre that shows the mass properties of a stack: 16 pulses of 0.6 s."""
     stack_rest_s: float = 0.5
     """Time for which a stack must be below its limits to count as stopped."""
     stack_moving_s: float = 0.2

@@ -30,7 +30,7 @@ PLAUSIBLE_M = 0.02
 PLAUSIBLE_RAD = math.radians(2.0)
 LONGEST_S = 1.0
 """After a longer gap every state is accepted."""
-_UNIT_WITHIN = 0.1
+UNIT_WITHIN = 0.1
 """Deviation of a quaternion's length from 1 that passes as its sender's rounding."""
 _ROUNDING = 1e-9
 """Asymmetry and negative eigenvalues of a covariance, as a share of its largest element, that pass
@@ -52,7 +52,7 @@ def why_invalid(odometry: Odometry) -> str:
         if not all(map(math.isfinite, getattr(odometry, name))):
             return f"{name} holds a value that is not finite"
     length = math.hypot(*odometry.q_wxyz)
-    if abs(length - 1.0) > _UNIT_WITHIN:
+    if abs(length - 1.0) > UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"
     o = odometry
     return _why_no_covariances(

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from chaserdock_protocol.messages import Level, PoseSolution, Sighting
 
-_UNIT_WITHIN = 0.1
-"""Deviation of a quaternion's length from 1 that passes as its sender's rounding."""
+from .odometry_validation import UNIT_WITHIN
+
 _ROUNDING = 1e-6
 """Asymmetry of a covariance, as a share of its largest element, that passes as rounding: perception
 may compute in single precision.
@@ -21,7 +21,7 @@ may compute in single precision.
 def why_invalid(solution: PoseSolution) -> str:
     """Return why a solution is not a pose with a positive definite covariance; empty if it is."""
     length = math.hypot(*solution.q_wxyz)
-    if not abs(length - 1.0) <= _UNIT_WITHIN:
+    if not abs(length - 1.0) <= UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"
     covariance = np.array(solution.covariance).reshape(6, 6)
     if np.abs(covariance - covariance.T).max() > _ROUNDING * np.abs(covariance).max():
@@ -35,7 +35,7 @@ def why_invalid(solution: PoseSolution) -> str:
 
 def _are_valid(solutions: Sequence[PoseSolution]) -> bool:
     """Return whether ``why_invalid`` would pass all solutions, without a call for each."""
-    if not all(abs(math.hypot(*s.q_wxyz) - 1.0) <= _UNIT_WITHIN for s in solutions):
+    if not all(abs(math.hypot(*s.q_wxyz) - 1.0) <= UNIT_WITHIN for s in solutions):
         return False
     covariances = np.array([s.covariance for s in solutions]).reshape(-1, 6, 6)
     largest = np.abs(covariances).max(axis=(1, 2))

@@ -40,7 +40,8 @@ from .warm_start import check_plan
 
 _ATTACHED_FACTOR = 1.2
 """Input limit of an attached chaser, relative to the largest input that follows the target; the
-rest is for feedback. 0.6 and 2.4 change no bit of `docking-contact`.
+rest is for feedback. It acts where others are planned beside it, as in
+`four-chaser-capture`.
 """
 _ATTACHED_MARGIN = 1e-3
 """Added to that limit, N and N m, because the solver needs a positive one where the target does not

@@ -68,7 +68,8 @@ class FlightTarget(Section):
         default="paper",
         description="Name of a known target: `paper`, `servicer`, `client` with markers, "
         "`geo_servicer`, `cubesat_12u` without; or, in a file, the path relative to it of a "
-        "target file (`….toml`) or of a mesh (`….glb`, `.gltf`, `.obj`, `.stl`, `.ply`). "
+        "target file (`….toml`) or of a mesh (`….glb`, `.gltf`, `.obj`, `.stl`, `.ply`, "
+        "`.off`, `.dae`). "
         "With `geometry`: the name of that geometry.",
     )
     geometry: Geometry | None = Field(

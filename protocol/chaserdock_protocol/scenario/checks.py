@@ -258,12 +258,7 @@ def _check_approach_cone(scenario: FlightScenario) -> None:
     cone_deg, camera = scenario.approach.cone_deg, scenario.camera_model()
     if cone_deg is None or scenario.approach.face_target:
         return
-    half_deg = math.degrees(
-        min(
-            math.atan(min(camera.cx_px, camera.width_px - 1.0 - camera.cx_px) / camera.fx_px),
-            math.atan(min(camera.cy_px, camera.height_px - 1.0 - camera.cy_px) / camera.fy_px),
-        )
-    )
+    half_deg = math.degrees(min(camera.angles_to_borders()))
     for i, c in enumerate(scenario.chasers):
         forward = rotations.rotate(c.q_wxyz, np.array([1.0, 0.0, 0.0]))
         off_deg = cone_deg + angle_deg(-np.asarray(c.position_m), forward)
@@ -679,14 +674,11 @@ def _ports_fault(scenario: FlightScenario, a: Port, b: Port) -> str:
             + f", and need {room_m:g} m (docking.corridor.lateral_m)"
         )
     centres_m = corridors_apart(a, b, reach_m, docking.entry_m)
-    for key, least_m in (
-        ("docking.clearance_m", docking.clearance_m),
-        ("limits.min_distance_chasers_m", scenario.limits.min_distance_chasers_m),
-    ):
-        if centres_m < least_m:
-            return (
-                f"the centres of {who} in their corridors come within {centres_m:.3g} m, nearer "
-                f"than {key} ({least_m:g} m) allows; the second would wait as long as the first "
-                "stays"
-            )
+    limit_m = scenario.limits.min_distance_chasers_m
+    if centres_m < limit_m + docking.corridor_margin_m:
+        return (
+            f"the centres of {who} in their corridors come within {centres_m:.3g} m, nearer than "
+            f"limits.min_distance_chasers_m ({limit_m:g} m) and {docking.corridor_margin_m:g} m "
+            "allow; the second would wait as long as the first stays"
+        )
     return ""

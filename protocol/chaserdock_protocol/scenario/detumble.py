@@ -31,9 +31,6 @@ class Identification(Section):
         description="Whether mass, centre of mass and inertia are identified, and used by the "
         "control of the stack. Without it those of `[target]` are taken as exact.",
     )
-    duration_s: Positive = Field(
-        default=10.0, description="Length of the manoeuvre that the command `identify` begins, s."
-    )
     thrust_share: Positive = Field(
         default=0.05,
         description="Standard deviation of each thruster's thrust, constant in a mission.",

@@ -57,6 +57,25 @@ _MOVED_KEYS: dict[tuple[str, ...], str] = {
 
 _REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
     ("camera", "renderer"): ("exact", "PyBullet's renderer is not a part of chaserdock any more"),
+    ("chaser", "modulation", "modulator"): (
+        "pwm",
+        "the Schmitt trigger was removed: with it errors were ten times larger, and propellant "
+        "three times",
+    ),
+    ("chaser", "modulation", "carry_over"): (
+        True,
+        "impulse that a period cannot give is always added to the next one",
+    ),
+    ("docking", "clearance_m"): (
+        0.45,
+        "it is limits.min_distance_chasers_m and 0.1 m now",
+    ),
+    ("success", "max_collisions"): (0, "any collision is a failure"),
+    ("success", "keep_load_limits"): (
+        True,
+        "the limits that [[docking.ports]] states are always judged",
+    ),
+    ("plume", "avoid_factor"): (10.0, "thrusters whose plume hits always cost 11 times as much"),
     **{
         path: (value, f"it is {value:g} in every flight now")
         for path, value in {
@@ -69,8 +88,13 @@ _REMOVED_KEYS: dict[tuple[str, ...], tuple[Any, str]] = {
             ("docking", "verify_position_m"): 0.005,
             ("docking", "verify_angle_deg"): 0.5,
             ("detumble", "response_s"): 0.5,
+            ("detumble", "identification", "duration_s"): 10.0,
+            ("chaser", "modulation", "resolution_s"): 0.001,
             ("chaser", "modulation", "schmitt_on"): 0.75,
             ("chaser", "modulation", "schmitt_off"): 0.25,
+            ("camera", "eclipse_ambient"): 0.05,
+            ("plume", "reach_m"): 10.0,
+            ("ranging", "bearing_noise_deg"): 0.005,
         }.items()
     },
 }

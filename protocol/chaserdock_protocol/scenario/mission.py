@@ -44,7 +44,8 @@ class Chaser(FlightChaser):
 
 
 class Success(Section):
-    """Criteria of a successful mission, evaluated on ground truth. Omitted criteria are not
+    """Criteria of a successful mission, evaluated on ground truth, in addition to those of every
+    mission: no collision, and loads on ports within their limits. Omitted criteria are not
     evaluated.
     """
 
@@ -76,14 +77,8 @@ class Success(Section):
         description="Half edge of the cube about the target's centre, along the axes of TRF, out "
         "of which the centre of a chaser must stay from its first abort on, m.",
     )
-    max_collisions: int = Field(default=0, ge=0, description="Largest number of collisions.")
     keep_distances: bool = Field(
         default=True, description="Whether the distances of `[limits]` must be kept."
-    )
-    keep_load_limits: bool = Field(
-        default=True,
-        description="Whether `force_limit_N` and `torque_limit_N_m` of `[[docking.ports]]` must "
-        "be kept in every physics step.",
     )
     steady_position_rms_m: Positive | None = Field(
         default=None,

@@ -8,7 +8,7 @@ import math
 from chaserdock_models.plume import PlumeFlux
 from pydantic import Field
 
-from .fields import NotNegative, Positive, Section
+from .fields import Positive, Section
 
 
 class PlumeSection(Section):
@@ -25,13 +25,6 @@ class PlumeSection(Section):
     )
     exponent: Positive = Field(
         default=5.0, description="Exponent m of its profile: 2 / (gamma - 1), 5 for cold nitrogen."
-    )
-    reach_m: Positive = Field(default=10.0, description="Distance up to which a plume acts, m.")
-    avoid_factor: NotNegative = Field(
-        default=10.0,
-        description="A thruster whose plume hits the target or another chaser within `reach_m` "
-        "(half angle `detumble.plume_deg`) costs so many times more in the allocation, in "
-        "addition: it fires only where others cannot give the wrench. 0: no avoidance.",
     )
 
     def flux(self) -> PlumeFlux:

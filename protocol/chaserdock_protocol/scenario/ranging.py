@@ -29,13 +29,6 @@ class Ranging(Section):
     range_share: Fraction = Field(
         default=1e-4, description="Standard deviation of the range in addition, as a share of it."
     )
-    bearing_noise_deg: Positive = Field(
-        default=0.005,
-        lt=10,
-        description="Standard deviation of the bearing per axis, degrees: about a tenth of a "
-        "pixel. Used by "
-        '`perception.name = "statistical"` only.',
-    )
     attitude_noise_deg: Positive = Field(
         default=0.02,
         lt=90,
@@ -45,8 +38,5 @@ class Ranging(Section):
 
     def errors(self) -> RangingErrors:
         """Return the errors in SI units and radians."""
-        bearing, attitude = (
-            math.radians(self.bearing_noise_deg),
-            math.radians(self.attitude_noise_deg),
-        )
-        return RangingErrors(self.range_noise_m, self.range_share, bearing, attitude, self.reach_m)
+        attitude = math.radians(self.attitude_noise_deg)
+        return RangingErrors(self.range_noise_m, self.range_share, attitude, self.reach_m)

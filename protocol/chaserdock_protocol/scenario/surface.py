@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 
 from .fields import Fraction, Name, NotNegative, Positive, Section, Vector
 
-SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply")
+SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae")
 """Endings of mesh files that can be read."""
 MAX_PARTS = 256
 """Parts of a mesh: each has collision hulls of its own, which physics compares in pairs."""

@@ -153,7 +153,8 @@ class Geometry(Section):
     mesh: str = Field(
         default="",
         description="Mesh that is drawn in place of the cuboids: path of a file (GLB, glTF, OBJ, "
-        "STL, PLY), relative to the file that names it, or name of a shipped satellite.",
+        "STL, PLY, OFF, COLLADA), relative to the file that names it, or name of a shipped "
+        "satellite.",
     )
     mesh_scale: Positive = Field(
         default=1.0, description="Factor from the mesh's unit of length to m."

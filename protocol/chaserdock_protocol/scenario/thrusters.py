@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -52,42 +51,15 @@ class Thruster(Section):
 
 
 class Modulation(Section):
-    """Conversion of commanded thrust to pulses ([thrusters.md](thrusters.md))."""
+    """Conversion of commanded thrust to one pulse per carrier period, its width proportional to the
+    thrust ([thrusters.md](thrusters.md))."""
 
-    modulator: Literal["pwm", "schmitt"] = Field(
-        default="pwm",
-        description="`pwm`: one pulse per carrier period, its width proportional to the thrust. "
-        "`schmitt`: open for whole periods, with hysteresis.",
-    )
     carrier_hz: int = Field(
         default=10,
         ge=1,
         le=240,
         description="Carrier frequency, Hz. It must divide `time.physics_hz`.",
     )
-    resolution_s: Positive = Field(
-        default=0.001,
-        description="Pulse widths are multiples of this, s: from 1e-6 to half a carrier period.",
-    )
-    carry_over: bool = Field(
-        default=True,
-        description="Add impulse that a period could not give, as below the minimum on-time, to "
-        "the next one.",
-    )
-    schmitt_on: ClassVar[float] = 0.75
-    schmitt_off: ClassVar[float] = 0.25
-    """Shares of full thrust at which `schmitt` opens, and below which it closes: symmetric about
-    one half, so that it has no bias, and half a thrust apart, which bounds its switching."""
-
-    @model_validator(mode="after")
-    def _check_consistent(self) -> Modulation:
-        if self.resolution_s < 1e-6:
-            raise ValueError(f"resolution_s ({self.resolution_s}) must be at least a microsecond")
-        if self.resolution_s > 0.5 / self.carrier_hz:
-            raise ValueError(
-                f"resolution_s ({self.resolution_s}) must be at most half a carrier period"
-            )
-        return self
 
 
 class ThrusterFailure(Section):

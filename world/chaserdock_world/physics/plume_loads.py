@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.plume import panels_of, plume_wrench
+from chaserdock_models.plume import REACH_M, panels_of, plume_wrench
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario import Scenario
@@ -29,7 +29,7 @@ class PlumeLoads:
     """Compute the loads of all plumes, and add them up until they are taken."""
 
     def __init__(self, scenario: Scenario, plume: PlumeSection) -> None:
-        self._flux, self._reach_m = plume.flux(), plume.reach_m
+        self._flux = plume.flux()
         body = scenario.chaser
         self._nozzles = np.array([t.position_m for t in body.thrusters])
         self._forces = np.array([t.direction for t in body.thrusters])
@@ -75,15 +75,11 @@ class PlumeLoads:
     def _wrench_on(
         self, hit: str, body: BodyState, nozzles: Array, forces: Array, thrusts_N: Array
     ) -> Array:
-        near = (
-            np.linalg.norm(nozzles - body.position_m, axis=1) - self._radius_m[hit] <= self._reach_m
-        )
+        near = np.linalg.norm(nozzles - body.position_m, axis=1) - self._radius_m[hit] <= REACH_M
         local = rotations.rotate_inverse(body.q_wxyz, nozzles - body.position_m)
         directions = rotations.rotate_inverse(body.q_wxyz, forces)
         panels = self._panels[hit]
-        return plume_wrench(
-            self._flux, panels, local, directions, np.where(near, thrusts_N, 0.0), self._reach_m
-        )
+        return plume_wrench(self._flux, panels, local, directions, np.where(near, thrusts_N, 0.0))
 
     def take(self, name: str) -> PlumeImpulse:
         """Return what a body has received since the last call."""

@@ -18,7 +18,6 @@ from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
 from chaserdock_world.orbit import TargetOrbit, earth_disc
@@ -37,6 +36,9 @@ from .scene_geometry import Obstacle
 # Motion of the target, px, for which motion blur takes one sample of the exposure, and most
 # samples.
 _BLUR_STEP_PX, _BLUR_SAMPLES_MAX = 0.5, 16
+
+_ECLIPSE_AMBIENT = 0.05
+"""Share of `camera.ambient` that remains in an eclipse: a scene that is all but black."""
 
 States = dict[str, BodyState]
 
@@ -64,12 +66,9 @@ class Cameras:
         @cache
         def renderer(camera: Camera) -> Renderer | MeshRenderer:
             spread_px = effects.point_spread_px
-            try:
-                if mesh is not None:
-                    return MeshRenderer(camera, mesh, background, spread_px, substitutes)
-                return Renderer(camera, self._target, background, spread_px)
-            except ValueError as error:
-                raise ScenarioError(f"camera: {error}") from None
+            if mesh is not None:
+                return MeshRenderer(camera, mesh, background, spread_px, substitutes)
+            return Renderer(camera, self._target, background, spread_px)
 
         self._renderers = [renderer(camera) for camera in self._cameras]
         glares = {c: Glare(c, effects.glare) for c in self._cameras} if effects.glare > 0.0 else {}
@@ -80,7 +79,7 @@ class Cameras:
         self._day = Light(
             section.sun_direction, 1.0 - section.ambient, section.ambient, section.lamp
         )
-        night = section.ambient * section.eclipse_ambient
+        night = section.ambient * _ECLIPSE_AMBIENT
         self._night = Light(section.sun_direction, 0.0, night, section.lamp)
         # A chaser's own body is behind its lens, its probe is not.
         self._own, self._others = (probe,), (body, probe)
@@ -127,9 +126,7 @@ class Cameras:
             return self._night if dark else self._day
         share = orbit.sunlit_share(time_s)
         x, y, z = orbit.to_sun(time_s).tolist()
-        ambient = section.ambient * (
-            section.eclipse_ambient + (1.0 - section.eclipse_ambient) * share
-        )
+        ambient = section.ambient * (_ECLIPSE_AMBIENT + (1.0 - _ECLIPSE_AMBIENT) * share)
         return Light((x, y, z), (1.0 - section.ambient) * share, ambient, section.lamp)
 
     def render(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:

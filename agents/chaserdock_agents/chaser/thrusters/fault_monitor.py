@@ -44,12 +44,8 @@ class FaultMonitor:
         self._noise = noise_of(scenario.navigation.errors())
         variance = quiescent_variance(self._noise, body)
         information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
-        # A single thruster cannot be tested by pulses of whole periods, nor by pulses below the
-        # noise.
-        testable = (
-            body.modulation.modulator == "pwm"
-            and _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
-        )
+        # A single thruster cannot be tested by pulses below the noise.
+        testable = _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
         self._self_test = ThrusterSelfTest(
             allocator,
             min_pulse_N_s,

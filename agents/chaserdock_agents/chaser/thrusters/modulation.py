@@ -18,6 +18,9 @@ from chaserdock_protocol.messages import ThrusterPulse
 from chaserdock_protocol.scenario.thrusters import Modulation, Thruster, thrusts_max
 from numpy.typing import NDArray
 
+_RESOLUTION_S = 0.001
+"""Pulse widths are multiples of this, s: a tenth of the minimum on-time of `tetra12`."""
+
 
 class Modulator:
     """Modulate the thrusters of one chaser.
@@ -29,7 +32,7 @@ class Modulator:
     def __init__(
         self, thrusters: Sequence[Thruster], modulation: Modulation, timing: Timing
     ) -> None:
-        self._m, self._timing = modulation, timing
+        self._timing = timing
         self._period_steps = timing.physics_hz // modulation.carrier_hz
         self._first_step = timing.latency_steps % self._period_steps
         self._full_N = thrusts_max(thrusters)
@@ -99,12 +102,7 @@ class Modulator:
         force_N = np.where(able, available_N, 1.0)
         held_N_s = self._commanded_N * period_s
         wanted_N_s = held_N_s + self.deficit_N_s
-        if self._m.modulator == "schmitt":
-            threshold = np.where(self._open, self._m.schmitt_off, self._m.schmitt_on)
-            width_s = np.where(wanted_N_s >= threshold * force_N * period_s, period_s, 0.0)
-        else:
-            width_s = self._widths_s(wanted_N_s / force_N, period_s)
-        width_s = np.where(able, width_s, 0.0)
+        width_s = np.where(able, self._widths_s(wanted_N_s / force_N, period_s), 0.0)
         full = width_s >= period_s - 0.5e-9
         # A thruster that stays open between periods has neither rise nor fall between them.
         given_s = np.where(width_s > 0.0, width_s - self._lag_s, 0.0) + np.where(
@@ -114,7 +112,7 @@ class Modulator:
         # The deficit is limited to a period of full thrust, so that saturation does not accumulate.
         most_N_s = force_N * period_s
         deficit = np.clip(wanted_N_s - given_s * force_N, -most_N_s, most_N_s)
-        self.deficit_N_s = np.where(able, (deficit if self._m.carry_over else 0.0) - held_N_s, 0.0)
+        self.deficit_N_s = np.where(able, deficit - held_N_s, 0.0)
         out = []
         for thruster in np.flatnonzero(width_s > 0.0):
             width_ns = min(round(width_s[thruster] * 1e9), period_ns)
@@ -128,10 +126,9 @@ class Modulator:
         """Return pulse widths (n,) for on-times (n,) at full thrust: whole steps between the
         minimum and the period.
         """
-        resolution_s = self._m.resolution_s
-        exact = (wanted_s + self._lag_s) / resolution_s
+        exact = (wanted_s + self._lag_s) / _RESOLUTION_S
         steps = np.floor(exact + 0.5)
-        width_s = np.where(wanted_s > 0.0, steps * resolution_s, 0.0)
+        width_s = np.where(wanted_s > 0.0, steps * _RESOLUTION_S, 0.0)
         # Widths below the minimum are also rounded to the nearest, so that thrusters with small
         # equal commands fire together.
         nearest_s = np.where(

@@ -8,24 +8,26 @@ import math
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.plume import angle_to_point, plume_hits
+from chaserdock_models.plume import REACH_M, angle_to_point, plume_hits
 from chaserdock_models.targets import Box
 from chaserdock_protocol.messages import Odometry, RelativeEstimate, TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
-from chaserdock_protocol.scenario.plume import PlumeSection
+
+_COST_FACTOR = 11.0
+"""Cost of a thruster whose plume hits, over that of others: large enough that it fires only where
+others cannot give the wrench."""
 
 
 class PlumeAvoidance:
     """Compute the cost factors of one chaser's thrusters from the poses relative to the target."""
 
-    def __init__(self, scenario: FlightScenario, plume: PlumeSection) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         self._nozzles = np.array([t.position_m for t in scenario.chaser.thrusters])
         self._forces = np.array([t.direction for t in scenario.chaser.thrusters])
         self._boxes = scenario.target_model().boxes
         self._size_m = scenario.chaser.size_m
         self._radius_m = math.hypot(*scenario.chaser.size_m) / 2.0
         self._half_angle_rad = math.radians(scenario.detumble.plume_deg)
-        self._reach_m, self._factor = plume.reach_m, 1.0 + plume.avoid_factor
 
     def cost_factors(self, own: Odometry | None, target: TargetEstimate) -> Array | None:
         """Return the cost factors (n,); above 1 for thrusters whose plume hits something.
@@ -38,11 +40,11 @@ class PlumeAvoidance:
             return None
         away = np.subtract(own.position_m, target.position_m)
         at = rotations.rotate_inverse(target.q_wxyz, away)
-        boxes = self._boxes if float(np.linalg.norm(away)) <= self._reach_m else ()
+        boxes = self._boxes if float(np.linalg.norm(away)) <= REACH_M else ()
         others = [
             r
             for r in target.relative
-            if r.chaser != own.chaser and float(np.linalg.norm(at - r.position_m)) <= self._reach_m
+            if r.chaser != own.chaser and float(np.linalg.norm(at - r.position_m)) <= REACH_M
         ]
         if not boxes and not others:
             return None
@@ -56,7 +58,7 @@ class PlumeAvoidance:
             )
             for nozzle, force in zip(nozzles, forces, strict=True)
         ]
-        return np.where(hits, self._factor, 1.0)
+        return np.where(hits, _COST_FACTOR, 1.0)
 
     def _near(self, nozzle: Array, force: Array, others: list[RelativeEstimate]) -> list[Box]:
         """Return the bodies (TRF) of chasers whose bounding sphere the plume of a thruster

@@ -73,9 +73,9 @@ class DetumbleActivity(Activity):
     def conclude(self, observation: Observation) -> None:
         """Advance the phases of the chasers that move the stack, and compute their thrusts."""
         now_s = observation.time_s
-        identify_s = self._fleet.scenario.detumble.identification.duration_s
         for chaser in self._fleet.chasers:
-            if chaser.phase is Phase.IDENTIFY and now_s - chaser.state.since_s >= identify_s:
+            into_s = now_s - chaser.state.since_s
+            if chaser.phase is Phase.IDENTIFY and into_s >= GUIDANCE.identify_s:
                 chaser.fire(Trigger.IDENTIFIED, now_s)
         self._follow_motion(observation)
         self._thrusts = self._command_thrusters(observation)

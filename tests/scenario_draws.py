@@ -27,8 +27,12 @@ NAMES: dict[KeyPath, tuple[str, ...]] = {
     ("target", "model"): tuple(target_names()),
 }
 """Keys whose values are names, and the names that there are."""
-SKIPPED = {"format", "name", "description", "duration_s", "extends", "surface", "mesh", "seed"}
-"""Keys that select no behaviour, or whose values are files or set below."""
+SKIPPED = {
+    *("format", "name", "description", "duration_s", "extends", "surface", "mesh", "seed"),
+    "simulation",
+}
+"""Keys that select no behaviour, or whose values are files or set below; and the network, which may
+be so bad that a mission does not begin in time."""
 UNIT = {"q_wxyz", "axis", "direction"}
 """Keys whose values have unit length."""
 MOST_ITEMS = 3

@@ -51,7 +51,7 @@ def test_a_valid_scenario_starts(drawn: tuple[str, dict[Any, Any]]) -> None:
     ("changes", "line"),
     [
         ({("chaser", "size_m"): [0.8, 0.4, 0.4]}, "chaser: probe_reach_m: the probe's tip, 0.35 m"),
-        ({("chaser", "mass_kg"): 1e-12}, "chaser.mass_kg: must be a number at least 0.001"),
+        ({("chaser", "mass_kg"): 1e-12}, "chaser: mass_kg: must be at least 0.001"),
         ({("chaser", "torque_max_N_m"): 1e-300}, "chaser.torque_max_N_m: must be at least 1e-12"),
         ({("camera", "sun_direction"): [1e-300, 0.0, 0.0]}, "sun_direction must not be zero"),
         (

@@ -17,7 +17,6 @@ from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
 
 from .fields import (
-    LARGEST,
     Name,
     NotNegative,
     Oriented,
@@ -271,6 +270,11 @@ def cuboid_inertia(
     return (mass_kg * (y + z) / 12, mass_kg * (x + z) / 12, mass_kg * (x + y) / 12)
 
 
+_LIGHTEST_KG = 1e-3
+"""Least mass of a chaser: newtons of thrust move a lighter one by more in a tick than filters bear.
+"""
+
+
 class Body(Section):
     """The body and actuators of every chaser."""
 
@@ -279,9 +283,7 @@ class Body(Section):
         description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters) or "
         "`tetra12` (12 thrusters). Its values replace the defaults below.",
     )
-    mass_kg: float = Field(
-        default=30.0, ge=1e-3, le=LARGEST, allow_inf_nan=False, description="Mass, kg."
-    )
+    mass_kg: Positive = Field(default=30.0, description="Mass, kg. At least 1 g.")
     size_m: PositiveVector = Field(
         default=(0.25, 0.25, 0.05), description="Edges of the body's cuboid (CRF), m."
     )
@@ -338,6 +340,8 @@ class Body(Section):
     def _check_consistent(self) -> Body:
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
+        if self.mass_kg < _LIGHTEST_KG:
+            raise ValueError(f"mass_kg: must be at least {_LIGHTEST_KG:g} (got {self.mass_kg:g})")
         front_m = self.size_m[0] / 2.0
         if self.probe_reach_m <= front_m:
             raise ValueError(

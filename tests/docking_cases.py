@@ -9,16 +9,20 @@ from typing import Any
 
 import numpy as np
 from chaserdock_controller.guidance.docking import DockingObservation
+from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import PortView
+from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
+from flight_cases import at, fleet_of, order, step
 
 TARGET_KG, CHASER_KG = 40.0, 17.8
 TARGET_INERTIA, CHASER_INERTIA = (0.683, 0.875, 0.9), (0.3, 0.31, 0.33)
 REACH_M = 0.35
 HZ = 960
+DT_S = 0.1
 PORTS = (
     {"chaser": 0, "position_m": [-0.2, 0.0, -0.05], "axis": [-1.0, 0.0, 0.0]},
     {"chaser": 1, "position_m": [0.2, 0.0, -0.05], "axis": [1.0, 0.0, 0.0]},
@@ -26,6 +30,12 @@ PORTS = (
     {"chaser": 3, "position_m": [0.0, 0.16, 0.0], "axis": [0.0, 1.0, 0.0]},
 )
 _HALF = float(np.sqrt(0.5))
+ONE_BY_ONE = [
+    {"at_s": 900.0, "command": "approach", "chasers": [0]},
+    {"at_s": 910.0, "command": "retreat", "chasers": [0]},
+    {"at_s": 920.0, "command": "approach", "chasers": [2]},
+]
+"""Timeline by which chasers 0 and 2, whose ports are near, never dock at the same time."""
 CHASERS = (
     {"position_m": [-1.0, 0.0, -0.05], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
     {"position_m": [1.0, 0.0, -0.05], "q_wxyz": [0.0, 0.0, 0.0, 1.0]},
@@ -55,6 +65,7 @@ def values(chasers: int = 1, **changes: Any) -> dict[str, Any]:
         "limits": {"min_distance_target_m": 0.75},
         "docking": {"kind": "capture", "ports": list(PORTS[:chasers])},
         "chasers": list(CHASERS[:chasers]),
+        "timeline": ONE_BY_ONE if chasers > 2 else [],
     }
     for key, value in changes.items():
         out[key] = {**out[key], **value} if isinstance(value, dict) and key in out else value
@@ -149,3 +160,42 @@ def senses(offset_m: Any, **changes: Any) -> DockingObservation:
     return DockingObservation(
         PortView(**(view | changes)), contact, latched, np.asarray(offset_m, dtype=float), q
     )
+
+
+class Pilot:
+    """Guidance with chasers that are always where their references are, unless stated otherwise."""
+
+    def __init__(self, chasers: int = 1, **changes: Any) -> None:
+        self.scenario = scenario(chasers, **changes)
+        self.guidance = fleet_of(self.scenario)
+        for chaser in self.guidance.chasers:
+            chaser.fire(Trigger.TARGET_ACQUIRED, 0.0)
+        self.now_s = 0.0
+        self.observed: dict[int, dict[str, Any]] = {}
+        self.fly(DT_S)
+
+    def phase(self, i: int = 0) -> str:
+        return self.guidance.chasers[i].phase
+
+    def ask(self, what: str, i: int = 0, **more: Any) -> tuple[bool, str]:
+        command = OperatorCommand(command=what, chaser=i, **more)  # type: ignore[arg-type]
+        answer = order(self.guidance, command, self.now_s)
+        return answer.accepted, answer.reason
+
+    def fly(self, seconds: float) -> None:
+        for _ in range(round(seconds / DT_S)):
+            self.now_s += DT_S
+            for i, chaser in enumerate(self.guidance.chasers):
+                position = at(chaser.state.move, self.now_s)[0]
+                port = senses(position, **self.observed.get(i, {}))
+                step(chaser, self.now_s, port=port)
+
+    def fly_to(self, phase: str, i: int = 0, limit_s: float = 80.0) -> None:
+        begun_s = self.now_s
+        while self.phase(i) != phase:
+            assert self.now_s - begun_s < limit_s, f"still in phase {self.phase(i)}"
+            if phase == "contact" and self.phase(i) == "final":
+                self.observed[i] = {"contact": True}
+            if phase in ("latched", "verified") and self.phase(i) == "final":
+                self.observed[i] = {"latched": True}
+            self.fly(DT_S)

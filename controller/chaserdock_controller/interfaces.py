@@ -211,12 +211,14 @@ class RelativePose:
     """Estimated pose of a chaser relative to the target.
 
     position_m: (3,) origin of CRF in TRF. q_wxyz: (4,) CRF to TRF. covariance: (6, 6), order
-    (position in TRF axes, m; dtheta in CRF axes, rad).
+    (position in TRF axes, m; dtheta in CRF axes, rad). random_covariance: (6, 6), the part of it
+    that two times in one view do not share, of a latched chaser.
     """
 
     position_m: Array
     q_wxyz: Array
     covariance: Array
+    random_covariance: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

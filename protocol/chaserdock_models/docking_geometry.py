@@ -77,6 +77,14 @@ def centre_offset(port: PortGeometry, reach_m: float, gap_m: float) -> Array:
     return np.asarray(port.position_m) + np.asarray(port.axis) * (reach_m + gap_m)
 
 
+def corridors_apart(a: PortGeometry, b: PortGeometry, reach_m: float, entry_m: float) -> float:
+    """Return the least distance (m) between the centres of two chasers in their corridors, from the
+    port to ``entry_m`` before it.
+    """
+    ends = [centre_offset(port, reach_m, gap_m) for port in (a, b) for gap_m in (0.0, entry_m)]
+    return segments_apart(*ends)
+
+
 def axis_error_deg(port: PortGeometry, q_off_wxyz: Array) -> float:
     """Return the angle between a chaser's +X and the inward axis of its port; ``q_off_wxyz`` (4,)
     CRF to TRF.

@@ -10,6 +10,7 @@ true distance. The NMPC's kernel computes the same (nmpc/native/planes.c).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -127,3 +128,36 @@ def distance_between(
         return -np.inf
     line = line / apart_m
     return apart_m - reach_along(body, -line, pose[1]) - reach_along(body, line, other[1])
+
+
+def swept_distance(a: Array, b: Array, sweep_a_m: ArrayLike, sweep_b_m: ArrayLike) -> float:
+    """Return the least gap (m) between two bodies of cuboids while each moves along a line.
+
+    ``a``, ``b`` (C, 15): the bodies where they begin, in one frame. ``sweep_a_m``, ``sweep_b_m``
+    (3,): their displacements, which may be made at any time, so that each place of one may meet
+    each place of the other. The gap is negative exactly if two places overlap; where edges or
+    corners are nearest it may fall short of the true distance.
+
+    Both swept cuboids are zonotopes, and so is their Minkowski difference: its faces are spanned by
+    pairs of edges (P. McMullen, "On zonotopes", 1971).
+    """
+    sweeps = np.asarray(sweep_a_m, dtype=float) / 2.0, np.asarray(sweep_b_m, dtype=float) / 2.0
+    gaps = []
+    for one, other in product(a, b):
+        apart = one[:3] + sweeps[0] - other[:3] - sweeps[1]
+        boxes = (row[3:12].reshape(3, 3).T * row[12:, None] for row in (one, other))
+        edges = np.vstack([*boxes, sweeps])
+        gaps.append(_zonotope_distance(apart, edges))
+    return min(gaps)
+
+
+def _zonotope_distance(centre_m: Array, edges_m: Array) -> float:
+    """Return the gap (m) between the origin and a zonotope of half edges (E, 3) about a centre
+    (3,), along its best separating direction.
+    """
+    first, second = np.triu_indices(len(edges_m), 1)
+    faces = np.cross(edges_m[first], edges_m[second])
+    directions = np.vstack([faces, centre_m])
+    lengths = np.linalg.norm(directions, axis=1)
+    directions = directions[lengths > 0.0] / lengths[lengths > 0.0, None]
+    return float((np.abs(directions @ centre_m) - np.abs(directions @ edges_m.T).sum(axis=1)).max())

@@ -154,6 +154,7 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
         ({"docking": {"entry_m": 0.15}}, "its corridor begins"),
         ({"target": {"motion": "constant_rates"}}, "needs torque_free"),
         ({"docking": {"kind": "held"}, "success": {"latched": [0]}}, "chaser 0 has no port"),
+        ({"chaser": {"size_m": [140.0, 330.0, 330.0]}}, "chaser: probe_reach_m: the probe's tip"),
     ],
 )
 def test_a_docking_section_that_cannot_be_flown_is_refused(changes: dict, message: str) -> None:

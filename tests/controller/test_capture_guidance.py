@@ -11,52 +11,9 @@ import pytest
 from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.guidance.activities.docking import pull_N
 from chaserdock_controller.guidance.horizon import ReferenceBuilder
-from chaserdock_controller.guidance.phases import Trigger
 from chaserdock_controller.interfaces import RelativePose, TargetState
-from chaserdock_protocol.messages import OperatorCommand
-from docking_cases import scenario, senses
-from flight_cases import at, drain, fleet_of, order, step
-
-DT_S = 0.1
-
-
-class Pilot:
-    """Guidance with chasers that are always where their references are, unless stated otherwise."""
-
-    def __init__(self, chasers: int = 1, **changes: Any) -> None:
-        self.scenario = scenario(chasers, **changes)
-        self.guidance = fleet_of(self.scenario)
-        for chaser in self.guidance.chasers:
-            chaser.fire(Trigger.TARGET_ACQUIRED, 0.0)
-        self.now_s = 0.0
-        self.observed: dict[int, dict[str, Any]] = {}
-        self.fly(DT_S)
-
-    def phase(self, i: int = 0) -> str:
-        return self.guidance.chasers[i].phase
-
-    def ask(self, what: str, i: int = 0, **more: Any) -> tuple[bool, str]:
-        command = OperatorCommand(command=what, chaser=i, **more)  # type: ignore[arg-type]
-        answer = order(self.guidance, command, self.now_s)
-        return answer.accepted, answer.reason
-
-    def fly(self, seconds: float) -> None:
-        for _ in range(round(seconds / DT_S)):
-            self.now_s += DT_S
-            for i, chaser in enumerate(self.guidance.chasers):
-                position = at(chaser.state.move, self.now_s)[0]
-                port = senses(position, **self.observed.get(i, {}))
-                step(chaser, self.now_s, port=port)
-
-    def fly_to(self, phase: str, i: int = 0, limit_s: float = 80.0) -> None:
-        begun_s = self.now_s
-        while self.phase(i) != phase:
-            assert self.now_s - begun_s < limit_s, f"still in phase {self.phase(i)}"
-            if phase == "contact" and self.phase(i) == "final":
-                self.observed[i] = {"contact": True}
-            if phase in ("latched", "verified") and self.phase(i) == "final":
-                self.observed[i] = {"latched": True}
-            self.fly(DT_S)
+from docking_cases import DT_S, Pilot, senses
+from flight_cases import at, drain, step
 
 
 def test_all_phases_in_order_and_the_latch_armed_only_where_it_should_be() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.joint import JointEstimator, kernels
-from chaserdock_controller.estimation.joint.estimator import relative_poses
+from chaserdock_controller.estimation.joint.estimator import random_covariance, relative_poses
 from chaserdock_controller.estimation.joint.measurements import (
     linearize,
     measurement,
@@ -675,3 +675,16 @@ def test_relative_pose_has_the_covariance_of_its_errors() -> None:
     sample = np.cov(np.array(draws).T)
     scale = np.sqrt(np.outer(np.diag(pose.covariance), np.diag(pose.covariance)))
     np.testing.assert_allclose(sample / scale, pose.covariance / scale, atol=0.12)
+
+
+def test_random_covariance_is_that_of_a_pose_with_known_camera_and_view() -> None:
+    """The same as after an exact measurement of the errors that a latched chaser keeps."""
+    state, rng = random_state(9), np.random.default_rng(9)
+    a = rng.normal(size=(TARGET + 2 * CHASER,) * 2) * 1e-4
+    p = a @ a.T
+    h = np.eye(len(p))[TARGET + CHASER + 30 : TARGET + CHASER + 43]
+    gain = p @ h.T @ np.linalg.inv(h @ p @ h.T)
+    known = msgspec.structs.replace(state, covariance=p - gain @ h @ p)
+    expected = relative_poses(known, [1])[0].covariance
+    found = random_covariance(msgspec.structs.replace(state, covariance=p), 1)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-12)

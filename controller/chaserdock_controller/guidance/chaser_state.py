@@ -10,7 +10,7 @@ from typing import NamedTuple
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import CameraCalibration, Level, Odometry
 
-from chaserdock_controller.interfaces import PlanningFailure, TargetState
+from chaserdock_controller.interfaces import PlanningFailure, RelativePose, TargetState
 
 from .docking import DockingObservation
 from .escape import RelativeState
@@ -34,9 +34,9 @@ class ChaserGuidance:
 
     ``since_s``: simulated time at which the phase began. ``inside_since_s``: time since which the
     chaser is within its tolerances. ``attempt``: number of the docking attempt, from 1. ``held``:
-    position (3,) and attitude (4,) in TRF when the pull test began. ``faces``: the reference
-    attitude turns with the offset so that the chaser faces the target. ``turns``: the body flies
-    the calibration manoeuvre. ``stuck``: it is to back out, but its latch does not open.
+    its estimated pose in TRF when the pull test began. ``faces``: the reference attitude turns with
+    the offset so that the chaser faces the target. ``turns``: the body flies the calibration
+    manoeuvre. ``stuck``: it is to back out, but its latch does not open.
     ``search``: progress along the search pattern.
     """
 
@@ -46,7 +46,7 @@ class ChaserGuidance:
     inside_since_s: float | None = None
     then: NextMove = NextMove.NONE
     attempt: int = 1
-    held: tuple[Array, Array] | None = None
+    held: RelativePose | None = None
     faces: bool = False
     turns: bool = False
     stuck: bool = False

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.docking_geometry import PortView, centre_offset, segments_apart
+from chaserdock_models.docking_geometry import PortView, centre_offset
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.docking import Docking, Port
+
+from chaserdock_controller.interfaces import RelativePose
 
 _ENTERED_M = 0.02
 """A chaser this far behind the entry counts as in the corridor. With less, errors of the estimate
@@ -72,18 +74,13 @@ def dock_of(scenario: FlightScenario, chaser: int) -> Dock | None:
     return None if port is None else Dock(port, scenario.chaser.probe_reach_m, scenario.docking)
 
 
-def corridors_apart(a: Dock, b: Dock) -> float:
-    """Return the least distance (m) between the centre lines of two corridors."""
-    ends = [(d.offset(0.0), d.entry()) for d in (a, b)]
-    return segments_apart(*ends[0], *ends[1])
-
-
 @dataclass(frozen=True)
 class DockingObservation:
     """Estimated geometry of a chaser at its port, and state of its docking sensor.
 
-    ``offset_m`` (3,), ``q_wxyz`` (4,): estimated centre and attitude in TRF. ``sensed``: the sensor
-    has reported in this tick; otherwise ``latched`` is its last report.
+    ``offset_m`` (3,), ``q_wxyz`` (4,): estimated centre and attitude in TRF. ``covariance`` (6, 6):
+    of their changes in one view (``RelativePose.random_covariance``); zero if it is unknown.
+    ``sensed``: the sensor has reported in this tick; otherwise ``latched`` is its last report.
     """
 
     view: PortView
@@ -92,3 +89,11 @@ class DockingObservation:
     offset_m: Array
     q_wxyz: Array
     sensed: bool = True
+    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def pose(self) -> RelativePose:
+        """Return the estimated pose of the chaser relative to the target, with the covariance of
+        its changes.
+        """
+        return RelativePose(self.offset_m, self.q_wxyz, self.covariance)

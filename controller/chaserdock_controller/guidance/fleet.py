@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.docking_geometry import corridors_apart
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
 
@@ -15,7 +16,6 @@ from chaserdock_controller.interfaces import LogEntry
 from . import command_validation as validation
 from .chaser_machine import ChaserMachine
 from .chaser_state import ChaserTick, CommandResult, PhaseChange
-from .docking import corridors_apart
 from .moves import MovePlanner
 from .parameters import GUIDANCE
 from .phases import ATTACHED, Phase, Trigger
@@ -145,13 +145,14 @@ class ChaserFleet:
     def why_corridor_occupied(self, chaser: ChaserMachine) -> str:
         """Return which chaser blocks an approach to a port; empty if none does."""
         docking, active = self.scenario.docking, 0
-        clearance_m = self.scenario.limits.min_distance_chasers_m + GUIDANCE.corridor_margin_m
+        corridor = self.scenario.chaser.probe_reach_m, docking.entry_m
+        clearance_m = docking.corridor_margin_m + self.scenario.limits.min_distance_chasers_m
         assert chaser.dock is not None
         for other in self.others(chaser):
             aligning = other.phase is Phase.ALIGN
             if other.dock is None or not (aligning or other.in_corridor()):
                 continue
             active += other.phase not in ATTACHED
-            if corridors_apart(chaser.dock, other.dock) < clearance_m:
+            if corridors_apart(chaser.dock.port, other.dock.port, *corridor) < clearance_m:
                 return f"chaser {other.number} is in the way"
         return f"{active} are docking already" if active >= docking.at_once else ""

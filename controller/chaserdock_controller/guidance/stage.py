@@ -140,7 +140,15 @@ class GuidanceStage:
         view = view_of(dock.port, dock.reach_m, q_off, body_state(own), moving)
         contact = status is not None and status.contact
         pose = pose_in_target(target, own)
-        return DockingObservation(view, contact, estimate.latched, *pose, sensed=status is not None)
+        changes = None if estimate.relative is None else estimate.relative.random_covariance
+        return DockingObservation(
+            view,
+            contact,
+            estimate.latched,
+            *pose,
+            sensed=status is not None,
+            covariance=np.zeros((6, 6)) if changes is None else changes,
+        )
 
     def _relative(self, estimate: ChaserEstimate, target: TargetState) -> RelativeState | None:
         """Return a chaser's state relative to the target; None unless passive safety is

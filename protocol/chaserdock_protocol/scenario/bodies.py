@@ -270,6 +270,11 @@ def cuboid_inertia(
     return (mass_kg * (y + z) / 12, mass_kg * (x + z) / 12, mass_kg * (x + y) / 12)
 
 
+_LIGHTEST_KG = 1e-3
+"""Least mass of a chaser: newtons of thrust move a lighter one by more in a tick than filters bear.
+"""
+
+
 class Body(Section):
     """The body and actuators of every chaser."""
 
@@ -278,7 +283,7 @@ class Body(Section):
         description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters) or "
         "`tetra12` (12 thrusters). Its values replace the defaults below.",
     )
-    mass_kg: Positive = Field(default=30.0, description="Mass, kg.")
+    mass_kg: Positive = Field(default=30.0, description="Mass, kg. At least 1 g.")
     size_m: PositiveVector = Field(
         default=(0.25, 0.25, 0.05), description="Edges of the body's cuboid (CRF), m."
     )
@@ -335,6 +340,15 @@ class Body(Section):
     def _check_consistent(self) -> Body:
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
+        if self.mass_kg < _LIGHTEST_KG:
+            raise ValueError(f"mass_kg: must be at least {_LIGHTEST_KG:g} (got {self.mass_kg:g})")
+        front_m = self.size_m[0] / 2.0
+        if self.probe_reach_m <= front_m:
+            raise ValueError(
+                f"probe_reach_m: the probe's tip, {self.probe_reach_m:g} m from the centre, is "
+                f"within the body, whose front is at {front_m:g} m; make probe_reach_m longer than "
+                f"that, or size_m[0] shorter than {2.0 * self.probe_reach_m:g} m"
+            )
         if self.actuation == "thrusters":
             check_layout(self.thrusters, self.wrench_max)
         return self

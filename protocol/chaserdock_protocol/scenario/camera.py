@@ -13,7 +13,7 @@ from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
 from chaserdock_models.lenses import LensModel
 from pydantic import Field, model_validator
 
-from .fields import Fraction, NotNegative, Number, Positive, Section, Vector
+from .fields import Fraction, NotNegative, Number, Positive, Section, Vector, is_zero
 
 SidePixels = Annotated[int, Field(ge=64, le=4096)]
 _LEAST_SHARE = 0.5
@@ -38,8 +38,12 @@ class Effects(Section):
         description="Grey level that the brightest hundredth of each image is exposed to, in "
         "place of `gain`, by a factor of 1/8 to 8. 0: off.",
     )
-    point_spread_px: NotNegative = Field(
-        default=0.6, description="Standard deviation of the lens' Gaussian blur, pixels."
+    point_spread_px: float = Field(
+        default=0.6,
+        ge=0,
+        le=20,
+        allow_inf_nan=False,
+        description="Standard deviation of the lens' Gaussian blur, pixels.",
     )
     read_noise: NotNegative = Field(
         default=1.5, description="Standard deviation of the read noise, grey levels."
@@ -184,7 +188,7 @@ class EarthSection(Section):
 
     @model_validator(mode="after")
     def _check_direction(self) -> EarthSection:
-        if not any(self.direction):
+        if is_zero(self.direction):
             raise ValueError("direction must not be zero")
         return self
 
@@ -261,7 +265,7 @@ class CameraSection(FlightCamera):
 
     @model_validator(mode="after")
     def _check_section(self) -> CameraSection:
-        if not any(self.sun_direction):
+        if is_zero(self.sun_direction):
             raise ValueError("sun_direction must not be zero")
         if self.calibration is not None:
             raise ValueError("calibration is resolved in scenario files only; give intrinsics")

@@ -14,11 +14,17 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
-from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
+from chaserdock_models.docking_geometry import axis_error_deg, centre_offset, corridors_apart
 from chaserdock_models.meshes import mass_properties
 from chaserdock_models.port_load import CarriedBody, tumble_load
 from chaserdock_models.satellites import satellite_names
-from chaserdock_models.shape_distance import box_table, distance_between, distance_from_cuboids
+from chaserdock_models.shape_distance import (
+    box_table,
+    distance_between,
+    distance_from_cuboids,
+    moved,
+    swept_distance,
+)
 from chaserdock_models.wrench_set import wrench_matrix
 from numpy.typing import ArrayLike
 
@@ -29,6 +35,7 @@ from .thrusters import check_pulses, thrusts_max
 
 if TYPE_CHECKING:
     from . import FlightScenario, Scenario
+    from .docking import Port
     from .schema import TimelineEntry
     from .target import Geometry
 
@@ -553,8 +560,6 @@ def _check_capture(scenario: FlightScenario) -> None:
             f"target.motion: docking by capture needs torque_free, which contact forces can move, "
             f"not {scenario.target.motion}"
         )
-    if scenario.chaser.probe_reach_m <= scenario.chaser.size_m[0] / 2:
-        raise ValueError("chaser.probe_reach_m: the probe must reach beyond the body's front")
     nearest_m = scenario.limits.min_distance_target_m
     for k, port in enumerate(scenario.docking.ports):
         entry_m = math.hypot(
@@ -573,3 +578,107 @@ def _check_capture(scenario: FlightScenario) -> None:
                 "degrees off the "
                 "axis into the port; change the attitude of the chaser or the axis"
             )
+    for (k, a), (n, b) in combinations(enumerate(scenario.docking.ports), 2):
+        if _at_once(scenario, a.chaser, b.chaser):
+            _check_ports_apart(scenario, (k, a), (n, b))
+
+
+_LEAVING = ("retreat", "abort", "goto")
+"""Commands by which a chaser leaves its port, and so frees it for others."""
+_FARTHEST_PORT_M = 100.0
+"""Distance between ports at which the search for the least one ends: no target is that large."""
+
+
+def _at_once(scenario: FlightScenario, *chasers: int) -> bool:
+    """Return whether two chasers may be at their ports at the same time.
+
+    The timeline may let one leave before the other comes. A chaser that it does not command to
+    approach may be commanded by an operator at any time.
+    """
+    stays: list[list[tuple[float, float]]] = []
+    for i in chasers:
+        own = sorted((e for e in scenario.timeline if i in e.chasers), key=lambda e: e.at_s)
+        stays.append(
+            [
+                (
+                    entry.at_s,
+                    next((e.at_s for e in own[k:] if e.command in _LEAVING), math.inf),
+                )
+                for k, entry in enumerate(own)
+                if entry.command == "approach"
+            ]
+            or [(0.0, math.inf)]
+        )
+    return any(a < other_end and b < end for a, end in stays[0] for b, other_end in stays[1])
+
+
+def _check_ports_apart(
+    scenario: FlightScenario, one: tuple[int, Port], other: tuple[int, Port]
+) -> None:
+    """Check that the corridors and bodies of two chasers at their ports keep their distances."""
+    (k, a), (n, b) = one, other
+    if not (fault := _ports_fault(scenario, a, b)):
+        return
+    apart_m = math.dist(a.position_m, b.position_m)
+    least_m = _least_port_distance_m(scenario, a, b) if apart_m > 0.0 else math.inf
+    need = "" if math.isinf(least_m) else f", must be at least {least_m:g} m apart"
+    raise ValueError(
+        f"docking.ports.{k} and docking.ports.{n}, {apart_m:.3g} m apart{need}: {fault}"
+    )
+
+
+def _least_port_distance_m(scenario: FlightScenario, a: Port, b: Port) -> float:
+    """Return the least distance (m, rounded up to 1 mm) of a port ``b`` from ``a``, in its
+    direction, without a fault; infinite if there is none of at most ``_FARTHEST_PORT_M``.
+    """
+    start = np.array(a.position_m)
+    apart_m = math.dist(a.position_m, b.position_m)
+    direction = (np.array(b.position_m) - start) / apart_m
+
+    def fits(distance_m: float) -> bool:
+        x, y, z = (start + direction * distance_m).tolist()
+        return not _ports_fault(scenario, a, b.model_copy(update={"position_m": (x, y, z)}))
+
+    low, high = apart_m, 2.0 * apart_m
+    while not fits(high):
+        if high > _FARTHEST_PORT_M:
+            return math.inf
+        low, high = high, 2.0 * high
+    while high - low > 1e-5:
+        middle = (low + high) / 2.0
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return math.ceil(high * 1e3) / 1e3
+
+
+def _ports_fault(scenario: FlightScenario, a: Port, b: Port) -> str:
+    """Return how two chasers at their ports are too near to one another, or empty."""
+    docking, reach_m = scenario.docking, scenario.chaser.probe_reach_m
+    body = box_table(scenario.chaser.boxes())
+    places = [centre_offset(port, reach_m, 0.0) for port in (a, b)]
+    turns = [scenario.chasers[port.chaser].q_wxyz for port in (a, b)]
+    first, second = moved(body, places, turns)
+    ways = [np.asarray(port.axis) * docking.entry_m for port in (a, b)]
+    room_m = docking.corridor.lateral_m
+    if docking.at_once > 1:
+        gap_m = swept_distance(first, second, ways[0], ways[1])
+    else:  # one is latched while the other comes
+        gap_m = min(
+            swept_distance(first, second, ways[0], np.zeros(3)),
+            swept_distance(first, second, np.zeros(3), ways[1]),
+        )
+    who = f"chasers {a.chaser} and {b.chaser}"
+    if gap_m < room_m:
+        return (
+            f"the bodies of {who} in their corridors "
+            + (f"overlap by {-gap_m:.3g} m" if gap_m < 0.0 else f"come within {gap_m:.3g} m")
+            + f", and need {room_m:g} m (docking.corridor.lateral_m)"
+        )
+    centres_m = corridors_apart(a, b, reach_m, docking.entry_m)
+    limit_m = scenario.limits.min_distance_chasers_m
+    if centres_m < limit_m + docking.corridor_margin_m:
+        return (
+            f"the centres of {who} in their corridors come within {centres_m:.3g} m, nearer than "
+            f"limits.min_distance_chasers_m ({limit_m:g} m) and {docking.corridor_margin_m:g} m "
+            "allow; the second would wait as long as the first stays"
+        )
+    return ""

@@ -122,6 +122,10 @@ class Docking(Section):
     """Longest last part, s: about twice 0.13 m, with the overdrive, at 0.01 m/s."""
     contact_timeout_s: ClassVar[float] = 5.0
     """Longest contact without a latch, s: some rebounds of the probe of 1 cm at 0.01 m/s."""
+    corridor_margin_m: ClassVar[float] = 0.1
+    """A chaser waits if its corridor comes nearer to one in use, between body centres, than the
+    least distance between chasers and this, m: both may be 0.03 m off (`corridor.lateral_m`), and
+    need some cm to brake."""
     settle_s: ClassVar[float] = 2.0
     """Wait between the latch and the pull test, s: 30 ticks of the default rate for estimates."""
     pull_s: ClassVar[float] = 1.0

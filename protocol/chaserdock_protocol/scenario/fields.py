@@ -22,6 +22,11 @@ from pydantic import (
 LARGEST = 1e12
 """Bound on the magnitude of every number, so that squares and products of values stay finite."""
 
+SMALLEST = 1e-12
+"""Least positive number, so that squares, products and inverses of values stay above zero and
+finite. Vectors shorter than this are zero.
+"""
+
 # Normalization leaves an error of at most 1.5 epsilon. A quaternion within this tolerance is kept
 # to the bit: the resolved scenario is validated again by every process, and a second normalization
 # could change the last bit.
@@ -50,8 +55,19 @@ def _unit_vector(v: tuple[float, float, float]) -> tuple[float, float, float]:
     return (v[0] / length, v[1] / length, v[2] / length)
 
 
+def is_zero(v: tuple[float, ...]) -> bool:
+    """Return whether a vector is zero, and so has no direction."""
+    return math.hypot(*v) < SMALLEST
+
+
+def _not_tiny(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"must be at least {SMALLEST:g}")
+    return value
+
+
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False), AfterValidator(_not_tiny)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Index = Annotated[int, Field(ge=0)]

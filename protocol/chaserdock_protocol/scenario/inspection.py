@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from .fields import Positive, Section, Vector
+from .fields import Positive, Section, Vector, is_zero
 
 
 class Inspection(Section):
@@ -27,6 +27,6 @@ class Inspection(Section):
 
     @model_validator(mode="after")
     def _check_axis(self) -> Inspection:
-        if not any(self.axis):
+        if is_zero(self.axis):
             raise ValueError("axis must not be zero")
         return self

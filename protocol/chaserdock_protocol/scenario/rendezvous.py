@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from .fields import Index, NotNegative, Positive, Section, Vector
+from .fields import Index, NotNegative, Positive, Section, Vector, is_zero
 
 
 class SpeedLimit(Section):
@@ -41,7 +41,7 @@ class ConeLimit(Section):
 
     @model_validator(mode="after")
     def _check_axis(self) -> ConeLimit:
-        if not any(self.axis):
+        if is_zero(self.axis):
             raise ValueError("axis: must not be 0")
         return self
 

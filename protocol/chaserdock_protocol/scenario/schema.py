@@ -24,6 +24,7 @@ from .fields import (
     Section,
     UnitQuaternion,
     Vector,
+    is_zero,
 )
 
 MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
@@ -314,7 +315,7 @@ class FlightChaser(Oriented):
 
     @model_validator(mode="after")
     def _check_position(self) -> FlightChaser:
-        if not any(self.position_m):
+        if is_zero(self.position_m):
             raise ValueError(
                 "position_m must not be the target's origin: the approach line begins there"
             )

@@ -47,6 +47,7 @@ from .state import (
     TARGET,
     TURN,
     VELOCITY,
+    VIEW,
     JointState,
     block,
     with_body,
@@ -177,6 +178,9 @@ class JointEstimator(Estimator):
         if s is None:
             return ()
         relative, cameras = self.relative_poses(), self.cameras()
+        for i, pose in relative.items():
+            if inputs.chasers[i].latched:
+                relative[i] = dataclasses.replace(pose, random_covariance=random_covariance(s, i))
         return tuple(
             ChaserMotion(
                 i,
@@ -282,7 +286,33 @@ def relative_poses(s: JointState, chasers: Sequence[int]) -> list[RelativePose]:
     in CRF.
     """
     rows = _pose_rows(tuple(chasers))
-    rt, n = so3.to_matrix(s.q_wxyz), len(rows)
+    places, j = _relative_jacobians(s, chasers)
+    covariances = j @ s.covariance[rows[:, :, None], rows[:, None, :]] @ j.transpose(0, 2, 1)
+    return [
+        RelativePose(place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)
+        for i, place, covariance in zip(chasers, places, covariances, strict=True)
+    ]
+
+
+def random_covariance(s: JointState, chaser: int) -> Array:
+    """Return the covariance (6, 6) of a chaser's pose relative to the target given the errors that
+    persist while its view stays the same: those of its camera and of the view.
+
+    Between two times in one view these errors cancel. Axes as in ``RelativePose``.
+    """
+    rows, start = _pose_rows((chaser,))[0], block(chaser).start
+    kept = start + np.arange(TURN.start, VIEW.stop)
+    j = _relative_jacobians(s, (chaser,))[1][0]
+    p, shared = s.covariance, j @ s.covariance[rows[:, None], kept]
+    own = np.linalg.pinv(p[kept[:, None], kept], rcond=1e-12, hermitian=True)
+    return j @ p[rows[:, None], rows] @ j.T - shared @ own @ shared.T
+
+
+def _relative_jacobians(s: JointState, chasers: Sequence[int]) -> tuple[list[Array], Array]:
+    """Return the centres (3,) of chasers in TRF, and the derivatives (n, 6, 12) of their relative
+    poses by the poses of target and chaser.
+    """
+    rt, n = so3.to_matrix(s.q_wxyz), len(chasers)
     c = np.array([so3.matrix_components(*s.attitudes_wxyz[i].tolist()) for i in chasers]).reshape(
         n, 3, 3
     )
@@ -292,8 +322,4 @@ def relative_poses(s: JointState, chasers: Sequence[int]) -> list[RelativePose]:
     j[:, 3:6, 3:6] = -(c.transpose(0, 2, 1) @ rt)
     for row, place in enumerate(places):
         j[row, 0:3, 3:6] = so3.skew(place)
-    covariances = j @ s.covariance[rows[:, :, None], rows[:, None, :]] @ j.transpose(0, 2, 1)
-    return [
-        RelativePose(place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)
-        for i, place, covariance in zip(chasers, places, covariances, strict=True)
-    ]
+    return places, j

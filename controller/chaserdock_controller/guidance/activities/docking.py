@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 
 from chaserdock_controller.interfaces import DirectCommand
@@ -16,6 +15,7 @@ from ..chaser_machine import Activity, ChaserMachine, pull
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
 from ..docking import Dock, DockingObservation
 from ..fleet import ChaserFleet
+from ..latch_test import motion_between, why_untold
 from ..parameters import GUIDANCE
 from ..phases import CORRIDOR, Phase, Trigger
 from ..trajectories import Glide, glide, stay, stop
@@ -89,7 +89,7 @@ class DockingActivity(Activity):
                 inside = not seen.view.fault(docking.corridor, docking.corridor.closing_m_s)
                 chaser.state = replace(state, inside_since_s=state.inside_since(inside, now_s))
             case Phase.LATCHED if state.held is None and now_s - state.since_s >= docking.settle_s:
-                chaser.state = replace(state, held=(seen.offset_m, seen.q_wxyz))
+                chaser.state = replace(state, held=seen.pose)
             case _:
                 pass
         if seen.latched and state.phase in CORRIDOR:
@@ -195,15 +195,15 @@ def _check_latched(chaser: ChaserMachine, seen: DockingObservation, now_s: float
     state, docking = chaser.state, chaser.scenario.docking
     if (outcome := check_latch(chaser, seen, now_s)) is not None or state.held is None:
         return outcome
-    offset, q = state.held
-    moved_m = float(np.linalg.norm(seen.offset_m - offset))
-    turned_deg = float(np.degrees(rotations.angle_between(q, seen.q_wxyz)))
-    reason = f"moved {moved_m * 1e3:.2f} mm and {turned_deg:.2f} deg under the pull"
-    if moved_m > docking.verify_position_m or turned_deg > docking.verify_angle_deg:
+    motion = motion_between(state.held, seen.pose, chaser.scenario)
+    reason = f"{motion} under the pull"
+    if motion.exceeded:
         return _failed(reason)
-    if now_s - state.since_s >= docking.settle_s + 2.0 * docking.pull_s:
-        return Trigger.PULL_WITHSTOOD, reason
-    return None
+    if now_s - state.since_s < docking.settle_s + 2.0 * docking.pull_s:
+        return None
+    if untold := why_untold(state.held, seen.pose, chaser.scenario):
+        return _failed(untold)
+    return Trigger.PULL_WITHSTOOD, reason
 
 
 def check_latch(chaser: ChaserMachine, seen: DockingObservation, now_s: float) -> _Outcome:

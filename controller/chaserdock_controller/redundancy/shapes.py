@@ -46,7 +46,7 @@ from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.guidance.pointing import SearchProgress
 from chaserdock_controller.guidance.trajectories import Circuit, Escape, Glide, Move, Part
 from chaserdock_controller.ingest.odometry_validation import Known
-from chaserdock_controller.interfaces import AppliedImpulse, ChaserPlan
+from chaserdock_controller.interfaces import AppliedImpulse, ChaserPlan, RelativePose
 from chaserdock_controller.parameters import nmpc_parameters
 
 Size = int | str
@@ -70,7 +70,13 @@ ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {
     Circuit: {"from_m": (_3,), "axis": (_3,)},
     ChaserGuidance: {"held": (_3, _4)},
     SearchProgress: {"q_start_wxyz": (_4,)},
-    DockingObservation: {"offset_m": (_3,), "q_wxyz": (_4,)},
+    DockingObservation: {"offset_m": (_3,), "q_wxyz": (_4,), "covariance": ((6, 6),)},
+    RelativePose: {
+        "position_m": (_3,),
+        "q_wxyz": (_4,),
+        "covariance": ((6, 6),),
+        "random_covariance": ((6, 6),),
+    },
     ChaserPlan: {"states": (("stages+1", 13),), "inputs": (("stages", 6),)},
     StackPlan: {"thrusts_N": (("steps", "stack"),), "remaining": (_6,)},
     ActivePlan: {"limits_N": (("stack",),)},

@@ -39,7 +39,6 @@ from chaserdock_controller.estimation.joint.state import (
 from chaserdock_controller.estimation.paper import SightedTarget
 from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_controller.estimation.types import MeasuredChaser, Shock
-from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.detumble.planning import StackPlan, StackProblem
 from chaserdock_controller.guidance.docking import DockingObservation
@@ -68,7 +67,6 @@ ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {
     Glide: {"from_m": (_3,), "along": (_3,)},
     Escape: {"state": (_6,), "acceleration_m_s2": (_3,)},
     Circuit: {"from_m": (_3,), "axis": (_3,)},
-    ChaserGuidance: {"held": (_3, _4)},
     SearchProgress: {"q_start_wxyz": (_4,)},
     DockingObservation: {"offset_m": (_3,), "q_wxyz": (_4,), "covariance": ((6, 6),)},
     RelativePose: {

@@ -3,17 +3,19 @@
 ...]``.
 
 Avoidance, swaps, clutter and tracking in one process; the cost of distances and of orbital motion
-in the plan; allocation, pulses and failures of thrusters. `benchmarks/nmpc.py` times the solver.
+in the plan; allocation, pulses and failures of thrusters; other rates of ticks and carriers.
+`benchmarks/nmpc.py` times the solver.
 """
 
 from common import main
-from parts import closed_loop, orbit_solve, shape_distance, thrusters
+from parts import closed_loop, orbit_solve, rates, shape_distance, thrusters
 
 GROUPS = (
     closed_loop.GROUP,
     shape_distance.GROUP,
     orbit_solve.GROUP,
     thrusters.GROUP,
+    rates.GROUP,
 )
 
 if __name__ == "__main__":

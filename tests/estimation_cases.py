@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_controller.estimation.types import Estimate, EstimatorInputs, MeasuredChaser
-from chaserdock_controller.interfaces import TargetState
+from chaserdock_controller.interfaces import AppliedImpulse, TargetState
 from chaserdock_models import rotations as rot
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.codec import vector
@@ -87,7 +87,7 @@ def see(
 def inputs_of(time_ns: int, seen: Iterable[Seen]) -> EstimatorInputs:
     """The inputs of a tick; what was measured before it arrives late."""
     seen = list(seen)
-    chasers = [MeasuredChaser(i, np.zeros(6)) for i in range(4)]
+    chasers = [MeasuredChaser(i, AppliedImpulse.steady(np.zeros(6))) for i in range(4)]
     for o, _ in seen:
         field = "odometry" if o.sim_time_ns == time_ns else "outdated"
         chasers[o.chaser] = replace(chasers[o.chaser], **{field: o})

@@ -13,6 +13,7 @@ import numpy as np
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
 from chaserdock_controller.estimation.joint.parameters import SightingNoise, TargetParameters
 from chaserdock_controller.estimation.types import EstimatorInputs, MeasuredChaser
+from chaserdock_controller.interfaces import AppliedImpulse
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
@@ -103,7 +104,8 @@ class SyntheticFlight:
         odometry = [self._odometry(i) for i in range(self.n)]
         sightings = tuple(self._sighting(i) for i in range(self.n))
         chasers = tuple(
-            MeasuredChaser(i, self.impulses[i].copy(), odometry[i]) for i in range(self.n)
+            MeasuredChaser(i, AppliedImpulse.steady(self.impulses[i].copy()), odometry[i])
+            for i in range(self.n)
         )
         return EstimatorInputs(self.time_ns, PERIOD_S, chasers, sightings)
 

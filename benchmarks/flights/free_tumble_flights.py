@@ -24,6 +24,7 @@ from chaserdock_controller.bodies.mass_properties import (
 from chaserdock_controller.estimation.composite_body import stated_properties
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters, parameters_of
 from chaserdock_controller.estimation.types import EstimatorInputs, MeasuredChaser
+from chaserdock_controller.interfaces import AppliedImpulse
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
@@ -142,7 +143,7 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
         measured = tuple(
             MeasuredChaser(
                 i,
-                _impulse(scenario, (before or own)[i], own[i]),
+                AppliedImpulse.steady(_impulse(scenario, (before or own)[i], own[i])),
                 odometry_of(sensor, i, own[i], tick, now_ns),
             )
             for i in chasers

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -36,6 +37,8 @@ _LIFT_M = 0.08
 what is behind them, where depths of centres alone err. Larger: plates cover what is in front of
 them.
 """
+_WIDEST_RAD = math.radians(75.0)
+"""Largest angle of the drawn field of view from the optical axis: a pyramid cannot show more."""
 _FACET_M = 0.02
 """Largest deviation of the drawn facets of a satellite from its curved surfaces."""
 
@@ -202,20 +205,10 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
         chaser += _probe(front, body.probe_reach_m)
 
     camera = scenario.camera_model()
-    edges = (
-        (0, 0),
-        (camera.width_px, 0),
-        (camera.width_px, camera.height_px),
-        (0, camera.height_px),
-    )
-
+    left, top, right, bottom = (math.tan(min(a, _WIDEST_RAD)) for a in camera.angles_to_borders())
     rays = [
-        [
-            (u - camera.cx_px) / camera.fx_px * view_m,
-            (v - camera.cy_px) / camera.fy_px * view_m,
-            view_m,
-        ]
-        for u, v in edges
+        [x * view_m, y * view_m, view_m]
+        for x, y in ((-left, -top), (right, -top), (right, bottom), (-left, bottom))
     ]
 
     origin = np.array(camera.position_crf_m)

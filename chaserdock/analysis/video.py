@@ -123,7 +123,7 @@ def frames(
     simulated time within ``part_s``.
     """
     number = len(flight.scenario.chasers)
-    camera = flight.scenario.camera
+    camera = flight.scenario.camera_model()
     aspect = camera.width_px / camera.height_px
     columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
     rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
@@ -148,7 +148,8 @@ def frames(
 
 
 def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: int) -> BgrImage:
-    height = round(width_px * flight.scenario.camera.height_px / flight.scenario.camera.width_px)
+    camera = flight.scenario.camera_model()
+    height = round(width_px * camera.height_px / camera.width_px)
     status = "no image yet"
     if pair is not None:
         try:

@@ -8,11 +8,14 @@ import sys
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .options import JsonOpt, SetOpt, complete_scenario, fail, print_result, refuse_options
+
+if TYPE_CHECKING:
+    from chaserdock.datasets.types import Selection
 
 
 class LayoutOption(StrEnum):
@@ -48,8 +51,8 @@ def dataset(
     source: Annotated[
         str,
         typer.Argument(
-            help="folder of a dataset (ours, or in the SPEED+ or BOP format) to score a perception "
-            "on; with --out: scenario whose target is drawn",
+            help="folder of a dataset (ours, or SPEED, SPEED+ or BOP) to score a perception on; "
+            "with --out: scenario whose target is drawn",
             autocompletion=complete_scenario,
         ),
     ],
@@ -111,8 +114,22 @@ def dataset(
         ),
     ] = None,
     split: Annotated[
-        SplitOption, typer.Option(help="scoring: part of the dataset")
-    ] = SplitOption.validation,
+        SplitOption | None,
+        typer.Option(
+            help="scoring: part of the dataset; by default validation, or train without it"
+        ),
+    ] = None,
+    domain: Annotated[
+        str | None,
+        typer.Option(
+            help="scoring: kind of images: synthetic (the default), lightbox or sunlamp of SPEED+, "
+            "synthetic or real of SPEED, a folder of BOP such as train_pbr"
+        ),
+    ] = None,
+    object: Annotated[
+        int | None,
+        typer.Option(min=0, help="scoring: number of the target in BOP scenes of several objects"),
+    ] = None,
     as_json: JsonOpt = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
 ) -> None:
@@ -122,9 +139,13 @@ def dataset(
     if out is None:
         drawing = ("layout", "seed", "range_m", "offset", "phase", "validation", "overrides")
         refuse_options(context, drawing, "only with --out")
-        _score(Path(source), name, scenario, split, images, as_json, quiet)
+        from chaserdock.datasets.types import Selection
+
+        wanted = Selection(domain, object, None if split is None else split.value)
+        _score(Path(source), name, scenario, wanted, images, as_json, quiet)
         return
-    refuse_options(context, ("name", "scenario", "split", "as_json"), "not with --out")
+    scoring = ("name", "scenario", "split", "domain", "object", "as_json")
+    refuse_options(context, scoring, "not with --out")
     if images is None:
         raise fail("--images: needed with --out")
 
@@ -150,7 +171,7 @@ def _score(
     folder: Path,
     name: str | None,
     scenario: str | None,
-    split: SplitOption,
+    wanted: Selection,
     images: int | None,
     as_json: bool,
     quiet: bool,
@@ -162,14 +183,13 @@ def _score(
     from chaserdock.datasets.evaluation import perception_of, score_perception
     from chaserdock.datasets.reading import read_dataset
 
-    data, flight = read_dataset(folder)
+    data, flight = read_dataset(folder, wanted)
     if scenario is not None:
         flight = flight_scenario(load_scenario(find_scenario(scenario)))
     if flight is None:
         raise fail(f"{folder}: states no target; give --scenario with the geometry of the target")
-    chosen = data.of_split(None if split is SplitOption.all else split.value)[:images]
-    if not chosen:
-        raise fail(f"{folder}: has no images in the split {split.value}; give another --split")
+    chosen = data.images[:images]
+    split = wanted.split or chosen[0].split
     method = perception_of(name, flight, data.camera)
     progress = _show_progress("image", len(chosen), quiet or as_json)
     figures = score_perception(method, chosen, data.camera, data.shape, progress)
@@ -177,15 +197,19 @@ def _score(
     facts = {
         "dataset": str(folder),
         "format": data.layout,
-        "split": split.value,
+        "domain": data.domain,
+        "object": data.object,
+        "split": split,
         "perception": used,
     }
+    parts = (data.layout, data.domain, split, data.object and f"object {data.object}")
+    title = f"{used} on {folder} ({', '.join(str(p) for p in parts if p)})"
     # JSON has no NaN: figures without a single pose are null.
     values = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in figures.items()}
     print_result(
         as_json,
         facts | values,
-        _table(f"{used} on {folder} ({data.layout}, {split.value})", figures),
+        _table(title, figures),
     )
 
 

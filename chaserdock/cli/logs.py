@@ -126,25 +126,17 @@ def _export(
 
 
 def _recover(log: list[Path], out: Path, as_json: bool) -> None:
-    """Copy what is readable; exit with status 1 when messages in the middle of the log are lost."""
+    """Copy what is readable; exit with status 1 when anything is known to be lost."""
     import msgspec
 
-    from chaserdock.logs.recover import recover
+    from chaserdock.logs.recover import loss_lines, recover
 
     if len(log) > 1:
         raise fail("--recover: needs one log")
     result = recover(log[0], out)
     lines = [f"{out}: {result.messages} messages in {result.chunks} chunks recovered"]
-    if result.skipped_bytes:
-        lines.append(f"{result.skipped_bytes} bytes are not readable")
-    lost = result.broken_records or result.messages_without_channel
-    if lost:
-        lines.append(
-            f"lost: {result.broken_records} damaged records, {result.messages_without_channel} "
-            "messages whose channel is declared in one of them"
-        )
-    print_result(as_json, msgspec.to_builtins(result), lines)
-    raise typer.Exit(1 if lost else 0)
+    print_result(as_json, msgspec.to_builtins(result), lines + loss_lines(result))
+    raise typer.Exit(0 if result.complete else 1)
 
 
 @with_link_options("keys", "lease")

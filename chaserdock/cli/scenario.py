@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,10 +109,13 @@ def scenario(
         _write_new(_only(names))
     elif show or changes:
         from chaserdock_protocol.scenario import load_scenario
+        from chaserdock_protocol.scenario.camera import lens_note
         from chaserdock_protocol.shipped_scenarios import find_scenario
 
         loaded = load_scenario(find_scenario(_only(names)), tuple(overrides or ()))
         print(as_toml(loaded, changes), end="")
+        if note := lens_note(loaded.camera_model()):
+            print(f"note: {note}", file=sys.stderr)
     else:
         _check(names, tuple(overrides or ()))
 
@@ -152,6 +156,7 @@ def _list_shipped(as_json: bool) -> None:
 def _check(names: list[str], overrides: tuple[str, ...]) -> None:
     """Print whether each scenario is valid; exit with status 2 if one is not."""
     from chaserdock_protocol.scenario import load_scenario
+    from chaserdock_protocol.scenario.camera import lens_note
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
     failed = False
@@ -165,6 +170,8 @@ def _check(names: list[str], overrides: tuple[str, ...]) -> None:
             number = len(found.chasers)
             chasers = "1 chaser" if number == 1 else f"{number} chasers"
             print(f"{file}: valid: {found.name}, {chasers}, {found.duration_s:g} s")
+            if note := lens_note(found.camera_model()):
+                print(f"{file}: note: {note}")
     if failed:
         raise typer.Exit(BAD_INPUT)
 

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layout of BOP datasets (T. Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", 2018;
-docs of bop_toolkit), grey.
+"""The layout of BOP datasets (T. Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation",
+2018; docs of bop_toolkit).
 
-Lengths are in millimetres; rotations, from the model to the camera, row-wise. Each split is a
-scene. There are no depth images.
+Lengths are in millimetres, rotations row-wise from the model to the camera. Written: one grey scene
+per split with one object, no depth images. Read: any scenes, of which one object is selected.
 """
 
 from __future__ import annotations
 
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,33 @@ import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.camera import Camera
+from chaserdock_models.camera import Camera, focal_and_centre
 from chaserdock_models.meshes import TriangleMesh
 from numpy.typing import NDArray
 
 from .json_files import numbers, read_object, write_json
 from .model_files import OBJECT, read_models, write_models
-from .types import DatasetError, LabelledDataset, LabelledImage, PoseLabel, Split, TargetShape
+from .types import (
+    DatasetError,
+    LabelledDataset,
+    LabelledImage,
+    PoseLabel,
+    Selection,
+    Split,
+    TargetShape,
+    check_camera,
+    read_pixels,
+)
 from .views import ViewImage
 
 _SCENE = "000000"
 _FOLDERS: dict[Split, str] = {"train": "train", "validation": "val"}
+_SPLITS: dict[str, Split] = {"train": "train", "val": "validation", "test": "validation"}
+_LABELS = "scene_gt.json"
 _IMAGE_FOLDERS = ("gray", "rgb")
+_MODEL_FOLDERS = ("models", "models_eval", "models_cad", "models_reconst")
+_LEAST_VISIBLE_SHARE = 0.1  # of an instance; the BOP challenges score none that shows less
+_EVERYTHING = Selection()
 
 
 class BopWriter:
@@ -41,7 +57,7 @@ class BopWriter:
     def __init__(
         self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape
     ) -> None:
-        check_camera(camera)
+        check_camera(camera, "bop")
         self._folder, self._camera = folder, camera
         write_models(mesh, shape, folder / "models")
         shutil.copytree(folder / "models", folder / "models_eval")
@@ -88,15 +104,6 @@ class BopWriter:
                 write_json(self._folder / _FOLDERS[split] / _SCENE / f"{name}.json", rows)
 
 
-def check_camera(camera: Camera) -> None:
-    """Raise DatasetError for a camera with lens distortion."""
-    if camera.distortion:
-        raise DatasetError(
-            "camera.intrinsics.distortion: the BOP format has no lens distortion; use --format "
-            "speed+, or a camera without it"
-        )
-
-
 def _info(image: ViewImage) -> dict[str, Any]:
     everything, visible = int(image.silhouette.sum()), int(image.visible.sum())
     return {
@@ -120,70 +127,158 @@ def _box(mask: NDArray[np.bool_], margin_px: tuple[int, int]) -> list[int]:
     return [left, top, int(columns[-1] - columns[0]) + 1, int(rows[-1] - rows[0]) + 1]
 
 
-def read_bop(folder: Path) -> LabelledDataset:
-    """Return a BOP dataset with one instance of one object per image. Raises DatasetError.
-
-    ``val`` and ``test`` count as validation. All images must have one camera.
+def domains_of(folder: Path) -> list[str]:
+    """Return the domains of a dataset in the layout of BOP: folders of scenes with labels, such as
+    ``test`` or ``train_pbr``.
     """
-    models = folder / "models"
-    shape = read_models(models) if models.is_dir() else None
-    general = read_object(folder / "camera.json")
-    size = tuple(
-        int(numbers(folder / "camera.json", general, key, ())) for key in ("width", "height")
+    return sorted(
+        {
+            file.parent.parent.name
+            for file in folder.glob(f"*/[0-9]*/{_LABELS}")
+            if _split_of(file.parent.parent.name) is not None
+        }
     )
-    images: list[LabelledImage] = []
-    matrices: list[Array] = []
-    for name in ("train", "val", "test"):
-        for scene in sorted(p for p in (folder / name).glob("[0-9]*") if p.is_dir()):
-            split: Split = "train" if name == "train" else "validation"
-            found = _read_scene(scene, split)
-            images += [image for image, _ in found]
-            matrices += [matrix for _, matrix in found]
-    if not images:
+
+
+def _split_of(domain: str) -> Split | None:
+    """Return the split of a domain, by the first part of its name; None for another folder."""
+    return _SPLITS.get(domain.partition("_")[0])
+
+
+def read_bop(folder: Path, wanted: Selection = _EVERYTHING) -> LabelledDataset:
+    """Return the images of a BOP dataset that show the wanted object. Raises DatasetError.
+
+    Without a domain, all those of the wanted split are read; ``val`` and ``test`` count as
+    validation. Images of one camera and size are needed. An image with several instances of the
+    object is kept once. As in BOP, an instance of which less than a tenth is visible does not
+    count.
+    """
+    domains = domains_of(folder)
+    if wanted.domain is not None and wanted.domain not in domains:
+        raise DatasetError(
+            f"{folder}: has no domain {wanted.domain}; give --domain: {' or '.join(domains)}"
+        )
+    found: list[_Instance] = []
+    for domain in _chosen_domains(domains, wanted):
+        for scene in sorted(p.parent for p in (folder / domain).glob(f"[0-9]*/{_LABELS}")):
+            found += _read_scene(scene)
+    number = _object(folder, wanted.object, found)
+    images: dict[Path, list[_Instance]] = {}
+    for instance in found:
+        if instance.object == number:
+            images.setdefault(instance.path, []).append(instance)
+    labelled = [
+        LabelledImage(path, first.label, first.split, tuple(i.label for i in others))
+        for path, (first, *others) in images.items()
+    ]
+    chosen = wanted.of_split(labelled, folder)
+    camera = _camera(folder, {i.path: i.matrix for i in found if i.object == number})
+    models = next((folder / m for m in _MODEL_FOLDERS if (folder / m).is_dir()), None)
+    shape = None if models is None else read_models(models, number)
+    return LabelledDataset("bop", camera, tuple(chosen), shape, wanted.domain, number)
+
+
+def _chosen_domains(domains: list[str], wanted: Selection) -> list[str]:
+    """Return the domains to read: of large ones, only those that are needed."""
+    if wanted.domain is not None:
+        return [wanted.domain]
+    validation = [d for d in domains if _split_of(d) == "validation"]
+    if wanted.split == "validation" or (wanted.split is None and validation):
+        return validation or domains
+    train = [d for d in domains if _split_of(d) == "train"]
+    return train or domains if wanted.split == "train" else domains
+
+
+def _object(folder: Path, wanted: int | None, found: list[_Instance]) -> int:
+    objects = sorted({instance.object for instance in found})
+    if not objects:
         raise DatasetError(
             f"{folder}: has no labelled images; expected train/000000/scene_gt.json or the like"
         )
-    first = matrices[0]
-    if any(not np.allclose(m, first, rtol=1e-9, atol=1e-9) for m in matrices):
+    if wanted is None and len(objects) == 1:
+        return objects[0]
+    if wanted not in objects:
+        given = "several objects" if wanted is None else f"no object {wanted} in its images"
         raise DatasetError(
-            f"{folder}: cam_K differs between images; a perception is made for one camera"
+            f"{folder}: has {given}; give --object: {', '.join(str(n) for n in objects)}"
         )
-    fx, fy, cx, cy = (float(first[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return wanted
+
+
+def _camera(folder: Path, matrices: dict[Path, Array]) -> Camera:
+    """Return the camera of images: its matrix by their labels, its size by the first image."""
+    path, first = next(iter(matrices.items()))
+    other = next((p for p, m in matrices.items() if not _same(m, first)), None)
+    if other is not None:
+        raise DatasetError(
+            f"{folder}: cam_K differs between images, {path} and {other}; a perception is made for "
+            "one camera: give --domain, or the images of one camera"
+        )
+    height, width = read_pixels(path).shape
     try:
-        camera = Camera(size[0], size[1], fx, fy, cx, cy)
+        fx, fy, cx, cy = focal_and_centre(first)
+        return Camera(width, height, fx, fy, cx, cy)
     except ValueError as error:
-        raise DatasetError(f"{folder / 'camera.json'}: {error}") from None
-    return LabelledDataset("bop", camera, tuple(images), shape)
+        raise DatasetError(f"{path.parents[1] / 'scene_camera.json'}: {error}") from None
 
 
-def _read_scene(scene: Path, split: Split) -> list[tuple[LabelledImage, Array]]:
-    cameras, labels = read_object(scene / "scene_camera.json"), read_object(scene / "scene_gt.json")
-    found = []
+def _same(a: Array, b: Array) -> bool:
+    return bool(np.allclose(a, b, rtol=1e-9, atol=1e-9))
+
+
+@dataclass(frozen=True, eq=False)
+class _Instance:
+    """An object in an image, and the image's camera matrix (3, 3)."""
+
+    object: int
+    path: Path
+    label: PoseLabel
+    split: Split
+    matrix: Array
+
+
+def _read_scene(scene: Path) -> list[_Instance]:
+    split = _split_of(scene.parent.name)
+    assert split is not None
+    cameras, labels = read_object(scene / "scene_camera.json"), read_object(scene / _LABELS)
+    info_file = scene / "scene_gt_info.json"
+    info = read_object(info_file) if info_file.is_file() else {}
+    found: list[_Instance] = []
     for key, rows in labels.items():
-        place = f"{scene / 'scene_gt.json'}: image {key}"
-        if (
-            not key.isdigit()
-            or not isinstance(rows, list)
-            or len(rows) != 1
-            or not isinstance(rows[0], dict)
-        ):
-            raise DatasetError(
-                f"{place}: must have one object with cam_R_m2c, cam_t_m2c and obj_id"
-            )
-        rotation = numbers(place, rows[0], "cam_R_m2c", (3, 3))
-        if (
-            not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-            or np.linalg.det(rotation) < 0.0
-        ):
-            raise DatasetError(f"{place}: cam_R_m2c must be a rotation, row-wise")
-        position = 1e-3 * numbers(place, rows[0], "cam_t_m2c", (3,))
+        place = f"{scene / _LABELS}: image {key}"
+        if not key.isdigit() or not isinstance(rows, list):
+            raise DatasetError(f"{place}: must have a list of objects")
         camera = cameras.get(key)
         if not isinstance(camera, dict):
             raise DatasetError(f"{scene / 'scene_camera.json'}: image {key} is missing")
         matrix = numbers(f"{scene / 'scene_camera.json'}: image {key}", camera, "cam_K", (3, 3))
-        label = PoseLabel(position, rotations.from_matrix(rotation))
-        found.append((LabelledImage(_image_file(scene, int(key)), label, split), matrix))
+        path = _image_file(scene, int(key))
+        for row, visible in zip(rows, _visible_shares(info.get(key), len(rows)), strict=True):
+            number, label = _parse_row(place, row)
+            if visible >= _LEAST_VISIBLE_SHARE:
+                found.append(_Instance(number, path, label, split, matrix))
     return found
+
+
+def _visible_shares(rows: Any, count: int) -> list[float]:
+    """Return the visible share of each object of an image; 1 where nothing states it."""
+    if not isinstance(rows, list) or len(rows) != count:
+        return [1.0] * count
+    shares = [row.get("visib_fract") if isinstance(row, dict) else None for row in rows]
+    return [float(s) if isinstance(s, int | float) else 1.0 for s in shares]
+
+
+def _parse_row(place: str, row: Any) -> tuple[int, PoseLabel]:
+    if not isinstance(row, dict) or type(row.get("obj_id")) is not int:
+        raise DatasetError(f"{place}: an object must have cam_R_m2c, cam_t_m2c and obj_id")
+    rotation = numbers(place, row, "cam_R_m2c", (3, 3))
+    if (
+        not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        or np.linalg.det(rotation) < 0.0
+    ):
+        raise DatasetError(f"{place}: cam_R_m2c must be a rotation, row-wise")
+    position = 1e-3 * numbers(place, row, "cam_t_m2c", (3,))
+    return row["obj_id"], PoseLabel(position, rotations.from_matrix(rotation))
 
 
 def _image_file(scene: Path, number: int) -> Path:

@@ -14,9 +14,9 @@ from pathlib import Path
 from chaserdock_protocol.errors import errors_of_writing
 from chaserdock_protocol.scenario import Scenario, flight_scenario_json
 
-from .bop import BopWriter, check_camera
+from .bop import BopWriter
 from .speed_plus import SpeedPlusWriter
-from .types import DatasetError, Layout, Split
+from .types import DatasetError, Layout, Split, check_camera
 from .views import ViewLimits, ViewRenderer
 
 DESCRIPTION = "dataset.json"
@@ -42,8 +42,8 @@ def export_dataset(
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: exists already; give a new folder")
-    if "bop" in layouts:
-        check_camera(scenario.camera_model())
+    for layout in layouts:
+        check_camera(scenario.camera_model(), layout)
     renderer = ViewRenderer(scenario, limits)
     first_validation = images - round(validation_share * images)
     with errors_of_writing(folder, DatasetError):

@@ -60,18 +60,23 @@ def _info(shape: TargetShape) -> dict[str, Any]:
     return info
 
 
-def read_models(folder: Path) -> TargetShape:
-    """Return the shape of the only model of a folder. Raises DatasetError."""
+def read_models(folder: Path, number: int | None = None) -> TargetShape:
+    """Return the shape of a model of a folder, by its number; of the only one without. Raises
+    DatasetError.
+    """
     # Needs trimesh, which is slow to import.
     from chaserdock_protocol.scenario.mesh_files import trimesh_scene
 
     info_file = folder / "models_info.json"
     infos = read_object(info_file)
-    if len(infos) != 1:
+    if number is None and len(infos) != 1:
         raise DatasetError(
             f"{info_file}: has {len(infos)} objects; a dataset of one target has one"
         )
-    key, info = next(iter(infos.items()))
+    key = next(iter(infos)) if number is None else str(number)
+    if key not in infos:
+        raise DatasetError(f"{info_file}: object {key} is missing")
+    info = infos[key]
     if not key.isdigit() or not isinstance(info, dict):
         raise DatasetError(f"{info_file}: must map the number of an object to its properties")
     file = folder / f"obj_{int(key):06d}.ply"

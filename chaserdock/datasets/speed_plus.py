@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layout of SPEED+ (T. H. Park et al., "SPEED+: Next-Generation Dataset for Spacecraft Pose
-Estimation across Domain Gap", 2022).
+"""Layouts of SPEED+ (T. H. Park et al., "SPEED+: Next-Generation Dataset for Spacecraft Pose
+Estimation across Domain Gap", 2022) and of SPEED (M. Kisantal et al., 2020), which is only read.
+
+SPEED+ has a folder per domain: ``synthetic`` with labels for training and validation, ``lightbox``
+and ``sunlamp`` with ``test.json``. SPEED has ``train.json`` and ``real.json`` beside ``images``.
 
 ``camera.json`` holds camera matrix and distortion as OpenCV defines them. A label names its image.
-``q_vbs2tango_true``: rotation from the target's axes to the camera's (scalar first), with x_camera
-= R(q) x_target + r. ``r_Vo2To_vbs_true``: the position r of the target's origin in the camera, m.
+``q_vbs2tango_true`` (SPEED: ``q_vbs2tango``): rotation from the target's axes to the camera's
+(scalar first), with x_camera = R(q) x_target + r. ``r_Vo2To_vbs_true``: the position r of the
+target's origin in the camera, m.
 """
 
 from __future__ import annotations
@@ -16,12 +20,20 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.camera import Camera
+from chaserdock_models.camera import Camera, focal_and_centre
 from chaserdock_models.meshes import TriangleMesh
 
 from .json_files import numbers, read_list, read_object, write_json
 from .model_files import read_models, write_models
-from .types import DatasetError, LabelledDataset, LabelledImage, PoseLabel, Split, TargetShape
+from .types import (
+    DatasetError,
+    LabelledDataset,
+    LabelledImage,
+    PoseLabel,
+    Selection,
+    Split,
+    TargetShape,
+)
 from .views import ViewImage
 
 _DOMAIN = "synthetic"
@@ -30,7 +42,22 @@ _PIXEL_M = 5.86e-6
 metres.
 """
 _Q, _R = "q_vbs2tango_true", "r_Vo2To_vbs_true"
-_SPLITS: tuple[Split, ...] = ("train", "validation")
+_IMAGES = "images"
+_LABEL_FILES: dict[str, Split] = {
+    "train": "train",
+    "validation": "validation",
+    "test": "validation",
+}
+_SPEED_Q = "q_vbs2tango"
+_SPEED_DOMAINS: dict[str, tuple[str, Split]] = {
+    "synthetic": ("train", "train"),
+    "real": ("real", "validation"),
+}
+"""Domain of SPEED: name of its labels and of its folder in ``images``, and split. The labels of
+``test`` and ``real_test`` were not published."""
+_SPEED_CAMERA = Camera(1920, 1200, 0.0176 / _PIXEL_M, 0.0176 / _PIXEL_M, 960.0, 600.0)
+"""SPEED's camera: a focal length of 17.6 mm, no distortion (M. Kisantal et al., table I)."""
+EVERYTHING = Selection()
 
 
 class SpeedPlusWriter:
@@ -80,30 +107,75 @@ def _camera_values(camera: Camera) -> dict[str, Any]:
         "ccx": camera.cx_px,
         "ccy": camera.cy_px,
         "cameraMatrix": camera.matrix().tolist(),
-        "distCoeffs": list((*camera.distortion, *[0.0] * 5)[:5]),
+        "distCoeffs": camera.ros_distortion()[1],
     }
 
 
-def read_speed_plus(folder: Path) -> LabelledDataset:
-    """Return a dataset in the layout of SPEED+, with the labels of its synthetic images. Raises
-    DatasetError.
+def domains_of(folder: Path) -> list[str]:
+    """Return the domains of a dataset in the layout of SPEED+: folders with images and labels."""
+    return sorted(
+        {
+            file.parent.name
+            for name in _LABEL_FILES
+            for file in folder.glob(f"*/{name}.json")
+            if (file.parent / _IMAGES).is_dir()
+        }
+    )
+
+
+def read_speed_plus(folder: Path, wanted: Selection = EVERYTHING) -> LabelledDataset:
+    """Return the images of a domain, by default the synthetic ones, of a dataset in the layout of
+    SPEED+. Raises DatasetError.
     """
+    domains = domains_of(folder)
+    domain = _domain(folder, wanted, domains)
     camera = _read_camera(folder / "camera.json")
-    domain = folder / _DOMAIN
     images: list[LabelledImage] = []
-    for split in _SPLITS:
-        file = domain / f"{split}.json"
+    for name, split in _LABEL_FILES.items():
+        file = folder / domain / f"{name}.json"
         if file.is_file():
-            images += [
-                _labelled(file, domain, split, k, row) for k, row in enumerate(read_list(file))
-            ]
-    if not images:
-        raise DatasetError(
-            f"{domain}: has no labels; expected train.json or validation.json with labels"
-        )
+            images += _read_labels(file, folder / domain / _IMAGES, split, (_Q, _R))
     models = folder / "models"
     shape = read_models(models) if models.is_dir() else None
-    return LabelledDataset("speed+", camera, tuple(images), shape)
+    chosen = tuple(wanted.of_split(images, folder / domain))
+    return LabelledDataset("speed+", camera, chosen, shape, domain)
+
+
+def is_speed(folder: Path) -> bool:
+    """Return whether a folder has the layout of SPEED."""
+    return (folder / _IMAGES).is_dir() and any(
+        (folder / f"{name}.json").is_file() for name, _ in _SPEED_DOMAINS.values()
+    )
+
+
+def read_speed(folder: Path, wanted: Selection = EVERYTHING) -> LabelledDataset:
+    """Return the images of a domain, by default the synthetic ones, of a dataset in the layout of
+    SPEED. Raises DatasetError.
+
+    The camera is that of ``camera.json``, or else the published one.
+    """
+    domains = [d for d, (name, _) in _SPEED_DOMAINS.items() if (folder / f"{name}.json").is_file()]
+    domain = _domain(folder, wanted, domains)
+    name, split = _SPEED_DOMAINS[domain]
+    stated = folder / "camera.json"
+    camera = _read_camera(stated) if stated.is_file() else _SPEED_CAMERA
+    keys = (_SPEED_Q, _R)
+    images = _read_labels(folder / f"{name}.json", folder / _IMAGES / name, split, keys)
+    chosen = tuple(wanted.of_split(images, folder))
+    return LabelledDataset("speed", camera, chosen, None, domain)
+
+
+def _domain(folder: Path, selection: Selection, domains: list[str]) -> str:
+    """Return the domain to read. Raises DatasetError."""
+    if selection.object is not None:
+        raise DatasetError(f"{folder}: shows one target, without a number; leave out --object")
+    wanted = selection.domain
+    if wanted is None and (len(domains) == 1 or _DOMAIN in domains):
+        return _DOMAIN if _DOMAIN in domains else domains[0]
+    if wanted not in domains:
+        given = "" if wanted is None else f"has no domain {wanted}; "
+        raise DatasetError(f"{folder}: {given}give --domain: {' or '.join(domains)}")
+    return wanted
 
 
 def _read_camera(file: Path) -> Camera:
@@ -113,25 +185,35 @@ def _read_camera(file: Path) -> Camera:
     coefficients = (
         numbers(file, values, "distCoeffs", (5,)) if "distCoeffs" in values else np.zeros(5)
     )
-    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     distortion = tuple(coefficients.tolist()) if coefficients.any() else ()
     try:
+        fx, fy, cx, cy = focal_and_centre(matrix)
         return Camera(width, height, fx, fy, cx, cy, distortion)
     except ValueError as error:
         raise DatasetError(f"{file}: {error}") from None
 
 
-def _labelled(file: Path, domain: Path, split: Split, number: int, row: Any) -> LabelledImage:
-    place = f"{file}: label {number}"
+def _read_labels(
+    file: Path, images: Path, split: Split, keys: tuple[str, str]
+) -> list[LabelledImage]:
+    """Read labels; ``keys``: those of attitude and position."""
+    rows = enumerate(read_list(file))
+    return [_labelled(f"{file}: label {k}", images, split, row, keys) for k, row in rows]
+
+
+def _labelled(
+    place: str, images: Path, split: Split, row: Any, keys: tuple[str, str]
+) -> LabelledImage:
+    q_key, r_key = keys
     if not isinstance(row, dict) or not isinstance(row.get("filename"), str):
-        raise DatasetError(f"{place}: must be an object with filename, {_Q} and {_R}")
-    q = numbers(place, row, _Q, (4,))
+        raise DatasetError(f"{place}: must be an object with filename, {q_key} and {r_key}")
+    q = numbers(place, row, q_key, (4,))
     if not abs(float(np.linalg.norm(q)) - 1.0) < 1e-3:
         raise DatasetError(
-            f"{place}: {_Q} must be a unit quaternion, scalar first; its norm is "
+            f"{place}: {q_key} must be a unit quaternion, scalar first; its norm is "
             f"{np.linalg.norm(q):.4g}"
         )
-    position = numbers(place, row, _R, (3,))
+    position = numbers(place, row, r_key, (3,))
     return LabelledImage(
-        domain / "images" / row["filename"], PoseLabel(position, rotations.normalize(q)), split
+        images / row["filename"], PoseLabel(position, rotations.normalize(q)), split
     )

@@ -18,12 +18,28 @@ from numpy.typing import NDArray
 
 Split = Literal["train", "validation"]
 Layout = Literal["speed+", "bop"]
+"""Layouts that are written."""
 
 
 class DatasetError(ChaserdockError):
     """A dataset that cannot be written, read or scored. The text is one line: file, fault, what is
     valid.
     """
+
+
+def check_camera(camera: Camera, layout: Layout) -> None:
+    """Raise DatasetError for a lens that a layout cannot state."""
+    key = "camera.intrinsics"
+    if layout == "bop" and camera.distorts:
+        raise DatasetError(
+            f"{key}.distortion: the BOP format has no lens distortion; use --format speed+, or a "
+            "camera without it"
+        )
+    if camera.lens_model != "perspective" or len(camera.distortion) > 5:
+        raise DatasetError(
+            f"{key}.distortion: the SPEED+ format has k1, k2, p1, p2, k3 only; this lens is "
+            f"{camera.lens_model} with {len(camera.distortion)} coefficients"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +52,12 @@ class PoseLabel:
 
 @dataclass(frozen=True, eq=False)
 class LabelledImage:
-    """An image file and its label."""
+    """An image file and its label. ``others``: labels of further instances of the same object."""
 
     path: Path
     label: PoseLabel
     split: Split
+    others: tuple[PoseLabel, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,32 +78,69 @@ class TargetShape:
         return self.continuous or len(self.symmetries) > 0
 
 
+@dataclass(frozen=True)
+class Selection:
+    """What to read of a dataset. ``domain``: kind of images, such as ``lightbox`` or ``train_pbr``,
+    None for the usual one; ``object``: number of the target, None for the only one; ``split``: None
+    for validation, or for training where there is nothing else.
+    """
+
+    domain: str | None = None
+    object: int | None = None
+    split: Split | Literal["all"] | None = "all"
+
+    def of_split(self, images: list[LabelledImage], folder: Path) -> list[LabelledImage]:
+        """Return the images of the selected split. Raises DatasetError if there are none."""
+        if not images:
+            raise DatasetError(f"{folder}: has no labelled images")
+        splits = sorted({i.split for i in images})
+        wanted = self.split
+        if wanted is None:
+            wanted = "validation" if "validation" in splits else "train"
+        chosen = [i for i in images if wanted in ("all", i.split)]
+        if not chosen:
+            raise DatasetError(
+                f"{folder}: has no images in the split {wanted}; it has {' and '.join(splits)}"
+            )
+        return chosen
+
+
 @dataclass(frozen=True, eq=False)
 class LabelledDataset:
-    """A dataset: camera, images, and the target's shape if the dataset has it."""
+    """What was selected of a dataset: camera, images, and the target's shape if the dataset has
+    it. ``domain``: the kind of images, ``object``: number of the target, where the layout has them.
+    """
 
-    layout: Layout
+    layout: Layout | Literal["speed"]
     camera: Camera
     images: tuple[LabelledImage, ...]
     shape: TargetShape | None
+    domain: str | None = None
+    object: int | None = None
 
     def of_split(self, split: Split | None) -> tuple[LabelledImage, ...]:
         """Return the images of a split; None for all images."""
         return tuple(i for i in self.images if split in (None, i.split))
 
 
-def read_grey(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """Return the grey image (h, w) of a file. Raises DatasetError if it cannot be read or is not of
-    the camera's size.
-    """
+def read_pixels(path: Path) -> NDArray[np.uint8]:
+    """Return the grey image (h, w) of a file. Raises DatasetError if it cannot be read."""
     pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if pixels is None:
         reason = "no such file" if not path.is_file() else "not an image"
         raise DatasetError(f"{path}: {reason}")
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def read_grey(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """Return the grey image (h, w) of a file. Raises DatasetError if it cannot be read or is not of
+    the camera's size.
+    """
+    pixels = read_pixels(path)
     height, width = pixels.shape
     if (width, height) != (camera.width_px, camera.height_px):
         raise DatasetError(
             f"{path}: {width} x {height} pixels; the camera of the dataset has {camera.width_px} "
             f"x {camera.height_px}"
         )
-    return np.asarray(pixels, dtype=np.uint8)
+    return pixels

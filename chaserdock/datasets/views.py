@@ -101,6 +101,9 @@ def draw_view(
     half = 0.5 * np.array([camera.width_px, camera.height_px])
     aside = rng.uniform(-limits.offset_share, limits.offset_share, 2) * half
     ideal = camera.undistort(half - 0.5 + aside)
+    while not np.isfinite(ideal).all():  # beyond the lens: nearer to the centre
+        aside = 0.9 * aside
+        ideal = camera.undistort(half - 0.5 + aside)
     ray = np.append((ideal - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px), 1.0)
     position = range_m * ray / np.linalg.norm(ray)
     q_irf_trf = rotations.normalize(rng.normal(size=4))
@@ -233,4 +236,5 @@ def _padded(camera: Camera, margin_px: tuple[int, int]) -> Camera:
         cx_px=camera.cx_px + x,
         cy_px=camera.cy_px + y,
         distortion=(),
+        lens_model="perspective",
     )

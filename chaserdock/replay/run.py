@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 
 import msgspec
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.recording.extent import late_begin_line, late_begin_s
 from chaserdock_protocol.recording.log import LogError, LogSource, read_log, read_scenario
 from chaserdock_protocol.replay_node import Stage, order_by_tick
 from chaserdock_protocol.scenario import flight_scenario, parse_scenario
@@ -90,5 +91,10 @@ def replay(
         notes.append(
             "flown in real time: arrival times are not recorded, so that differences are not "
             "conclusive"
+        )
+    if (begin_s := late_begin_s(log)) is not None:
+        notes.append(
+            f"{late_begin_line(begin_s)}, so that the replay does not start from the state of the "
+            "flight and differences are not conclusive"
         )
     return Replay(through=through, topics=comparison.finish(), notes=notes)

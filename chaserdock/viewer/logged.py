@@ -20,13 +20,12 @@ from chaserdock_protocol.recording.scan import (
     LogSource,
     errors_of_parsing,
     log_files,
-    parse_chunk,
+    parse_record,
     record_at,
     records,
 )
 from chaserdock_protocol.recording.schema_migrations import decode_logged
 from chaserdock_protocol.topics import Topic
-from mcap.opcode import Opcode
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
 
@@ -48,8 +47,7 @@ _DECODED = (
 )
 """Topics of the plots and the event list; they are decoded while the log is indexed."""
 _CHUNKS_KEPT = 24
-"""Decoded chunks of a log that are kept. Larger: more memory; smaller: moving back and forth
-decodes again.
+"""Decoded chunks of a log that are kept; without chunks, messages. Chosen, for memory.
 """
 
 
@@ -93,16 +91,16 @@ class LoggedMission:
     def _index_file(self, path: Path) -> None:
         state, channels = FileState(), self._channels.setdefault(path, {})
         for opcode, content in records(path, state):
-            if opcode != Opcode.CHUNK:
-                continue
             with errors_of_parsing(path):
-                inside = parse_chunk(content)
-            channels |= {record.id: record for record in inside if isinstance(record, Channel)}
+                inside = parse_record(opcode, content)
+                channels |= {record.id: record for record in inside if isinstance(record, Channel)}
+                found = [(channels[r.channel_id], r) for r in inside if isinstance(r, McapMessage)]
+            if not found:
+                continue
             number = len(self._chunks)
             self._chunks.append((path, state.place))
-            for record in inside:
-                if isinstance(record, McapMessage):
-                    self._index_message(channels[record.channel_id], record, number)
+            for channel, message in found:
+                self._index_message(channel, message, number)
 
     def _index_message(self, channel: Channel, stored: McapMessage, chunk: int) -> None:
         key = channel.topic
@@ -144,7 +142,7 @@ class LoggedMission:
         """Return the messages of a chunk by key."""
         path, place = self._chunks[number]
         with errors_of_parsing(path):
-            inside = parse_chunk(record_at(path, place))
+            inside = parse_record(*record_at(path, place))
         out: dict[str, list[tuple[Channel, McapMessage]]] = defaultdict(list)
         for record in inside:
             if isinstance(record, McapMessage):

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
+import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.geometry_errors import GeometryParameter
 from chaserdock_models.mounting import MountedChaser
@@ -95,12 +96,22 @@ class TickOutputs:
 
 
 class AppliedImpulse(NamedTuple):
-    """Impulse (6,), N s and N m s, body axes, since the previous tick. ``measured``: reported by
-    thrusters; else as commanded.
+    """What the actuators of a chaser gave since the tick before; forces and torques, body axes.
+
+    ``impulse`` (6,): N s and N m s. ``moment`` (6,): its first moment about the middle of that
+    time, N s² and N m s², positive for what acts early. ``magnitude`` (6,): sum of the magnitudes
+    of the parts, which may cancel. ``measured``: as thrusters report it; else as commanded.
     """
 
     impulse: Array
-    measured: bool
+    moment: Array
+    magnitude: Array
+    measured: bool = False
+
+    @classmethod
+    def steady(cls, impulse: Array) -> AppliedImpulse:
+        """Return the ``impulse`` (6,) of a wrench that was constant."""
+        return cls(impulse, np.zeros(6), np.abs(impulse))
 
 
 @dataclass(frozen=True, eq=False)

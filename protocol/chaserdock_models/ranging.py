@@ -67,7 +67,7 @@ def _in_view(errors: RangingErrors, camera: Camera, position_m: Array) -> bool:
     """Return whether a target is in reach and in the image."""
     if float(np.linalg.norm(position_m)) > errors.reach_m:
         return False
-    u, v = camera.project_ideal(position_m[None])[0]
+    u, v = camera.project(position_m[None])[0]
     return bool(0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0)
 
 

@@ -195,6 +195,36 @@ class Valves:
             np.add.at(out.T, number, full_thrust_ns.T * (1e-9 * self._thrust_N[number, None]))
         return out
 
+    def first_moments(self, from_ns: int, to_ns: int) -> Array:
+        """Return the first moment (n,) of each thruster's thrust F about the middle of an interval,
+        N s²: the integral of (middle - t) F dt.
+
+        It is positive for a thruster that fires early, and zero for a constant thrust. With the
+        impulse it gives the exact displacement of a free mass: m dx = impulse T / 2 + moment.
+        """
+        thruster, begin, end, rise, fall, factor = self._spans()
+        out = np.zeros(len(self._thrusters))
+        if len(thruster):
+            duration = float(to_ns - from_ns)
+
+            def about_end(at: Array, length: Array) -> Array:
+                # Integral of (to - t) F dt = that of the impulse since `from`, for one edge.
+                before = _ramp(from_ns - at, length) * duration
+                return (
+                    _ramp_integral(to_ns - at, length)
+                    - _ramp_integral(from_ns - at, length)
+                    - before
+                )
+
+            def impulse(at: Array, length: Array) -> Array:
+                return _ramp(to_ns - at, length) - _ramp(from_ns - at, length)
+
+            moment = about_end(begin, rise) - about_end(end, fall)
+            moment -= (impulse(begin, rise) - impulse(end, fall)) * duration / 2.0
+            number = thruster.astype(int)
+            np.add.at(out, number, factor * moment * (1e-18 * self._thrust_N[number]))
+        return out
+
     def open_s(self, from_ns: int, to_ns: int) -> Array:
         """Return how long each thruster's valve is open between two times, (n,) s."""
         out = np.zeros(len(self._thrusters))
@@ -219,3 +249,11 @@ def _ramp(after_ns: Array, length_ns: Array) -> Array:
     length = np.maximum(length_ns, 1e-3)
     # A span that never ends has an infinitely late fall, where ``x`` is zero.
     return np.where(x < length, x * x / (2.0 * length), x - length_ns / 2.0)
+
+
+def _ramp_integral(after_ns: Array, length_ns: Array) -> Array:
+    """Return the integral of ``_ramp`` from 0 to ``after_ns``, nanoseconds²."""
+    x = np.maximum(after_ns, 0.0)
+    length = np.maximum(length_ns, 1e-3)
+    late = x * (x - length_ns) / 2.0 + length_ns * length_ns / 6.0
+    return np.where(x < length, x * x * x / (6.0 * length), late)

@@ -636,8 +636,10 @@ class ThrusterReport(Message, frozen=True, kw_only=True):
 
     ``force_max_N`` and ``torque_max_N_m`` can be reached on all body axes at once. ``coming_*``:
     remaining impulse (body axes) of commanded pulses, without the part that belongs to the next
-    command. ``given_*``: expected impulse of all thrusters since the previous report.
-    ``given_thrusters_N_s``: the same of each thruster; with identification only.
+    command. ``given_*``: of the thrusters since the previous report, as expected: their impulse,
+    its first moment about the middle of that time (positive for what acts early), and the sum of
+    the magnitudes of each thruster's part; ``given_thrusters_N_s``: of each, with identification
+    only.
     """
 
     chaser: ChaserId
@@ -649,6 +651,10 @@ class ThrusterReport(Message, frozen=True, kw_only=True):
     isolated: Thrusters = ()
     given_impulse_N_s: Vector3 = (0.0, 0.0, 0.0)
     given_angular_impulse_N_m_s: Vector3 = (0.0, 0.0, 0.0)
+    given_moment_N_s2: Vector3 = (0.0, 0.0, 0.0)
+    given_angular_moment_N_m_s2: Vector3 = (0.0, 0.0, 0.0)
+    given_magnitude_N_s: Vector3 = (0.0, 0.0, 0.0)
+    given_angular_magnitude_N_m_s: Vector3 = (0.0, 0.0, 0.0)
     given_thrusters_N_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
 
 
@@ -822,7 +828,7 @@ VERSION: dict[type[Struct], int] = {
     SolverStatus: 1,
     ActuatorCommand: 2,
     Lease: 1,
-    ThrusterReport: 2,
+    ThrusterReport: 3,
     Event: 1,
     Health: 1,
     RecorderAck: 1,

@@ -20,6 +20,7 @@ from chaserdock_controller.ingest.latency_compensation import (
     CommandHistory,
     predict_state,
 )
+from chaserdock_models.thruster_model import Valves
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
@@ -45,6 +46,35 @@ def reporting(s: Scenario) -> tuple[ThrusterController, Callable[[Odometry], Thr
         return pilot.observe(odometry)
 
     return pilot, observe
+
+
+def test_a_report_states_impulse_moment_and_magnitude_of_the_pulses_since_the_last_one() -> None:
+    """Pulses of a wrench in general position, summed in small steps."""
+    s = mission()
+    thrusters, valves = ThrusterController(s, 0), Valves(s.chaser.thrusters)
+    matrix = wrench_matrix(s.chaser.thrusters)
+    thrusts_N = np.linspace(0.2, 1.3, 12)
+    for tick in range(4):
+        odometry = at_rest(s, tick)
+        report = thrusters.observe(odometry)
+        command = thrusters.add_pulses(passed_on(wrench(s, tick)), thrusts_N)
+        for pulse in command.pulses:
+            valves.pulse(pulse.thruster, pulse.open_ns, pulse.close_ns)
+    before_ns, now_ns = s.timing.tick_time_ns(2), s.timing.tick_time_ns(3)
+    edges = np.linspace(before_ns, now_ns, 5001)
+    given = valves.impulses(edges)
+    early_s = ((before_ns + now_ns) / 2 - (edges[1:] + edges[:-1]) / 2) * 1e-9
+    for expected, force, torque in (
+        (matrix @ given.sum(axis=0), report.given_impulse_N_s, report.given_angular_impulse_N_m_s),
+        (matrix @ (early_s @ given), report.given_moment_N_s2, report.given_angular_moment_N_m_s2),
+        (
+            np.abs(matrix) @ given.sum(axis=0),
+            report.given_magnitude_N_s,
+            report.given_angular_magnitude_N_m_s,
+        ),
+    ):
+        assert np.abs(expected).max() > 1e-4
+        np.testing.assert_allclose([*force, *torque], expected, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["stuck_off", "stuck_on", "weak"])

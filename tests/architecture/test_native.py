@@ -10,6 +10,7 @@ import itertools
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from chaserdock_controller.nmpc import native as nmpc_native
 from chaserdock_controller.nmpc.rti import RtiSolver
 from chaserdock_models import native, passive_safety
 from chaserdock_models.camera import Camera
+from chaserdock_models.lenses import LensModel
 from chaserdock_models.native import KernelLibrary
 from chaserdock_models.native.build import LIBRARY_NAME, NATIVE_FOLDERS, X86_64, source_digest
 from chaserdock_models.shape_distance import box_table, chaser_boxes
@@ -76,9 +78,20 @@ def test_every_instruction_set_gives_the_same_bits(
 
 
 @pytest.mark.parametrize("number", LEVELS)
-@pytest.mark.parametrize("distortion", [(), (-0.18, 0.05, 0.0006, -0.0004)])
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("perspective", ()),
+        ("perspective", (-0.18, 0.05, 0.0006, -0.0004)),
+        ("perspective", (0.5, 0, 0, 0, 0, 1.9, 0.3, 0, 1e-3, 0, 1e-3, 0, 0.02, -0.02)),
+        ("equidistant", (0.35, 0.0, 0.0, 0.0)),
+    ],
+)
 def test_every_instruction_set_sees_the_same_bits(
-    number: int, distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+    number: int,
+    model: LensModel,
+    distortion: tuple[float, ...],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Corners of large markers and of such with a narrow border, and a pose from a start far
     off.
@@ -86,7 +99,7 @@ def test_every_instruction_set_sees_the_same_bits(
     if not has(number):
         pytest.skip(f"this processor has no copy {number}")
     rng = np.random.default_rng(3)
-    camera = Camera.from_hfov(320, 240, 1.0, distortion=distortion)
+    camera = replace(Camera.from_hfov(320, 240, 1.0), distortion=distortion, lens_model=model)
     outlined = np.arange(12) % 2 == 0
     image = rng.integers(0, 60, (240, 320), dtype=np.uint8)
     quads = np.array([[40, 40], [90, 45], [88, 95], [38, 90]]) + rng.uniform(0, 120, (12, 1, 2))

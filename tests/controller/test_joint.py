@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.bodies.target_body import TargetBody
-from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.joint import JointEstimator, kernels
 from chaserdock_controller.estimation.joint.estimator import relative_poses
 from chaserdock_controller.estimation.joint.measurements import (
     linearize,
@@ -28,9 +28,11 @@ from chaserdock_controller.estimation.joint.state import (
     ATTITUDE_DRIFT,
     CENTRE,
     CHASER,
+    FORCE,
     POSITION_DRIFT,
     SIGHTING_CHANNEL,
     TARGET,
+    TORQUE,
     VIEW,
     JointState,
     block,
@@ -41,8 +43,10 @@ from chaserdock_controller.estimation.joint.state import (
 from chaserdock_controller.estimation.joint.update import update
 from chaserdock_controller.estimation.types import EstimatorInputs, Shock
 from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_turns
+from chaserdock_controller.interfaces import AppliedImpulse
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.navigation import NavigationErrors
@@ -52,6 +56,7 @@ from scipy.stats import chi2
 
 SCENARIO = scenario()
 STEP = 1e-6
+AT_REST = [AppliedImpulse.steady(np.zeros(6))] * 2
 LATCHED = TargetBody(1.0, np.diag([1.0, 2.0, 2.5]), np.array([0.3, -0.2, 0.1]))
 """Target and chaser."""
 
@@ -144,28 +149,89 @@ def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None
     state = msgspec.structs.replace(
         random_state(seed), covariance=np.zeros((TARGET + 2 * CHASER,) * 2)
     )
-    impulses = np.random.default_rng(seed).normal(size=(2, 6)) * np.repeat([0.02, 0.002], 3)
-    after = predict(state, round(PERIOD_S * 1e9), impulses, p)
+    rng = np.random.default_rng(seed)
+    given = [
+        AppliedImpulse(
+            *(rng.normal(size=(3, 6)) * np.repeat([0.02, 0.002], 3) * [[1], [0.03], [1]])
+        )
+        for _ in range(2)
+    ]
+    after = predict(state, round(PERIOD_S * 1e9), given, p)
     noise = after.covariance
     for k in range(TARGET + 2 * CHASER):
         e = np.zeros(TARGET + 2 * CHASER)
         e[k] = STEP
-        moved = predict(inject(state, e), round(PERIOD_S * 1e9), impulses, p)
+        moved = predict(inject(state, e), round(PERIOD_S * 1e9), given, p)
         column = difference(after, moved) / STEP
         unit = np.zeros_like(noise)
         unit[k, k] = 1.0
         grown = (
             predict(
-                msgspec.structs.replace(state, covariance=unit), round(PERIOD_S * 1e9), impulses, p
+                msgspec.structs.replace(state, covariance=unit), round(PERIOD_S * 1e9), given, p
             ).covariance
             - noise
         )
         np.testing.assert_allclose(grown, np.outer(column, column), atol=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("period_s", [1.0 / 15.0, 0.2])
+def test_a_prediction_takes_the_times_of_pulses_into_account(seed: int, period_s: float) -> None:
+    """Against a fine integration of two pulses in any direction that may cancel, on a chaser with
+    an offset centre of mass, a disturbance and a rate."""
+    p, state = parameters(SCENARIO, navigation("orbit")), random_state(seed, 1)
+    rng = np.random.default_rng(seed)
+    pulses = rng.normal(size=(2, 6)) * np.repeat([1.0, 0.1], 3)
+    pulses[1] -= pulses[0]
+    begin_s, length_s = np.array([0.1, 0.7]) * period_s, 0.2 * period_s
+    steps = 400
+    x = np.concatenate(
+        [
+            state.positions_m[0],
+            state.velocities_m_s[0],
+            state.attitudes_wxyz[0],
+            state.omegas_rad_s[0],
+        ]
+    )
+    own = state.of(0, slice(FORCE.start, TORQUE.stop))
+    given = np.zeros((3, 6))
+    for k in range(steps):
+        at_s = (k + 0.5) * period_s / steps
+        parts = pulses * ((begin_s < at_s) & (at_s < begin_s + length_s))[:, None]
+        h, wrench = period_s / steps, parts.sum(axis=0)
+        given += [wrench * h, wrench * (h * (period_s / 2 - at_s)), np.abs(parts).sum(axis=0) * h]
+        total = kernels.wrench_at_origin(
+            wrench + own, state.of(0, CENTRE), x[10:13], p.body.mass_kg, np.array(p.body.inertia)
+        )
+        x = propagate(x, total, p.body, h)
+    after = predict(state, state.time_ns + round(period_s * 1e9), [AppliedImpulse(*given)], p)
+    steady = AppliedImpulse(given[0], np.zeros(6), given[2])
+    without = predict(state, state.time_ns + round(period_s * 1e9), [steady], p)
+
+    def errors(s: JointState) -> tuple[float, float]:
+        turn = rotations.log(rotations.multiply(rotations.conjugate(x[6:10]), s.attitudes_wxyz[0]))
+        return float(np.linalg.norm(s.positions_m[0] - x[:3])), float(np.linalg.norm(turn))
+
+    for with_moment, as_constant in zip(errors(after), errors(without), strict=True):
+        assert with_moment < 0.1 * as_constant
+
+
+def test_pulses_that_cancel_make_a_prediction_uncertain() -> None:
+    p, state = parameters(SCENARIO, navigation("orbit")), random_state(1, 1)
+    magnitude = np.array([0.02, 0.01, 0.03, 0.002, 0.001, 0.003])
+    cancelled = AppliedImpulse(np.zeros(6), np.zeros(6), magnitude)
+    sigma = [
+        np.sqrt(np.diag(predict(state, state.time_ns + 100_000_000, [given], p).covariance))
+        for given in (AppliedImpulse.steady(magnitude), cancelled, AT_REST[0])
+    ]
+    np.testing.assert_allclose(sigma[0], sigma[1], rtol=0.02)
+    rates = [block(0).start + k for k in (*range(3, 6), *range(9, 12))]
+    assert (sigma[1][rates] > 1.01 * sigma[2][rates]).all()
+
+
 def test_drifts_of_odometry_fade() -> None:
     p, state = parameters(SCENARIO, navigation("orbit")), random_state(0)
-    later = predict(state, state.time_ns + 10_000_000_000, np.zeros((2, 6)), p)
+    later = predict(state, state.time_ns + 10_000_000_000, AT_REST, p)
     n = p.navigation
     assert min(n.position_drift_m, n.attitude_drift_rad) > 0.0
     for part, time_s in (
@@ -214,13 +280,11 @@ def test_covariance_of_another_size_is_refused() -> None:
     p, state = parameters(SCENARIO, navigation("orbit")), random_state(0)
     wrong = msgspec.structs.replace(state, covariance=np.eye(TARGET + CHASER))
     with pytest.raises(ValueError, match=r"2 chasers with a covariance of shape \(55, 55\)"):
-        predict(wrong, 1, np.zeros((2, 6)), p)
+        predict(wrong, 1, AT_REST, p)
     with pytest.raises(ValueError, match="2 chasers"):
         update(wrong, {}, {}, mounting_of(p.camera), p)
     with pytest.raises(ValueError, match="other numbers of chasers"):
-        predict(
-            msgspec.structs.replace(state, alive=np.ones(1, dtype=bool)), 1, np.zeros((2, 6)), p
-        )
+        predict(msgspec.structs.replace(state, alive=np.ones(1, dtype=bool)), 1, AT_REST, p)
 
 
 def test_gates_are_quantiles_of_chi_square() -> None:

@@ -19,6 +19,7 @@ from chaserdock_controller.estimation.joint.state import (
     empty_state,
 )
 from chaserdock_controller.estimation.stage import EstimationStage
+from chaserdock_controller.interfaces import AppliedImpulse
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_acceleration, cw_transition, cw_wrench
@@ -59,7 +60,9 @@ def predicted(
 ) -> JointState:
     parameters = parameters_of(scenario)
     for k in range(1, ticks + 1):
-        state = predict(state, round(k * period_s * 1e9), np.zeros((1, 6)), parameters)
+        state = predict(
+            state, round(k * period_s * 1e9), [AppliedImpulse.steady(np.zeros(6))], parameters
+        )
     return state
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from chaserdock_controller.ingest.chaser import ChaserIngest
 from chaserdock_controller.ingest.latency_compensation import CommandHistory, predict_state
+from chaserdock_controller.interfaces import ChaserInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.scenario.bodies import Body
-from flight_cases import odometry, quick, start
+from flight_cases import odometry, quick, scenario, start
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -147,4 +149,24 @@ def test_without_commands_a_chaser_coasts() -> None:
     np.testing.assert_allclose(x[:3], [1.06, 1.88, 3.0], rtol=0, atol=1e-12)
     np.testing.assert_allclose(
         x[6:10], rotations.integrate(o.q_wxyz, [0, 0, 0.1], 2.0), rtol=0, atol=1e-9
+    )
+
+
+def test_commands_that_change_within_a_tick_have_a_moment_about_its_middle() -> None:
+    """Half a tick of latency at 15 Hz: the command before acts in the first half of the tick."""
+    s = scenario()
+    period_ns = round(1e9 / s.time.rate_hz)
+    history, first, second = CommandHistory(), wrench(1.0), wrench(-0.4)
+    history.add(0, first)
+    history.add(round(1.5 * period_ns), second)
+    inputs = ChaserInputs(0, odometry=odometry(tick=2))
+    seen, _ = ChaserIngest(s, 0).observe(inputs, 2, 2 * period_ns, history)
+    half_s = 0.5 * period_ns / 1e9
+    assert seen.impulse is not None
+    np.testing.assert_allclose(seen.impulse.impulse, half_s * (first + second), rtol=1e-6)
+    np.testing.assert_allclose(
+        seen.impulse.moment, half_s**2 / 2.0 * (first - second), rtol=1e-6, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        seen.impulse.magnitude, half_s * (np.abs(first) + np.abs(second)), rtol=1e-6
     )

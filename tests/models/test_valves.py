@@ -37,6 +37,23 @@ def test_a_pulse_gives_thrust_times_width_and_half_of_fall_less_rise() -> None:
         assert given_N_s(valves)[0] == pytest.approx(2.0 * (0.040 + (fall - rise) / 2e3), rel=1e-12)
 
 
+@pytest.mark.parametrize(("from_ms", "to_ms"), [(80.0, 240.0), (103.0, 138.0), (126.0, 200.0)])
+def test_first_moment_is_the_integral_of_thrust_by_time_to_the_middle(
+    from_ms: float, to_ms: float
+) -> None:
+    """Two thrusters with pulses that begin before, end after or lie within the interval."""
+    valves = Valves([thruster(4.0, 8.0), thruster(0.0, 3.0, 5.0)])
+    for number, begin, end in ((0, 100, 120), (0, 135, 230), (1, 90, 110), (1, 180, 195)):
+        assert valves.pulse(number, begin * MS, end * MS)
+    valves.fail(1, "weak", 150 * MS, 0.4)
+    edges = np.linspace(from_ms, to_ms, 4001) * MS
+    given, at_s = valves.impulses(edges), (edges[:-1] + edges[1:]) / 2e9
+    expected = ((from_ms + to_ms) / 2e3 - at_s) @ given
+    found = valves.first_moments(round(from_ms * MS), round(to_ms * MS))
+    assert np.abs(expected).min() > 1e-5
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
 def test_thrust_rises_and_falls_linearly() -> None:
     valves = Valves([thruster(4.0, 8.0)])
     valves.pulse(0, 100 * MS, 120 * MS)

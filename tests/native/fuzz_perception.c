@@ -43,15 +43,28 @@ static Settings settings(void) {
     return s;
 }
 
+/* A lens of any kind. */
+static Lens any_lens(void) {
+    Lens lens = {(double)whole(0, 3), chance(0.5) ? __builtin_inf() : value(0.1, 4.0), {0}, {0}};
+    for (int i = 0; i < 14; i++) lens.k[i] = value(-0.2, 0.2);
+    for (int i = 0; i < 9; i++) lens.tilt[i] = (i % 4 == 0) + value(-0.05, 0.05);
+    return lens;
+}
+
 static void refine_corners(void) {
     static const double around[8] = {-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0};
     const int64_t height = whole(2, 40), width = whole(2, 40), n = whole(0, 2);
     const uint8_t *image = image_of(height, width);
-    double *lens = doubles(9, -0.2, 0.2), *margin = doubles(n, 0.0, 0.3), *corners = outputs(8 * n),
-           *sigma = outputs(n);
-    uint8_t *good = bytes(n), *outlined = bytes(n);
+    double *camera = outputs(4), *margin = doubles(n, 0.0, 0.3), *corners = outputs(8 * n),
+           *sigma = outputs(n), *frames = doubles(9 * n, -0.02, 0.02);
+    uint8_t *good = bytes(n), *outlined = bytes(n), *framed = bytes(n);
     Settings set = settings();
-    for (int i = 0; i < 2; i++) lens[i] = value(20.0, 60.0), lens[2 + i] = value(0.0, 40.0);
+    Lens lens = any_lens();
+    for (int i = 0; i < 2; i++) camera[i] = value(20.0, 60.0), camera[2 + i] = value(0.0, 40.0);
+    for (int64_t m = 0; m < n; m++) framed[m] = (uint8_t)whole(0, 1), frames[9 * m + 8] = value(0.5, 1.5);
+    const int distorted = (int)whole(0, 1);
+    if (!distorted)
+        for (int64_t m = 0; m < n; m++) framed[m] = 0;
     for (int64_t m = 0; m < n; m++) {
         const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height),
                      half = uniform(1.0, 15.0);
@@ -61,8 +74,8 @@ static void refine_corners(void) {
                                      : (i % 2 ? y : x) + half * around[i] + uniform(-1.0, 1.0);
     }
     double *given = copy_of(corners, 8 * n);
-    NAME(refine_corners)(image, height, width, lens, whole(0, 1), &set, (double)whole(3, 9), n,
-                         margin, outlined, corners, good, sigma);
+    NAME(refine_corners)(image, height, width, camera, distorted ? &lens : NULL, frames, framed, &set,
+                         (double)whole(3, 9), n, margin, outlined, corners, good, sigma);
     for (int64_t m = 0; m < n; m++) {
         CHECK(good[m] <= 1 && sigma[m] >= 1.0 && finite(sigma[m]));
         if (good[m]) CHECK(all_finite(corners + 8 * m, 8) && all_finite(given + 8 * m, 8));
@@ -237,11 +250,10 @@ static void control_points(void) {
 static void align_points(void) {
     const int64_t height = whole(2, 60), width = whole(2, 60), n = whole(0, 60);
     LevelCamera camera = {
-        value(20.0, 90.0), value(20.0, 90.0), value(0.0, 60.0), value(0.0, 60.0), {0},
-        (double)height,    (double)width};
+        value(20.0, 90.0), value(20.0, 90.0), value(0.0, 60.0), value(0.0, 60.0),
+        (double)height,    (double)width,     any_lens()};
     AlignSettings set = {(double)whole(0, 30), (double)whole(0, 6), value(0.0, 0.5),
                          value(0.5, 4.0), value(0.5, 3.0)};
-    for (int i = 0; i < 5; i++) camera.distortion[i] = value(-0.2, 0.2);
     float *image = floats(height * width);
     for (int64_t i = 0; i < height * width; i++) image[i] = (float)value(0.0, 255.0);
     double *points = doubles(3 * n, -0.5, 0.5), *ahead = outputs(3 * n),
@@ -276,9 +288,12 @@ static void measure_pose(void) {
     int64_t *seen = block((size_t)m * 8);
     double *corners = doubles(12 * m, -0.2, 0.2), *origins = doubles(3 * m, -0.2, 0.2),
            *normals = doubles(3 * m, -1.0, 1.0);
-    int64_t count =
-        NAME(measure_pose)(lens, limits, corners, origins, normals, m, pose, doubles(6, -3.0, 3.0),
-                           seen, outputs(8 * m), covariance, error);
+    const int distorted = (int)whole(0, 1);
+    double *imaged = doubles(8 * m, -20.0, 500.0), *stretch = doubles(m, 1.0, 4.0);
+    int64_t count = NAME(measure_pose)(lens, limits, corners, origins, normals, m, pose,
+                                       distorted ? imaged : NULL, distorted ? stretch : NULL,
+                                       doubles(6, -3.0, 3.0), seen, outputs(8 * m), covariance,
+                                       error);
     CHECK(count >= -1 && count <= m);
     if (count > 0) CHECK(all_finite(covariance, 36));
     for (int i = 0; i < 6 && count > 0; i++) CHECK(covariance[7 * i] >= 0.0);

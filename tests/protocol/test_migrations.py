@@ -107,6 +107,21 @@ def test_old_ticks_without_names_list_the_only_controller() -> None:
         )
 
 
+def test_old_thruster_reports_state_the_magnitude_of_the_net_impulse() -> None:
+    sample: Any = BY_TYPE[m.ThrusterReport]
+    net, turning = (0.01, -0.02, 0.03), (-1e-3, 2e-3, 3e-3)
+    message = msgspec.structs.replace(
+        sample, given_impulse_N_s=net, given_angular_impulse_N_m_s=turning
+    )
+    fields = msgspec.msgpack.decode(codec.encode(message))
+    old = {k: v for k, v in fields.items() if "moment" not in k and "magnitude" not in k}
+    encoding = "application/msgpack;chaserdock.ThrusterReport.v2"
+    found = decode_logged(m.ThrusterReport, msgspec.msgpack.encode(old), encoding)
+    assert found.given_magnitude_N_s == (0.01, 0.02, 0.03)
+    assert found.given_angular_magnitude_N_m_s == (1e-3, 2e-3, 3e-3)
+    assert found.given_moment_N_s2 == (0.0, 0.0, 0.0)
+
+
 def test_migrated_messages_are_validated() -> None:
     fields, encoding = version_1(PRESENT["BodyTruth"])
     for changed in (

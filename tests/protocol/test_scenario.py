@@ -14,6 +14,7 @@ from chaserdock_models import rotations
 from chaserdock_models.targets import target_model
 from chaserdock_protocol.scenario import (
     ScenarioError,
+    flight_scenario,
     load_scenario,
     parse_scenario,
     scenario_from_json,
@@ -327,3 +328,11 @@ def test_rates_are_accepted_exactly_when_they_divide(
     else:
         assert divides
         assert scenario.timing.steps_per_tick * rate_hz == physics_hz
+
+
+@pytest.mark.parametrize(("rate_hz", "dt_s"), [(60, 0.1), (10, 0.1), (8, 0.125), (1, 1.0)])
+def test_the_step_of_the_prediction_is_at_least_a_tick(rate_hz: int, dt_s: float) -> None:
+    values = good() | {"time": {"rate_hz": rate_hz, "image_hz": 1}}
+    scenario = parse_scenario(values, "x")
+    assert scenario.controller.dt_s == dt_s
+    assert flight_scenario(scenario).controller == scenario.controller

@@ -9,7 +9,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.shape_distance import chaser_boxes
 from chaserdock_models.targets import Box, TargetModel, target_model
 from chaserdock_protocol.scenario.camera import Effects
-from chaserdock_world.rendering.background import Light
+from chaserdock_world.rendering.background import SPACE_LEVEL, Light
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.scene_geometry import VisibleBox, paint_order
@@ -316,11 +316,28 @@ def test_texture_levels_preserve_the_mean():
     assert texture.mean() / 255.0 == pytest.approx(marked * share + (1.0 - marked) * 0.95, abs=2e-3)
 
 
-def test_renderer_refuses_a_non_invertible_lens():
-    with pytest.raises(ValueError, match="distortion"):
-        Renderer(
-            Camera.from_hfov(640, 480, 1.6, distortion=(-0.9, 0.0, 0.0, 0.0)), target_model("paper")
-        )
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera(320, 240, 200.0, 200.0, 160.0, 120.0, (-0.9, 0.0, 0.0, 0.0)),
+        Camera(320, 240, 75.0, 74.0, 157.0, 122.0, (0.02, 0.0, 0.0, 0.0), lens_model="equidistant"),
+    ],
+    ids=["turns back", "ends at 90 degrees"],
+)
+def test_an_image_is_drawn_up_to_where_the_lens_ends(camera):
+    """A large white wall in front: white up to the rim, black beyond."""
+    renderer = Renderer(camera, target_model("paper"))
+    wall = (Box((60.0, 60.0, 0.1), shade=1.0),)
+    image = renderer.render(
+        EYE, AHEAD, [0.0, 0.0, -9.0], FACING, [(wall, np.array([0.0, 0.0, 2.0]), AHEAD)],
+        Light((0.0, 0.0, -1.0)),
+    )  # fmt: skip
+    grid = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1)
+    away = np.linalg.norm(camera.normalized(camera.undistort(grid)), axis=-1)
+    assert np.all(image[away < min(0.8 * camera.lens.valid_radius, 3.0)] > 200)
+    outside = cv2.erode(np.isnan(away).astype(np.uint8), np.ones((3, 3)), borderValue=1) > 0
+    assert outside.any()
+    assert np.all(image[outside] == SPACE_LEVEL)
 
 
 def test_chaser_boxes_reach_to_the_probe_tip():

@@ -86,11 +86,12 @@ class ViewerLayer:
         self._camera_pose = (camera.position_crf_m, camera.q_crf_irf_wxyz)
         matrix = [float(x) for x in camera.matrix().ravel()]
         self._inverse_matrix = np.linalg.inv(camera.matrix())
+        model, coefficients = camera.ros_distortion()
         self._calibration: dict[str, Any] = {
             "width": camera.width_px,
             "height": camera.height_px,
-            "distortion_model": "plumb_bob",
-            "D": [*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5],
+            "distortion_model": "kannala_brandt" if model == "equidistant" else model,
+            "D": coefficients,
             "K": matrix,
             "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             "P": [*matrix[0:3], 0.0, *matrix[3:6], 0.0, *matrix[6:9], 0.0],

@@ -182,16 +182,17 @@ def image(message: m.Image) -> ros.sensor_msgs__msg__Image:
 
 
 def camera_info(message: m.Image, camera: Camera) -> ros.sensor_msgs__msg__CameraInfo:
-    """Return the calibration that belongs to an image (distortion model ``plumb_bob``: k1, k2, p1,
-    p2, k3).
+    """Return the calibration that belongs to an image (distortion model ``plumb_bob``,
+    ``rational_polynomial`` or ``equidistant``).
     """
     k = camera.matrix()
+    model, coefficients = camera.ros_distortion()
     return ros.sensor_msgs__msg__CameraInfo(
         _header(message.sim_time_ns, camera_frame(message.chaser)),
         camera.height_px,
         camera.width_px,
-        "plumb_bob",
-        np.array([*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5]),
+        model,
+        np.array(coefficients),
         k.ravel(),
         np.eye(3).ravel(),
         np.column_stack([k, np.zeros(3)]).ravel(),

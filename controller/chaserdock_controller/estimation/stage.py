@@ -20,6 +20,7 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_controller.ingest.latency_compensation import predict_state
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_controller.interfaces import (
+    AppliedImpulse,
     ChaserEstimate,
     ChaserObservation,
     IdentifiedStack,
@@ -36,6 +37,7 @@ from .target_shape import ShapeEstimation, shape_parameters
 from .types import ChaserMotion, Estimator, EstimatorInputs, MeasuredChaser
 
 _NOTHING = np.zeros(6)
+_AT_REST = AppliedImpulse.steady(_NOTHING)
 
 
 class EstimationStage:
@@ -162,7 +164,7 @@ class EstimationStage:
         chasers = tuple(
             MeasuredChaser(
                 chaser=c.chaser,
-                impulse=_NOTHING if c.impulse is None else c.impulse.impulse,
+                impulse=_AT_REST if c.impulse is None else c.impulse,
                 odometry=c.measured,
                 outdated=c.outdated,
                 last_command=c.last_command,

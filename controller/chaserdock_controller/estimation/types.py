@@ -14,7 +14,7 @@ from chaserdock_protocol.messages import Level, Odometry, Sighting
 
 from chaserdock_controller.bodies.body_shape import BodyShape
 from chaserdock_controller.bodies.target_body import TargetBody
-from chaserdock_controller.interfaces import RelativePose, TargetState
+from chaserdock_controller.interfaces import AppliedImpulse, RelativePose, TargetState
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,14 +22,14 @@ class MeasuredChaser:
     """What is measured and known of one chaser in a tick.
 
     ``odometry``: measured in this tick, else None. ``outdated``: then the newest one, with the time
-    of its tick. ``impulse`` (6,): N s and N m s, body axes, given by its actuators in the last
-    ``EstimatorInputs.covered_s``. ``last_command`` (6,): N and N m, of a chaser without odometry in
-    this tick; the plan that it flies is unknown to the controller. ``latched``: its latch holds the
-    target. ``contact``: it has touched the target since the previous tick.
+    of its tick. ``impulse``: given by its actuators in the last ``EstimatorInputs.covered_s``.
+    ``last_command`` (6,): N and N m, of a chaser without odometry in this tick; the plan that it
+    flies is unknown to the controller. ``latched``: its latch holds the target. ``contact``: it has
+    touched the target since the previous tick.
     """
 
     chaser: int
-    impulse: Array
+    impulse: AppliedImpulse
     odometry: Odometry | None = None
     outdated: Odometry | None = None
     last_command: Array | None = None

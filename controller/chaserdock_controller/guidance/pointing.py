@@ -46,6 +46,9 @@ degrees/s.
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
     """Return width and height of the field of view, rad."""
+    if camera.distorts:
+        left, top, right, bottom = camera.angles_to_borders()
+        return left + right, top + bottom
     return (
         2.0 * math.atan(camera.width_px / 2.0 / camera.fx_px),
         2.0 * math.atan(camera.height_px / 2.0 / camera.fy_px),

@@ -90,11 +90,21 @@ class ChaserIngest:
         """
         r = self.report
         if r is not None and r.tick == tick:
-            given = np.array([*r.given_impulse_N_s, *r.given_angular_impulse_N_m_s])
-            return AppliedImpulse(given, measured=True)
+            return AppliedImpulse(
+                np.array([*r.given_impulse_N_s, *r.given_angular_impulse_N_m_s]),
+                np.array([*r.given_moment_N_s2, *r.given_angular_moment_N_m_s2]),
+                np.array([*r.given_magnitude_N_s, *r.given_angular_magnitude_N_m_s]),
+                measured=True,
+            )
         segments = sent.segments(time_ns - self._period_ns, time_ns)
-        commanded = sum((w * ((end - begin) / 1e9) for begin, end, w in segments), np.zeros(6))
-        return AppliedImpulse(commanded, measured=False)
+        middle_ns = time_ns - self._period_ns // 2
+        impulse, moment, magnitude = np.zeros((3, 6))
+        for begin_ns, end_ns, wrench in segments:
+            given = wrench * ((end_ns - begin_ns) / 1e9)
+            impulse += given
+            moment += given * ((middle_ns - (begin_ns + end_ns) // 2) / 1e9)
+            magnitude += np.abs(given)
+        return AppliedImpulse(impulse, moment, magnitude)
 
     def _ahead(
         self, tick: int, time_ns: int, effective_ns: int, sent: CommandHistory

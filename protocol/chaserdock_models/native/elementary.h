@@ -48,6 +48,16 @@ static inline void sine_cosine(double angle, double *sine, double *cosine) {
     *cosine = c;
 }
 
+/* Return the arc tangent of x >= 0 to about 2e-16: the angle is halved three times, then its Taylor
+ * series. */
+static inline double arctangent(double x) {
+    if (x > 1e16) return 1.5707963267948966;
+    for (int i = 0; i < 3; i++) x = x / (1.0 + sqrt_of(1.0 + x * x));
+    double y = x * x, sum = 0.0;
+    for (int i = 23; i >= 1; i -= 2) sum = 1.0 / i - y * sum;
+    return 8.0 * (x * sum);
+}
+
 /* Solve A x = b in place (A (n, n) by rows, b (n) becomes x) with row pivoting. Return 0 if A is
  * singular. */
 static inline int solve_rows(double *a, double *b, int n) {

@@ -65,12 +65,17 @@ __all__ = [
     "LogError",
     "LogSource",
     "LogWriter",
+    "NoScenario",
     "Record",
     "count_messages",
     "logged_scenario",
     "read_log",
     "read_scenario",
 ]
+
+
+class NoScenario(LogError):
+    """A log without its scenario: of another program, or copied by a tool that left it out."""
 
 
 @dataclass(frozen=True)
@@ -362,7 +367,7 @@ def logged_scenario(source: LogSource) -> tuple[Scenario, dict[str, str]]:
 def _scenario_of(path: Path) -> tuple[dict[str, str], str]:
     data, attachments = read_head(path)
     if SCENARIO_ATTACHMENT not in attachments:
-        raise LogError(f"{path}: holds no scenario; was it recorded by chaserdock?")
+        raise NoScenario(f"{path}: holds no scenario; was it recorded by chaserdock?")
     try:
         return data, attachments[SCENARIO_ATTACHMENT].decode()
     except UnicodeDecodeError:

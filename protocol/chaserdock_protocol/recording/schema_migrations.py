@@ -48,6 +48,17 @@ def _exact_odometry(fields: dict[str, Any]) -> dict[str, Any]:
     return fields | dict.fromkeys(names, exact)
 
 
+def _net_magnitudes(fields: dict[str, Any]) -> dict[str, Any]:
+    """State the magnitudes of the net impulse, as pulses that cancel were not reported."""
+    added = {
+        "given_magnitude_N_s": "given_impulse_N_s",
+        "given_angular_magnitude_N_m_s": "given_angular_impulse_N_m_s",
+    }
+    return fields | {
+        name: [abs(x) for x in fields.get(net, (0.0,) * 3)] for name, net in added.items()
+    }
+
+
 def _observed_controllers(fields: dict[str, Any]) -> dict[str, Any]:
     """Replace the commander that the world named by the controllers that took part."""
     controllers = dict(fields.get("standing_by", {}))
@@ -72,6 +83,7 @@ UPGRADES: dict[tuple[str, int], Upgrade] = {
     ("Sighting", 1): _bad_image,
     ("ActuatorCommand", 1): _each("pulses", _renamed(jet="thruster")),
     ("ThrusterReport", 1): _renamed(jets="thrusters"),
+    ("ThrusterReport", 2): _net_magnitudes,
     ("ThrusterFaultCommand", 1): _renamed(jet="thruster"),
     ("OperatorCommand", 1): _renamed(jet="thruster"),
     ("ControllerState", 1): _each("operated", _renamed(jet="thruster")),

@@ -4,15 +4,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated
 
+import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
+from chaserdock_models.lenses import LensModel
 from pydantic import Field, model_validator
 
 from .fields import Fraction, NotNegative, Number, Positive, Section, Vector
 
 SidePixels = Annotated[int, Field(ge=64, le=4096)]
+_LEAST_SHARE = 0.5
+"""A lens must be invertible in so much of the image (chosen): published wide-angle calibrations
+that turn back do so at the corners, in a tenth of it."""
+_NO_FISHEYE = math.tan(math.radians(85.0))
+"""A fisheye that ends at a larger angle draws a circle in a black image, as it should."""
+_GRID = 61
+"""Points along the image, and about the rim of a lens, at which validity is looked at."""
 REPLACED_BY_INTRINSICS = ("width_px", "height_px", "hfov_deg")
 
 
@@ -68,16 +78,81 @@ class Intrinsics(Section):
     cx_px: Number = Field(description="Principal point, x, pixels.")
     cy_px: Number = Field(description="Principal point, y, pixels.")
     distortion: tuple[Number, ...] = Field(
-        default=(), description="OpenCV's coefficients k1, k2, p1, p2[, k3]. Empty: no distortion."
+        default=(),
+        description="OpenCV's coefficients: k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4[, "
+        "tau_x, tau_y]]]]; of an `equidistant` lens k1, k2, k3, k4. Empty: no distortion.",
+    )
+    lens_model: LensModel = Field(
+        default="perspective",
+        description="`perspective`, or `equidistant`: a fisheye lens.",
     )
 
     @model_validator(mode="after")
-    def _check_coefficients(self) -> Intrinsics:
-        if len(self.distortion) not in (0, 4, 5):
-            raise ValueError(
-                f"distortion takes k1, k2, p1, p2[, k3], not {len(self.distortion)} numbers"
-            )
+    def _check_lens(self) -> Intrinsics:
+        check_lens(self.camera())
         return self
+
+    def camera(self) -> Camera:
+        """Return the camera at the origin. Raises ValueError for a wrong number of coefficients."""
+        fisheye = self.lens_model == "equidistant"
+        return Camera(
+            self.width_px,
+            self.height_px,
+            self.fx_px,
+            self.fy_px,
+            self.cx_px,
+            self.cy_px,
+            self.distortion if fisheye or any(self.distortion) else (),
+            lens_model=self.lens_model,
+        )
+
+
+def check_lens(camera: Camera) -> None:
+    """Raise ValueError for a lens that can be inverted in less than half of the image: a wrong
+    calibration.
+
+    Where the lens ends before the corners only, the image is black beyond, as with a fisheye.
+    """
+    share, reach_px = valid_share(camera), valid_reach_px(camera)
+    if share < _LEAST_SHARE and camera.lens.valid_radius < _NO_FISHEYE:
+        angle = math.degrees(math.atan(camera.lens.valid_radius))
+        raise ValueError(
+            f"the distortion can be inverted only up to {reach_px:.0f} px from the principal point "
+            f"({angle:.1f} degrees), in {share:.0%} of the image of {camera.width_px} x "
+            f"{camera.height_px}; calibrate with the board in all of the image"
+        )
+
+
+def valid_share(camera: Camera) -> float:
+    """Return the share of the image in which the distortion can be inverted."""
+    if not camera.distorts:
+        return 1.0
+    u, v = (np.linspace(0.0, n - 1.0, _GRID) for n in (camera.width_px, camera.height_px))
+    ideal = camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))
+    return float(np.isfinite(ideal).all(axis=-1).mean())
+
+
+def valid_reach_px(camera: Camera) -> float:
+    """Return the least distance from the principal point, pixels of the image, at which the lens
+    ends.
+    """
+    radius = camera.lens.valid_radius
+    radius = (1.0 - 1e-9) * radius if math.isfinite(radius) else _NO_FISHEYE
+    turn = np.linspace(0.0, 2.0 * math.pi, _GRID, endpoint=False)
+    rim = camera.lens.distort(radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+    return float(np.linalg.norm(rim * (camera.fx_px, camera.fy_px), axis=-1).min())
+
+
+def lens_note(camera: Camera) -> str | None:
+    """Return a line on a lens that ends before the corners of the image, None for others."""
+    share = valid_share(camera)
+    if share == 1.0:
+        return None
+    return (
+        f"camera: the lens ends {valid_reach_px(camera):.0f} px from the principal point "
+        f"({math.degrees(math.atan(camera.lens.valid_radius)):.1f} degrees): the image beyond, "
+        f"{1.0 - share:.1%} of it, stays black"
+    )
 
 
 class Eclipse(Section):
@@ -154,18 +229,7 @@ class FlightCamera(Section):
             return Camera(
                 c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px, (), self.position_m, q
             )
-        distortion = i.distortion if any(i.distortion) else ()
-        return Camera(
-            i.width_px,
-            i.height_px,
-            i.fx_px,
-            i.fy_px,
-            i.cx_px,
-            i.cy_px,
-            distortion,
-            self.position_m,
-            q,
-        )
+        return replace(i.camera(), position_crf_m=self.position_m, q_crf_irf_wxyz=q)
 
 
 class CameraSection(FlightCamera):
@@ -176,8 +240,9 @@ class CameraSection(FlightCamera):
     calibration: str | None = Field(
         default=None,
         exclude=True,
-        description="Path, relative to the scenario file, of an OpenCV calibration file (YAML, "
-        "JSON or XML) to read `intrinsics` from.",
+        description="Path, relative to the scenario file, of a calibration file to read "
+        "`intrinsics` from: of OpenCV (YAML, JSON or XML), ROS (`camera_info`) or Kalibr "
+        "(camchain; `camchain.yaml#cam1` names one of several cameras).",
     )
     sun_direction: Vector = Field(
         default=(-0.4, -0.5, 0.77), description="Direction to the sun (WRF), any length but 0."

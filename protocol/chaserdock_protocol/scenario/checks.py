@@ -251,12 +251,7 @@ def _check_approach_cone(scenario: FlightScenario) -> None:
     cone_deg, camera = scenario.approach.cone_deg, scenario.camera_model()
     if cone_deg is None or scenario.approach.face_target:
         return
-    half_deg = math.degrees(
-        min(
-            math.atan(min(camera.cx_px, camera.width_px - 1.0 - camera.cx_px) / camera.fx_px),
-            math.atan(min(camera.cy_px, camera.height_px - 1.0 - camera.cy_px) / camera.fy_px),
-        )
-    )
+    half_deg = math.degrees(min(camera.angles_to_borders()))
     for i, c in enumerate(scenario.chasers):
         forward = rotations.rotate(c.q_wxyz, np.array([1.0, 0.0, 0.0]))
         off_deg = cone_deg + angle_deg(-np.asarray(c.position_m), forward)

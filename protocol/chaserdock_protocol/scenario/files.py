@@ -13,11 +13,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from chaserdock_models.satellites import satellite_names
 from chaserdock_models.targets import TargetModel, target_model, target_names
 from pydantic import TypeAdapter, ValidationError
 
+from .calibration_files import read_calibration
 from .errors import ScenarioError, invalid
 from .fields import Positive, Vector
 from .surface import SUFFIXES
@@ -131,49 +131,3 @@ def find_target(name: str) -> TargetModel:
         return target_model(name)
     except ValueError as error:
         raise ScenarioError(f"{error}, or a file ….toml or ….glb") from None
-
-
-def read_calibration(path: Path) -> dict[str, Any]:
-    """Return ``camera.intrinsics`` from an OpenCV calibration file. Raises ScenarioError.
-
-    The file is YAML, JSON or XML with ``image_width``, ``image_height``, ``camera_matrix`` and
-    ``distortion_coefficients``.
-    """
-    import cv2  # slow to import, and needed for such files only
-
-    if not path.is_file():
-        raise ScenarioError(f"{path}: no such calibration file")
-    try:
-        store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        if not store.isOpened():
-            raise ScenarioError(f"{path}: not a calibration file of OpenCV (YAML, JSON or XML)")
-        matrix = store.getNode("camera_matrix").mat()
-        lens = store.getNode("distortion_coefficients").mat()
-        width, height = (store.getNode(key).real() for key in ("image_width", "image_height"))
-        store.release()
-    except (cv2.error, SystemError) as error:
-        reason = str(error).strip().splitlines()[-1]
-        raise ScenarioError(f"{path}: not a calibration file of OpenCV: {reason}") from None
-
-    if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
-        raise ScenarioError(f"{path}: camera_matrix must be a 3 x 3 matrix")
-    if width < 1 or height < 1:
-        raise ScenarioError(f"{path}: image_width and image_height must be positive")
-
-    coefficients = [] if lens is None else np.ravel(lens).astype(float).tolist()
-    while len(coefficients) > 5 and coefficients[-1] == 0.0:
-        coefficients.pop()
-    if len(coefficients) not in (0, 4, 5):
-        raise ScenarioError(
-            f"{path}: distortion_coefficients must be k1, k2, p1, p2[, k3]; these are "
-            f"{len(coefficients)}"
-        )
-    return {
-        "width_px": int(width),
-        "height_px": int(height),
-        "fx_px": float(matrix[0, 0]),
-        "fy_px": float(matrix[1, 1]),
-        "cx_px": float(matrix[0, 2]),
-        "cy_px": float(matrix[1, 2]),
-        "distortion": coefficients,
-    }

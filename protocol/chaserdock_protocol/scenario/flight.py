@@ -88,6 +88,11 @@ class FlightScenario(Section):
 
     @model_validator(mode="after")
     def _check_flight(self) -> FlightScenario:
+        try:
+            controller = self.controller.at_rate(self.time.rate_hz)
+        except ValueError as error:
+            raise ValueError(f"controller: {error}") from None
+        object.__setattr__(self, "controller", controller)
         check_flight(self)
         return self
 

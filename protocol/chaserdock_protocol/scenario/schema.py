@@ -153,7 +153,11 @@ class Controller(ControllerOptions):
         default=3.0,
         description=f"Prediction horizon, s: at least one and at most {MAX_STAGES} steps `dt_s`.",
     )
-    dt_s: Positive = Field(default=0.1, description="Step of the prediction, s.")
+    dt_s: Positive = Field(
+        default=0.1,
+        description="Step of the prediction, s. A command is held for a tick, so a shorter step is "
+        "lengthened to one.",
+    )
     falloff: Fraction = Field(
         default=0.0,
         description="Linear decrease of the stage weights along the horizon: 0 is constant, 1 "
@@ -194,6 +198,18 @@ class Controller(ControllerOptions):
         if stages > MAX_STAGES:
             raise ValueError(f"horizon_s / dt_s is {stages:.0f} stages; at most {MAX_STAGES}")
         return self
+
+    def at_rate(self, rate_hz: int) -> Controller:
+        """Return the controller for ticks at ``rate_hz``: its step is at least a tick, for which a
+        command is held.
+
+        Raises ValueError for a horizon shorter than a tick.
+        """
+        if self.dt_s * rate_hz >= 1.0 - 1e-9:
+            return self
+        if self.horizon_s < 1.0 / rate_hz:
+            raise ValueError(f"horizon_s ({self.horizon_s:g} s) is shorter than a tick")
+        return self.model_copy(update={"dt_s": 1.0 / rate_hz})
 
 
 class Limits(Section):

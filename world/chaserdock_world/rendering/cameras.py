@@ -18,7 +18,6 @@ from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
 from chaserdock_world.orbit import TargetOrbit, earth_disc
@@ -67,12 +66,9 @@ class Cameras:
         @cache
         def renderer(camera: Camera) -> Renderer | MeshRenderer:
             spread_px = effects.point_spread_px
-            try:
-                if mesh is not None:
-                    return MeshRenderer(camera, mesh, background, spread_px, substitutes)
-                return Renderer(camera, self._target, background, spread_px)
-            except ValueError as error:
-                raise ScenarioError(f"camera: {error}") from None
+            if mesh is not None:
+                return MeshRenderer(camera, mesh, background, spread_px, substitutes)
+            return Renderer(camera, self._target, background, spread_px)
 
         self._renderers = [renderer(camera) for camera in self._cameras]
         glares = {c: Glare(c, effects.glare) for c in self._cameras} if effects.glare > 0.0 else {}

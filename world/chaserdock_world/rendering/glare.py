@@ -40,7 +40,8 @@ class Glare:
             (ideal[..., 1] - camera.cy_px) / camera.fy_px,
         )
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
-        self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        # Beyond the lens no light arrives: a ray of 0 is at 80 degrees from every sun.
+        self._rays = np.nan_to_num(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def add(self, image: NDArray[np.uint8], to_sun_irf: Array) -> NDArray[np.uint8]:
         """Return the image (h, w) with the sun in direction ``to_sun_irf`` (3,), a unit vector.

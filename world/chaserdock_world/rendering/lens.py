@@ -7,8 +7,23 @@ import math
 
 import cv2
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from numpy.typing import NDArray
+
+from .background import SPACE_LEVEL
+
+_CANVAS_MOST = 4.0
+"""Largest ideal image, in widths and heights of the image: 77 and 74 degrees from the axis for a
+fisheye of 640 x 480 with 285 px. It bounds memory and time."""
+_WEAK_STRETCH, _STRETCH_STEP_PX = 1.5, 8
+"""A lens is sampled once a pixel where a pixel covers at most so many ideal ones along a side,
+which draws edges within 0.01 px; looked at on a grid of this step."""
+_STRONG_SAMPLES = 3
+"""Otherwise so many samples along a pixel: at 60 degrees from a fisheye's axis it covers 4 x 1.7
+ideal pixels."""
+_OUTSIDE = -1e4
+"""Coordinate outside of every image."""
 
 
 def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
@@ -25,45 +40,79 @@ def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8
 class Lens:
     """Map the ideal image, which renderers draw, to the distorted image of ``camera``.
 
-    ``origin_px`` (2,): ideal pixel coordinates of the ideal image's first pixel. ``size_px``: its
-    width and height, larger than the frame where the lens covers more. Raises ValueError if the
-    distortion is not invertible everywhere in the image.
+    ``point_spread_px``: standard deviation of the lens' Gaussian blur. ``origin_px`` (2,): ideal
+    pixel coordinates of the ideal image's first pixel; ``size_px``: its width and height, larger
+    than the frame where the lens covers more. ``canvas_spread_px``: the blur of the ideal image.
+    The image is black where the lens images nothing, and beyond ``_CANVAS_MOST``.
     """
 
-    def __init__(self, camera: Camera):
+    def __init__(self, camera: Camera, point_spread_px: float = 0.0):
         self.camera = camera
         self.origin_px = np.zeros(2)
         self.size_px = (camera.width_px, camera.height_px)
+        self.canvas_spread_px, self._spread_px = point_spread_px, 0.0
+        self._samples = 1
         self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-        if any(camera.distortion):
+        if camera.distorts:
             self._make_maps()
 
     def _make_maps(self) -> None:
-        width, height = self.size_px
-        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
-        # Camera.undistort is too slow for a million points.
-        matrix = self.camera.matrix()
-        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-        undistorted = cv2.undistortPoints(
-            grid.reshape(-1, 1, 2),
-            matrix,
-            np.array(self.camera.distortion),
-            None,
-            None,
-            matrix,
-            criteria=criteria,
-        )
-        ideal = np.asarray(undistorted, dtype=float).reshape(grid.shape)
-        if not np.all(np.abs(self.camera.distort(ideal) - grid) < 1e-3):
-            raise ValueError("the lens distortion cannot be inverted everywhere in the image")
-        low = np.floor(ideal.min(axis=(0, 1))) - 1.0
-        high = np.ceil(ideal.max(axis=(0, 1))) + 2.0
-        if np.any(high - low > 4.0 * np.array(self.size_px)):
-            raise ValueError("the lens distortion is too strong to be rendered")
+        ideal = self._ideal_pixels()
+        stretch = self.camera.stretch(ideal[::_STRETCH_STEP_PX, ::_STRETCH_STEP_PX])
+        if np.nanmax(stretch) > _WEAK_STRETCH:
+            # A pixel covers several of the ideal image: it averages them, and then comes the blur.
+            self._samples = _STRONG_SAMPLES
+            self.canvas_spread_px, self._spread_px = 0.0, self.canvas_spread_px
+            ideal = self._between(ideal)
+        else:
+            ideal = ideal[1:-1, 1:-1]
+        low = np.floor(np.nanmin(ideal, axis=(0, 1))) - 1.0
+        high = np.ceil(np.nanmax(ideal, axis=(0, 1))) + 2.0
         self.origin_px = low
         self.size_px = (int(high[0] - low[0]), int(high[1] - low[1]))
-        maps = (ideal - low).astype(np.float32)
+        maps = np.nan_to_num(ideal - low, nan=_OUTSIDE).astype(np.float32)
         self._maps = (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]))
+
+    def _ideal_pixels(self) -> Array:
+        """Return the ideal pixels (h + 2, w + 2, 2) of the image and one pixel around it; NaN where
+        nothing is drawn.
+        """
+        camera = self.camera
+        width, height = camera.width_px, camera.height_px
+        grid = np.stack(
+            np.meshgrid(np.arange(-1.0, width + 1.0), np.arange(-1.0, height + 1.0)), axis=-1
+        )
+        if camera.lens_model == "perspective" and math.isinf(camera.lens.valid_radius):
+            # Faster for a million points than Camera.undistort.
+            matrix = camera.matrix()
+            criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+            coefficients = np.array(camera.distortion)
+            ideal = np.asarray(
+                cv2.undistortPoints(
+                    grid.reshape(-1, 1, 2), matrix, coefficients, None, None, matrix,
+                    criteria=criteria,
+                ),
+                dtype=float,
+            ).reshape(grid.shape)  # fmt: skip
+            with np.errstate(invalid="ignore", over="ignore"):
+                missed = ~np.all(np.abs(camera.distort(ideal) - grid) < 1e-3, axis=-1)
+            ideal[missed] = camera.undistort(grid[missed])
+        else:
+            ideal = camera.undistort(grid)
+        middle = 0.5 * np.array([width - 1.0, height - 1.0])
+        most = 0.5 * _CANVAS_MOST * np.array([width, height])
+        with np.errstate(invalid="ignore"):
+            ideal[np.any(np.abs(ideal - middle) > most, axis=-1)] = np.nan
+        return ideal
+
+    def _between(self, ideal: Array) -> Array:
+        """Return the ideal pixels of samples within the pixels, by linear interpolation: within
+        0.01 px, as the lens is smooth.
+        """
+        n = self._samples
+        size = (n * ideal.shape[1], n * ideal.shape[0])
+        fine = np.asarray(cv2.resize(ideal, size, interpolation=cv2.INTER_LINEAR), dtype=float)
+        return fine[n:-n, n:-n]
 
     def distort(self, ideal: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the distorted image (h, w) of an ideal image of ``size_px``.
@@ -72,4 +121,12 @@ class Lens:
         """
         if self._maps is None:
             return ideal
-        return np.asarray(cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
+        image = np.asarray(
+            cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR, borderValue=SPACE_LEVEL),
+            dtype=np.uint8,
+        )
+        if self._samples == 1:
+            return image
+        size = (self.camera.width_px, self.camera.height_px)
+        fine = spread_points(image, self._samples * self._spread_px)
+        return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

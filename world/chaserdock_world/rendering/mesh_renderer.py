@@ -173,8 +173,7 @@ class MeshRenderer:
     """Render what ``camera`` sees of a target with a mesh and of other bodies.
 
     Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard
-    deviation of a Gaussian. ``substitutes``: meshes that are drawn in place of boxes. Raises
-    ValueError if the camera's distortion is not invertible everywhere in the image.
+    deviation of a Gaussian. ``substitutes``: meshes that are drawn in place of boxes.
     """
 
     def __init__(
@@ -186,12 +185,12 @@ class MeshRenderer:
         substitutes: Mapping[Box, TriangleMesh] | None = None,
     ):
         self.camera = camera
-        self._point_spread_px = point_spread_px
         self._substitutes = dict(substitutes or {})
         self._target = _body_of(mesh)
         self._bodies: dict[tuple[Box, ...], _Body] = {}
         self._threads = threading.local()
-        self._lens = Lens(camera)
+        self._lens = Lens(camera, point_spread_px)
+        self._point_spread_px = self._lens.canvas_spread_px
         self._size = self._lens.size_px
         self._background = Background(camera, self._lens.origin_px, self._size, earth)
         self._frustum = Frustum(camera, self._lens.origin_px, self._size)

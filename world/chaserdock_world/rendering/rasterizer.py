@@ -76,8 +76,7 @@ class Renderer:
     """Render what ``camera`` sees of a target and of other bodies.
 
     Stateless but for caches: equal arguments give equal images. ``point_spread_px``: standard
-    deviation of a Gaussian. Raises ValueError if the camera's distortion is not invertible
-    everywhere in the image.
+    deviation of a Gaussian.
     """
 
     def __init__(
@@ -89,7 +88,6 @@ class Renderer:
     ):
         self.camera = camera
         self.model = model
-        self._point_spread_px = point_spread_px
         # Textures by box, face, and how often width and height are halved; coarser ones are made on
         # demand.
         self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {
@@ -98,7 +96,8 @@ class Renderer:
             for face in range(6)
         }
         # The canvas is the ideal image; with lens distortion it extends beyond the frame.
-        self._lens = Lens(camera)
+        self._lens = Lens(camera, point_spread_px)
+        self._point_spread_px = self._lens.canvas_spread_px
         self._origin, self._size = self._lens.origin_px, self._lens.size_px
         self._background = Background(camera, self._origin, self._size, earth)
         self._frustum = Frustum(camera, self._origin, self._size)

@@ -10,6 +10,8 @@ is that the result is a finite pose in front of the camera.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from chaserdock_models import rotations
@@ -25,11 +27,8 @@ def detect(
     image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dictionary
 ) -> Detections:
     """Detect markers with OpenCV's default settings and sub-pixel corners, in ideal pixels."""
-    if camera.distortion:
-        matrix = camera.matrix()
-        image = np.asarray(
-            cv2.undistort(image, matrix, np.array(camera.distortion)), dtype=np.uint8
-        )
+    if camera.distorts:
+        image = np.asarray(cv2.remap(image, *_maps(camera), cv2.INTER_LINEAR), dtype=np.uint8)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
@@ -38,6 +37,16 @@ def detect(
     return Detections(
         np.asarray(ids, dtype=np.int64).ravel(), np.array(corners, dtype=float).reshape(-1, 4, 2)
     )
+
+
+@lru_cache(maxsize=4)
+def _maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the pixel of the image, x and y (h, w), of each ideal pixel; outside of the image
+    where the lens images nothing.
+    """
+    grid = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1)
+    px = np.nan_to_num(camera.distort(grid), nan=-10.0).astype(np.float32)
+    return np.ascontiguousarray(px[..., 0]), np.ascontiguousarray(px[..., 1])
 
 
 def solve(

@@ -20,6 +20,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, cuboid_corners
 from numpy.typing import ArrayLike, NDArray
 
+from .lens import strong_stretch
 from .pnp import TargetPose
 
 POINT_SPREAD_PX = 0.65
@@ -170,7 +171,7 @@ class BearingFinder:
         ideal = self._camera.undistort(spot.centroid_px)
         place = self._along(ideal, target.range_m)
         centre = ideal - (seen.centroid_px - self._camera.project_ideal(place))
-        sigma_px = math.hypot(spot.noise_px, bias_px(seen.radius_px))
+        sigma_px = math.hypot(spot.noise_px, bias_px(seen.radius_px)) * self._stretch(ideal)
         return self._pose(centre, sigma_px, target)
 
     def _choose(
@@ -215,13 +216,17 @@ class BearingFinder:
         if not np.all(np.isfinite(ideal)):
             return None
         expected = self._silhouette(self._along(ideal, target.range_m), target.q_wxyz)
-        radius = _blurred(expected.radius_px)
+        stretch = self._stretch(ideal)
+        radius = _blurred(expected.radius_px / stretch)
         fits = (
             abs(spot.radius_px - radius)
             <= _SPOT.size_share * radius + _SPOT.size_sigmas * spot.noise_px
         )
-        level = spot.flux / expected.area_px2
+        level = spot.flux / (expected.area_px2 / stretch**2)
         return expected if fits and _SPOT.level_min <= level <= _SPOT.level_max else None
+
+    def _stretch(self, ideal_px: Array) -> float:
+        return float(strong_stretch(self._camera, ideal_px)) if self._camera.distorts else 1.0
 
     def _silhouette(self, position_irf_m: Array, q_wxyz: Array) -> Silhouette:
         return silhouette(self._camera, self._corners, q_wxyz, position_irf_m)

@@ -5,8 +5,9 @@ Contours and corner filters bias the corners of a black square inwards. Here a c
 each side to the centroids of the grey-level gradient across it. Then the grey levels of the pixels
 along a side are fitted by those of a blurred edge; a white border that ends at a known distance is
 fitted with its outer edge. Sides are curves in the distorted image, so the place of each pixel is
-mapped through the lens. Pixels are not interpolated: that would bias an edge by its place between
-pixels.
+mapped through the lens; where that compresses the image much, as a fisheye does, sides are fitted
+on a plane across the line of sight to the marker (`MarkerFrames`). Pixels are not interpolated:
+that would bias an edge by its place between pixels.
 
 The arithmetic is in C (native/corners.c): a few markers are too little work to vectorize with
 NumPy.
@@ -24,6 +25,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 from numpy.typing import NDArray
 
+from .lens import MarkerFrames, native_lens
 from .native import LIBRARY, function
 
 
@@ -140,7 +142,8 @@ def refine(
     side, the black border included. ``margin_share`` (n,): width of the white border over the side
     of the marker. Raises ValueError for an image less than two pixels wide or high.
     """
-    corners = np.array(corners_ideal_px, dtype=float, order="C")
+    frames = MarkerFrames.of(camera, corners_ideal_px)
+    corners = np.array(frames.into(corners_ideal_px), dtype=float, order="C")
     n = len(corners)
     image, margin = np.ascontiguousarray(image), np.array(margin_share, dtype=float, order="C")
     ends = np.array(outlined, dtype=np.uint8, order="C")
@@ -148,10 +151,12 @@ def refine(
         raise ValueError(f"an image of {image.shape} has no corners")
     good, sigma = np.zeros(n, dtype=np.uint8), np.ones(n)
     k = camera
-    lens = (c_double * 9)(k.fx_px, k.fy_px, k.cx_px, k.cy_px, *k.distortion)
+    matrix = (c_double * 4)(k.fx_px, k.fy_px, k.cx_px, k.cy_px)
+    lens = byref(native_lens(camera)) if camera.distorts else None
     function("refine_corners")(
         c_void_p(image.ctypes.data), c_int64(image.shape[0]), c_int64(image.shape[1]),
-        lens, c_int64(bool(k.distortion)), byref(SETTINGS), c_double(cells),
+        matrix, lens, address(frames.to_ray), address(frames.framed), byref(SETTINGS),
+        c_double(cells),
         c_int64(n), address(margin), address(ends), address(corners), address(good), address(sigma),
     )  # fmt: skip
-    return Refined(corners, good.view(np.bool_), sigma)
+    return Refined(frames.out_of(corners), good.view(np.bool_), sigma * frames.stretch)

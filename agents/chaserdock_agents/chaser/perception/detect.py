@@ -149,7 +149,10 @@ def region_of(
     # The sum is finite only if every coordinate is.
     if not math.isfinite(float(points.sum())) or min(points[:, 2].tolist()) < 0.02:
         return None
-    x_px, y_px = camera.project(points).T.tolist()
+    px = camera.project(points)
+    if not math.isfinite(float(px.sum())):  # some of it is beyond the lens
+        return None
+    x_px, y_px = px.T.tolist()
     across, down = _grown(x_px, camera.width_px), _grown(y_px, camera.height_px)
     if across is None or down is None:
         return None

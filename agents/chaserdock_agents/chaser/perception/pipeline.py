@@ -126,6 +126,8 @@ class Perception:
         rows = np.array([self._rows.get(i, -1) for i in found.ids.tolist()], dtype=np.intp)
         known = rows >= 0
         px, rows = self.camera.undistort(found.corners_px[known]), rows[known]
+        imaged = np.isfinite(px).all(axis=(1, 2))
+        px, rows = px[imaged], rows[imaged]
         cells = self._dictionary.markerSize + 2
         margin, outlined = self._table.margin_share[rows], self._table.outlined[rows]
         refined = corners.refine(image, self.camera, px, cells, margin, outlined)

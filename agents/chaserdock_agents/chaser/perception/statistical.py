@@ -23,6 +23,7 @@ from chaserdock_protocol.pose_image import decode_pose
 from chaserdock_protocol.scenario.ranging import Ranging
 from numpy.typing import ArrayLike, NDArray
 
+from .lens import strong_stretch
 from .native import function
 from .pipeline import PerceptionResult
 from .pnp import MIN_SINGLE_COSINE, MarkerTable, TargetPose
@@ -86,12 +87,15 @@ class StatisticalPerception:
             (table.corners, table.origins, table.normals),
             (seen, px, covariance, error),
         )
+        imaged = self._imaged(pose) if self._camera.distorts else (None, None)
         count = function("measure_pose", c_int64)(
             self._lens,
             _LIMITS,
             *map(address, surface),
             c_int64(m),
-            *map(address, (pose, white, *outputs)),
+            address(pose),
+            *(a if a is None else address(a) for a in imaged),
+            *map(address, (white, *outputs)),
         )
 
         if count < 0:
@@ -107,6 +111,16 @@ class StatisticalPerception:
         )
         used = seen != 0
         return PerceptionResult((found,), table.ids[used], self._camera.distort(px[used]), ())
+
+    def _imaged(self, pose: Array) -> tuple[Array, Array]:
+        """Return the pixels of all corners in the image (m, 4, 2), and the stretch of the image at
+        each marker (m,).
+        """
+        turn, position = pose[3:].reshape(3, 3), pose[:3]
+        with np.errstate(invalid="ignore"):
+            px = self._camera.project(self._table.corners @ turn.T + position)
+            centres = self._camera.project_ideal(self._table.origins @ turn.T + position)
+            return px, strong_stretch(self._camera, centres)
 
     def _by_range(self, position: Array, q: Array, white: Array) -> PerceptionResult | None:
         """Return the pose from bearing, range and the attitude that the target sends.

@@ -81,9 +81,10 @@ class ThrusterController:
         """
         before, self._odometry = self._odometry, odometry
         now_ns = odometry.sim_time_ns
-        given_N_s = np.zeros(self._matrix.shape[1])
+        given_N_s = moments_N_s2 = np.zeros(self._matrix.shape[1])
         if before is not None and before.sim_time_ns < now_ns:
             given_N_s = self._impulses(before.sim_time_ns, now_ns)
+            moments_N_s2 = self._valves.first_moments(before.sim_time_ns, now_ns)
             if touched:
                 self._monitor.reset()
             else:
@@ -94,7 +95,7 @@ class ThrusterController:
         if now_ns - self._pruned_ns > _HISTORY_NS:
             self._pruned_ns = now_ns
             self._valves.forget_before(now_ns - _HISTORY_NS)
-        return self._report(odometry, given_N_s)
+        return self._report(odometry, given_N_s, moments_N_s2)
 
     def report_failure(self, thruster: int, kind: FailureKind, factor: float, at_ns: int) -> None:
         """Take over a failure that the hardware reports; ``factor``: remaining share of the
@@ -118,7 +119,7 @@ class ThrusterController:
     def _impulses(self, from_ns: int, to_ns: int) -> Array:
         return self._valves.impulses(np.array([from_ns, to_ns]))[0]
 
-    def _report(self, odometry: Odometry, given_N_s: Array) -> ThrusterReport:
+    def _report(self, odometry: Odometry, given_N_s: Array, moments_N_s2: Array) -> ThrusterReport:
         scale = min(1.0, self._set.box_scale(self.health.available_N(), self._box))
         if scale != self._scale and self._scale is not None:
             text = f"wrench limits are {scale:.3f} of the body's"
@@ -139,7 +140,8 @@ class ThrusterController:
         # belongs to that command.
         pulses_N_s = self._impulses(odometry.sim_time_ns, effective_ns + _MAX_PERIOD_NS)
         coming = self._matrix @ (pulses_N_s - self._modulator.advance_N_s(effective_ns))
-        total = self._matrix @ given_N_s
+        total, moment = self._matrix @ given_N_s, self._matrix @ moments_N_s2
+        magnitude = np.abs(self._matrix) @ given_N_s
         return ThrusterReport(
             tick=odometry.tick,
             sim_time_ns=odometry.sim_time_ns,
@@ -152,6 +154,10 @@ class ThrusterController:
             isolated=isolated,
             given_impulse_N_s=vector(total[:3]),
             given_angular_impulse_N_m_s=vector(total[3:]),
+            given_moment_N_s2=vector(moment[:3]),
+            given_angular_moment_N_m_s2=vector(moment[3:]),
+            given_magnitude_N_s=vector(magnitude[:3]),
+            given_angular_magnitude_N_m_s=vector(magnitude[3:]),
             given_thrusters_N_s=vector(given_N_s) if self._reports_each else (),
         )
 

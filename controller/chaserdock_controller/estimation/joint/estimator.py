@@ -187,7 +187,7 @@ class JointEstimator(Estimator):
                 _NO_DISTURBANCE
                 if inputs.chasers[i].latched
                 else disturbance(
-                    s, i, inputs.chasers[i].impulse / inputs.covered_s, self.parameters
+                    s, i, inputs.chasers[i].impulse.impulse / inputs.covered_s, self.parameters
                 ),
                 relative.get(i),
                 self.motion_covariance(i),

@@ -202,7 +202,7 @@ def predict(
     motion: MotionParameters,
     target: Array,
     target_noise: Array,
-    impulses: Array,
+    given: Array,
     orbital: Array,
     fade_view: Array,
     prior: Array,
@@ -217,12 +217,12 @@ def predict(
     Raises ValueError for sizes that contradict each other, as in a damaged checkpoint.
     """
     n = check_size(mean, covariance)
-    if any(len(a) != n for a in (impulses, orbital, fade_view, alive, latched)):
+    if any(len(a) != n for a in (given, orbital, fade_view, alive, latched)):
         raise ValueError(f"a state of {n} chasers with other numbers of chasers in its fields")
     out = np.empty_like(covariance)
     work = scratch(_work_size("predict_workspace", n, len(covariance)))
     arrays: tuple[NDArray[Any], ...] = (
-        target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance,
+        target, target_noise, given, orbital, fade_view, prior, alive, latched, mean, covariance,
         out, work,
     )  # fmt: skip
     function("predict")(

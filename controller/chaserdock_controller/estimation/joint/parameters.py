@@ -156,6 +156,8 @@ class JointParameters:
     """As calibrated."""
     navigation: NavigationErrors
     """Errors of the chasers' sensors."""
+    tick_s: float = 0.1
+    """Time between ticks."""
     force_max_N: float = 1.0
     torque_max_N_m: float = 0.1
 
@@ -220,6 +222,9 @@ class JointParameters:
     """
     collective_rejections: int = 3
     """Consecutive rejections by most cameras after which the target's rates are widened."""
+    collective_cameras: int = 3
+    """Cameras with a sighting from which on most of them can outvote the estimate of a chaser: with
+    fewer, the error may as well be that of the only chaser that disagrees."""
     iterated_updates: int = 5
     """Number of updates after a start of the target that are iterated, because they are far from
     linear.
@@ -276,6 +281,7 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
         body=body,
         camera=scenario.camera_model(),
         navigation=scenario.navigation.errors(),
+        tick_s=1.0 / rate_hz,
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
         unexpected_velocity_m_s=body.force_max_N / body.mass_kg / rate_hz / math.sqrt(3.0),

@@ -15,7 +15,7 @@ its sensors are Gauss-Markov processes or constants.
 from __future__ import annotations
 
 import math
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from ctypes import c_double
 from functools import lru_cache
 
@@ -26,6 +26,7 @@ from chaserdock_protocol.scenario.navigation import NavigationErrors
 from msgspec.structs import replace
 
 from chaserdock_controller.bodies.body_shape import RATIOS, SHAPE
+from chaserdock_controller.interfaces import AppliedImpulse
 
 from . import kernels
 from .kernels import CHASER_MEAN, TARGET_MEAN
@@ -56,16 +57,16 @@ _YOUNG_S = 1.0
 def predict(
     state: JointState,
     time_ns: int,
-    impulses: Array,
+    given: Sequence[AppliedImpulse],
     p: JointParameters,
     latched: Set[int] = frozenset(),
     nominal_s: float = math.inf,
 ) -> JointState:
     """Propagate the state to ``time_ns``.
 
-    ``impulses`` (N, 6): N s and N m s, body axes, given by the actuators since the state's time.
-    ``nominal_s``: time that these impulses cover; beyond it the command is unknown. Raises
-    ValueError for an earlier time.
+    ``given``: what the actuators of each chaser gave since then. ``nominal_s``: the time that it
+    covers, the last before ``time_ns``; before that the command is unknown. Raises ValueError for
+    an earlier time.
     """
     dt = (time_ns - state.time_ns) * 1e-9
     if dt == 0.0:
@@ -74,15 +75,18 @@ def predict(
         raise ValueError(f"cannot predict backwards, from {state.time_ns} to {time_ns} ns")
     moved, target_transition = _predict_target(state, dt, p)
     n, orbital = state.chasers, np.zeros((state.chasers, 6))
+    unknown_s = max(0.0, dt - nominal_s)
+    applied = np.array([(g.impulse, g.moment, g.magnitude) for g in given], dtype=float)
+    applied[:, 1] -= applied[:, 0] * (unknown_s / 2.0)  # about the middle of dt
     mean = packed(moved)
     if p.mean_motion_rad_s:
         for i, row in enumerate(mean[TARGET_MEAN:].reshape(n, CHASER_MEAN)[:, :13]):
             orbital[i] = cw_wrench(p.mean_motion_rad_s, row, p.body.mass_kg, p.inertia)
     covariance = kernels.predict(
-        _motion(dt, p, max(0.0, dt - nominal_s)),
+        _motion(dt, p, unknown_s),
         np.ascontiguousarray(target_transition[:, :TARGET]),
         _target_noise(dt, p, bool(latched)) if state.target_known else np.zeros((TARGET, TARGET)),
-        np.array(impulses, dtype=float),
+        applied,
         orbital,
         np.array([math.exp(-dt / p.sighting_noise(k).view_time_s) for k in state.markers.tolist()]),
         chaser_prior(p),

@@ -114,8 +114,8 @@ def _propagate(state: JointState, record: FilterTick, p: JointParameters) -> Joi
     """
     state = with_body(state, p.target)
     latched = frozenset(c.chaser for c in record.chasers if c.latched)
-    impulses = np.array([c.impulse for c in record.chasers])
-    state = predict(state, record.time_ns, impulses, p, latched, record.covered_s)
+    given = [c.impulse for c in record.chasers]
+    state = predict(state, record.time_ns, given, p, latched, record.covered_s)
     newest = state.odometry_ns.copy()
     for i, odometry in record.odometry.items():
         if not state.alive[i] or min(newest[i], state.measured_ns[i]) < _stale_ns(record, p):
@@ -183,7 +183,7 @@ def _check_cameras(
         return replace(now, collective=0)
     collective = now.collective + 1
     now = replace(now, collective=collective)
-    if collective == p.collective_rejections:
+    if collective == p.collective_rejections and len(seen) >= p.collective_cameras:
         return replace(
             now, hypotheses=tuple(with_uncertain_rates(h, p.target) for h in now.hypotheses)
         )

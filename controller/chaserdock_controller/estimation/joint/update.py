@@ -74,8 +74,6 @@ from .state import (
 _POSE = (CHANNELS.index("position"), CHANNELS.index("attitude"))
 _RATES = (CHANNELS.index("velocity"), CHANNELS.index("rate"))
 _SIGHTING, _ODOMETRY = frozenset({SIGHTING_CHANNEL}), frozenset(range(1, len(CHANNELS)))
-_TICK_S = 0.1
-"""Time, s, for which unexpected motion displaces a chaser: about a tick at most."""
 
 
 @dataclass(frozen=True)
@@ -459,9 +457,9 @@ def _unexpected_motion(i: int, running: RunningUpdate, p: JointParameters) -> Ar
     variances, own = np.zeros(len(running.covariance)), block(i).start
     for part, sigma in (
         (VELOCITY, p.unexpected_velocity_m_s),
-        (POSITION, p.unexpected_velocity_m_s * _TICK_S),
+        (POSITION, p.unexpected_velocity_m_s * p.tick_s),
         (RATE, p.unexpected_omega_rad_s),
-        (ATTITUDE, p.unexpected_omega_rad_s * _TICK_S),
+        (ATTITUDE, p.unexpected_omega_rad_s * p.tick_s),
         (FORCE, p.force_max_N),
         (TORQUE, p.torque_max_N_m),
     ):

@@ -8,7 +8,7 @@ signed correlation and give the pose by robust least squares (native/align.c).
 from __future__ import annotations
 
 import math
-from ctypes import c_double, c_int64
+from ctypes import Structure, byref, c_double, c_int64
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,11 +19,22 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 from numpy.typing import NDArray
 
-from ..native import function
+from ..lens import NativeLens, native_lens
+from ..native import LIBRARY, function
 from ..pipeline import GeometryInformation
 from ..refine import PoseInCamera
 from .mesh import NO_PATTERN, WRINKLES, TrackerMesh
 from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
+
+
+@LIBRARY.structure("LevelCamera")
+class _LevelCamera(Structure):
+    """`LevelCamera` of native/align.c."""
+
+    _fields_ = [
+        ("fx", c_double), ("fy", c_double), ("cx", c_double), ("cy", c_double),
+        ("height", c_double), ("width", c_double), ("lens", NativeLens),
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -311,7 +322,7 @@ def image_window(
 ) -> NDArray[np.float32]:
     """Return the image of level ``k`` on the grid of a window of ideal pixels."""
     image = pyramid.level(k)
-    if not pyramid.camera.distortion:
+    if not pyramid.camera.distorts:
         return image[top : top + window.height, left : left + window.width]
     # The distortion is smooth: map every eighth pixel only, and interpolate between them.
     rows, columns = -(-window.height // 8) + 1, -(-window.width // 8) + 1
@@ -417,16 +428,15 @@ def _match(
     """
     image = pyramid.level(points.level)
     n = len(points.points_m)
-    distortion = (*pyramid.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    camera = (c_double * 11)(*pyramid.lens(points.level), *distortion, *image.shape)
+    camera = _LevelCamera(*pyramid.lens(points.level), *image.shape, native_lens(pyramid.camera))
     settings = (c_double * 5)(reach_px, iterations, _MATCH.min_correlation, _MATCH.noise, inlier_px)
     displacement = np.einsum("k,kni->ni", modes, points.displaced_m) if len(modes) else 0.0
     at, ahead = points.points_m + displacement, points.ahead_m + displacement
     pose, residual, weight = pose_array(prior), np.empty(n), np.empty(n)
     correlation, rows, work = np.empty(n), np.empty((n, 6)), np.empty(2 * n)
     inside = function("align_points", c_int64)(
-        camera, address(image), settings, address(at), address(ahead), address(points.profiles),
-        address(points.border_m),
+        byref(camera), address(image), settings, address(at), address(ahead),
+        address(points.profiles), address(points.border_m),
         c_int64(n), address(pose), address(residual), address(weight), address(correlation),
         address(rows), address(work),
     )  # fmt: skip

@@ -7,7 +7,7 @@
  * pose follows from the shifts along the gradients by iteratively reweighted least squares on SE(3)
  * with Tukey's biweight, as in C. Harris, C. Stennett, "RAPID", BMVC 1990, and later model-based
  * trackers. */
-#include "base.h"
+#include "lens.h"
 
 /* Samples to either side of a control point, a pixel apart: an edge, its spread, and some of both
  * surfaces. */
@@ -25,11 +25,12 @@ typedef struct {
     double cell_px, per_cell, min_gradient;
 } PointChoice;
 
-/* A camera on the grid of one image level: pinhole, and Brown-Conrady distortion (k1, k2, p1, p2,
- * k3). */
+/* A camera on the grid of one image level. */
 typedef struct {
-    double fx, fy, cx, cy, distortion[5], height, width;
+    double fx, fy, cx, cy, height, width;
+    Lens lens;
 } LevelCamera;
+LAYOUT(LevelCamera, fx, fy, cx, cy, height, width, lens)
 
 /* ``reach_px``: searched at first on both sides; ``iterations``; ``min_correlation`` of a match;
  * ``noise``: grey levels;
@@ -155,11 +156,9 @@ EXPORT int64_t NAME(control_points)(const float *view, const float *nearest, con
 
 /* Convert an ideal pixel of a level to a pixel of the distorted image. */
 static inline void distort_px(const LevelCamera *c, double u, double v, double *out) {
-    const double *k = c->distortion;
-    double x = (u - c->cx) / c->fx, y = (v - c->cy) / c->fy, r2 = x * x + y * y;
-    double radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]));
-    out[0] = (x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)) * c->fx + c->cx;
-    out[1] = (y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y) * c->fy + c->cy;
+    distort_ray(&c->lens, (u - c->cx) / c->fx, (v - c->cy) / c->fy, out);
+    out[0] = out[0] * c->fx + c->cx;
+    out[1] = out[1] * c->fy + c->cy;
 }
 
 /* Shift of best correlation of ``profile`` along ``taps`` (2 (reach + HALF) + 1), in steps; refined

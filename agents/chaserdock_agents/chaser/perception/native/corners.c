@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Refines marker corners as intersections of lines fitted to the sides. Method:
  * chaserdock_agents.chaser.perception.corners. */
-#include "base.h"
+#include "lens.h"
 
 /* Capacity: lines across a side; the settings have 8. */
 #define ROWS_MOST 20
@@ -17,9 +17,14 @@
 
 typedef struct {
     const uint8_t *image;
-    int64_t height, width, distorted;
-    /* fx, fy, cx, cy, k1, k2, p1, p2, k3 */
-    const double *lens;
+    int64_t height, width;
+    /* fx, fy, cx, cy */
+    const double *camera;
+    /* Null without distortion. */
+    const Lens *lens;
+    /* Frame (3, 3) of the marker in work: from its coordinates (x, y, 1), in which one unit is about
+     * a pixel of the image, to rays; null: they are ideal pixels. */
+    const double *frame;
 } Image;
 
 /* Settings, in the order of the Python caller. */
@@ -82,13 +87,19 @@ static double level_at(const Image *p, double x, double y) {
     return upper + (lower - upper) * y;
 }
 
-/* Converts an ideal to a distorted pixel (Brown-Conrady). */
+/* Converts coordinates of the marker in work to a distorted pixel; NaN beyond the lens. */
 static void distort(const Image *p, double *x, double *y) {
-    const double *l = p->lens;
-    double a = (*x - l[2]) / l[0], b = (*y - l[3]) / l[1], r2 = a * a + b * b;
-    double radial = 1.0 + r2 * (l[4] + r2 * (l[5] + r2 * l[8]));
-    *x = ((a * radial + 2.0 * l[6] * a * b) + l[7] * (r2 + 2.0 * a * a)) * l[0] + l[2];
-    *y = ((b * radial + l[6] * (r2 + 2.0 * b * b)) + 2.0 * l[7] * a * b) * l[1] + l[3];
+    const double *l = p->camera;
+    double ideal[2] = {(*x - l[2]) / l[0], (*y - l[3]) / l[1]}, seen[2];
+    if (p->frame) {
+        double at[3] = {*x, *y, 1.0}, ray[3];
+        multiply3(p->frame, at, ray);
+        double ahead = ray[2] > 0.0 ? ray[2] : __builtin_nan("");
+        for (int k = 0; k < 2; k++) ideal[k] = ray[k] / ahead;
+    }
+    distort_ray(p->lens, ideal[0], ideal[1], seen);
+    *x = seen[0] * l[0] + l[2];
+    *y = seen[1] * l[1] + l[3];
 }
 
 /* Samples a row across a side: position `along` it (-0.5 to 0.5), offsets `across` (taps), pixels,
@@ -101,7 +112,7 @@ static int row_of(const Image *p, const Side *s, double along, const double *acr
     for (int k = 0; k < 2; k++) base[k] = (s->start[k] + 0.5 * s->vector[k]) + along * s->vector[k];
     for (int t = 0; t < taps; t++) {
         double x = base[0] + s->normal[0] * across[t], y = base[1] + s->normal[1] * across[t];
-        if (p->distorted) distort(p, &x, &y);
+        if (p->lens) distort(p, &x, &y);
         if (t == 0 || t == taps - 1)
             inside &=
                 x >= 0.0 && x <= (double)(p->width - 1) && y >= 0.0 && y <= (double)(p->height - 1);
@@ -304,7 +315,7 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
         double at = end + (length - 2.0 * end) * (c + 0.5) / band->columns, ideal[2], shift[2],
                seen[2];
         for (int j = 0; j < 2; j++) seen[j] = ideal[j] = s->start[j] + at / length * s->vector[j];
-        if (p->distorted) distort(p, seen, seen + 1);
+        if (p->lens) distort(p, seen, seen + 1);
         for (int j = 0; j < 2; j++) shift[j] = seen[j] - ideal[j];
         double most = outward_limit(set, border, outer, at);
         double low = seen[o] - inner / s->normal[o], high = seen[o] + most / s->normal[o];
@@ -320,7 +331,7 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
             double pixel[2], q[2];
             pixel[k] = line, pixel[o] = row;
             for (int j = 0; j < 2; j++) q[j] = pixel[j] - shift[j];
-            for (int i = 0; i < 2 && p->distorted; i++) {
+            for (int i = 0; i < 2 && p->lens; i++) {
                 double d[2] = {q[0], q[1]};
                 distort(p, d, d + 1);
                 for (int j = 0; j < 2; j++) q[j] += pixel[j] - d[j];
@@ -454,17 +465,18 @@ static int fit_side(const Image *p, const Settings *set, const Edge *edge, const
     return fine;
 }
 
-/* Refines corners (n, 4, 2), ideal pixels, in place. `good` (n): whether all four sides are usable;
+/* Refines corners (n, 4, 2) in place, in the frame (n, 3, 3) of a marker if it is `framed` (n), else
+ * in ideal pixels. `lens`: null without distortion. `good` (n): whether all four sides are usable;
  * otherwise the corners are unchanged, as for corners that are not finite. `sigma` (n): uncertainty
  * relative to that of a large marker. `margin` (n): width of the white border over the marker's
  * side; `outlined` (n): whether it ends there on all sides. `cells`: cells along a side, including
  * the black border. */
 EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width,
-                                 const double *lens, int64_t distorted, const Settings *set,
-                                 double cells, int64_t n, const double *margin,
-                                 const uint8_t *outlined, double *corners, uint8_t *good,
-                                 double *sigma) {
-    Image p = {image, height, width, distorted, lens};
+                                 const double *camera, const Lens *lens, const double *frames,
+                                 const uint8_t *framed, const Settings *set, double cells,
+                                 int64_t n, const double *margin, const uint8_t *outlined,
+                                 double *corners, uint8_t *good, double *sigma) {
+    Image p = {image, height, width, camera, lens, NULL};
     Edge edge;
     Band band;
     tabulate(&edge);
@@ -474,6 +486,7 @@ EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t w
         Side sides[4];
         Border borders[4];
         int fine = 1;
+        p.frame = framed[m] ? frames + 9 * m : NULL;
         copy(given, refined, 8);
         sides_of(refined, sides);
         for (int i = 0; i < 4; i++)

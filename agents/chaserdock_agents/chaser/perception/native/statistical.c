@@ -29,21 +29,26 @@ static int factorize6(double *a, double least) {
     return 1;
 }
 
-/* Pixels (4, 2) and cosine of the angle of view of marker i in a pose; return whether it is
- * detected. */
+/* Ideal pixels (4, 2) and cosine of the angle of view of marker i in a pose; return whether it is
+ * detected. ``imaged`` (4, 2): its pixels in the image, null without distortion. ``stretch``: ideal
+ * pixels per pixel of the image. ``side``: shortest side, pixels of the image. */
 static int see_marker(const PinholeCamera *lens, const MarkerLimits *limits, const double *corners,
                       const double *origin, const double *normal, const double *position,
-                      const double *rotation, double *px, double *side, double *cosine) {
+                      const double *rotation, const double *imaged, double stretch, double *px,
+                      double *side, double *cosine) {
     double low = 1e300, right = -1e300, bottom = -1e300, centre[3], outwards[3];
+    int inside = 1;
     for (int k = 0; k < 4; k++) {
         double at[3];
         multiply3(rotation, corners + 3 * k, at);
         for (int j = 0; j < 3; j++) at[j] += position[j];
         px[2 * k] = at[0] / at[2] * lens->fx + lens->cx;
         px[2 * k + 1] = at[1] / at[2] * lens->fy + lens->cy;
-        low = min_of(low, min_of(px[2 * k], px[2 * k + 1]));
-        right = max_of(right, px[2 * k]);
-        bottom = max_of(bottom, px[2 * k + 1]);
+        const double *at_px = (imaged ? imaged : px) + 2 * k;
+        inside &= finite(at_px[0]) && finite(at_px[1]);
+        low = min_of(low, min_of(at_px[0], at_px[1]));
+        right = max_of(right, at_px[0]);
+        bottom = max_of(bottom, at_px[1]);
     }
     double least = 1e300;
     for (int k = 0; k < 4; k++) {
@@ -51,12 +56,12 @@ static int see_marker(const PinholeCamera *lens, const MarkerLimits *limits, con
         double u = a[0] - b[0], v = a[1] - b[1];
         least = min_of(least, u * u + v * v);
     }
-    *side = sqrt_of(least);
+    *side = sqrt_of(least) / stretch;
     multiply3(rotation, origin, centre);
     multiply3(rotation, normal, outwards);
     for (int j = 0; j < 3; j++) centre[j] += position[j];
     *cosine = -dot3(outwards, centre) / sqrt_of(dot3(centre, centre));
-    return low >= limits->margin_px && right <= lens->width - 1.0 - limits->margin_px &&
+    return inside && low >= limits->margin_px && right <= lens->width - 1.0 - limits->margin_px &&
            bottom <= lens->height - 1.0 - limits->margin_px && *cosine > limits->least_cosine &&
            *side >= limits->least_side_px;
 }
@@ -91,14 +96,16 @@ static void add_information(const PinholeCamera *lens, const double *corners,
 
 /* Measure a pose as an image would, by the markers that it shows. ``corners`` (m, 4, 3),
  * ``origins`` and ``normals`` (m, 3): of m markers in the target's axes. ``pose``: position (3) and
- * rotation (3, 3) of the target in the camera. ``white`` (6): standard normal numbers. Writes which
- * markers are seen (m), the ideal pixels of all corners (m, 4, 2), and, by position and rotation
- * vector, the covariance (6, 6) of the pose and an error (6) drawn from it. Returns the number of
- * markers seen; 0 if none is or if they do not determine the pose; -1 if a corner of any is behind
- * the camera. */
+ * rotation (3, 3) of the target in the camera. ``imaged`` (m, 4, 2) and ``stretch`` (m): pixels of
+ * the corners in the image, and ideal pixels per such pixel; both null without distortion.
+ * ``white`` (6): standard normal numbers. Writes which markers are seen (m), the ideal pixels of all
+ * corners (m, 4, 2), and, by position and rotation vector, the covariance (6, 6) of the pose and an
+ * error (6) drawn from it. Returns the number of markers seen; 0 if none is or if they do not
+ * determine the pose; -1 if a corner of any is behind the camera. */
 EXPORT int64_t NAME(measure_pose)(const PinholeCamera *lens, const MarkerLimits *limits,
                                   const double *corners, const double *origins,
                                   const double *normals, int64_t m, const double *pose,
+                                  const double *imaged, const double *stretch,
                                   const double *white, int64_t *seen, double *px,
                                   double *covariance, double *error) {
     const double *position = pose, *rotation = pose + 3;
@@ -108,13 +115,14 @@ EXPORT int64_t NAME(measure_pose)(const PinholeCamera *lens, const MarkerLimits 
     zero(information, 36);
     int64_t count = 0;
     for (int64_t i = 0; i < m; i++) {
-        double side, cosine;
+        double side, cosine, ratio = stretch ? stretch[i] : 1.0;
         seen[i] = see_marker(lens, limits, corners + 12 * i, origins + 3 * i, normals + 3 * i,
-                             position, rotation, px + 8 * i, &side, &cosine);
+                             position, rotation, imaged ? imaged + 8 * i : NULL, ratio, px + 8 * i,
+                             &side, &cosine);
         if (!seen[i]) continue;
         count++;
         cosine_of_last = cosine;
-        double sigma = limits->sigma_px * max_of(1.0, limits->small_side_px / side);
+        double sigma = limits->sigma_px * max_of(1.0, limits->small_side_px / side) * ratio;
         add_information(lens, corners + 12 * i, position, rotation, sigma, information);
     }
     if (count == 0 || (count == 1 && cosine_of_last < limits->least_cosine_single)) return 0;

@@ -77,11 +77,11 @@ static void add_element(double *p, int64_t d, int64_t first, int r, int c, doubl
     p[d * (first + r) + first + c] += added;
 }
 
-/* Add the process noise of a chaser to the lower triangle of p. impulse (6): of the command.
- * prior (CHASER - 12): variances of the additive states. */
-static void add_noise(double *p, int64_t d, int64_t first, const double *impulse,
+/* Add the process noise of a chaser to the lower triangle. magnitude (6): of the impulses of its
+ * actuators, which may cancel. prior (CHASER - 12): variances of additive states. */
+static void add_noise(double *p, int64_t d, int64_t first, const double *magnitude,
                       const double *fade, const double *prior, int is_latched, const Motion *m) {
-    const double force = length3(impulse), dt = m->dt;
+    const double force = length3(magnitude), dt = m->dt;
     for (int k = 0; k < 3; k++) {
         double linear = m->latched_acceleration * dt,
                angular = m->latched_angular_acceleration * dt;
@@ -90,7 +90,7 @@ static void add_noise(double *p, int64_t d, int64_t first, const double *impulse
             const double share = m->control_force_share * force / m->mass,
                          unknown = m->force_max * m->unknown_s / m->mass;
             linear = share * share + unknown * unknown;
-            const double torque = m->control_torque_share * impulse[3 + k],
+            const double torque = m->control_torque_share * magnitude[3 + k],
                          arm = m->control_arm * force;
             const double more = m->torque_max * m->unknown_s;
             angular = (torque * torque + arm * arm + more * more) / (m->inertia[k] * m->inertia[k]);
@@ -116,12 +116,13 @@ EXPORT int64_t NAME(predict_workspace)(int64_t n, int64_t d) {
     return d * d + n * (MOTION * COUPLED + CHASER) + 144 + 4 * 8;
 }
 
-/* Predict the chasers' `mean` in place, and write the predicted `covariance` (D, D) to `out`.
- * target, target_noise (12, 12): transition and process noise of the target. impulses (n, 6): N
- * s, N m s. orbital (n, 6): wrench of the orbit. fade_view (n,): decay of the view error.
- * alive, latched (n,): 0 or 1. prior (31): variances of the additive states. */
+/* Predict the chasers' `mean` in place, and `covariance` (D, D) to `out`. target, target_noise (12,
+ * 12): of the target. given (n, 3, 6): of the actuators, the impulse (N s, N m s), its first moment
+ * about the middle of dt, and the sum of the magnitudes of its parts. orbital (n, 6): wrench of the
+ * orbit. fade_view (n,): decay of the view's error. alive, latched (n,): 0 or 1. prior (31):
+ * variances of the additive states. */
 EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *target,
-                          const double *target_noise, const double *impulses, const double *orbital,
+                          const double *target_noise, const double *given, const double *orbital,
                           const double *fade_view, const double *prior, const int64_t *alive,
                           const int64_t *latched, double *mean, const double *covariance,
                           double *out, double *work) {
@@ -132,20 +133,26 @@ EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *t
         for (int j = 0; j < 12; j++) transposed[12 * j + i] = target[12 * i + j];
     for (int64_t i = 0; i < n; i++) {
         double *x = mean + TARGET_MEAN + CHASER_MEAN * i, *own = fade + CHASER * i, wrench[6] = {0},
-               centre[3] = {0}, total[6];
+               lead[6] = {0}, centre[3] = {0}, total[6];
+        const double *impulse = given + GIVEN * i, *moment = impulse + 6;
         double *additive = x + ADDITIVE;
         for (int k = 0; k < CHASER; k++) own[k] = k >= VIEW ? fade_view[i] : 1.0;
         for (int k = 0; k < 3; k++)
             own[POSITION_DRIFT + k] = m->fade_position, own[ATTITUDE_DRIFT + k] = m->fade_attitude;
         if (!latched[i]) {
-            for (int k = 0; k < 6; k++)
-                wrench[k] = impulses[6 * i + k] / m->dt + additive[FORCE + k];
+            for (int k = 0; k < 6; k++) {
+                wrench[k] = impulse[k] / m->dt + additive[FORCE + k];
+                lead[k] = moment[k] / m->dt;
+            }
             copy(additive + CENTRE, centre, 3);
         }
         shift_wrench(wrench, centre, x + OMEGA, m->mass, m->inertia, total);
-        motion_transition(x, wrench, total, centre, m, motion + MOTION * COUPLED * i);
+        motion_transition(x, wrench, total, lead, centre, m, motion + MOTION * COUPLED * i);
         for (int k = 0; k < 6; k++) total[k] += orbital[6 * i + k];
+        /* A constant wrench has no moment: impulses at both ends that cancel add it. */
+        push(x, lead, 1.0, centre, m);
         move(x, total, m);
+        push(x, lead, -1.0, centre, m);
         for (int k = FORCE; k < CHASER; k++) additive[k] *= own[k];
     }
     propagate(n, d, transposed, motion, fade, covariance, g, out);
@@ -153,7 +160,7 @@ EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *t
         for (int j = 0; j <= i; j++) out[d * i + j] += target_noise[12 * i + j];
     for (int64_t i = 0; i < n; i++)
         if (alive[i])
-            add_noise(out, d, first_of(i), impulses + 6 * i, fade + CHASER * i, prior,
+            add_noise(out, d, first_of(i), given + GIVEN * i + 12, fade + CHASER * i, prior,
                       latched[i] != 0, m);
     mirror(out, d);
 }

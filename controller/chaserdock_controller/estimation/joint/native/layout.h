@@ -38,6 +38,8 @@ enum {
     CHANNELS = 5,
     SEEN = TARGET + CHASER
 };
+/* Components of what the actuators of a chaser gave: impulse, first moment, magnitude. */
+enum { GIVEN = 18 };
 
 static inline int64_t size_of(int64_t n) { return TARGET + CHASER * n; }
 static inline int64_t first_of(int64_t i) { return TARGET + CHASER * i; }

@@ -72,11 +72,27 @@ static void move(double *y, const double *u, const Motion *p) {
     normalize_quaternion(y + QUATERNION);
 }
 
-/* Write the transposed rows 0 .. COUPLED - 1 of a chaser's transition 1 + A dt + (A dt)^2 / 2
- * to `out` (MOTION, COUPLED); the other rows are those of the identity. wrench (6): at the
- * centre of mass; total (6): at the origin. */
+/* Change velocity and rate of a state (13) by `sign` times an impulse (6) in body axes; centre (3):
+ * its centre of mass. */
+static void push(double *y, const double *impulse, double sign, const double *centre,
+                 const Motion *p) {
+    const double at_rest[3] = {0};
+    double total[6], gained[3], c[9];
+    shift_wrench(impulse, centre, at_rest, p->mass, p->inertia, total);
+    matrix_of(y + QUATERNION, c);
+    for (int i = 0; i < 3; i++) gained[i] = dot3(c + 3 * i, total);
+    for (int i = 0; i < 3; i++) {
+        y[3 + i] += sign * gained[i] / p->mass;
+        y[OMEGA + i] += sign * total[3 + i] / p->inertia[i];
+    }
+}
+
+/* Transposed rows 0 .. COUPLED - 1 of a chaser's transition 1 + A dt + (A dt)^2 / 2, `out` (MOTION,
+ * COUPLED); its other rows are those of the unit matrix. wrench, total (6): at the centre of mass,
+ * at the origin. lead (6): impulse at the beginning and, negative, at the end of dt. */
 static void motion_transition(const double *x, const double *wrench, const double *total,
-                              const double *centre, const Motion *p, double *out) {
+                              const double *lead, const double *centre, const Motion *p,
+                              double *out) {
     double a[COUPLED * MOTION], c[9], centre_skew[9], turning[9], m[9], n[9], alpha[3], momentum[3],
         spin[3];
     const double *omega = x + OMEGA, *inertia = p->inertia;
@@ -99,6 +115,12 @@ static void motion_transition(const double *x, const double *wrench, const doubl
             rate[MOTION * i + FORCE + j] = -centre_skew[3 * i + j] / inertia[i];
         rate[MOTION * i + TORQUE + i] = 1.0 / inertia[i];
     }
+    skew(lead, m);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            a[MOTION * (ATTITUDE + i) + CENTRE + j] = m[3 * i + j] / inertia[i];
+    multiply_matrices(c, m, n);
+    put(a, MOTION, ATTITUDE, -1.0 / p->mass, n);
     skew(wrench, m);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) rate[MOTION * i + CENTRE + j] = m[3 * i + j] / inertia[i];

@@ -279,7 +279,7 @@ def test_push_of_a_latched_chaser_moves_the_whole_stack(seed: int) -> None:
     impulse = rng.uniform(-0.3, 0.3, 6)
     seen = ChaserObservation(
         0, np.ones(6), odometry=moving_odometry(rng, 0, 32, target.time_ns),
-        impulse=AppliedImpulse(impulse, measured=False),
+        impulse=AppliedImpulse.steady(impulse),
     )  # fmt: skip
     composite.disturb(Observation(32, target.time_ns, target.time_ns, (seen,)))
     (shock,) = estimator.shocks

@@ -7,6 +7,7 @@ and in every kind of motion. The right sides are finite differences of paths in 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -102,7 +103,7 @@ class Flight:
         self.target = FreeTarget(self.start)
         self.builder = ReferenceBuilder(self.scenario)
 
-    def horizon(self, relative: list[RelativePose | None] | None = None) -> HorizonReference:
+    def horizon(self, relative: Sequence[RelativePose | None] | None = None) -> HorizonReference:
         known = self.relative if relative is None else relative
         return self.builder.horizon(self.chasers, self.start, BODY, frozenset(), known)
 

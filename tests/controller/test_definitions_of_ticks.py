@@ -174,9 +174,14 @@ def test_plan_begins_when_its_first_command_takes_effect(flown: Flown) -> None:
 def test_estimator_receives_the_impulse_of_the_tick_that_has_passed(flown: Flown) -> None:
     parts = flown.between(flown.time_s - 1 / HZ, flown.time_s)
     assert len(parts) == 2  # a command took effect in it
-    impulse = sum((duration_s * wrench for duration_s, wrench in parts), np.zeros(6))
     given = flown.estimator.asked[-1].chasers[0].impulse
-    np.testing.assert_allclose(getattr(given, "impulse", given), impulse, atol=1e-9)
+    impulse = sum((duration_s * wrench for duration_s, wrench in parts), np.zeros(6))
+    np.testing.assert_allclose(given.impulse, impulse, atol=1e-9)
+    np.testing.assert_allclose(given.magnitude, sum(d * np.abs(w) for d, w in parts), atol=1e-9)
+    # About the middle of the tick: the first part acts early, the second late.
+    (first_s, first), (second_s, second) = parts
+    early = first_s * first * second_s / 2 - second_s * second * first_s / 2
+    np.testing.assert_allclose(given.moment, early, atol=1e-9)
 
 
 def test_messages_of_a_tick_are_of_its_own_time(flown: Flown) -> None:

@@ -16,7 +16,7 @@ from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.composite_body import CompositeBody
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.hypotheses import FilterState, mixture_covariance
-from chaserdock_controller.estimation.joint.measurements import sighting_covariance
+from chaserdock_controller.estimation.joint.measurements import odometry_noise, sighting_covariance
 from chaserdock_controller.estimation.joint.motion_models import process_noise, steady_motion
 from chaserdock_controller.estimation.joint.prediction import disturbance
 from chaserdock_controller.estimation.joint.replay import FilterTick
@@ -435,6 +435,17 @@ def test_floors_of_sightings_are_in_their_own_units() -> None:
     )
     added = sighting_covariance(solution, p) - stated
     np.testing.assert_allclose(added, np.diag([0.02**2] * 3 + [0.5**2] * 3), atol=1e-15)
+
+
+def test_floors_of_odometry_are_in_their_own_units() -> None:
+    rng = np.random.default_rng(0)
+    floors = {"position_m": 0.02, "velocity_m_s": 0.3, "attitude_rad": 0.5, "omega_rad_s": 0.7}
+    p = changed(
+        parameters(scenario(), navigation("lab")),
+        **{f"floor_{name}": floor for name, floor in floors.items()},
+    )
+    noise = odometry_noise(moving_odometry(rng, 0, 0, 0), p)
+    np.testing.assert_allclose(noise, np.diag(np.repeat(np.square([*floors.values()]), 3)))
 
 
 @SEEDS

@@ -19,8 +19,14 @@ from chaserdock_controller.estimation.types import (
     EstimatorInputs,
 )
 from chaserdock_controller.guidance.escape import EscapePlanner, RelativeState
+from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_controller.guidance.trajectories import move_to, stay
-from chaserdock_controller.interfaces import TargetState, TickOutputs
+from chaserdock_controller.interfaces import (
+    ChaserEstimate,
+    OwnMotion,
+    TargetState,
+    TickOutputs,
+)
 from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, NmpcSolver
 from chaserdock_controller.nmpc import stage as planning
 from chaserdock_models import rotations
@@ -232,3 +238,36 @@ def test_margin_of_a_move_is_that_of_its_coasts_from_a_turning_target(seed: int)
         distances.append(float(np.linalg.norm(r + t * v)))
     expected = (min(distances) - mission.limits.min_distance_target_m) / sigma_m
     assert planner.move_margin(known, move, 1.0) == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_abort_has_the_margin_of_its_coast_with_the_error_of_its_burn(seed: int) -> None:
+    """Between those with the error's effect at the closest approach and at the coast's end."""
+    rng, duration_s, sigma_m = np.random.default_rng(seed), 200.0, 0.03
+    mission = scenario(limits={"passive_safety": "enforce", "passive_safety_s": duration_s})
+    state = np.concatenate([rng.uniform(1, 2, 3), rng.uniform(-0.03, 0.03, 3)])
+    spread = np.diag([sigma_m**2] * 3 + [1e-30] * 3)
+    known = RelativeState(state, spread, Uniform(rng).estimate_at(0))
+    move, margin = EscapePlanner(mission, 0.05).escape(known, 1.0)
+    burn_s, burn = move.burn_s, move.acceleration_m_s2
+    r = state[:3] + burn_s * state[3:] + 0.5 * burn_s**2 * burn
+    v = state[3:] + burn_s * burn
+    t = min(max(-float(r @ v) / float(v @ v), 0.0), duration_s)
+    room_m = float(np.linalg.norm(r + t * v)) - mission.limits.min_distance_target_m
+    sigma_m_s = 0.03 * burn_s * float(np.linalg.norm(burn))
+    most, least = (room_m / math.hypot(sigma_m, s * sigma_m_s) for s in (t, duration_s))
+    assert room_m > 0.0
+    assert least - 1e-6 <= margin <= most + 1e-6
+
+
+def test_guidance_knows_position_and_velocity_relative_to_the_target() -> None:
+    rng = np.random.default_rng(8)
+    mission, estimator = scenario(limits={"passive_safety": "enforce"}), Uniform(rng)
+    target, own = estimator.estimate_at(10**9), odometry(0, 10, 10**9)
+    motion = OwnMotion(own, np.zeros(13), np.zeros(6))
+    estimate = ChaserEstimate(0, motion, motion_covariance=np.eye(6))
+    known = GuidanceStage(mission)._relative(estimate, target)
+    assert known is not None
+    apart = np.array(own.position_m) - target.position_m
+    np.testing.assert_allclose(known.state[:3], apart, atol=1e-15)
+    np.testing.assert_allclose(known.state[3:], own.velocity_m_s - estimator.velocity, atol=1e-15)

@@ -252,6 +252,15 @@ def test_a_new_move_continues_the_present_motion(kind: str) -> None:
             np.testing.assert_allclose(rate, 0.0, atol=1e-7)
 
 
+def test_glide_is_slow_from_the_end_of_its_first_length_on() -> None:
+    along, begun = np.array([2.0, -1.0, 2.0]) / 3.0, np.array([0.3, 0.7, -0.4])
+    path = glide(begun, along, 1.3, (0.5, 0.05), (0.3, 0.02))
+    slow_s = path.start_s + path.ramps_s[0] + path.holds_s[0] + path.ramps_s[1]
+    places, speeds, _ = path.at([slow_s, path.start_s + path.duration_s])
+    np.testing.assert_allclose(places, begun + np.outer([0.5, 0.8], along), atol=1e-12)
+    np.testing.assert_allclose(speeds[0], 0.02 * along, atol=1e-12)
+
+
 def test_port_is_seen_as_by_an_observer_on_it() -> None:
     """Rates of gap, side and attitude by differences of poses in TRF."""
     rng, h = np.random.default_rng(7), 1e-4

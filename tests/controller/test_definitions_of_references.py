@@ -15,7 +15,7 @@ import pytest
 from chaserdock_controller.guidance.chaser_machine import ChaserMachine
 from chaserdock_controller.guidance.horizon import ReferenceBuilder
 from chaserdock_controller.guidance.phases import Phase
-from chaserdock_controller.guidance.pointing import calibration_turns
+from chaserdock_controller.guidance.pointing import calibration_turns, turning_wrench
 from chaserdock_controller.guidance.trajectories import (
     Escape,
     Motion,
@@ -26,6 +26,7 @@ from chaserdock_controller.guidance.trajectories import (
     stop,
 )
 from chaserdock_controller.interfaces import HorizonReference, RelativePose, TargetState
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_models.docking_geometry import view_of
@@ -39,6 +40,7 @@ from general_position import (
     FreeTarget,
     attitude,
     matrix,
+    moving_odometry,
     relative_pose,
     target_state,
     turn_between,
@@ -259,6 +261,20 @@ def test_glide_is_slow_from_the_end_of_its_first_length_on() -> None:
     places, speeds, _ = path.at([slow_s, path.start_s + path.duration_s])
     np.testing.assert_allclose(places, begun + np.outer([0.5, 0.8], along), atol=1e-12)
     np.testing.assert_allclose(speeds[0], 0.02 * along, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_turn_of_a_search_follows_attitude_and_rate(seed: int) -> None:
+    """A critically damped oscillator of 2 rad/s about the moving attitude."""
+    rng = np.random.default_rng(seed)
+    body = scenario(chaser={"inertia_kg_m2": list(INERTIA), "torque_max_N_m": 9.0}).chaser
+    own, inertia = moving_odometry(rng, 0, 0, 0), np.diag(INERTIA)
+    error, rate = rng.uniform(-0.2, 0.2, (2, 3))
+    q = rotations.multiply(own.q_wxyz, rotations.exp(error))
+    soon = rotations.multiply(q, rotations.exp(0.02 * rate))
+    omega = np.array(own.omega_rad_s)
+    torque = inertia @ (4.0 * error + 4.0 * (rate - omega)) + np.cross(omega, inertia @ omega)
+    np.testing.assert_allclose(turning_wrench(own, body, q, soon)[3:], torque, atol=1e-9)
 
 
 def test_port_is_seen_as_by_an_observer_on_it() -> None:

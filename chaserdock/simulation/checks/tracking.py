@@ -24,13 +24,15 @@ SETTLED_S = 10.0
 centimetres off, and one that has flown without commands returns in about 8 s.
 """
 LEAST_TRACKING, MOST_TRACKING, FLIGHT_TRACKING = 0.2, 1.5, 6.0
-"""Bounds of the mean normalized tracking error over many flights, and the largest in one."""
+"""Bounds of the mean normalized tracking error over many flights, and the largest in one. A gamma
+distribution of mean 1 and the spread below exceeds the last in one flight of 100,000.
+"""
 TRACKING = Expectation(
     "tracking accuracy",
     "normalized tracking error",
     LEAST_TRACKING,
     MOST_TRACKING,
-    0.5,
+    0.6,
     FLIGHT_TRACKING,
 )
 

@@ -13,13 +13,15 @@ printed, no signal handler is installed; the functions work in notebooks and in 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-from chaserdock_protocol.errors import ChaserdockError
-
-from .api import RunResult, list_scenarios, load_scenario, open_log, run
-
+TYPE_CHECKING = False  # as type checkers know it; `typing` alone takes most of this import
 if TYPE_CHECKING:
+    from typing import Any
+
+    from chaserdock_protocol.errors import ChaserdockError, MissingPackageError, ScenarioError
+    from chaserdock_protocol.recording.scan import LogError
+
+    from .api import RunResult, list_scenarios, load_scenario, open_log, run
+    from .launch.launcher import RunError
     from .logs.reader import Log
     from .summary import ChaserSummary, Summary
 
@@ -27,7 +29,11 @@ __all__ = [
     "ChaserSummary",
     "ChaserdockError",
     "Log",
+    "LogError",
+    "MissingPackageError",
+    "RunError",
     "RunResult",
+    "ScenarioError",
     "Summary",
     "list_scenarios",
     "load_scenario",
@@ -37,13 +43,20 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import the types that need heavy modules on first use."""
-    if name == "Log":
-        from .logs.reader import Log
-
-        return Log
-    if name in ("ChaserSummary", "Summary"):
-        from . import summary
-
-        return getattr(summary, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import what is used on first use: the program's start must be quick, and stoppable."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in ("ChaserdockError", "MissingPackageError", "ScenarioError"):
+        from chaserdock_protocol import errors as home
+    elif name == "LogError":
+        from chaserdock_protocol.recording import scan as home
+    elif name == "RunError":
+        from .launch import launcher as home
+    elif name == "Log":
+        from .logs import reader as home
+    elif name in ("ChaserSummary", "Summary"):
+        from . import summary as home
+    else:
+        from . import api as home
+    found = globals()[name] = getattr(home, name)
+    return found

@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ScenarioError
 from chaserdock_protocol.stall import DEFAULT_STALL_S
 
 from .toml_text import toml_value
@@ -26,10 +27,6 @@ if TYPE_CHECKING:
 StrPath = str | Path
 
 
-class OverrideError(ChaserdockError):
-    """A scenario override has a value that TOML cannot express."""
-
-
 @dataclass(frozen=True)
 class RunResult:
     """A flown mission. ``summary``: its evaluation; ``summary.success`` is the verdict. ``dir``:
@@ -38,6 +35,14 @@ class RunResult:
 
     summary: Summary
     dir: Path
+
+    def __repr__(self) -> str:
+        return f"{self.summary!r}\n  files: {self.dir}"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the verdict with all that qualifies it."""
+        shown = self.summary._repr_html_()  # pyright: ignore[reportPrivateUsage] (IPython's name)
+        return f"{shown}<p>files: <code>{escape(str(self.dir))}</code></p>"
 
     @cached_property
     def log(self) -> Log:
@@ -71,31 +76,40 @@ def run(
         **changes: scenario values; tables are merged: ``duration_s=20, camera={"width_px": 640}``.
 
     A mission that fails is a result with ``summary.success == False``. Raises ScenarioError for an
-    invalid scenario or override, RunError when the mission cannot start or leaves no log. An
-    exception, such as KeyboardInterrupt, ends all processes of the mission.
+    invalid scenario or override, MissingPackageError for one that needs a package that is not
+    installed, RunError when the mission cannot start or leaves no log. A mission that cannot start
+    leaves no folder. An exception, such as KeyboardInterrupt, ends all processes of the mission.
     """
+    from chaserdock_protocol.transport import TransportError
+
     from .launch.launcher import RunError, fly_mission
     from .launch.progress import Show, print_json_line
     from .summary import Summary
 
-    outcome = fly_mission(
-        scenario,
-        None if out is None else Path(out),
-        mode,
-        override_texts(overrides, changes),
-        seed=seed,
-        show=Show.none if on_event is None else Show.json,
-        keys=None if keys is None else Path(keys),
-        emit=on_event or print_json_line,
-        stall_s=stall_s,
-    )
+    try:
+        outcome = fly_mission(
+            scenario,
+            None if out is None else Path(out),
+            mode,
+            override_texts(overrides, changes),
+            seed=seed,
+            show=Show.none if on_event is None else Show.json,
+            keys=None if keys is None else Path(keys),
+            emit=on_event or print_json_line,
+            stall_s=stall_s,
+            option="",
+        )
+    except TransportError as error:
+        raise RunError(str(error)) from error
     if outcome.summary is None:
         raise RunError(outcome.failure or f"{outcome.folder}: no readable log")
     return RunResult(Summary.from_dict(outcome.summary), outcome.folder)
 
 
 def open_log(source: StrPath | Sequence[StrPath]) -> Log:
-    """Open a log: the folder of a run, a file, or the files of a rotated log. Raises LogError."""
+    """Open a log: the folder of a run, a file, or the files of a rotated log. Raises LogError, and
+    ScenarioError if the log's scenario is not valid.
+    """
     from .logs.reader import open_log as open_source
 
     return open_source(source)
@@ -110,7 +124,7 @@ def load_scenario(
     from chaserdock_protocol.scenario import load_scenario as load
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
-    return load(find_scenario(str(scenario)), override_texts(overrides, changes))
+    return load(find_scenario(str(scenario)), override_texts(overrides, changes), option="")
 
 
 def list_scenarios() -> list[str]:
@@ -124,14 +138,14 @@ def override_texts(
     overrides: Mapping[str, object] | None, changes: Mapping[str, object]
 ) -> tuple[str, ...]:
     """Return overrides as ``key.path=VALUE`` in TOML's notation, nested tables flattened. Raises
-    OverrideError.
+    ScenarioError for a value that TOML cannot express.
     """
     texts: list[str] = []
     for key, value in [*_flatten("", changes), *_flatten("", overrides or {})]:
         try:
             texts.append(f"{key}={toml_value(value)}")
         except TypeError as error:
-            raise OverrideError(f"{key}: {error}") from None
+            raise ScenarioError(f"{key}: {error}") from None
     return tuple(texts)
 
 

@@ -12,4 +12,6 @@ violation.
 BAD_INPUT = 2
 """The command could not run: invalid input, no reply, a file that cannot be read or written."""
 STOPPED = 130
-"""Stopped before the end by Ctrl-C or SIGTERM (128 + SIGINT, the convention of shells)."""
+"""Stopped before the end by Ctrl-C or SIGTERM (128 + SIGINT, the convention of shells). `view` and
+`router` have no other end.
+"""

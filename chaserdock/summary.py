@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import Any
 
 import msgspec
 from chaserdock_protocol.messages import DrawnBody
 from msgspec import Struct
+
+from .verdict import Verdict, verdict_of
 
 
 class SteadyErrors(Struct, frozen=True, kw_only=True):
@@ -188,6 +191,9 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     success: bool
     failures: list[str]
     not_judged: list[str]
+    doubts: list[str] = []
+    ended: str = ""
+    run_failure: str | None = None
     events: list[TimedEvent]
     chasers: dict[int, ChaserSummary]
     min_distance_chasers_m: float | None
@@ -205,6 +211,24 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     drawn: list[DrawnBody] = []
     stack: StackRest | None = None
     plumes: dict[str, PlumeSummary] = {}
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the verdict with all that qualifies it."""
+        return verdict_of(self.as_dict())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of a summary.json."""
+        return msgspec.to_builtins(self, str_keys=True)
+
+    def __repr__(self) -> str:
+        head = f"{self.scenario}, seed {self.seed}: {self.verdict.headline}"
+        return "\n".join([head, *(f"  {line}" for line in self.verdict.lines())])
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        head = f"<b>{escape(self.scenario)}</b>, seed {self.seed}: {self.verdict.badge()}"
+        return f"<p>{head}</p>{self.verdict.html()}"
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Summary:

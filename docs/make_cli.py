@@ -38,9 +38,9 @@ The same for every command; what "good" means for a command is stated with it be
 | --- | --- |
 {statuses}
 
-`world`, `chaser`, `controller` and `record` close their files and exit with status 1 when they are
-stopped before the mission has ended, `router` with 0. An error is one line per fault on standard
-error that names the option or file and what is valid; standard output carries results only.
+A process of a mission that is stopped closes its files first. An error is one line per fault on
+standard error that names the option or file and what is valid; standard output carries results
+only.
 
 ## Shell completion
 `chaserdock --install-completion` sets up completion of commands, options, shipped scenarios and

@@ -22,6 +22,7 @@ from chaserdock_protocol.messages import (
     DrawnTruth,
     Event,
     Health,
+    MissionEnd,
     PassiveSafety,
     PlumeLoad,
     PortLoad,
@@ -241,9 +242,9 @@ class RecordedFlight:
 
     ``estimates``: the fused estimate is ``target``. ``estimate_known`` (K,): the target was tracked
     or predicted. ``relative``: of the chasers whose pose the estimator publishes, while the target
-    is known. ``identified``: None without identification. ``expected_commands``: number of actuator
-    commands that all ticks expected. ``blas``: linear algebra library of each process; empty if an
-    older log does not state it.
+    is known. ``identified``: None without identification. ``end``: None in a log that ends before
+    the mission does. ``expected_commands``: number of actuator commands that all ticks expected.
+    ``blas``: linear algebra library of each process; empty if an older log does not state it.
     """
 
     scenario: Scenario
@@ -267,6 +268,7 @@ class RecordedFlight:
     world: WorldHistory
     drawn: tuple[DrawnBody, ...]
     events: list[Event]
+    end: MissionEnd | None
     replies: list[CommandReply]
     counts: dict[str, int]
     lost: dict[str, int]
@@ -362,6 +364,7 @@ class _Collector:
     world: WorldHistory = field(default_factory=WorldHistory)
     drawn: tuple[DrawnBody, ...] = ()
     events: list[Event] = field(default_factory=list)
+    end: MissionEnd | None = None
     replies: list[CommandReply] = field(default_factory=list)
     health: dict[str, Health] = field(default_factory=dict)
     sent: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -399,7 +402,15 @@ class _Collector:
                 self.world.add(message)
             case Sighting() | PortLoad() | PassiveSafety():
                 self._add_of_chaser(message)
-            case Event() | CommandReply() | Health() | DrawnTruth() | PlumeLoad() | StackEstimate():
+            case (
+                Event()
+                | MissionEnd()
+                | CommandReply()
+                | Health()
+                | DrawnTruth()
+                | PlumeLoad()
+                | StackEstimate()
+            ):
                 self._add_report(message)
 
     def _add_of_chaser(self, message: Sighting | PortLoad | PassiveSafety) -> None:
@@ -417,9 +428,18 @@ class _Collector:
                 )
 
     def _add_report(
-        self, message: Event | CommandReply | Health | DrawnTruth | PlumeLoad | StackEstimate
+        self,
+        message: Event
+        | MissionEnd
+        | CommandReply
+        | Health
+        | DrawnTruth
+        | PlumeLoad
+        | StackEstimate,
     ) -> None:
         match message:
+            case MissionEnd():
+                self.end = message
             case StackEstimate():
                 self.stack = message
                 self.identified.add((message.sim_time_ns / 1e9,), *values_of(message.target))
@@ -551,6 +571,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         world=c.world,
         drawn=c.drawn,
         events=c.events,
+        end=c.end,
         replies=c.replies,
         counts=dict(sorted(c.counts.items())),
         lost=dict(c.gaps.lost),

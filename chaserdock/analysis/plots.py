@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+from chaserdock_protocol.output_files import replaced
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -135,9 +136,9 @@ def legend_above(axes: Axes, columns: int = 8) -> None:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure in the format of the path's suffix; equal figures give equal SVG files."""
-    with styled(path.stem):
+    with styled(path.stem), replaced(path) as new:
         figure.savefig(
-            path, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None
+            new, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None
         )
 
 

@@ -15,17 +15,18 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import write_atomically
 
 from chaserdock.html_page import PAGE_FILES, html_page, table
+from chaserdock.verdict import verdict_of
 
 from .criteria import capture_state
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
-from .mass_properties import property_rows, stated_values, true_values
+from .mass_properties import PRIOR_ONLY, property_rows, true_values
 from .plots import decimation, to_inline_svg
 from .replay_scene import replay_data, small_images
-from .summary import summary_of
+from .summary import summary_of_run
 from .time_series import load_traces
 
 _DASH = "–"  # noqa: RUF001
@@ -39,15 +40,14 @@ def write_report(log: Path, out: Path | None = None) -> Path:
     """
     out = out or (log if log.is_dir() else log.parent) / "report.html"
     text = report_of(log)
-    with errors_of_writing(out):
-        out.write_text(text, encoding="utf-8")
+    write_atomically(out, text)
     return out
 
 
 def report_of(log: Path) -> str:
     """Return the report as HTML. Raise LogError for an unreadable log."""
     flight = load_flight(log)
-    result = summary_of(flight)
+    result = summary_of_run(flight, log)
     every = decimation(flight.world.ticks)
     traces = load_traces(log, range(len(flight.scenario.chasers)), every)
 
@@ -117,11 +117,7 @@ def _rms(mean_square: float | None, unit: str, factor: float) -> str:
 
 def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
     s = flight.scenario
-    verdict = (
-        '<span class="verdict good">success</span>'
-        if result["success"]
-        else '<span class="verdict bad">not successful</span>'
-    )
+    verdict = verdict_of(result).badge()
     where = [
         ("figures", "Figures"),
         ("events", "Events"),
@@ -142,10 +138,7 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
 
 
 def _outcome(result: dict[str, Any]) -> str:
-    if not result["failures"]:
-        return ""
-    items = "".join(f"<li>{escape(f)}</li>" for f in result["failures"])
-    return f'<h2>Criteria not met</h2><ul class="bad">{items}</ul>'
+    return verdict_of(result).html()
 
 
 def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
@@ -320,7 +313,7 @@ def _identified(flight: RecordedFlight) -> str:
     drawn = next((b for b in flight.drawn if b.body == "target"), None)
     last = flight.identified.last
     rows = property_rows(
-        last, stated_values(flight.scenario), None if drawn is None else true_values(drawn), _DASH
+        last, flight.scenario, None if drawn is None else true_values(drawn), _DASH
     )
     chasers = ", ".join(map(str, last.chasers))
     stack = f"stack with chasers {chasers}" if chasers else "stack"
@@ -330,7 +323,8 @@ def _identified(flight: RecordedFlight) -> str:
         f'<h2 id="identified">Identified mass properties</h2>{table(head, cells)}'
         f'<p class="faint">At {last.sim_time_ns / 1e9:.1f} s, with one standard deviation. Centre '
         "of mass and inertia about it in "
-        "TRF axes. Stated: what the controllers know before the flight.</p>"
+        "TRF axes. Stated: what the controllers know before the flight. "
+        f"{PRIOR_ONLY.strip('()').capitalize()}: the flight has taught nothing about it.</p>"
     )
 
 

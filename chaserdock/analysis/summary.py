@@ -5,21 +5,25 @@ docs/summary.md.
 
 from __future__ import annotations
 
+import json
 import math
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
+from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
+
+from chaserdock.verdict import estimate_doubts, verdict_of
 
 from .columns import nanoseconds, rows_since
 from .criteria import (
@@ -38,13 +42,43 @@ from .flight import RecordedFlight, SafetyHistory, Track, load_flight
 from .pose_errors import normalized_square, pose_error, relative_pose
 from .rendezvous import rendezvous_failures, rendezvous_of, rendezvous_text
 
+SUMMARY_NAME = "summary.json"
+"""Name of a flight's summary, beside its log."""
 _POSE_ERRORS = ("position_m", "orientation_rad", "nees")
 _BLOCK = 1 << 14  # rows processed at a time
 
 
 def summarize(log: Path) -> dict[str, Any]:
-    """Evaluate a log. Raise LogError for an unreadable log."""
-    return summary_of(load_flight(log))
+    """Evaluate a log, or the folder of a run. Raise LogError for an unreadable log."""
+    return summary_of_run(load_flight(log), log)
+
+
+def summary_of_run(flight: RecordedFlight, log: Path) -> dict[str, Any]:
+    """Evaluate a flight, and adopt what only its launcher knew: a ``run_failure`` in the
+    summary.json beside the log. One of another flight (digest) counts as absent.
+    """
+    result = summary_of(flight)
+    file = (log if log.is_dir() else log.parent) / SUMMARY_NAME
+    try:
+        written = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+    except (OSError, ValueError) as error:
+        raise LogError(
+            f"{file}: not readable: {error}; delete it to judge the flight by its log alone"
+        ) from None
+    if isinstance(written, dict):
+        known = cast("dict[str, Any]", written)
+        if known.get("digest") == result["digest"] and known.get("run_failure"):
+            add_run_failure(result, str(known["run_failure"]))
+    return result
+
+
+def add_run_failure(result: dict[str, Any], failure: str) -> None:
+    """Add to a summary why its launcher holds the flight for failed."""
+    result |= {
+        "success": False,
+        "failures": [failure, *result["failures"]],
+        "run_failure": failure,
+    }
 
 
 def true_reference(
@@ -314,6 +348,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "success": False,
         "failures": [],
         "not_judged": [],
+        "doubts": [],
+        "ended": _ended(flight),
         "events": _events(flight),
         "chasers": chasers,
         "min_distance_chasers_m": min(between) if between else None,
@@ -349,7 +385,16 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
     judged, result["not_judged"] = judged_criteria(s)
     result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
+    result["doubts"] = estimate_doubts(result)
     return result
+
+
+def _ended(flight: RecordedFlight) -> str:
+    """Return why the flight ended, and when."""
+    if flight.end is None:
+        return "not known: the log ends before the mission does"
+    early = "" if flight.end.complete else "early, "
+    return f"{early}{flight.end.reason} at {flight.end.sim_time_ns / 1e9:.2f} s"
 
 
 def _passive_safety(history: SafetyHistory) -> dict[str, float]:
@@ -473,8 +518,9 @@ def _exceeded(what: str, value: float | None, limit: float | None, unit: str) ->
 def text_of(result: dict[str, Any]) -> str:
     """Format the summary as a few lines of text."""
     factor = result["sim_time_s"] / result["wall_time_s"] if result["wall_time_s"] else 0.0
+    verdict = verdict_of(result)
     lines = [
-        f"{result['scenario']}: {'success' if result['success'] else 'FAILED'}; "
+        f"{result['scenario']}: {verdict.headline}; "
         f"{result['sim_time_s']:.1f} s flown in "
         f"{result['wall_time_s']:.1f} s ({factor:.2f} x real time), digest {result['digest'][:16]}"
     ]
@@ -517,6 +563,5 @@ def text_of(result: dict[str, Any]) -> str:
             f"{latency['p99'] * 1e3:.1f} ms; "
             f"{result['late_commands']} commands late, {result['unanswered']} missing"
         )
-    lines += [f"  not met: {failure}" for failure in result["failures"]]
-    lines += [f"  not judged: {reason}" for reason in result["not_judged"]]
+    lines += [f"  {line}" for line in verdict.lines()]
     return "\n".join(lines)

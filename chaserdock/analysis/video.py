@@ -15,9 +15,12 @@ import cv2
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
+from chaserdock_protocol.output_files import replaced
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import Background, Earth, Light
+
+from chaserdock.verdict import Verdict, verdict_of
 
 from .body_renderer import BodyRenderer
 from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint, draw, tint
@@ -26,7 +29,7 @@ from .flight import RecordedFlight, Track, load_flight
 from .images import Pair, columns_for, shots
 from .scene import scene_of
 from .snapshot import annotated_image
-from .summary import summary_of, tracking_errors
+from .summary import summary_of_run, tracking_errors
 from .time_series import ActuatorHistory, load_traces
 
 ENDINGS = (".mp4", ".webp", ".gif")
@@ -85,7 +88,7 @@ def write_video(
         raise LogError(f"{log}: holds no motion of the target; nothing to film")
 
     number = 0
-    with errors_of_writing(out), av.open(str(out), "w") as container:
+    with errors_of_writing(out), replaced(out) as new, av.open(str(new), "w") as container:
         stream: Any = container.add_stream(_CODECS[ending], rate=fps)
         stream.width, stream.height = width_px, height_px
         stream.pix_fmt = {".mp4": "yuv420p", ".webp": "yuv420p", ".gif": "rgb8"}[ending]
@@ -101,13 +104,10 @@ def write_video(
             image.pts = number
             container.mux(stream.encode(image))
             number += 1
-        if number:
-            container.mux(stream.encode())
-
-    if not number:
-        out.unlink(missing_ok=True)
-        after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
-        raise LogError(f"{log}: holds no image{after}; nothing to film")
+        if not number:
+            after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
+            raise LogError(f"{log}: holds no image{after}; nothing to film")
+        container.mux(stream.encode())
     return number
 
 
@@ -128,8 +128,9 @@ def frames(
     columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
     rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
     side_px = columns * shot_px
+    verdict = verdict_of(summary_of_run(flight, log))
     external = _ExternalView(
-        flight, load_plumes(log, flight), width_px - side_px, height_px, part_s
+        flight, load_plumes(log, flight), width_px - side_px, height_px, part_s, verdict
     )
     for time_s, latest in shots(log, number, every_s, part_s[0]):
         if time_s > part_s[1] + 1e-9:
@@ -180,8 +181,9 @@ class _ExternalView:
         width_px: int,
         height_px: int,
         part_s: tuple[float, float],
+        verdict: Verdict,
     ) -> None:
-        self.flight, self._plumes = flight, plumes
+        self.flight, self._plumes, self._verdict = flight, plumes, verdict
         self.size = (width_px, height_px)
         self.scene = scene_of(flight.scenario)
         sun = np.array(to_sun(flight.scenario))
@@ -189,7 +191,6 @@ class _ExternalView:
 
         self.numbers = flight.flown
         self.target = target = flight.truth["target"]
-        self._verdict = "success" if summary_of(flight)["success"] else "not successful"
 
         self._begin_s, self._end_s = part_s[0], min(float(target.time_s[-1]), part_s[1])
         self._span_s = max(self._end_s - self._begin_s, 1e-3)
@@ -370,7 +371,14 @@ class _ExternalView:
             self._end_s - time_s < _TITLE_SHARE * self._span_s
             and self._end_s >= float(self.target.time_s[-1]) - 1e-6
         ):
-            put(self._verdict, _MARGIN_PX + 4, 72, _INK, 0.8)
+            put(self._verdict.headline, _MARGIN_PX + 4, 72, _INK, 0.8)
+            lines = (
+                part
+                for text in self._verdict.lines()
+                for part in wrapped(text, self.size[0] - 3 * _MARGIN_PX, 0.5)
+            )
+            for line, text in enumerate(lines):
+                put(text, _MARGIN_PX + 4, 96 + 20 * line, _INK, 0.5)
         for line, i in enumerate(self.numbers):
             phase = _phase(self.phases[i], time_s)
             times, position, _ = self.errors[i]

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from chaserdock_agents.chaser.perception.detect import dictionary_of
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.output_files import write_atomically
 from numpy.typing import NDArray
 
 LEAST_IMAGES = 6
@@ -186,13 +187,11 @@ def find_board(
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
     """Write OpenCV's YAML, JSON or XML, by the file's suffix. Raise OSError."""
-    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    if not store.isOpened():
-        raise OSError(f"{path} cannot be opened")
+    store = cv2.FileStorage(path.name, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     store.write("image_width", calibration.width_px)
     store.write("image_height", calibration.height_px)
     store.write("camera_matrix", calibration.matrix)
     store.write("distortion_coefficients", calibration.distortion.reshape(1, -1))
     store.write("avg_reprojection_error", calibration.total_rms_px)
     store.write("nr_of_frames", len(calibration.rms_px))
-    store.release()
+    write_atomically(path, store.releaseAndGetString())

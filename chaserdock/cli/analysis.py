@@ -151,14 +151,12 @@ def _draw_figures(log: Path, out: Path, format: str) -> None:
 
 
 def _draw_cameras(log: Path, out: Path, at_s: float, width: int) -> None:
-    import cv2
-
     from chaserdock.analysis.snapshot import snapshot
+    from chaserdock.images import write_image
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise fail(f"--out {out}: must end in .png or .jpg")
-    if not cv2.imwrite(str(out), snapshot(log, at_s, width)):
-        raise fail(f"--out {out}: cannot be written")
+    write_image(out, snapshot(log, at_s, width))
 
 
 def video(

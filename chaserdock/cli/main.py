@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import sys
@@ -14,7 +15,8 @@ import typer
 from chaserdock_protocol.errors import ChaserdockError
 from typer.exceptions import TyperException
 
-from chaserdock.exit_codes import FAILED
+from chaserdock.exit_codes import FAILED, STOPPED
+from chaserdock.launch.signals import interrupts
 
 from .analysis import judge, report, video
 from .calibrate import calibrate
@@ -80,8 +82,24 @@ def program(
 
 
 def main() -> None:
-    """Run the program; report an error as one line, and a closed pipe (``| head``) not at all."""
+    """Run the program; report an error and a stop as one line, a closed pipe (``| head``) not at
+    all.
+    """
     gc.set_threshold(_GC_THRESHOLD)
+    try:
+        with interrupts():
+            _run()
+    except KeyboardInterrupt:
+        print("chaserdock: stopped", file=sys.stderr)
+        sys.exit(STOPPED)
+    finally:
+        _flush_output()
+        # Otherwise Python searches all modules for garbage once more before it exits, which takes a
+        # fifth of a short command's time.
+        gc.freeze()
+
+
+def _run() -> None:
     try:
         if notice := renamed(sys.argv[1:]):
             raise ChaserdockError(notice)
@@ -90,15 +108,18 @@ def main() -> None:
         sys.exit(fail(str(error)).exit_code)
     except TyperException as error:
         sys.exit(_report_usage_error(error))
+    except typer.Abort:  # what click makes of KeyboardInterrupt
+        raise KeyboardInterrupt from None
     except BrokenPipeError:
         sys.exit(FAILED)
-    finally:
-        _flush_output()
-        # Otherwise Python searches all modules for garbage once more before it exits, which takes a
-        # fifth of a short command's time.
-        gc.freeze()
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        sys.exit(fail(f"{error.filename or 'standard output'}: {error.strerror}").exit_code)
 
 
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""Errors of a disk on which nothing can be written."""
 _PLAIN_TEXTS = {
     "Value error, ": "",
     "Input should be a valid integer, unable to parse string as an integer": "must be a whole "
@@ -128,9 +149,14 @@ def _report_usage_error(error: Any) -> int:
 
 
 def _flush_output() -> None:
-    """Flush standard output; discard it when the reader has closed the pipe."""
+    """Flush standard output; discard it when the reader has closed the pipe, or the disk is full.
+
+    The latter ends the program with status 2.
+    """
     assert sys.__stdout__ is not None  # sys.stdout may be click's wrapper by now
     try:
         sys.__stdout__.flush()
-    except BrokenPipeError:
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())
+        if not isinstance(error, BrokenPipeError):
+            sys.exit(fail(f"standard output: {error.strerror}").exit_code)

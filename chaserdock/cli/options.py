@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.shipped_scenarios import shipped_names
+from chaserdock_protocol.stall import SHORTEST_STALL_S
 
 from chaserdock.exit_codes import BAD_INPUT
 
@@ -100,7 +101,7 @@ StallOpt = Annotated[
     float,
     typer.Option(
         "--stall-s",
-        min=1.0,
+        min=SHORTEST_STALL_S,
         help="seconds without progress after which a lock-step mission ends, or without the "
         "world after which a process ends",
     ),
@@ -365,6 +366,10 @@ def with_link_options(
     return decorate
 
 
+_JUDGED_BY_RIGHTS = ("operator", "viewer")
+"""Commands of these may have the keys of any process with the rights (``launch.reach``)."""
+
+
 def tls_of(keys: Path, process: str) -> Tls:
     """Return the TLS files of a process, in the mission's folder ``keys`` or in the folder of the
     process.
@@ -382,4 +387,8 @@ def tls_of(keys: Path, process: str) -> Tls:
                 f"make a mission's keys with `chaserdock deploy --keys {keys}`, and give {name} "
                 "its folder"
             )
+    if folder == keys and process not in _JUDGED_BY_RIGHTS:
+        from chaserdock.launch.reach import check_holder
+
+        check_holder(tls.certificate, process, [name])
     return tls

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from chaserdock_protocol.stall import DEFAULT_STALL_S
 
+from chaserdock.exit_codes import FAILED, STOPPED
+
 from .options import (
     ChaserArg,
     JoinTimeoutOpt,
@@ -33,13 +35,16 @@ if TYPE_CHECKING:
 
 
 def start_process(name: str, options: ProcessOptions) -> None:
-    """Run a process by its entry point (group ``chaserdock.processes``) and exit with its
-    status.
+    """Run a process by its entry point (group ``chaserdock.processes``) and exit with its status:
+    ``STOPPED`` where it did not end its work because of a signal.
     """
+    from chaserdock_protocol.process import stopped_by_signal
+
     installed = [e for e in entry_points(group="chaserdock.processes") if e.name == name]
     if not installed:
         raise fail(f"no process {name!r} is installed")
-    sys.exit(installed[0].load()(options))
+    status = installed[0].load()(options)
+    sys.exit(STOPPED if status == FAILED and stopped_by_signal() else status)
 
 
 @with_link_options()

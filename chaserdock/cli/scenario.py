@@ -187,18 +187,18 @@ def _write_new(name: str) -> None:
     """Write a scenario file that can be run, and changed."""
     import tomllib
 
+    from chaserdock_protocol.output_files import write_atomically
     from chaserdock_protocol.scenario import parse_scenario
 
     path = Path(name if name.endswith(".toml") else f"{name}.toml")
     example = tomllib.loads(_NEW.format(name="example", file="example.toml"))
     parse_scenario(example | {"name": path.stem}, name)
+    if path.exists():
+        raise fail(f"{path}: exists already")
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(_NEW.format(name=path.stem, file=path))
-    except FileExistsError:
-        raise fail(f"{path}: exists already") from None
+        write_atomically(path, _NEW.format(name=path.stem, file=path))
     except OSError as error:
-        raise fail(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise fail(str(error)) from None
     print(f"{path}: run it with: chaserdock run {path}")
 
 

@@ -30,7 +30,7 @@ def target(
         typer.Argument(
             metavar="TARGET",
             help="mesh file (.glb, .gltf, .obj, .stl, .ply, .off or .dae), target file (.toml), "
-            "shipped target (paper, servicer) or satellite (geo_servicer, cubesat_12u, "
+            "shipped target (paper, servicer, client) or satellite (geo_servicer, cubesat_12u, "
             "chaser_body)",
         ),
     ],

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera, focal_and_centre
 from chaserdock_models.meshes import TriangleMesh
 from numpy.typing import NDArray
+
+from chaserdock.images import write_image
 
 from .json_files import numbers, read_object, write_json
 from .model_files import OBJECT, read_models, write_models
@@ -80,9 +81,9 @@ class BopWriter:
             self._scenes[split] = {"scene_camera": {}, "scene_gt": {}, "scene_gt_info": {}}
             for name in ("gray", "mask", "mask_visib"):
                 (scene / name).mkdir(parents=True)
-        cv2.imwrite(str(scene / "gray" / f"{number:06d}.png"), image.pixels)
+        write_image(scene / "gray" / f"{number:06d}.png", image.pixels)
         for name, mask in (("mask", image.mask), ("mask_visib", image.visible)):
-            cv2.imwrite(str(scene / name / f"{number:06d}_000000.png"), 255 * mask.astype(np.uint8))
+            write_image(scene / name / f"{number:06d}_000000.png", 255 * mask.astype(np.uint8))
         key, rows, label = str(number), self._scenes[split], image.view.label
         rows["scene_camera"][key] = {
             "cam_K": self._camera.matrix().ravel().tolist(),

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import Scenario, flight_scenario_json
 
 from .bop import BopWriter
@@ -59,7 +60,7 @@ def export_dataset(
             progress(number + 1)
         for writer in writers:
             writer.close()
-        (folder / DESCRIPTION).write_text(_description(scenario, images, limits), encoding="utf-8")
+        write_atomically(folder / DESCRIPTION, _description(scenario, images, limits))
 
 
 def _description(scenario: Scenario, images: int, limits: ViewLimits) -> str:

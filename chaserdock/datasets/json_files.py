@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.output_files import write_atomically
 
 from .types import DatasetError
 
@@ -17,7 +18,7 @@ from .types import DatasetError
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write an object, one line per key. Raises OSError."""
     rows = [f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in values.items()]
-    path.write_text("{\n" + ",\n".join(rows) + "\n}\n", encoding="utf-8")
+    write_atomically(path, "{\n" + ",\n".join(rows) + "\n}\n")
 
 
 def _read(path: Path) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models.meshes import TriangleMesh, triangle_soup
+from chaserdock_protocol.output_files import write_atomically
 
 from .json_files import numbers, read_object, write_json
 from .shapes import diameter_of
@@ -43,7 +44,7 @@ def _write_ply(mesh: TriangleMesh, path: Path) -> None:
     ]  # fmt: skip
     lines = [" ".join(f"{v:.6g}" for v in row) for row in vertices.tolist()]
     faces = [f"3 {a} {b} {c}" for a, b, c in triangles.tolist()]
-    path.write_text("\n".join([*head, *lines, *faces]) + "\n", encoding="ascii")
+    write_atomically(path, "\n".join([*head, *lines, *faces]) + "\n")
 
 
 def _info(shape: TargetShape) -> dict[str, Any]:

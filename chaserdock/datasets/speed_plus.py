@@ -17,11 +17,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera, focal_and_centre
 from chaserdock_models.meshes import TriangleMesh
+from chaserdock_protocol.output_files import write_atomically
+
+from chaserdock.images import write_image
 
 from .json_files import numbers, read_list, read_object, write_json
 from .model_files import read_models, write_models
@@ -78,8 +80,8 @@ class SpeedPlusWriter:
     def add(self, number: int, split: Split, image: ViewImage) -> None:
         """Write image ``number``, from 0, with its mask, and keep its label."""
         name, label = f"img{number + 1:06d}.png", image.view.label
-        cv2.imwrite(str(self._domain / "images" / name), image.pixels)
-        cv2.imwrite(str(self._domain / "masks" / name), 255 * image.visible.astype(np.uint8))
+        write_image(self._domain / "images" / name, image.pixels)
+        write_image(self._domain / "masks" / name, 255 * image.visible.astype(np.uint8))
         q = label.q_irf_trf_wxyz
         self._labels[split].append(
             {
@@ -93,7 +95,7 @@ class SpeedPlusWriter:
         """Write the labels."""
         for split, labels in self._labels.items():
             text = ",\n".join(json.dumps(label) for label in labels)
-            (self._domain / f"{split}.json").write_text(f"[\n{text}\n]\n", encoding="utf-8")
+            write_atomically(self._domain / f"{split}.json", f"[\n{text}\n]\n")
 
 
 def _camera_values(camera: Camera) -> dict[str, Any]:

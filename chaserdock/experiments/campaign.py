@@ -7,15 +7,16 @@ import sys
 from pathlib import Path
 
 from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import write_atomically
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from chaserdock.launch.signals import stop_on_signals
 
 from .campaign_file import load_campaign
-from .campaign_report import sections
+from .campaign_report import qualification, sections
 from .page import html
 from .plan import ExperimentError, ExperimentPlan
-from .results import repeat_command, rows_of, wilson, write_table
+from .results import repeat_command, rows_of, verdict_of_flight, wilson, write_table
 from .worker import ExperimentProgress, Workers, fly, fly_plan
 
 
@@ -41,13 +42,14 @@ def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | Non
     rows = rows_of(plan, outcomes)
     table, report = folder / "results.parquet", folder / "report.html"
     write_table(rows, table)
-    report.write_text(html(plan.name, sections(plan, rows, folder)), encoding="utf-8")
+    write_atomically(report, html(plan.name, sections(plan, rows, folder)))
     passed = sum(bool(r["success"]) for r in rows)
     low, high = wilson(passed, len(rows))
     print(
         f"{plan.name}: {passed} of {len(rows)} passed, {100 * passed / len(rows):.1f} % "
-        f"(95 %: {100 * low:.1f} to {100 * high:.1f} %)\n{table}\n{report}"
+        f"(95 %: {100 * low:.1f} to {100 * high:.1f} %)"
     )
+    print("\n".join([*qualification(rows), str(table), str(report)]))
     if remaining := len(plan.flights) - len(rows):
         print(
             f"chaserdock: stopped, {remaining} runs remain; repeat the command to resume",
@@ -63,6 +65,7 @@ def _fly_one(plan: ExperimentPlan, folder: Path, only: int) -> int:
     flight = plan.flights[only]
     print(repeat_command(flight))
     outcome = fly(flight, "all", folder / "single-runs")
-    verdict = "passed" if outcome.status == 0 else outcome.last_words
-    print(f"{flight.label} ({flight.name}): {verdict}\n{outcome.log or 'no log'}")
+    verdict = verdict_of_flight(outcome)
+    print(f"{flight.label} ({flight.name}): {verdict.headline}")
+    print("\n".join([*(f"  {line}" for line in verdict.lines()), outcome.log or "no log"]))
     return DONE if outcome.status == 0 else FAILED

@@ -6,6 +6,7 @@ from __future__ import annotations
 import html
 import math
 import os
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,12 @@ from .page import PageSection, Table
 from .plan import ExperimentPlan, PlannedFlight
 from .results import (
     ResultRow,
+    cause_of,
     causes,
     metrics_of,
     numbers_of,
     rank_correlation,
+    remarks,
     repeat_command,
     wilson,
 )
@@ -49,7 +52,7 @@ def sections(plan: ExperimentPlan, rows: list[ResultRow], folder: Path) -> list[
         f"(95 % confidence: {100 * low:.1f} to {100 * high:.1f} %, Wilson)</p>"
     )
     return [
-        PageSection("", (f"{flown}{resume}.", rate)),
+        PageSection("", (f"{flown}{resume}.", rate, *qualification(rows))),
         *_causes(rows),
         *_sensitivities(plan, rows),
         *_failures(plan, rows, folder),
@@ -59,7 +62,31 @@ def sections(plan: ExperimentPlan, rows: list[ResultRow], folder: Path) -> list[
 def _causes(rows: list[ResultRow]) -> list[PageSection]:
     counted = tuple((str(n), cause) for cause, n in causes(rows))
     head = ("runs", "first failure (# stands for a number)")
-    return [PageSection("Outcomes by cause", (Table(head, counted, text=True),))] if counted else []
+    found = (
+        [PageSection("Outcomes by cause", (Table(head, counted, text=True),))] if counted else []
+    )
+    for title, kind in (("Criteria not judged", "not_judged"), ("Doubtful estimates", "doubts")):
+        lines = tuple((str(n), text) for text, n in remarks(rows, kind))
+        if lines:
+            table = Table(("runs", "remark (# stands for a number)"), lines, text=True)
+            found.append(PageSection(title, (table,)))
+    ends = Counter(cause_of(r["ended"]) for r in rows if r["ended"])
+    if ends:
+        lines = tuple((str(n), reason) for reason, n in ends.most_common())
+        head = ("runs", "end of the flight (# stands for a number)")
+        found.append(PageSection("Ends", (Table(head, lines, text=True),)))
+    return found
+
+
+def qualification(rows: list[ResultRow]) -> list[str]:
+    """Return a line about the passed runs whose verdict is qualified; none without any."""
+    passed = [r for r in rows if r["success"]]
+    counts = (
+        (sum(r["not_judged"] != "[]" for r in passed), "with criteria not judged"),
+        (sum(r["doubts"] != "[]" for r in passed), "with a NEES out of range"),
+    )
+    texts = [f"{n} {what}" for n, what in counts if n]
+    return [f"Of the {len(passed)} that passed: {', '.join(texts)}."] if texts else []
 
 
 def _sensitivities(plan: ExperimentPlan, rows: list[ResultRow]) -> list[PageSection]:

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from chaserdock_models.rotations import rotate
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import Scenario, load_scenario
 
 from chaserdock.exit_codes import BAD_INPUT, DONE
@@ -42,7 +43,7 @@ def main() -> int:
         return BAD_INPUT
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    write_atomically(folder / "summary.json", json.dumps(summary))
     return DONE
 
 
@@ -73,6 +74,7 @@ def fly_alone(scenario: Scenario, alone: Alone | None = None) -> Mapping[str, An
         "seed": scenario.seed,
         "sim_time_s": scenario.duration_s,
         "failures": [],
+        "not_judged": ["success: the controller flew alone, against no criteria"],
         "chasers": chasers,
         "solver": {"solve_s": solve_s, "failures": flight.failed_solves},
     }

@@ -68,7 +68,7 @@ def plan_flight(
     """Return a flight, named by a digest of the resolved scenario, ``alone`` and ``salt``. Raise
     ScenarioError.
     """
-    resolved = load_scenario(scenario, overrides)
+    resolved = load_scenario(scenario, overrides, option="")
     flown = salt + resolved.model_dump_json()
     if alone is not None:
         _check_alone(resolved, alone)

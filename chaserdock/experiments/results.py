@@ -8,14 +8,31 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from chaserdock_protocol.output_files import replaced
+
+from chaserdock.verdict import Verdict, verdict_of
 
 from .plan import ExperimentPlan, PlannedFlight
 from .worker import FlightOutcome
 
 ResultRow = dict[str, Any]
-_FIXED = ("run", "index", "seed", "success", "cause", "failures", "digest", "log")
+_FIXED = (
+    "run",
+    "index",
+    "seed",
+    "success",
+    "cause",
+    "failures",
+    "ended",
+    "not_judged",
+    "doubts",
+    "digest",
+    "log",
+)
 
 _OF_CHASERS: tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]], ...] = (
     ("steady_position_mse_m2", ("steady", "position_mse_m2"), max),
@@ -32,6 +49,15 @@ are combined.
 """
 
 
+def verdict_of_flight(outcome: FlightOutcome) -> Verdict:
+    """Return the verdict on a flight of a plan. Without criteria that are not met, the last words
+    of a flight that failed are its cause.
+    """
+    verdict = verdict_of(outcome.summary or {})
+    last_words = () if outcome.status == 0 else (outcome.last_words or "ended without output",)
+    return replace(verdict, success=outcome.status == 0, not_met=verdict.not_met or last_words)
+
+
 def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultRow:
     """Return a flight as a row of plain values: varied values (``vary.NAME``), outcome, results in
     SI units.
@@ -39,17 +65,19 @@ def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultR
     No value depends on the speed of the machine: equal plans give equal tables.
     """
     s = outcome.summary or {}
-    failures = list(s.get("failures", [])) or (
-        [outcome.last_words or "ended without output"] if outcome.status else []
-    )
+    verdict = verdict_of_flight(outcome)
+    failures = list(verdict.not_met)
 
     row: ResultRow = {
         "run": flight.name,
         "index": index,
         "seed": flight.seed,
-        "success": outcome.status == 0,
+        "success": verdict.success,
         "cause": cause_of(failures[0]) if failures else "",
         "failures": json.dumps(failures),
+        "ended": verdict.ended,
+        "not_judged": json.dumps(verdict.not_judged),
+        "doubts": json.dumps(verdict.doubts),
         "digest": s.get("digest", ""),
         "log": outcome.log or "",
     }
@@ -133,6 +161,14 @@ def causes(rows: list[ResultRow]) -> list[tuple[str, int]]:
     )
 
 
+def remarks(rows: list[ResultRow], kind: str) -> list[tuple[str, int]]:
+    """Return what qualifies the flights' verdicts (column ``kind``), numbers replaced by ``#``,
+    with the numbers of flights, most frequent first.
+    """
+    counted = Counter(text for r in rows for text in {cause_of(t) for t in json.loads(r[kind])})
+    return sorted(counted.items(), key=lambda item: (-item[1], item[0]))
+
+
 def rank_correlation(x: list[float], y: list[float]) -> float:
     """Return Spearman's rank correlation of the finite pairs; NaN for fewer than three or a
     constant column.
@@ -170,6 +206,5 @@ def write_table(rows: list[ResultRow], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    temporary = path.with_suffix(".tmp")
-    pq.write_table(pa.Table.from_pylist(rows), temporary)
-    temporary.replace(path)
+    with replaced(path) as new:
+        pq.write_table(pa.Table.from_pylist(rows), new)

@@ -24,9 +24,12 @@ from typing import Any, Literal
 
 import msgspec
 from chaserdock_protocol.errors import require_extra
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.scan import LOG_NAME
 from msgspec import Struct
+
+from chaserdock.verdict import verdict_of
 
 from .plan import ExperimentError, ExperimentPlan, PlannedFlight
 
@@ -115,12 +118,7 @@ def write_result(folder: Path, outcome: FlightOutcome) -> None:
         return
     path = result_path(folder, outcome.name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        file.write(msgspec.json.format(msgspec.json.encode(outcome)) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(outcome)) + b"\n")
 
 
 def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
@@ -239,7 +237,9 @@ class ExperimentProgress:
         if self._ended_before is None:
             self._ended_before = ended - 1
         each_s = (time.monotonic() - self._start_s) / (ended - self._ended_before)
-        verdict = "passed" if outcome.status == 0 else f"FAILED: {outcome.last_words}"
+        verdict = verdict_of(outcome.summary or {}).headline
+        if outcome.status != 0:
+            verdict = f"FAILED: {outcome.last_words}"
         left_min = each_s * (total - ended) / 60
         left = f", about {left_min:.0f} min left" if ended < total else ""
         varied = ", ".join(f"{name}={value}" for name, value in flight.varied.items())

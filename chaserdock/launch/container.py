@@ -22,6 +22,8 @@ from collections.abc import Callable
 
 import psutil
 
+from chaserdock.exit_codes import STOPPED
+
 ROUTER_TIMEOUT_S = 60.0
 """Time, s, without a connection to the router after which a process considers the mission over."""
 _NOT_IN_SCENARIO = 10
@@ -76,8 +78,8 @@ def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None
 
 
 def run(arguments: list[str], host: str, port: int) -> int:
-    """Run the program to its end and forward signals to it. Returns its status, or 0 when the
-    router is gone for good.
+    """Run the program to its end and forward signals to it. Returns its status, ``STOPPED`` if
+    a forwarded signal killed it, or 0 when the router is gone for good.
     """
     process: subprocess.Popen[bytes] | None = None
     stopping: int | None = None
@@ -110,6 +112,8 @@ def run(arguments: list[str], host: str, port: int) -> int:
                 process.terminate()
                 process.wait()
                 return 0
+    if stopping is not None and status == -stopping:
+        return STOPPED  # before it could handle the signal
     if status == 0 and stopping is None and arguments[0] not in ("router", "judge"):
         wait_for_router_exit(host, port, lambda: stopping is not None)
     return status

@@ -22,6 +22,7 @@ from chaserdock.exit_codes import STOPPED
 from .launcher import Fleet, judge, print_outcome, start_line
 from .mission_address import MissionAddress
 from .progress import ProgressReporter, Show
+from .reach import TO_JUDGE, check_rights
 
 LOG_CLOSED_S = 60.0
 """Wall time, s, after the end of the mission within which the recorder must close its log."""
@@ -39,8 +40,10 @@ def judge_mission(
     report.html beside the log.
 
     Returns the exit status. ``world_timeout_s``: wall time after which an absent world counts as
-    lost. Raises JoinRefused without a mission within ``timeout_s``, JudgeError if it left no log.
+    lost. Raises JoinRefused without a mission within ``timeout_s``, JudgeError if it left no log,
+    RightsError.
     """
+    check_rights(link, "judge", TO_JUDGE)
     node = Node("operator", "operator", link)
     try:
         stop = StopSignal(watch_parent=False)

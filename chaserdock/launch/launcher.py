@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -13,22 +14,25 @@ import threading
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import psutil
 from chaserdock_agents.router.process import NAME as ROUTER
 from chaserdock_protocol import topics
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ChaserdockError, WriteError, errors_of_writing
 from chaserdock_protocol.messages import MissionEnd
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED, Mode
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario.loading import SET_OPTION
 from chaserdock_protocol.shipped_scenarios import find_scenario
-from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
+from chaserdock_protocol.stall import DEFAULT_STALL_S, SHORTEST_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, Tls, TransportError
 from chaserdock_protocol.transport.session import find_world, ignore_foreign_publishers
@@ -111,7 +115,9 @@ class Fleet:
         """
         output = folder / f"{name.replace('/', '-')}.txt"
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
-        with output.open("wb") as out, deferred_signals():
+        with errors_of_writing(output, RunError):
+            out = output.open("wb")
+        with out, deferred_signals():
             process = subprocess.Popen(
                 [sys.executable, "-m", "chaserdock", *arguments, "--watch-parent"],
                 stdin=subprocess.PIPE,
@@ -207,7 +213,7 @@ def check_port(port: int) -> None:
         try:
             probe.bind(("127.0.0.1", port))
         except OSError as error:
-            raise RunError(f"--port {port}: {error.strerror}; choose another port") from None
+            raise RunError(f"port {port}: {error.strerror}; choose another port") from None
 
 
 def check_keys(keys: Path, chasers: int) -> None:
@@ -216,7 +222,7 @@ def check_keys(keys: Path, chasers: int) -> None:
 
     if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
         raise RunError(
-            f"--keys {keys}: {reason}; make a mission's keys with `chaserdock deploy --keys {keys}`"
+            f"keys {keys}: {reason}; make a mission's keys with `chaserdock deploy --keys {keys}`"
         )
 
 
@@ -276,6 +282,7 @@ def fly_mission(
     stall_s: float = DEFAULT_STALL_S,
     port: int | None = None,
     namespace: str | None = None,
+    option: str = SET_OPTION,
 ) -> MissionOutcome:
     """Fly a scenario. Writes log, summary and the processes' output to ``folder``, by default a new
     one in ``runs/``.
@@ -284,13 +291,14 @@ def fly_mission(
     viewer there until the end of the flight. ``keys``: connect through a router, over TLS, with
     access rights. ``stall_s``: longest time (s) without progress. ``port``, ``namespace``: where
     other processes reach the mission, by default a free port and a unique name; while the mission
-    flies, ``network.json`` in the folder states them. ``stop_requested``: polled. Installs no
-    signal handler; an exception ends all processes. Raises RunError, ScenarioError,
-    MissingPackageError or TransportError if the mission cannot start.
+    flies, ``network.json`` in the folder states them. ``stop_requested``: polled. ``option``: see
+    ``load_scenario``. Installs no signal handler; an exception ends all processes. Raises RunError,
+    ScenarioError, MissingPackageError or TransportError if the mission cannot start; it then leaves
+    no folder.
     """
     path = find_scenario(str(scenario_name))
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
-    scenario = load_scenario(path, overrides)
+    scenario = load_scenario(path, overrides, option)
     require_packages(scenario)
 
     folder = folder or _new_folder(path.stem)
@@ -301,12 +309,18 @@ def fly_mission(
         check_port(port)
     if (folder / LOG_NAME).exists():
         raise RunError(
-            f"{folder} contains a mission.mcap; a log is never overwritten, choose another --out"
+            f"{folder} contains a mission.mcap; a log is never overwritten, choose another folder"
         )
+    if mode not in get_args(Mode):
+        raise RunError(f"mode {mode!r}: must be one of {', '.join(get_args(Mode))}")
+    if not stall_s >= SHORTEST_STALL_S:
+        raise RunError(f"stall_s {stall_s!r}: must be at least {SHORTEST_STALL_S:g} s")
 
+    created = [f for f in (output, *output.parents) if not f.exists()]
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
+        _remove(created, folder)
         raise RunError(f"{folder}: cannot be created: {error.strerror or error}") from None
 
     namespace = namespace or f"run-{uuid.uuid4().hex[:12]}"
@@ -339,6 +353,7 @@ def fly_mission(
 
         stall = ["--stall-s", f"{stall_s:g}"]
         start_all(fleet, scenario, path, folder, mode, overrides, [*network, *stall])
+        created.clear()
         failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
     finally:
         reporter.close()
@@ -347,7 +362,20 @@ def fly_mission(
             hub.close()
         observers.end()
         remove_address(folder)
+        _remove(created, folder)
     return judge(fleet, folder, failure, reporter)
+
+
+def _remove(created: list[Path], folder: Path) -> None:
+    """Remove the folders, the innermost first, that a refused mission created, with what it wrote
+    to ``folder``. Its parents stay if another mission uses them.
+    """
+    for path in created:
+        if path.is_relative_to(folder):
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                path.rmdir()
 
 
 _folders: set[Path] = set()
@@ -483,11 +511,12 @@ def judge(
     fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter
 ) -> MissionOutcome:
     """Write summary.json from the log in ``folder``. Returns and reports the outcome."""
-    from chaserdock.analysis.summary import summarize
+    from chaserdock.analysis.flight import load_flight
+    from chaserdock.analysis.summary import SUMMARY_NAME, add_run_failure, summary_of
 
     stopped = failure == STOPPED_BY_OPERATOR
     try:
-        summary = summarize(folder / LOG_NAME)
+        summary = summary_of(load_flight(folder / LOG_NAME))
     except LogError as error:
         outcome = MissionOutcome(
             folder, STOPPED if stopped else FAILED, None, failure or str(error)
@@ -495,11 +524,13 @@ def judge(
         reporter.report(Failed(status=outcome.status, text=outcome.failure or ""))
         return outcome
     if failure is not None:
-        summary["failures"] = [failure, *summary["failures"]]
-        summary["success"] = False
+        add_run_failure(summary, failure)
     if fleet.children:  # processes on other machines are not measured
         summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    try:
+        write_atomically(folder / SUMMARY_NAME, json.dumps(summary, indent=2) + "\n")
+    except WriteError as error:
+        add_run_failure(summary, str(error))
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
     reporter.report(Result(status=status, folder=str(folder), summary=summary))
     return MissionOutcome(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.output_files import write_atomically
 from msgspec import Struct
 
 ADDRESS_FILE = "network.json"
@@ -37,7 +38,7 @@ class MissionAddress(Struct, frozen=True, kw_only=True):
 
 def write_address(folder: Path, address: MissionAddress) -> None:
     """Write the address into the folder of the run."""
-    (folder / ADDRESS_FILE).write_bytes(msgspec.json.encode(address) + b"\n")
+    write_atomically(folder / ADDRESS_FILE, msgspec.json.encode(address) + b"\n")
 
 
 def read_address(folder: Path) -> MissionAddress:

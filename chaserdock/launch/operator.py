@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 
-from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import (
     CommandReply,
@@ -15,6 +14,8 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.transport import Link, Node
 from msgspec import Struct
+
+from .reach import TO_COMMAND, TO_INJECT_FAULTS, Rights, check_rights, why_silent
 
 
 class OperatorError(ChaserdockError):
@@ -34,7 +35,7 @@ def send_command(
     """Send a command to the controller and return its reply.
 
     ``before_s``: simulated time after which the controller refuses it. Raises OperatorError without
-    a reply within ``timeout_s``, TransportError.
+    a reply within ``timeout_s``, RightsError, TransportError.
     """
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z: required by goto, and by no other command")
@@ -50,7 +51,7 @@ def send_command(
         operator=operator,
         expires_ns=None if before_s is None else round(before_s * 1e9),
     )
-    return _request(link, topics.OPERATE_KEY, request, timeout_s, "controller")
+    return _request(link, TO_COMMAND, command, request, timeout_s, "controller")
 
 
 def send_thruster_fault(
@@ -63,19 +64,21 @@ def send_thruster_fault(
     operator: str = "",
 ) -> CommandReply:
     """Inject a thruster failure in the world and return its reply. Raises OperatorError,
-    TransportError.
+    RightsError, TransportError.
     """
     if (kind == "weak") != (factor is not None):
         raise OperatorError("--factor: required by weak, and by no other kind")
     request = ThrusterFaultCommand(
         chaser=chaser, thruster=thruster, kind=kind, factor=factor, operator=operator
     )
-    return _request(link, topics.THRUSTER_FAULT_KEY, request, timeout_s, "world")
+    return _request(link, TO_INJECT_FAULTS, "thruster-fault", request, timeout_s, "world")
 
 
 def _request(
-    link: Link, key: str, request: Struct, timeout_s: float, receiver: str
+    link: Link, rights: Rights, what: str, request: Struct, timeout_s: float, receiver: str
 ) -> CommandReply:
+    check_rights(link, what, rights)
+    (key,) = rights.queries
     node = Node("operator", "operator", link)
     try:
         start_s = time.monotonic()
@@ -85,8 +88,7 @@ def _request(
                 return reply
             time.sleep(0.05)  # not connected yet
         raise OperatorError(
-            f"no reply from the {receiver} within {timeout_s:g} s (namespace {link.namespace}, "
-            f"connect {', '.join(link.connect)}); is a mission running?"
+            f"no reply from the {receiver} within {timeout_s:g} s; {why_silent(link)}"
         )
     finally:
         node.close()

@@ -31,6 +31,39 @@ def stop_on_signals(notice: str = "") -> Generator[threading.Event]:
             signal.signal(number, handler)
 
 
+class StopRequested(KeyboardInterrupt):
+    """SIGINT or SIGTERM has arrived.
+
+    Not KeyboardInterrupt itself: with that, Python ends the process by SIGINT where it has passed
+    through ``exec``, although it was handled.
+    """
+
+
+def _request_stop(*_: object) -> None:
+    raise StopRequested
+
+
+@contextmanager
+def interrupts() -> Generator[None]:
+    """Let SIGINT and SIGTERM raise StopRequested, so that all that is open is closed.
+
+    Does nothing outside the main thread, and for a signal that is ignored.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {
+        number: signal.signal(number, _request_stop)
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) != signal.SIG_IGN
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 @contextmanager
 def deferred_signals() -> Generator[None]:
     """Defer Python's handlers of SIGINT and SIGTERM, which may raise exceptions, to the end of the

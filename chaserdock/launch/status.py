@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
@@ -20,6 +20,13 @@ from chaserdock_protocol.process import print_status
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.session import find_world, ignore_foreign_publishers
 from rich.table import Table
+
+from .reach import STATUS_TOPICS, TO_OBSERVE, check_rights, is_reachable, why_silent
+
+DISCOVERY_S = 20.0
+"""Wall time, s, in which the processes of a mission at a reachable address are found. Longer: a
+wrong namespace is noticed later; shorter: missions on loaded machines are denied.
+"""
 
 
 class StatusError(ChaserdockError):
@@ -102,24 +109,23 @@ def expected(name: str, tick: Tick | None) -> bool | None:
 
 
 def observe(link: Link, seconds: float) -> MissionStatus:
-    """Listen for ``seconds`` of wall time without joining the mission. Raises StatusError when
-    there is no process.
+    """Listen for ``seconds`` of wall time without joining the mission, from the first process on.
+    Raises StatusError when there is no process, RightsError.
+
+    Until the first process, listen for up to ``DISCOVERY_S`` if an endpoint accepts connections: on
+    a loaded machine discovery takes longer than any status.
     """
-    status = MissionStatus()
-    node = Node("operator", "operator", link)
+    check_rights(link, "status", TO_OBSERVE)
+    status, found = MissionStatus(), False
+    patience_s = max(seconds, DISCOVERY_S)
+    connect_s = patience_s if is_reachable(link) else seconds
+    node = Node("operator", "operator", replace(link, connect_timeout_s=connect_s))
     try:
 
         def changed(process: str, alive: bool) -> None:
             (status.alive.add if alive else status.alive.discard)(process)
 
-        for topic in (
-            topics.TICK,
-            topics.REFERENCE,
-            topics.TARGET,
-            topics.END,
-            topics.PRESENCE,
-            topics.EVENT,
-        ):
+        for topic in STATUS_TOPICS:
             node.subscribe(topic)
         node.watch_liveliness(changed)
         if world := find_world(node):
@@ -128,18 +134,20 @@ def observe(link: Link, seconds: float) -> MissionStatus:
                 world,
                 lambda detail, _: print_status("status", f"foreign publisher: {detail}"),
             )
-        deadline = time.monotonic() + seconds
+        begun_s, deadline = time.monotonic(), time.monotonic() + seconds
         while time.monotonic() < deadline:
             received = node.receive(0.05)
             if received is not None:
                 status.update(received.message, time.monotonic())
+            if status.alive and not found:
+                found, deadline = True, time.monotonic() + seconds
+            if not found and time.monotonic() >= deadline and is_reachable(link):
+                deadline = min(time.monotonic() + seconds, begun_s + patience_s)
     finally:
         node.close()
-    if not status.alive:
-        raise StatusError(
-            f"no process found within {seconds:g} s (namespace {link.namespace}, "
-            f"connect {', '.join(link.connect)}); is a mission running?"
-        )
+    if not found:
+        waited_s = round(time.monotonic() - begun_s, 1)
+        raise StatusError(f"no process found within {waited_s:g} s; {why_silent(link)}")
     return status
 
 

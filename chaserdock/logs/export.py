@@ -13,6 +13,7 @@ from typing import Any, Literal
 import pyarrow as pa
 import pyarrow.parquet as pq
 from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import replaced
 from chaserdock_protocol.recording.log import LogError, LogSource, read_log
 
 from .tables import TopicTable
@@ -75,8 +76,9 @@ def export(
             if name not in files:
                 if path.exists():
                     raise LogError(f"{path}: already exists; export into an empty folder")
+                new = open_files.enter_context(replaced(path))
                 files[name] = open_files.enter_context(
-                    closing(_create_file(path, chunk.schema, format))
+                    closing(_create_file(new, chunk.schema, format))
                 )
             files[name].write_table(chunk)
             rows[path.name] += chunk.num_rows

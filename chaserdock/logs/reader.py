@@ -86,13 +86,18 @@ class Log:
     def table(self, name: str | Topic) -> pyarrow.Table:
         """Return a topic as one table of all chasers. Columns: ``chaserdock.logs.tables``. Raises
         LogError.
-        """
-        from .tables import TopicTable
 
-        table = TopicTable(topic_named(name))
-        for record in self.records(name):
+        ``name``: as in ``records``, or that of a file that ``chaserdock log --export`` writes, such
+        as ``"chaser_sighting"`` or, for its solutions, ``"chaser_sighting_solutions"``.
+        """
+        from .tables import TopicTable, topic_of_table
+
+        exported = topic_of_table(name) if isinstance(name, str) else None
+        table = TopicTable(exported or topic_named(name))
+        for record in self.records(exported or name):
             table.add(record)
-        return table.take()
+        tables = dict(table.take_all())
+        return tables[name] if exported and isinstance(name, str) else tables[table.name]
 
     def _keys(self, names: tuple[str | Topic, ...]) -> set[str]:
         keys: set[str] = set()
@@ -122,5 +127,6 @@ def topic_named(name: str | Topic) -> Topic:
             return topic
     found = topics.topic_of_key(name)
     if found is None:
-        raise LogError(f"{name}: no such topic; known: {', '.join(t.key for t in topics.TOPICS)}")
+        known = ", ".join(t.key for t in topics.TOPICS)
+        raise LogError(f"{name}: no such topic or table; known topics: {known}")
     return found[0]

@@ -134,6 +134,7 @@ def recover(log: Path, out: Path) -> Recovered:
                 try:
                     found = _recover(data, target, str(log))
                 except OSError as error:
+                    out.unlink(missing_ok=True)
                     raise LogError(f"{out}: cannot be written: {error.strerror or error}") from None
             is_log = data[: len(MCAP0_MAGIC)] == MCAP0_MAGIC
     except FileExistsError:

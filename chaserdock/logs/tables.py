@@ -18,7 +18,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import msgspec
 import pyarrow as pa
 from chaserdock_protocol.recording.log import Record
-from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.topics import TOPICS, Topic
 from msgspec import inspect
 
 UNITS = {
@@ -178,6 +178,17 @@ def table_name(topic: Topic) -> str:
         .replace("/{process}", "")
         .replace("/", "_")
     )
+
+
+def table_names(topic: Topic) -> list[str]:
+    """Return the names of a topic's tables: its own, and those of its lists of structures."""
+    own = table_name(topic)
+    return [own, *(f"{own}_{field}" for field in _columns(topic.kind, images=False)[1])]
+
+
+def topic_of_table(name: str) -> Topic | None:
+    """Return the topic that has a table of this name, or None."""
+    return next((topic for topic in TOPICS if name in table_names(topic)), None)
 
 
 class TopicTable:

@@ -6,10 +6,13 @@ qz qw``, in WRF.
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TextIO
 
 from chaserdock_protocol import topics
+from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import replaced
 from chaserdock_protocol.recording.log import LogError, LogSource, Record
 
 from .reader import open_log
@@ -43,7 +46,7 @@ def write_tracks(
     wanted = (topics.TRUTH_BODY, topics.TARGET, topics.ODOMETRY, topics.REFERENCE)
     files: dict[str, TextIO] = {}
     points: dict[str, int] = {}
-    try:
+    with errors_of_writing(folder, LogError), ExitStack() as open_files:
         folder.mkdir(parents=True, exist_ok=True)
         for record in opened.records(*wanted):
             time_ns = record.message.sim_time_ns
@@ -51,20 +54,17 @@ def write_tracks(
             if name is None or not from_s <= time_ns / 1e9 <= to_s:
                 continue
             if name not in files:
-                files[name] = (folder / f"{name}.tum").open("x", encoding="ascii")
+                path = folder / f"{name}.tum"
+                if path.exists():
+                    raise LogError(f"{path}: already exists; write into an empty folder")
+                new = open_files.enter_context(replaced(path))
+                files[name] = open_files.enter_context(new.open("w", encoding="ascii"))
             w, x, y, z = record.message.q_wxyz
             values = " ".join(repr(v) for v in (*record.message.position_m, x, y, z, w))
             files[name].write(
                 f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d} {values}\n"
             )
             points[f"{name}.tum"] = points.get(f"{name}.tum", 0) + 1
-    except FileExistsError as error:
-        raise LogError(f"{error.filename}: already exists; write into an empty folder") from None
-    except OSError as error:
-        raise LogError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    finally:
-        for file in files.values():
-            file.close()
     if not points:
         raise LogError(f"{log}: contains no track between {from_s:g} and {to_s:g} s")
     return dict(sorted(points.items()))

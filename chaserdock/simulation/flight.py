@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from chaserdock_protocol.transport import RawSample
 
@@ -51,15 +53,21 @@ def fly_case(
     ``folder``: keep the log there. ``to_violation``: end the flight at the first violation.
     """
     with contextlib.ExitStack() as stack:
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=memory_folder())))
-        path = (folder or scratch) / "scenario.toml"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(toml_document(case), encoding="utf-8")
+        in_memory = tempfile.TemporaryDirectory(
+            prefix=f"chaserdock-{os.getpid()}-", dir=memory_folder()
+        )
+        scratch = Path(stack.enter_context(in_memory))
+        path = scratch / "scenario.toml"
+        write_atomically(path, toml_document(case))
         try:
             checks, fingerprint = FlightChecks(load_scenario(path)), 0
         except ScenarioError as error:
             # The text must not name the temporary file.
-            raise ScenarioError(str(error).replace(f"{scratch / path.name}: ", "")) from None
+            raise ScenarioError(str(error).replace(f"{path}: ", "")) from None
+        if folder is not None:  # only now: a refused case leaves no folder
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / "scenario.toml"
+            write_atomically(path, toml_document(case))
 
         def tap(sender: str, raw: RawSample) -> None:
             nonlocal fingerprint

@@ -11,6 +11,7 @@ import multiprocessing.connection
 import os
 import re
 import signal
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -18,10 +19,12 @@ from pathlib import Path
 from typing import cast
 
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
+from chaserdock.exit_codes import STOPPED
 from chaserdock.toml_text import toml_document
 
 from .checks.check import Violation
@@ -32,6 +35,8 @@ from .swarm import Case, draw_case
 
 _NOT_DOCKED = "ends in phase "
 """Start of the text about a chaser that should have docked or be safe."""
+_END_S = 5.0
+"""Wall time, s, in which a process ends its flight and removes its folder."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +139,10 @@ class _Worker:
             return UnflownSeed(self.seed, f"its process ended with status {status}{why}")
 
     def end(self) -> None:
-        """End the process at once."""
+        """End the process; kill it if it does not end."""
         self._process.terminate()
+        self._process.join(_END_S)
+        self._process.kill()
         self._process.join()
         self.connection.close()
 
@@ -147,6 +154,8 @@ def _work(options: SeedOptions, connection: Connection) -> None:
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # Ctrl-C reaches all processes; the parent ends this one
+    # As an exception: the flight's folder in memory is removed.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(STOPPED))
     with contextlib.suppress(EOFError):
         while True:
             seed = connection.recv()
@@ -235,7 +244,7 @@ def write_case(result: SimulationResult, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{Path(result.case['extends']).stem}-seed-{result.seed}.toml"
     lines = [f"# {violation}" for violation in result.violations]
-    path.write_text("\n".join([*lines, toml_document(result.case)]), encoding="utf-8")
+    write_atomically(path, "\n".join([*lines, toml_document(result.case)]))
     return path
 
 

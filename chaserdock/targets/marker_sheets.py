@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from chaserdock_agents.chaser.perception.detect import dictionary_of
 from chaserdock_models.targets import Marker, TargetModel, clear_margin_m
+from chaserdock_protocol.output_files import replaced
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -53,19 +54,23 @@ def write_sheets(
     """Write one PDF, or one SVG per sheet (numbered if several). Returns the number of sheets, and
     the files.
 
-    Raise ValueError for a marker that does not fit on a sheet or is not in its dictionary.
+    Raise ValueError for a target without markers, and for a marker that does not fit on a sheet or
+    is not in its dictionary.
     """
+    if not model.markers:
+        raise ValueError("has no markers to print; it is seen by its shape (perception model)")
     sheets = lay_out(model, size_mm)
     written = []
     with matplotlib.rc_context(_STYLE):
         if out.suffix.lower() == ".pdf":
-            with PdfPages(out) as pdf:
+            with replaced(out) as new, PdfPages(new) as pdf:
                 for sheet in sheets:
                     pdf.savefig(_figure_of(sheet))
             return len(sheets), [out]
         for number, sheet in enumerate(sheets, 1):
             path = out if len(sheets) == 1 else out.with_stem(f"{out.stem}-{number}")
-            _figure_of(sheet).savefig(path, format="svg", metadata={"Date": None})
+            with replaced(path) as new:
+                _figure_of(sheet).savefig(new, format="svg", metadata={"Date": None})
             written.append(path)
     return len(sheets), written
 

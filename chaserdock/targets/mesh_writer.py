@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from chaserdock_models.meshes import Material, TriangleMesh
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario.mesh_files import EXTRAS
 from chaserdock_protocol.scenario.surface import SurfaceMaterial
 
@@ -36,12 +37,12 @@ def write_mesh(mesh: TriangleMesh, path: Path) -> None:
         solid.metadata[EXTRAS] = extras
         scene.add_geometry(solid, node_name=part.name, geom_name=part.name)
     if path.suffix.lower() == ".glb":
-        path.write_bytes(export_glb(scene))
+        write_atomically(path, export_glb(scene))
         return
     text, files = export_obj(scene, return_texture=True, mtl_name=f"{path.stem}.mtl")
     for name, data in files.items():
-        (path.parent / name).write_bytes(data)
-    path.write_text(text)
+        write_atomically(path.parent / name, data)
+    write_atomically(path, text)
 
 
 def _pbr(m: Material) -> Any:

@@ -28,6 +28,9 @@ from chaserdock_protocol.transport import Link, Node, NoRouterError, ReceivedMes
 from chaserdock_protocol.transport.network import unique_id
 from chaserdock_protocol.transport.session import ignore_foreign_publishers
 
+from chaserdock.exit_codes import STOPPED
+from chaserdock.launch.reach import TO_VIEW, check_rights
+
 from .address import DEFAULT_HOST, page_token, url_of
 from .history import History, reply_text
 from .page import Page
@@ -74,9 +77,10 @@ class ViewOptions:
 
 
 def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> int:
-    """Serve the page until stopped; return 0. Raise ViewError or TransportError if it cannot
-    start.
+    """Serve the page until stopped; return ``STOPPED``. Raise ViewError, RightsError or
+    TransportError if it cannot start.
     """
+    check_rights(link, "view", TO_VIEW)
     stop, token = StopSignal(watch_parent), page_token()
     with ThreadPoolExecutor(1, "session") as opener:
         opener.submit(int).result()
@@ -103,7 +107,7 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
                     if mission is not None:
                         run_id = mission.run_id
                         _MissionView(patient, server, mission, options).run(stop)
-    return 0
+    return STOPPED
 
 
 class _Stopped(Exception):

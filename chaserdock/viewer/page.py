@@ -17,6 +17,7 @@ from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock.analysis.snapshot import annotated_image
+from chaserdock.verdict import Verdict
 
 from . import text
 from .history import History
@@ -270,9 +271,17 @@ class Page:
         self._reply.content = text
 
     def draw(
-        self, state: MissionState, history: History, mode: str, speed: float | None, lost: set[str]
+        self,
+        state: MissionState,
+        history: History,
+        mode: str,
+        speed: float | None,
+        lost: set[str],
+        verdict: Verdict | None = None,
     ) -> None:
-        """Draw the scene and the images; text and plots twice per second only."""
+        """Draw the scene and the images; text and plots twice per second only. ``verdict``: of a
+        log that has been judged.
+        """
         slow = time.monotonic() - self._drawn_s >= _SLOW_S
         with self._server.atomic():
             self._scene_view.draw(state, history, slow)
@@ -280,11 +289,17 @@ class Page:
                 self._slider.value = round(state.time_s(), 1)
             if slow:
                 self._drawn_s = time.monotonic()
-                self._write(state, history, mode, speed, lost)
+                self._write(state, history, mode, speed, lost, verdict)
         self._draw_image(state)
 
     def _write(
-        self, state: MissionState, history: History, mode: str, speed: float | None, lost: set[str]
+        self,
+        state: MissionState,
+        history: History,
+        mode: str,
+        speed: float | None,
+        lost: set[str],
+        verdict: Verdict | None,
     ) -> None:
         mass = (
             ()
@@ -293,7 +308,7 @@ class Page:
         )
         for element, content in (
             *mass,
-            (self._head, text.head(self._scenario, state, mode, speed)),
+            (self._head, text.head(self._scenario, state, mode, speed, verdict)),
             (self._table, text.chasers(state, history)),
             (self._faults, text.faults(state, history, lost)),
             (self._events, text.events(history.lines_until(state.time_s(), 200), most=12)),

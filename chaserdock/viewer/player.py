@@ -3,10 +3,17 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from pathlib import Path
 
 from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.recording.scan import LogError, LogSource
+
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summary_of_run
+from chaserdock.exit_codes import STOPPED
+from chaserdock.verdict import Verdict, verdict_of
 
 from .address import page_token, url_of
 from .live import PERIOD_S, ViewOptions
@@ -18,7 +25,7 @@ from .server import page_server
 def view_log(
     source: LogSource, options: ViewOptions, at_s: float | None = None, watch_parent: bool = False
 ) -> int:
-    """Serve the page until stopped; return 0. Play from the start, or pause at ``at_s``.
+    """Serve the page until stopped; return ``STOPPED``. Play from the start, or pause at ``at_s``.
 
     Raise LogError, or ViewError if the page cannot be served.
     """
@@ -29,6 +36,7 @@ def view_log(
         raise LogError(f"--at {at_s:g}: the log ends at {mission.end_s:.2f} s")
     if at_s is not None:
         line.at_s, line.playing = at_s, False
+    judgement = Judgement(source)
     mode = f"log of run {mission.run.get('run_id', '?')}, {mission.run.get('mode', '?')}"
     with page_server(options.host, options.port, token) as server:
         truth = mission.truth and options.truth
@@ -47,11 +55,36 @@ def view_log(
                 state = mission.at(line.at_s)
                 if not truth:
                     state.truth.clear()
-                page.draw(state, mission.history, mode, None, set())
+                page.draw(state, mission.history, mode, None, set(), judgement.verdict)
             before_s = begun_s
             took_s = time.monotonic() - begun_s
             time.sleep(max(PERIOD_S - took_s, 0.2 * took_s))
-    return 0
+    return STOPPED
+
+
+class Judgement:
+    """The verdict on a log, judged on a thread: the page of a long log does not wait for it.
+
+    ``verdict``: None until then. A log that cannot be judged is a failure that states why.
+    """
+
+    def __init__(self, source: LogSource) -> None:
+        self.verdict: Verdict | None = None
+        self._source = source
+        self._thread = threading.Thread(target=self._judge, name="judgement", daemon=True)
+        self._thread.start()
+
+    def _judge(self) -> None:
+        first = self._source if isinstance(self._source, Path) else self._source[0]
+        try:
+            self.verdict = verdict_of(summary_of_run(load_flight(self._source), first))
+        except LogError as error:
+            self.verdict = Verdict(False, not_met=(f"the log cannot be judged: {error}",))
+
+    def wait(self) -> Verdict | None:
+        """Wait for the verdict and return it."""
+        self._thread.join()
+        return self.verdict
 
 
 def advance(line: Timeline, wall_s: float) -> None:

@@ -8,19 +8,27 @@ import re
 
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock.analysis.mass_properties import property_rows, stated_values, true_values
+from chaserdock.analysis.mass_properties import property_rows, true_values
+from chaserdock.verdict import Verdict
 
 from .history import History, Line
 from .snapshot import ChaserState, MissionState
 
 _MARKS = {"info": "", "warning": "⚠ ", "error": "⛔ "}
+_VERDICT_MARKS = {"good": "✓ ", "partial": "⚠ ", "bad": "⛔ "}
 _FRESH_S = 2.0
 """Age (s) up to which a latency is shown: that of stopped images is out of date."""
 _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
 
 
-def head(scenario: FlightScenario, state: MissionState, mode: str, speed: float | None) -> str:
-    """Return time, speed, estimator status, and how the mission ended."""
+def head(
+    scenario: FlightScenario,
+    state: MissionState,
+    mode: str,
+    speed: float | None,
+    verdict: Verdict | None = None,
+) -> str:
+    """Return time, speed, estimator status, how the mission ended and, for a log, the verdict."""
     lines = [
         f"**{scenario.name}** · {mode}",
         f"**{state.time_s():.1f} s** of {scenario.duration_s:g} s",
@@ -33,10 +41,14 @@ def head(scenario: FlightScenario, state: MissionState, mode: str, speed: float 
         )
         if state.target.rejected:
             lines[-1] += f", rejected: {_numbers(state.target.rejected)}"
-    if state.ended is not None:
+    if verdict is not None:
+        lines.append(f"{_VERDICT_MARKS[verdict.level]}**verdict: {verdict.headline}**")
+        lines += verdict.lines()
+    elif state.ended is not None:
         lines.append(
             f"{'ended' if state.ended.complete else '⛔ ended early'}: {state.ended.reason}"
         )
+        lines.append("the verdict needs the log: `chaserdock judge`")
     return "  \n".join(lines)
 
 
@@ -74,7 +86,7 @@ def mass_properties(scenario: FlightScenario, state: MissionState) -> str:
     true = None if state.true_body is None else true_values(state.true_body)
     head = ("", "target", "stated", *(("true",) if true is not None else ()), "stack")
     lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
-    for row in property_rows(state.stack, stated_values(scenario), true, "-"):
+    for row in property_rows(state.stack, scenario, true, "-"):
         cells = (
             row.name,
             row.target,

@@ -36,6 +36,7 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
 from .core import ControllerCore
+from .ingest.early_messages import EarlyMessages
 from .ingest.tick_inputs import TickInputCollector
 from .interfaces import TickOutputs
 from .redundancy.checkpoint import Checkpoint, CheckpointError
@@ -109,6 +110,7 @@ class ControllerProcess:
         self.requests = OperatorRequests()
         self.standby = HotStandby(self.name, realtime, replaying)
         self.checkpoint = Checkpoint(core, [c.validation for c in self.inputs.chasers])
+        self._early = EarlyMessages(node)
         self._left_at = (-1, -1)
         self._last_result: tuple[Tick, TickOutputs, float] | None = None
         self._idle_receives = 0
@@ -159,13 +161,19 @@ class ControllerProcess:
             self.heartbeat.report_waiting(received, self._missing_keys)
         if released is not None:
             self._dispatch(released)
-        elif received is not None and not self._dispatch_leadership(received):
-            if self.standby.hold_back(received, self.done_tick):
-                return
-            self._dispatch(received)
+        elif received is not None:
+            for due in self._early.in_turn(received):
+                self._take(due)
         tick = self.tick
         if tick is not None and tick.tick > self.done_tick and self._is_ready(tick):
             self._process(tick)
+
+    def _take(self, received: ReceivedMessage) -> None:
+        """Apply a message, or hold it until this process knows its role."""
+        if not self._dispatch_leadership(received) and not self.standby.hold_back(
+            received, self.done_tick
+        ):
+            self._dispatch(received)
 
     def _missing_keys(self) -> tuple[str, ...]:
         """Return the keys of the messages for which the open tick waits, or with which the next one

@@ -11,10 +11,19 @@ class ChaserdockError(Exception):
     """A request cannot be carried out. The text states what failed, where, and what is valid."""
 
 
+class ScenarioError(ChaserdockError):
+    """A scenario that is not valid; the text has one line per error."""
+
+
 class MissingPackageError(ChaserdockError, ImportError):
     """A package that this part of chaserdock needs is not installed. The text states how to install
     it.
     """
+
+
+def how_to_install(extra: str) -> str:
+    """Return how to install an extra of chaserdock. No package index has chaserdock yet."""
+    return f"in a clone of chaserdock, pip install -e '.[{extra}]'"
 
 
 def require_extra(package: str, extra: str) -> None:
@@ -23,18 +32,32 @@ def require_extra(package: str, extra: str) -> None:
     """
     if find_spec(package) is None:
         raise MissingPackageError(
-            f"{package} is not installed; install chaserdock[{extra}]: pip install "
-            f"'chaserdock[{extra}]'",
+            f"{package}, of the extra chaserdock[{extra}], is not installed; "
+            f"{how_to_install(extra)}",
             name=package,
         )
+
+
+class WriteError(ChaserdockError, OSError):
+    """A file cannot be written. The text names it and the reason."""
+
+    def __init__(self, path: Path | str, reason: OSError) -> None:
+        super().__init__(reason.errno or 0, reason.strerror or str(reason), str(path))
+
+    def __str__(self) -> str:
+        return f"{self.filename}: cannot be written: {self.strerror}"
 
 
 @contextmanager
 def errors_of_writing(
     path: Path | str, kind: type[ChaserdockError] = ChaserdockError
 ) -> Iterator[None]:
-    """Raise an OSError as an error of this ``kind``, which names the path and the reason."""
+    """Raise an OSError as an error of this ``kind``, which names the file, or else the path, and
+    the reason.
+    """
     try:
         yield
+    except WriteError as error:
+        raise kind(str(error)) from None
     except OSError as error:
-        raise kind(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise kind(str(WriteError(path, error))) from None

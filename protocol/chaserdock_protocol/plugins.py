@@ -20,6 +20,9 @@ _GROUPS: dict[Kind, str] = {
     "solver": "chaserdock.solvers",
 }
 
+_METHODS: dict[Kind, str] = {"perception": "estimate", "estimator": "update", "solver": "solve"}
+"""Method that is called first in a flight."""
+
 
 class PluginError(ChaserdockError):
     """A plugin is not installed or cannot be loaded. The text lists the installed ones."""
@@ -42,6 +45,24 @@ def require(kind: Kind, name: str, own: tuple[str, ...]) -> None:
             f"{kind} {name!r} is unknown; built in: {', '.join(own)}; installed (entry points of "
             f"{_GROUPS[kind]!r}): {', '.join(known) or 'none'}"
         )
+
+
+def make(kind: Kind, name: str, own: tuple[str, ...], *arguments: Any) -> Any:
+    """Return what the installed part ``name`` makes of its arguments. Raises PluginError, also if
+    it raises an error.
+    """
+    factory = load(kind, name, own)
+    try:
+        part = factory(*arguments)
+    except ChaserdockError:
+        raise
+    except Exception as error:  # a plugin may raise anything
+        raise PluginError(
+            f"{kind} {name!r} does not start: {type(error).__name__}: {error}"
+        ) from error
+    if not callable(getattr(part, _METHODS[kind], None)):
+        raise PluginError(f"{kind} {name!r} has no method {_METHODS[kind]}, which it must have")
+    return part
 
 
 def load(kind: Kind, name: str, own: tuple[str, ...]) -> Callable[..., Any]:

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -91,6 +92,14 @@ class ProcessOptions:
         return StopSignal(self.watch_parent, self.signals)
 
 
+_signalled = threading.Event()
+
+
+def stopped_by_signal() -> bool:
+    """Return whether a ``StopSignal`` of this process has received SIGINT or SIGTERM."""
+    return _signalled.is_set()
+
+
 class StopSignal:
     """Record that this process is to stop.
 
@@ -108,6 +117,7 @@ class StopSignal:
             threading.Thread(target=self._watch, name="parent", daemon=True).start()
 
     def _on_signal(self, *_: object) -> None:
+        _signalled.set()
         self._event.set()
 
     def _watch(self) -> None:
@@ -123,5 +133,6 @@ class StopSignal:
 
 
 def print_status(process: str, text: str) -> None:
-    """Print one line to standard error."""
-    print(f"{process}: {text}", file=sys.stderr, flush=True)
+    """Print one line to standard error, if that can be written: a full disk ends no process."""
+    with suppress(OSError):
+        print(f"{process}: {text}", file=sys.stderr, flush=True)

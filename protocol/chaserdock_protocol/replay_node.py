@@ -39,6 +39,10 @@ class ReplayNode:
         """Return the next message, as ``Node.receive`` does, without waiting."""
         return self._pending.popleft() if self._pending else None
 
+    def is_forged(self, received: ReceivedMessage) -> bool:
+        """Return False: what is put in is what the recorder took."""
+        return False
+
     def publish(self, topic: Topic, message: Message, place: int | str | None = None) -> None:
         """Collect a message, as ``Node.publish`` sends it."""
         self._published.append((topic, place, message))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
-from .errors import ChaserdockError
+from .errors import ScenarioError
 
 _HERE = Path(__file__).resolve()
 # In a source tree the folder lies beside the packages, in an installed package inside `chaserdock`.
@@ -16,7 +16,7 @@ _RENAMED = {"jet-failure": "thruster-failure"}
 """Former names of shipped scenarios."""
 
 
-class ScenarioNotFound(ChaserdockError):
+class ScenarioNotFound(ScenarioError):
     """No scenario file of that path, and no shipped scenario of that name."""
 
 

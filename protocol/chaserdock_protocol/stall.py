@@ -9,6 +9,8 @@ DEFAULT_STALL_S = 60.0
 """Time (s) without progress after which a lock-step mission ends, and without the world after which
 a process ends.
 """
+SHORTEST_STALL_S = 1.0
+"""Least time (s) that may be set for it: a slow tick of a busy machine takes as long."""
 _LONGEST_STEP_S = 0.5
 """Most that one step of waiting counts, s. Callers update at least twice a second; in a longer step
 the process, or the machine, stood still.

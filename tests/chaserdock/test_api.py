@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from chaserdock_protocol.messages import TargetEstimate
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
+from chaserdock_protocol.transport import TransportError
 from harness import ROOT
 
 import chaserdock as cd
@@ -154,7 +156,7 @@ def test_errors_are_exceptions_with_the_text_of_the_command_line(tmp_path: Path)
         match=r"nowhere: no such scenario file or shipped scenario; .*shipped: abort",
     ):
         cd.run("nowhere")
-    with pytest.raises(ScenarioError, match="widht_px"):
+    with pytest.raises(ScenarioError, match=r"^camera\.widht_px=640: unknown key camera\.widht_px"):
         cd.run("single", out=tmp_path / "run", camera={"widht_px": 640})
     assert not (tmp_path / "run").exists()
     with pytest.raises(
@@ -166,6 +168,56 @@ def test_errors_are_exceptions_with_the_text_of_the_command_line(tmp_path: Path)
     (tmp_path / "mission.mcap").write_bytes(b"")
     with pytest.raises(cd.ChaserdockError, match="a log is never overwritten"):
         cd.run("single", out=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("refused", "message"),
+    [
+        ({"duraton_s": 20}, "duraton_s=20: unknown key duraton_s; did you mean duration_s"),
+        ({"overrides": {"name.x": 1}}, "name.x=1: name is a value"),
+        ({"overrides": {"chasers.9.position_m": 1}}, "9 must be a number from 0 to 0"),
+        ({"camera": {"calibration": "none.yaml"}}, 'camera.calibration="none.yaml": '),
+        ({"mode": "fast"}, "mode 'fast': must be one of lockstep, realtime"),
+        ({"stall_s": 0.0}, "stall_s 0.0: must be at least 1 s"),
+        ({"keys": "none"}, "keys none: it contains no keys"),
+    ],
+)
+def test_errors_of_python_speak_python(
+    refused: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(cd.ChaserdockError, match=re.escape(message)) as caught:
+        cd.run("single", out=tmp_path / "a" / "run", **refused)
+    assert not re.search(r"--(set|out|keys|mode|stall-s)\b", str(caught.value).split(";")[0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_documented_error_is_a_public_name() -> None:
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"\b[A-Z][A-Za-z]*Error\b", text))
+    assert {"ScenarioError", "LogError", "RunError"} <= named
+    for name in named:
+        assert issubclass(getattr(cd, name), cd.ChaserdockError), name
+    with pytest.raises(cd.ScenarioError, match="no such scenario file"):
+        cd.load_scenario("nowhere")
+    with pytest.raises(cd.ScenarioError, match="a value of type set"):
+        cd.load_scenario("single", camera={1})
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_mission_that_cannot_start_leaves_no_folder(
+    beside: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_hub(*_: Any, **__: Any) -> Any:
+        if beside:  # another mission has begun to use the folder of runs meanwhile
+            (tmp_path / "runs" / "other").mkdir()
+        raise TransportError("no free port")
+
+    monkeypatch.setattr("chaserdock.launch.launcher.open_hub", no_hub)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(cd.RunError, match="no free port"):
+        cd.run("single")
+    left = [path.relative_to(tmp_path) for path in tmp_path.rglob("*")]
+    assert sorted(map(str, left)) == (["runs", "runs/other"] if beside else [])
 
 
 def test_overrides_are_keywords_or_dotted_keys() -> None:
@@ -230,7 +282,8 @@ def test_typed_summary_has_every_field(log: Path) -> None:
     assert msgspec.to_builtins(typed, str_keys=True) == {
         key: value
         for key, value in plain.items()
-        if key not in ("peak_memory_bytes", "cpu_s") and (key, value) != ("drawn", [])
+        if key not in ("peak_memory_bytes", "cpu_s")
+        and (key, value) not in (("drawn", []), ("doubts", []))
     }
 
 

@@ -124,7 +124,15 @@ def test_sample_follows_its_distributions_and_is_reproducible(tmp_path: Path) ->
     ("wrong", "message"),
     [
         ('scenario = "nowhere"', "nowhere"),
-        ("seeds = 0", "seeds"),
+        ("seeds = 0", "c.toml: seeds: must be a whole number from 1 to 100000 or an array of"),
+        ("seeds = [-1]", "c.toml: seeds.0: must be a whole number at least 0"),
+        ('seeds = "x"', "seeds: must be a whole number from 1 to 100000 or an array of whole"),
+        ("set = 5", "set: must be a table (got 5)"),
+        ("[vary]\nduration_s = 5", "vary.duration_s: must be a table (got 5)"),
+        ("[vary.duration_s]\nvalues = 5", "vary.duration_s.values: must be an array of values"),
+        ('[vary.duration_s]\nuniform = [1, "a"]', "uniform.1: must be a number (got 'a')"),
+        ("[vary.duration_s]\nnormal = [1]", "normal: must be an array of 2 numbers (got [1])"),
+        ("[set]\nduraton_s = 5", "(nothing varied): duraton_s=5: unknown key duraton_s"),
         ("seeds = [1, 1]", "different numbers"),
         ('method = "random"', "require each other"),
         ('[vary."chaser.mass_kg"]\nuniform = [1.0, 2.0]', "a grid needs values"),
@@ -144,6 +152,9 @@ def test_invalid_file_raises_a_clear_error(tmp_path: Path, wrong: str, message: 
     with pytest.raises(ScenarioError, match=re.escape(message)) as caught:
         load_campaign(tmp_path / "c.toml")
     assert "c.toml" in str(caught.value)
+    pydantic = re.compile(r"constrained|tuple|dictionary|Field|instance|valid integer|--set")
+    assert not pydantic.search(str(caught.value))
+    assert len(str(caught.value).splitlines()) == 1
 
 
 @given(

@@ -119,6 +119,16 @@ def test_version() -> None:
     assert finished("--version") == (0, f"chaserdock {metadata.version('chaserdock')}\n")
 
 
+def test_a_full_disk_under_standard_output_is_one_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        process = chaserdock("scenario", stdout=full, stderr=subprocess.PIPE, text=True)
+        _, errors = process.communicate()
+    assert (process.returncode, errors) == (
+        2,
+        "chaserdock: standard output: No space left on device\n",
+    )
+
+
 def test_closed_pipe_is_no_error() -> None:
     golden = str(ROOT / "tests" / "golden" / "two-chasers.mcap")
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -250,7 +260,7 @@ def test_run_refuses_a_port_in_use(tmp_path: Path) -> None:
             "run", "single", "--out", str(tmp_path / "run"), "--port", str(port)
         )
     assert status == 2
-    assert output == f"chaserdock: --port {port}: Address already in use; choose another port\n"
+    assert output == f"chaserdock: port {port}: Address already in use; choose another port\n"
     assert not (tmp_path / "run").exists()
 
 

@@ -15,9 +15,16 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.codec import encode
 from chaserdock_protocol.recording.log import LogWriter
 from docking_cases import scenario
+from msgspec.structs import replace
 
 from chaserdock.analysis.figures import identification
 from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.mass_properties import (
+    PRIOR_ONLY,
+    prior_sigmas,
+    property_rows,
+    stated_values,
+)
 from chaserdock.analysis.plots import MissingData
 from chaserdock.analysis.report import report_of
 from chaserdock.analysis.time_series import Traces
@@ -65,7 +72,8 @@ def drawn() -> m.DrawnTruth:
 def made_log(path: Path, identified: int) -> Path:
     """A log of one chaser at rest, with so many estimates of the stack."""
     writer = LogWriter(path)
-    mission = scenario(detumble={"identification": {"enabled": True}})
+    known = {"mass_sigma_share": 0.5, "inertia_sigma_share": 1.0, "centre_of_mass_sigma_m": 0.1}
+    mission = scenario(detumble={"identification": {"enabled": True}}, target=known)
     writer.describe(mission.model_dump_json(), {"mode": "lockstep"})
 
     def put(topic: topics.Topic, place: Any, message: Any) -> None:
@@ -128,6 +136,27 @@ def test_report_has_a_table_of_identified_stated_and_true_values(log: Path) -> N
         if f">{x}</td>" not in row
     ] == []
     assert "stack with chasers 0" in section
+
+
+def test_values_that_the_flight_taught_nothing_about_say_so() -> None:
+    """A standard deviation of 3.9 kg, where 4 kg were stated before the flight, is no
+    measurement.
+    """
+    mission = scenario(target={"mass_sigma_share": 0.1, "inertia_sigma_share": 0.1})
+    prior = prior_sigmas(mission)
+    values, estimate = stated_values(mission), stack_estimate(7)
+    sigmas = prior * np.array([0.97, *[0.5] * 3, 1.0, *[0.5] * 5])
+    covariance = tuple(np.diag(sigmas**2).reshape(-1).tolist())
+    body = m.MassEstimate(
+        mass_kg=values[0],
+        centre_of_mass_m=tuple(values[1:4].tolist()),
+        inertia_kg_m2=tuple(values[4:].tolist()),
+        covariance=covariance,
+    )
+    found = replace(estimate, target=body, stack=body)
+    rows = property_rows(found, mission, None, "-")
+    assert [r.name for r in rows if PRIOR_ONLY in r.target] == ["mass, kg", "Ixx, kg m²"]
+    assert [r.name for r in rows if PRIOR_ONLY in r.stack] == ["mass, kg", "Ixx, kg m²"]
 
 
 def test_viewer_shows_the_latest_values_and_their_convergence(log: Path) -> None:

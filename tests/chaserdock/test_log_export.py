@@ -117,7 +117,9 @@ def test_open_log_iterates_typed_messages_by_topic() -> None:
         f"truth/body/{b}" for b in ("target", "chaser/0", "chaser/1")
     }
     assert sum(1 for _ in log.records()) == sum(log.counts.values())
-    with pytest.raises(LogError, match="nonsense: no such topic; known: world/tick"):
+    with pytest.raises(
+        LogError, match="nonsense: no such topic or table; known topics: world/tick"
+    ):
         log.table("nonsense")
 
 
@@ -154,3 +156,14 @@ def test_errors_equal_those_of_evo(tmp_path: Path) -> None:
         shutil.unpack_archive(result, tmp_path / relation)
         theirs = json.loads((tmp_path / relation / "stats.json").read_text())["rmse"]
         assert theirs == pytest.approx(float(np.sqrt(np.mean(ours**2))), rel=0.01)
+
+
+def test_every_exported_file_is_a_table_of_the_same_name(tmp_path: Path) -> None:
+    """Names of files and of `Log.table` are one set, with the lists of structures."""
+    export(GOLDEN, tmp_path, "parquet")
+    log = open_log(GOLDEN)
+    files = sorted(tmp_path.glob("*.parquet"))
+    assert "chaser_sighting_solutions" in [file.stem for file in files]
+    for file in files:
+        assert log.table(file.stem).equals(pq.read_table(file)), file.stem
+    assert log.table("chaser_sighting").equals(log.table("chaser/{chaser}/sighting"))

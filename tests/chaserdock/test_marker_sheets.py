@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception.detect import detect, dictionary_of
-from chaserdock_models.targets import target_model
+from chaserdock_models.targets import target_model, target_names
+from typer.testing import CliRunner
 
+from chaserdock.cli.main import app
 from chaserdock.targets.marker_sheets import SHEETS_MM, lay_out, write_sheets
 
 POINTS_PER_MM = 72.0 / 25.4
@@ -108,3 +110,18 @@ def test_markers_lie_within_the_printable_area() -> None:
 def test_marker_larger_than_the_sheet_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="too large"):
         write_sheets(target_model("servicer"), tmp_path / "m.pdf", (100.0, 150.0))
+
+
+@pytest.mark.parametrize("name", ["geo_servicer", "cubesat_12u"])
+def test_target_without_markers_has_no_sheets(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="has no markers to print"):
+        write_sheets(target_model(name), tmp_path / "m.pdf", SHEETS_MM["a4"])
+    said = CliRunner().invoke(app, ["target", name, "--markers", str(tmp_path / "m.pdf")])
+    assert said.exit_code == 2
+    assert f"{name}: has no markers to print" in said.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_names_every_shipped_target() -> None:
+    said = CliRunner().invoke(app, ["target", "--help"]).output
+    assert [name for name in target_names() if name not in said] == []

@@ -47,7 +47,7 @@ def test_world_without_pybullet_names_its_platforms_and_mujoco(command: tuple[st
     assert program == ("world" if command[0] == "world" else "chaserdock")
     assert text.startswith("the world needs PyBullet, which is not installed; it has wheels for")
     assert "Python 3.11 on Linux x86_64 only" in line
-    assert "pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\"" in line
+    assert "pip install -e '.[mujoco]' and set world.engine = \"mujoco\"" in line
 
 
 MUJOCO = """
@@ -101,8 +101,8 @@ def test_a_command_without_its_extra_names_it(
     done = without(package, *command)
     assert done.returncode == 2
     assert done.stderr == (
-        f"chaserdock: {package} is not installed; install chaserdock[{extra}]: pip install "
-        f"'chaserdock[{extra}]'\n"
+        f"chaserdock: {package}, of the extra chaserdock[{extra}], is not installed; in a clone of "
+        f"chaserdock, pip install -e '.[{extra}]'\n"
     )
 
 

@@ -10,21 +10,28 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from chaserdock_protocol import topics
 from chaserdock_protocol.messages import Tick
 from chaserdock_protocol.recording.log import read_log
+from chaserdock_protocol.transport import Link, Node, Tls
 from cryptography import x509
 from harness import ROOT, SHORT, all_gone, chaserdock, find_child, finished, run, sets, wait_for_log
 from mission_keys import make_keys
+from typer.testing import CliRunner
 
+from chaserdock.cli.main import app
 from chaserdock.launch import container
 from chaserdock.launch.keys import KeysError, init_keys, names, why_not_usable
 from chaserdock.launch.launcher import free_port
-from chaserdock.launch.status import MissionStatus, expected
+from chaserdock.launch.operator import OperatorError, send_command
+from chaserdock.launch.reach import TO_COMMAND, Rights, RightsError, check_rights
+from chaserdock.launch.status import MissionStatus, StatusError, expected, observe
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -75,7 +82,11 @@ def test_keys_are_not_overwritten_and_expire(tmp_path: Path) -> None:
         (["chaser", "0", "--keys", "{keys}", "-e", "tcp/127.0.0.1:1"], "must be tls/HOST:PORT"),
         (["router", "--keys", "{keys}", "-l", "tcp/127.0.0.1:0"], "must be tls/HOST:PORT"),
         (["router", "--until", "nobody"], "--until nobody"),
-        (["status", "-e", "tcp/127.0.0.1:1", "--duration", "0.5"], "no process found"),
+        (
+            ["status", "-e", "tcp/127.0.0.1:1", "--duration", "0.5"],
+            "nothing listens at tcp/127.0.0.1:1",
+        ),
+        (["command", "hold", "0", "-e", "tcp/127.0.0.1:1", "--timeout", "0.5"], "nothing listens"),
     ],
 )
 def test_invalid_network_options_are_one_line(
@@ -279,7 +290,7 @@ def test_container_forwards_signals_and_leaves_no_process(tmp_path: Path) -> Non
     process = subprocess.Popen([sys.executable, "-m", "chaserdock.launch.container", *arguments])
     recorder = find_child(process, "chaserdock", "record", timeout_s=60.0)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(timeout=60) != 0
+    assert process.wait(timeout=60) == 130
     assert all_gone([recorder], timeout_s=60.0)
 
 
@@ -305,7 +316,7 @@ def test_container_forwards_a_signal_that_arrives_while_it_starts_its_process(
         signal.SIGTERM, lambda number, frame: pytest.fail("the container has no handler yet")
     )
     try:
-        assert container.run(["record"], "router", 7447) == -signal.SIGTERM
+        assert container.run(["record"], "router", 7447) == 130
     finally:
         for number, handler in before:
             signal.signal(number, handler)
@@ -331,3 +342,73 @@ def test_status_computes_speed_and_expected_processes() -> None:
     ]
     assert MissionStatus().speed is None
     assert MissionStatus().as_dict()["tick"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key", "needed"),
+    [
+        (["status"], "chaser-0", "recorder or operator or viewer or bridge"),
+        (["command", "hold", "0"], "chaser-0", "operator or viewer or bridge"),
+        (["command", "hold", "0"], "recorder", "operator or viewer or bridge"),
+        (
+            ["command", "thruster-fault", "0", "--thruster", "1", "--fault", "stuck_on"],
+            "viewer",
+            "thruster-fault needs those of operator",
+        ),
+        (["judge", "{out}", "--live"], "controller", "recorder or operator or viewer"),
+        (["view"], "chaser-0", "recorder or operator or viewer or bridge"),
+        (["chaser", "1"], "chaser-0", "chaser/1 needs those of chaser-1"),
+        (["record", "--out", "{out}"], "operator", "recorder needs those of recorder"),
+        (["router"], "world", "router needs those of router"),
+    ],
+)
+def test_wrong_keys_are_named_with_the_right_ones(
+    arguments: list[str], key: str, needed: str, tmp_path: Path
+) -> None:
+    """Nothing is asked of the network: the certificate says who the caller is."""
+    keys = make_keys(tmp_path / "keys") / key
+    filled = [a.format(out=tmp_path / "out") for a in arguments]
+    said = CliRunner().invoke(app, [*filled, "--keys", str(keys)])
+    assert f"these are the keys of {key}; " in str(said.exception)
+    assert needed in str(said.exception)
+
+
+def test_keys_of_any_process_with_the_rights_are_accepted(tmp_path: Path) -> None:
+    keys = make_keys(tmp_path)
+    for name in Rights(reads=(topics.TICK,)).holders():
+        link = Link(tls=Tls.in_folder(keys / name))
+        check_rights(link, "this", Rights(reads=(topics.TICK,)))
+    check_rights(Link(tls=Tls.in_folder(keys / "chaser-2")), "this", Rights(reads=(topics.TICK,)))
+    check_rights(Link(), "this", TO_COMMAND)
+    (keys / "operator" / "cert.pem").write_text("none")
+    with pytest.raises(RightsError, match=r"cert\.pem: not a certificate"):
+        check_rights(Link(tls=Tls.in_folder(keys / "operator")), "this", TO_COMMAND)
+
+
+def test_status_finds_a_mission_that_answers_late() -> None:
+    """On a loaded machine a process is discovered after the time that `status` listens."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    world = Node("world", "world", Link("late", (), (endpoint,)))
+    later = threading.Timer(1.0, world.declare_liveliness)
+    try:
+        later.start()
+        seen = observe(Link("late", (endpoint,)), 0.2)
+        assert seen.alive == {"world"}
+    finally:
+        later.join()
+        world.close()
+
+
+def test_silence_at_an_address_that_answers_is_not_called_no_mission(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("chaserdock.launch.status.DISCOVERY_S", 0.3)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    world = Node("world", "world", Link("mine", (), (endpoint,)))
+    try:
+        with pytest.raises(StatusError, match="another namespace than yours, or is too busy"):
+            observe(Link("yours", (endpoint,)), 0.1)
+        with pytest.raises(OperatorError, match="another namespace than yours, or is too busy"):
+            send_command(Link("yours", (endpoint,)), "hold", 0, None, 0.1)
+    finally:
+        world.close()

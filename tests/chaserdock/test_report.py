@@ -57,6 +57,7 @@ from chaserdock.analysis.time_series import (
     load_traces,
 )
 from chaserdock.analysis.video import _ExternalView, frames, wrapped, write_video
+from chaserdock.verdict import Verdict
 
 TICK_NS = 1_000_000_000 // 15
 SIZE: dict[str, Any] = {"width_px": 96, "height_px": 64}
@@ -218,7 +219,7 @@ def test_truncated_log_gives_a_report(short_flight: Path, tmp_path: Path) -> Non
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: int(0.6 * len(whole))])
     page = checked(report_of(cut))
-    assert "not successful" in page.words
+    assert "FAILED" in page.words
     assert "ended at" in page.words
 
 
@@ -548,7 +549,8 @@ def test_external_view_shows_plumes_and_the_simulated_stars(tmp_path: Path) -> N
     views = []
     for duty in (np.zeros((1, thrusters)), np.ones((1, thrusters))):
         history = ActuatorHistory(np.array([0.0, 1.0]), np.zeros((1, 3)), np.zeros((1, 3)), duty)
-        views.append(_ExternalView(flight, {0: history}, 640, 480, (0.0, 1.0)).draw(0.2))
+        view = _ExternalView(flight, {0: history}, 640, 480, (0.0, 1.0), Verdict(True))
+        views.append(view.draw(0.2))
     idle, firing = (view.astype(int) for view in views)
     brighter = (firing - idle).min(axis=2) > 20
     assert np.count_nonzero(brighter) > 50

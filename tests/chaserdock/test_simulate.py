@@ -14,7 +14,7 @@ import psutil
 import pytest
 import typer
 from chaserdock_protocol.messages import Tick
-from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from harness import ROOT, chaserdock, finished
 
 from chaserdock.cli.simulate import simulate
@@ -268,3 +268,9 @@ def test_regressions_are_scenarios_that_run_accepts() -> None:
     for path in (ROOT / "tests" / "regressions").glob("*.toml"):
         status, text = finished("scenario", str(path))
         assert status == 0, text
+
+
+def test_refused_case_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"^unknown key duraton_s"):
+        fly_case({"extends": "single", "duraton_s": 1.0}, 0, tmp_path / "case")
+    assert list(tmp_path.iterdir()) == []

@@ -3,19 +3,28 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+from chaserdock_protocol.errors import WriteError
+from chaserdock_protocol.recording.log import logged_scenario
 from harness import ROOT
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summarize, summary_of
+from chaserdock.launch import launcher
+from chaserdock.launch.progress import ProgressReporter, Show
 from chaserdock.summary import Summary
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
-RUN_ONLY = {"peak_memory_bytes", "cpu_s"}
+RUN_ONLY = {"peak_memory_bytes", "cpu_s", "run_failure"}
 DETUMBLING_ONLY = {"stack"}
 PLUMES_ONLY = {"plumes"}
 IN_SOME_FLIGHTS = {"capture", "passive_safety", "rendezvous"}
@@ -46,21 +55,21 @@ def test_documented_fields_equal_the_produced_fields() -> None:
 
 
 def test_estimate_is_judged_relative_to_each_chaser() -> None:
-    """A shift of one chaser's estimated pose by 5 mm is its error, and violates the criterion; a
+    """A shift of one chaser's estimated pose by 15 mm is its error, and violates the criterion; a
     common drift does not.
     """
     flight = load_flight(GOLDEN)
-    limits = flight.scenario.success.model_copy(update={"max_estimate_position_m": 0.003})
+    limits = flight.scenario.success.model_copy(update={"max_estimate_position_m": 0.005})
     scenario = flight.scenario.model_copy(update={"success": limits, "settling_s": 1.0})
     before = summary_of(replace(flight, scenario=scenario))
-    assert before["chasers"]["0"]["relative_estimate"]["max_position_error_m"] < 0.002
+    assert before["chasers"]["0"]["relative_estimate"]["max_position_error_m"] < 0.004
     assert not [f for f in before["failures"] if "estimated pose" in f]
 
     history = flight.relative[0]
-    shifted = replace(history, position_m=history.position_m + np.array([0.003, 0.0, 0.004]))
+    shifted = replace(history, position_m=history.position_m + np.array([0.009, 0.0, 0.012]))
     after = summary_of(replace(flight, scenario=scenario, relative={**flight.relative, 0: shifted}))
     error = after["chasers"]["0"]["relative_estimate"]
-    assert abs(error["position_rms_m"] - 0.005) < 0.002
+    assert abs(error["position_rms_m"] - 0.015) < 0.004
     assert error["nees_mean"] > 5.0 * before["chasers"]["0"]["relative_estimate"]["nees_mean"]
     (failure,) = [f for f in after["failures"] if "estimated pose" in f]
     assert failure.startswith(
@@ -79,3 +88,19 @@ def test_estimate_without_relative_poses_is_judged_by_the_target() -> None:
     scenario = flight.scenario.model_copy(update={"success": limits, "settling_s": 1.0})
     failures = summary_of(replace(flight, scenario=scenario, relative={}))["failures"]
     assert any(f.startswith("largest position error of the estimate") for f in failures)
+
+
+def test_a_verdict_that_cannot_be_written_is_shown_and_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, _: str) -> None:
+        raise WriteError(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+
+    shutil.copy(GOLDEN, tmp_path / "mission.mcap")
+    monkeypatch.setattr(launcher, "write_atomically", full)
+    reporter = ProgressReporter(logged_scenario(GOLDEN)[0], Show.none)
+    outcome = launcher.judge(launcher.Fleet(), tmp_path, None, reporter)
+    assert outcome.status == 1
+    assert outcome.summary is not None
+    text = f"{tmp_path / 'summary.json'}: cannot be written: No space left on device"
+    assert text in outcome.summary["failures"]

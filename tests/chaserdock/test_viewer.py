@@ -525,7 +525,7 @@ def test_viewer_without_a_router_reports_it_and_can_be_stopped() -> None:
         assert process.stdout.readline() == line
         process.send_signal(signal.SIGTERM)
         assert process.stdout.read() == ""
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=60) == 130
     finally:
         process.kill()
 

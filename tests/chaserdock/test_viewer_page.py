@@ -43,7 +43,7 @@ def viewer(*arguments: str) -> Iterator[str]:
         yield url[0]
     finally:
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=60) == 130
         if process.stderr is not None:
             process.stderr.close()
 

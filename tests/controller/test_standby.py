@@ -5,8 +5,9 @@ the same.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -15,8 +16,14 @@ from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import Glide, Move, stay
 from chaserdock_controller.process import ControllerProcess
-from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
+from chaserdock_controller.redundancy.checkpoint import (
+    OWN_ARRAYS,
+    Checkpoint,
+    CheckpointError,
+    ControllerCheckpoint,
+)
 from chaserdock_controller.redundancy.serialization import decode, encode
+from chaserdock_controller.redundancy.shapes import ARRAYS
 from chaserdock_controller.redundancy.standby import HotStandby
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
@@ -358,6 +365,107 @@ def test_an_invalid_checkpoint_is_refused_completely(
     with pytest.raises(CheckpointError):
         saved.restore(bad)
     assert msgspec.msgpack.decode(saved.save()) == msgspec.msgpack.decode(state)
+
+
+def encoded_arrays(value: Any) -> Iterator[list[Any]]:
+    """Yield the arrays in a decoded checkpoint: kind, shape, content."""
+    if isinstance(value, list) and [type(item) for item in value] == [str, list, bytes]:
+        yield value
+    elif isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from encoded_arrays(item)
+
+
+_ONE = {"f": np.ones(1).tobytes(), "i": np.ones(1, dtype=int).tobytes(), "b": b"\1"}
+
+
+@pytest.fixture(scope="module")
+def saved_state(scenario: Scenario, ticks: Any) -> bytes:
+    """The checkpoint after twelve ticks."""
+    one, saved = memory(scenario)
+    for tick in list(ticks)[:12]:
+        deliver(one, *ticks[tick])
+    return saved.save()
+
+
+@pytest.mark.parametrize("shape", ["empty", "one", "more", "flat", "large"])
+def test_a_checkpoint_with_an_array_of_a_wrong_shape_is_refused_completely(
+    scenario: Scenario, saved_state: bytes, shape: str
+) -> None:
+    """Each array is replaced in turn. Only an array without elements may be empty."""
+    saved, state = memory(scenario)[1], saved_state
+    saved.restore(state)
+    values = msgspec.msgpack.decode(state)
+    accepted = 0
+    for array in encoded_arrays(values):
+        before = list(array)
+        dimensions = len(array[1])
+        match shape:
+            case "empty":
+                array[1:] = [0] * dimensions, b""
+            case "one":
+                array[1:] = [1] * dimensions, _ONE[array[0]]
+            case "more":
+                array[1:] = (
+                    [array[1][0] + 1, *array[1][1:]],
+                    array[2] + bytes(len(array[2]) // max(1, array[1][0])),
+                )
+            case "flat":
+                array[1] = [1, *array[1]]
+            case _ if array[0] == "f":
+                array[2] = np.full(len(array[2]) // 8, 1e200).tobytes()
+        if array != before:
+            try:
+                saved.restore(msgspec.msgpack.encode(values))
+                accepted += 1
+            except CheckpointError:
+                pass
+        array[:] = before
+    assert accepted == 0
+    assert msgspec.msgpack.decode(saved.save()) == msgspec.msgpack.decode(state)
+
+
+def array_fields(kind: Any, owner: tuple[type, str], found: set[tuple[type, str]]) -> None:
+    """Collect the fields with arrays in a type and all types that it contains."""
+    if get_origin(kind) is np.ndarray:
+        found.add(owner)
+    for inner in get_args(kind):
+        array_fields(inner, owner, found)
+    names = getattr(kind, "__struct_fields__", None) or getattr(kind, "__dataclass_fields__", ())
+    if isinstance(kind, type) and (kind, "") not in found:
+        found.add((kind, ""))
+        hints = get_type_hints(kind)
+        for name in names or getattr(kind, "_fields", ()):
+            array_fields(hints[name], (kind, name), found)
+
+
+def test_every_array_that_a_checkpoint_may_contain_has_a_declared_shape() -> None:
+    found: set[tuple[type, str]] = set()
+    array_fields(ControllerCheckpoint, (ControllerCheckpoint, ""), found)
+    declared = {(k, name) for k, each in {**ARRAYS, **OWN_ARRAYS}.items() for name in each}
+    assert {(k, name) for k, name in found if name} == declared
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("chasers", 0, "machine", "state", "move", "parts"), []),
+        (("estimator", "_buffer", "records", 0, "chasers"), []),
+        (("estimator", "_buffer", "records", 0, "state", "hypotheses"), []),
+        (("estimator", "_buffer", "records", 0, "chasers", 0, "chaser"), 7),
+        (("estimator", "target", "body_covariance"), [[1.0]]),
+    ],
+)
+def test_a_checkpoint_with_a_list_or_number_that_does_not_fit_is_refused(
+    scenario: Scenario, saved_state: bytes, path: tuple[Any, ...], value: Any
+) -> None:
+    saved = memory(scenario)[1]
+    values = part = msgspec.msgpack.decode(saved_state)
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    with pytest.raises(CheckpointError, match=f"{path[-1]}|chaser 7"):
+        saved.restore(msgspec.msgpack.encode(values))
 
 
 class Sample(msgspec.Struct, forbid_unknown_fields=True):

@@ -96,8 +96,16 @@ def test_agreement() -> None:
         seen = {0, 1, 2} if tick % 3 else {0, 2}
         found = [watches[i].update(now_s, True) for i in sorted(seen - rejected)]
         found += [watches[i].update(now_s, False) for i in sorted(rejected)]
-        events_at += [(tick, event[0]) for event in found if event is not None]
-    assert events_at == [(40, "warning"), (70, "info")]
+        events_at += [(tick, *event) for event in found if event is not None]
+    # A single chaser, or one that alone sees the target, has no others to disagree with.
+    assert events_at == [
+        (
+            40,
+            "warning",
+            "chaser 2: sightings disagree with the estimate: camera or odometry fault",
+        ),
+        (70, "info", "chaser 2: sightings agree with the estimate again"),
+    ]
 
 
 def test_odometry_is_doubtful_until_sightings_agree_since_it_was_interrupted() -> None:

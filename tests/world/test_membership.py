@@ -7,9 +7,10 @@ import threading
 import time
 from collections.abc import Callable
 
+import msgspec
 import pytest
-from chaserdock_protocol import topics
-from chaserdock_protocol.messages import JoinRequest, Presence
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol.messages import JoinRequest, Presence, encoding_of
 from chaserdock_protocol.scenario.simulation import SimulationSection
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.network import RawSample
@@ -297,6 +298,33 @@ def test_presence_of_a_replaced_process_that_goes_on_is_ignored(heartbeat: Heart
     heartbeat.take(presence("chaser/0-2"))
     heartbeat.take(presence("chaser/0-1"))
     assert heartbeat.heard() == {"chaser/0": "chaser/0-2"}
+
+
+def test_a_forged_presence_shuts_no_process_out(heartbeat: Heartbeat) -> None:
+    """Before the world lists the process, and after."""
+    heartbeat.take(presence("chaser/0-1"))
+    for k in range(1000):
+        heartbeat.take(presence(f"forged-{k}"))
+    heartbeat.take(presence("chaser/0-1"))
+    listed = Presence(process="world", instance="world-1", heard=first("chaser/0"), world="w")
+    heartbeat.take(listed)
+    heartbeat.take(presence("chaser/0-1"))
+    assert heartbeat.heard()["chaser/0"] == "chaser/0-1"
+    heartbeat.take(presence("forged-again"))
+    assert heartbeat.heard()["chaser/0"] == "chaser/0-1"
+    assert len(heartbeat._replaced) < 1000
+    heartbeat.forget("chaser/0")
+    heartbeat.take(msgspec.structs.replace(listed, heard={}))  # the world has lost it
+    heartbeat.take(presence("chaser/0-2"))
+    assert heartbeat.heard()["chaser/0"] == "chaser/0-2"
+
+
+def test_a_message_names_the_process_of_its_key(node: Node) -> None:
+    key = topics.PRESENCE.key_of("chaser/0")
+    for process, expected in (("chaser/0", True), ("world", False), ("controller", False)):
+        message = Presence(process=process, instance="x", heard={})
+        raw = RawSample(key, encoding_of(Presence), codec.encode(message), 0, "s")
+        assert (node._decode(topics.PRESENCE, "chaser/0", raw) is not None) == expected
 
 
 def test_a_process_is_replaced_when_the_world_lists_another_instance(

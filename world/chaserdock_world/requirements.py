@@ -9,7 +9,7 @@ import platform
 import sys
 from importlib.util import find_spec
 
-from chaserdock_protocol.errors import MissingPackageError, require_extra
+from chaserdock_protocol.errors import MissingPackageError, how_to_install, require_extra
 from chaserdock_protocol.scenario import Scenario
 
 
@@ -26,7 +26,7 @@ def require_packages(scenario: Scenario) -> None:
 def require_pybullet(
     what: str = "the world",
     instead: str = (
-        "elsewhere, pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\" "
+        f'elsewhere, {how_to_install("mujoco")} and set world.engine = "mujoco" '
         "(--set world.engine=mujoco)"
     ),
 ) -> None:

@@ -35,6 +35,7 @@ from .fallback_control import FallbackControl
 from .inbox import ChaserInbox
 from .outbox import ChaserOutputs, Outbox
 from .perception import make_perception
+from .perception_watch import PerceptionWatch, Trouble
 from .thrusters.controller import ThrusterController
 from .thrusters.failure_reports import FailureReports
 from .vision import Vision
@@ -63,6 +64,7 @@ class ChaserCore:
         self.outbox = Outbox(number)
         self.inbox = ChaserInbox()
         self.vision = vision or Vision(make_perception(scenario))
+        self._perception_watch = PerceptionWatch(scenario.perception.name)
         self.gate = CommandGate(scenario, number, realtime, self.outbox)
         self.fallback = FallbackControl(scenario, number, self.outbox)
         has_thrusters = scenario.chaser.actuation == "thrusters"
@@ -171,7 +173,24 @@ class ChaserCore:
             return
         if sighting.status == "bad_image" and (before is None or before.status != "bad_image"):
             self.outbox.warn("bad image", sighting.detail, image.tick, image.sim_time_ns)
+        self._watch_perception("perception failed", self.vision.failure, image)
         self.outbox.publish(topics.SIGHTING, sighting)
+
+    def note_duration(self, image: Image, took_s: float) -> ChaserOutputs:
+        """Return what to publish of the time that an image took, in real time: a warning if no
+        command stayed valid meanwhile.
+        """
+        valid_s = self.scenario.controller.command_lifetime_s
+        late = f"{took_s:.2f} s for an image, longer than a command is valid ({valid_s:g} s)"
+        self._watch_perception("perception late", late if took_s > valid_s else "", image)
+        return self.outbox.take()
+
+    def _watch_perception(self, what: Trouble, detail: str, image: Image) -> None:
+        """Count, and report, what went wrong in an image; nothing if ``detail`` is empty."""
+        if detail:
+            self.outbox.count_rejected(f"image:{what}")
+        if (report := self._perception_watch.update(what, detail)) is not None:
+            self.outbox.event(*report, image.tick, image.sim_time_ns)
 
     def _observe_thrusters(self) -> None:
         """Publish the thrusters' capability and the events of fault detection.

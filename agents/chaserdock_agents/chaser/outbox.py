@@ -18,8 +18,8 @@ class ChaserOutputs:
     """What follows from a received message.
 
     ``messages``: to be published in this order. ``stale``: whether the message came too late or
-    twice. ``rejected``: why a command must not count, as the traffic counters name it; empty for
-    others.
+    twice. ``rejected``: why a command must not count or what went wrong in an image, as the
+    traffic counters name it; empty for others.
     """
 
     messages: list[Outgoing] = field(default_factory=list)

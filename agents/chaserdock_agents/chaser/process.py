@@ -7,7 +7,7 @@ import cv2
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import create_fault_layer
-from chaserdock_protocol.messages import JoinReply, MissionEnd, Presence, Sighting, Tick
+from chaserdock_protocol.messages import Image, JoinReply, MissionEnd, Presence, Sighting, Tick
 from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
@@ -16,6 +16,7 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
 from .core import ChaserCore
+from .outbox import ChaserOutputs
 
 _RECEIVE_TIMEOUT_S = 0.2
 """Interval, s, at which the process looks whether it was stopped or the world is gone. The latter
@@ -105,6 +106,12 @@ class ChaserProcess:
         started_s = node.host.now_s()
         outputs = self.core.step(received, started_s)
         took_s = node.host.now_s() - started_s
+        self._publish(outputs, took_s)
+        if self.core.realtime and isinstance(received.message, Image):
+            self._publish(self.core.note_duration(received.message, took_s), took_s)
+
+    def _publish(self, outputs: ChaserOutputs, took_s: float) -> None:
+        node = self.node
         node.counts.stale += outputs.stale
         if outputs.rejected:
             node.counts.rejected[outputs.rejected] += 1

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from chaserdock_protocol import codec
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     ExpectedPose,
@@ -20,6 +21,7 @@ from chaserdock_protocol.messages import (
     RangeMeasurement,
     Sighting,
 )
+from chaserdock_protocol.pose_image import UnusableImage
 from numpy.typing import NDArray
 
 from .perception import (
@@ -41,8 +43,18 @@ turns by 10 degrees/s has turned by 3, the reach of a start (``tracking``).
 """
 
 
+_LONGEST_TEXT = 400
+"""Longest reason, characters, so that a message has room for it and for what failed."""
+
+
 class BadImage(Exception):
     """An image message without a valid image of the stated size."""
+
+
+class PerceptionFailed(Exception):
+    """A perception raised an error or returned something else than a result. The text says
+    what.
+    """
 
 
 def decode_image(image: Image) -> NDArray[np.uint8]:
@@ -94,32 +106,49 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
     """Return the sighting of the target in an image.
 
     By markers or, where that is more accurate, by bearing and range. The caller sets
-    ``wall_estimate_s``.
+    ``wall_estimate_s``. Raises PerceptionFailed.
     """
-    header: dict[str, Any] = {
-        "tick": image.tick,
-        "sim_time_ns": image.sim_time_ns,
-        "chaser": image.chaser,
-    }
+    header = _header(image)
     try:
         pixels = decode_image(image)
-        seen = perception.estimate(pixels, predicted)
-    except (BadImage, ValueError) as error:
-        return Sighting(
-            **header,
-            status="bad_image",
-            solutions=(),
-            marker_ids=(),
-            corners_px=(),
-            rejected_ids=(),
-            detail=str(error)[:500],
-        )
+        sighting = _measure(perception, pixels, image.ranging, predicted, header)
+        codec.decode(Sighting, codec.encode(sighting))  # raises what a reader would refuse
+    except (BadImage, UnusableImage) as error:
+        return Sighting(**header, status="bad_image", **_EMPTY, detail=str(error)[:_LONGEST_TEXT])
+    except Exception as error:  # an installed perception may raise or return anything
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        raise PerceptionFailed(text[:_LONGEST_TEXT]) from error
+    return sighting
 
+
+def without_sighting(image: Image, reason: str) -> Sighting:
+    """Return the sighting of an image in which perception failed."""
+    return Sighting(**_header(image), status="nothing", **_EMPTY, detail=reason)
+
+
+_EMPTY: dict[str, Any] = {"solutions": (), "marker_ids": (), "corners_px": (), "rejected_ids": ()}
+
+
+def _header(image: Image) -> dict[str, Any]:
+    return {"tick": image.tick, "sim_time_ns": image.sim_time_ns, "chaser": image.chaser}
+
+
+def _measure(
+    perception: PerceptionMethod,
+    pixels: NDArray[np.uint8],
+    ranging: RangeMeasurement | None,
+    predicted: Prediction | None,
+    header: dict[str, Any],
+) -> Sighting:
+    """Return the sighting in a grey image (height, width)."""
+    seen = perception.estimate(pixels, predicted)
+    if not hasattr(seen, "solutions"):
+        raise TypeError(f"estimate() returned {type(seen).__name__}, not a PerceptionResult")
     solutions, detail = tuple(_solution(pose) for pose in seen.solutions), ""
     rejected = tuple(int(i) for i in seen.rejected_ids)
-    if image.ranging is not None and isinstance(perception, FarPerception):
+    if ranging is not None and isinstance(perception, FarPerception):
         try:
-            far = _by_bearing(perception.by_bearing, pixels, image.ranging, predicted)
+            far = _by_bearing(perception.by_bearing, pixels, ranging, predicted)
             if not solutions or _variance(far) < _variance(solutions[0]):
                 return _without_markers(header, far, rejected)
         except BearingError as error:
@@ -212,8 +241,8 @@ def apply_geometry(
     covariance = np.array(estimate.covariance).reshape(k, k) / np.outer(sigmas, sigmas)
     try:
         correct(np.array(estimate.values) / sigmas, covariance)
-    except ValueError as error:
-        return str(error)
+    except Exception as error:  # an installed perception may raise anything
+        return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
     return None
 
 

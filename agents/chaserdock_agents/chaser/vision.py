@@ -8,7 +8,13 @@ from collections import deque
 from chaserdock_protocol.messages import ExpectedPose, Image, Sighting, WrenchCommand
 
 from .perception import PerceptionMethod
-from .sighting import apply_geometry, look, prediction_from
+from .sighting import (
+    PerceptionFailed,
+    apply_geometry,
+    look,
+    prediction_from,
+    without_sighting,
+)
 
 REMEMBERED_IMAGES = 64
 """Ticks of processed images that are remembered to recognize repeated ones. More than the delay of
@@ -20,12 +26,14 @@ class Vision:
     """Turn the images of one chaser into sightings.
 
     Each image is searched near the last ``sighting``, or where the controller expects the target.
+    A perception that fails gives a sighting of nothing, and ``failure`` says why.
     ``perception``: None for a chaser that gets no images, as in studies with drawn sightings.
     """
 
     def __init__(self, perception: PerceptionMethod | None) -> None:
         self.perception = perception
         self.sighting: Sighting | None = None
+        self.failure = ""
         self._expected: ExpectedPose | None = None
         self._processed: deque[int] = deque(maxlen=REMEMBERED_IMAGES)
 
@@ -36,7 +44,12 @@ class Vision:
         assert self.perception is not None
         self._processed.append(image.tick)
         predicted = prediction_from(self.sighting, self._expected, image.sim_time_ns)
-        self.sighting = look(self.perception, image, predicted)
+        self.failure = ""
+        try:
+            self.sighting = look(self.perception, image, predicted)
+        except PerceptionFailed as error:
+            self.failure = str(error)
+            self.sighting = without_sighting(image, self.failure)
         return self.sighting
 
     def has_processed(self, tick: int) -> bool:

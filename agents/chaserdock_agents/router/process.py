@@ -65,7 +65,7 @@ def main(options: ProcessOptions) -> int:
         if auditor is not None:
             auditor.publish_total()
     print_status(NAME, "ended")
-    return 0
+    return 1 if stop() else 0
 
 
 class _AuditLogger:

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 from chaserdock_controller.nmpc.open_backend import missing_part
 from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.output_files import write_atomically
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from chaserdock.experiments.page import html, markdown
@@ -49,7 +50,7 @@ def fly_and_report(plan: ExperimentPlan, out: Path, quick: bool = False, jobs: i
             ("reproduction.md", markdown(TITLE, parts)),
             ("reproduction.html", html(TITLE, parts)),
         ):
-            (out / name).write_text(text, encoding="utf-8")
+            write_atomically(out / name, text)
             _report(f"wrote {out / name}")
     if stop.is_set():
         _report("stopped; repeat the command to resume")
@@ -69,7 +70,7 @@ def begun(out: Path) -> Provenance:
     """
     path = out / f"provenance-{code_digest()}.json"
     if not path.exists():
-        path.write_bytes(msgspec.json.encode(provenance()))
+        write_atomically(path, msgspec.json.encode(provenance()))
     return msgspec.json.decode(path.read_bytes(), type=Provenance)
 
 

@@ -21,4 +21,4 @@ def make_estimator(name: str, scenario: FlightScenario) -> Estimator:
         return JointEstimator(parameters_of(scenario), len(scenario.chasers))
     if name == "paper":
         return PaperEstimator(scenario.camera_model())
-    return plugins.load("estimator", name, ESTIMATORS)(scenario)
+    return plugins.make("estimator", name, ESTIMATORS, scenario)

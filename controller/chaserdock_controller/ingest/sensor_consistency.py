@@ -53,9 +53,9 @@ class SensorConsistency:
             self.agrees, self.since_s = agrees, now_s
         elif not agrees and not self.inconsistent and lasts_s >= DISAGREES_S:
             self.inconsistent = True
-            what = "sightings disagree with the other chasers: camera or odometry fault"
+            what = "sightings disagree with the estimate: camera or odometry fault"
             return "warning", f"chaser {self.chaser}: {what}"
         elif agrees and self.inconsistent and lasts_s >= AGREES_S:
             self.inconsistent = False
-            return "info", f"chaser {self.chaser}: sightings agree with the other chasers again"
+            return "info", f"chaser {self.chaser}: sightings agree with the estimate again"
         return None

@@ -42,4 +42,4 @@ def make_solver(
         from .open_backend import OpenSolver
 
         return OpenSolver(params, n, max_iterations)
-    return plugins.load("solver", name, BACK_ENDS)(params, n, max_iterations)
+    return plugins.make("solver", name, BACK_ENDS, params, n, max_iterations)

@@ -28,6 +28,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from chaserdock_protocol.errors import how_to_install
 
 from .casadi_nlp import SingleShootingSolver
 from .casadi_problem import Nlp, build_nlp
@@ -58,7 +59,7 @@ def missing_part() -> str | None:
     nothing.
     """
     if importlib.util.find_spec("opengen") is None:
-        return "solver 'open' needs the package opengen: pip install 'chaserdock[open]'"
+        return f"solver 'open' needs the package opengen: {how_to_install('open')}"
     if shutil.which("cargo") is None:
         return "solver 'open' needs cargo, Rust's build tool, on the PATH: see https://rustup.rs"
     return None

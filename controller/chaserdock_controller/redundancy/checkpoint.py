@@ -32,6 +32,7 @@ from chaserdock_controller.ingest.odometry_validation import Known, OdometryVali
 from chaserdock_controller.interfaces import ChaserPlan, PlanningFailure
 
 from .serialization import decode, encode
+from .shapes import MisfitError, Shape, check_fit
 
 PartT = TypeVar("PartT", bound=Struct)
 
@@ -210,6 +211,21 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     plans: dict[int, Array]
 
 
+OWN_ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {
+    MachineState: {"position_m": ((3,),)},
+    SentState: {"_sent": ((6,),)},
+    StackControlState: {"_mean_rates": ((6,),)},
+    SequencerState: {"_pending_N_s": (("waiting",),), "_thrusts_N": (("waiting",),)},
+    PaperEstimatorState: {
+        "_poses": ((3,), (4,)),
+        "_rates": ((3,), (3,)),
+        "_mean": ((3,), (4,)),
+    },
+    ControllerCheckpoint: {"plans": (("stages", 6),)},
+}
+"""Shapes of the arrays in the parts above."""
+
+
 class Checkpoint:
     """Saves and restores the state of one controller. ``odometry``: odometry validation of each
     chaser.
@@ -286,6 +302,10 @@ class Checkpoint:
         try:
             state = decode(data, ControllerCheckpoint)
         except (ValueError, RecursionError) as error:
+            raise CheckpointError(str(error)) from None
+        try:
+            check_fit(state, self._core.scenario, OWN_ARRAYS)
+        except MisfitError as error:
             raise CheckpointError(str(error)) from None
         timeline = sorted(self._core.scenario.timeline, key=lambda entry: entry.at_s)
         chasers = len(self._core.scenario.chasers)

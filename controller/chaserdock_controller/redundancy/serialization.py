@@ -15,6 +15,7 @@ from msgspec import Struct
 Decoded = TypeVar("Decoded")
 
 _DTYPES = {"f": np.float64, "i": np.int64, "b": np.bool_}
+_WORDS = {"f": "numbers", "i": "integers", "b": "booleans"}
 
 
 class EncodedArray(Struct, array_like=True, forbid_unknown_fields=True):
@@ -56,10 +57,13 @@ def _decode_array(kind: Any, value: Any) -> Any:
     dtype = _DTYPES.get(encoded.kind)
     if dtype is None or min(encoded.shape, default=0) < 0:
         raise ValueError(f"an array of kind {encoded.kind!r} and shape {encoded.shape}")
-    array = np.frombuffer(encoded.content, dtype=dtype).reshape(encoded.shape).copy()
+    array = np.frombuffer(encoded.content, dtype=dtype).reshape(encoded.shape)
     if not np.isfinite(array).all():
         raise ValueError("an array with a value that is not finite")
-    return array
+    declared = np.dtype(kind.__args__[1].__args__[0])
+    if not np.can_cast(array.dtype, declared):
+        raise ValueError(f"an array of {_WORDS[encoded.kind]}, not {_WORDS[declared.kind]}")
+    return array.astype(declared)
 
 
 def _reject_nan(value: Any) -> None:

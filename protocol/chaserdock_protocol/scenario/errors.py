@@ -11,10 +11,18 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ScenarioError
 
 from .fields import LARGEST
-from .json_schema import SchemaNode, expected_text, key_paths, node_at, schema_of
+from .json_schema import (
+    SchemaNode,
+    expected_text,
+    key_paths,
+    node_at,
+    options_of,
+    schema_of,
+    without_alternatives,
+)
 
 _LONGEST_VALUE = 60  # characters of a value in an error, so that it stays one line
 _WITH_BOUNDS = ("greater_than_equal", "less_than_equal")
@@ -24,6 +32,7 @@ _FROM_SCHEMA = (
     "bool_type",
     "string_type",
     "tuple_type",
+    "dict_type",
     "model_type",
     "literal_error",
     "greater_than",
@@ -33,10 +42,6 @@ _FROM_SCHEMA = (
     "too_long",
 )
 """Kinds of errors (pydantic's names) whose text is what the schema expects."""
-
-
-class ScenarioError(ChaserdockError):
-    """A scenario that is not valid; the text has one line per error."""
 
 
 def path_text(parts: Sequence[str | int]) -> str:
@@ -53,13 +58,15 @@ def value_text(value: object) -> str:
 
 def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
     """Return one line per error of validating ``model``."""
-    root, errors = schema_of(model), error.errors()
+    root = schema_of(model)
+    errors = [{**e, "loc": without_alternatives(e["loc"], root)} for e in error.errors()]
     paths = [e["loc"] for e in errors]
     lines: list[str] = []
     for e in errors:
-        # An invalid element also makes its array too short; report the element only.
+        # An invalid element also makes its array too short, or no other kind of value that is
+        # possible there; report the element only.
         path = e["loc"]
-        if e["type"] == "too_short" and any(
+        if (e["type"] == "too_short" or _has_alternatives(path, root)) and any(
             len(p) > len(path) and p[: len(path)] == path for p in paths
         ):
             continue
@@ -67,6 +74,12 @@ def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
         if line not in lines:
             lines.append(line)
     return lines
+
+
+def _has_alternatives(path: Sequence[str | int], root: SchemaNode) -> bool:
+    """Return whether a value may be of several kinds, such as a number or an array."""
+    node = node_at(root, path)
+    return node is not None and len(options_of(node, root)) > 1
 
 
 def invalid(error: ValidationError, model: type[BaseModel], source: object) -> ScenarioError:

@@ -49,13 +49,39 @@ def node_at(root: SchemaNode, path: Sequence[str | int]) -> SchemaNode | None:
     """Return the schema of the value at a path, or None for an unknown key."""
     node: SchemaNode | None = root
     for part in path:
-        node = resolved(node, root)
-        node = (
-            item_of(node, part) if isinstance(part, int) else node.get("properties", {}).get(part)
-        )
+        below = (_below(option, part) for option in options_of(node, root))
+        node = next((found for found in below if found is not None), None)
         if node is None:
             return None
     return resolved(node, root)
+
+
+def _below(node: SchemaNode, part: str | int) -> SchemaNode | None:
+    """Return the schema of an array's element or of a table's key, or None."""
+    if isinstance(part, int):
+        return item_of(node, part)
+    others = node.get("additionalProperties")
+    return node.get("properties", {}).get(part, others if isinstance(others, dict) else None)
+
+
+def options_of(node: SchemaNode, root: SchemaNode) -> list[SchemaNode]:
+    """Return the alternatives of a value, without null; one for most."""
+    node = resolved(node, root)
+    options = [o for o in node.get("anyOf", ()) if o.get("type") != "null"]
+    return [resolved(option, root) for option in options] or [node]
+
+
+def without_alternatives(path: Sequence[str | int], root: SchemaNode) -> tuple[str | int, ...]:
+    """Return a path of pydantic without the parts that name the alternative it tried for a
+    value.
+    """
+    plain: list[str | int] = []
+    for part in path:
+        node = node_at(root, plain)
+        several = node is not None and len(options_of(node, root)) > 1
+        if not (several and node_at(root, [*plain, part]) is None):
+            plain.append(part)
+    return tuple(plain)
 
 
 def description_of(node: SchemaNode, root: SchemaNode) -> str:
@@ -107,6 +133,8 @@ def expected_text(node: SchemaNode, root: SchemaNode, every: bool = False) -> st
     """Return in words what a value must be, such as "a number greater than 0"; empty if the schema
     does not say.
     """
+    if len(options := options_of(node, root)) > 1:
+        return " or ".join(expected_text(option, root, every) for option in options)
     if "enum" in node:
         return f"one of {', '.join(map(str, node['enum']))}"
     if "const" in node:

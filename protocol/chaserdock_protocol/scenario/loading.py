@@ -26,16 +26,21 @@ source's values to those of the steps before.
 """
 
 
-def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
+SET_OPTION = "--set "
+"""Precedes an override in the errors of a command."""
+
+
+def load_scenario(path: Path, overrides: Sequence[str] = (), option: str = SET_OPTION) -> Scenario:
     """Load a scenario file with ``key.path=value`` overrides (values in TOML's notation). Raises
     ScenarioError.
 
+    ``option``: precedes an override in errors; empty for overrides that no command line stated.
     Paths in a file are relative to it, those in an override to the working directory. The plugins
     that the scenario names must be installed; this is not required of a scenario from the world or
     a log.
     """
     steps = [(str(file), _merging(values, str(file))) for file, values in _read_with_parents(path)]
-    scenario = _validated([*steps, *_override_steps(overrides)], str(path))
+    scenario = _validated([*steps, *_override_steps(overrides, option)], str(path))
     _require_plugins(scenario, str(path))
     return scenario
 
@@ -45,7 +50,7 @@ def parse_scenario(values: dict[str, Any], source: str, overrides: Sequence[str]
     error.
     """
     _check_format(values, source)
-    return _validated([(source, lambda _: values), *_override_steps(overrides)], source)
+    return _validated([(source, lambda _: values), *_override_steps(overrides, SET_OPTION)], source)
 
 
 def scenario_from_json(text: str, source: str) -> Scenario:
@@ -101,23 +106,28 @@ def _merging(values: Values, source: str) -> Callable[[Values], Values]:
     return step
 
 
-def _override_steps(overrides: Sequence[str]) -> list[Step]:
-    return [(f"--set {text}", _overriding(text)) for text in overrides]
+def _override_steps(overrides: Sequence[str], option: str) -> list[Step]:
+    return [(f"{option}{text}", _overriding(text, option)) for text in overrides]
 
 
-def _overriding(text: str) -> Callable[[Values], Values]:
+def _overriding(text: str, option: str) -> Callable[[Values], Values]:
+    source = f"{option}{text}"
+
     def step(before: Values) -> Values:
-        values = with_override(
-            before, text, lambda v: Scenario.model_validate(v).model_dump(mode="json")
-        )
-        _check_format(values, f"--set {text}")
+        try:
+            values = with_override(
+                before, text, lambda v: Scenario.model_validate(v).model_dump(mode="json")
+            )
+        except ScenarioError as error:
+            raise ScenarioError(f"{option}{error}") from None
+        _check_format(values, source)
         try:
             resolve_files(values, Path())
         except ScenarioError as error:
             raise ScenarioError(
-                "\n".join(f"--set {text}: {line}" for line in str(error).splitlines())
+                "\n".join(f"{source}: {line}" for line in str(error).splitlines())
             ) from None
-        _check_camera(before, values, f"--set {text}")
+        _check_camera(before, values, source)
         return values
 
     return step

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Change the values of a scenario: variants (``extends``) and overrides (``--set``)."""
+"""Change the values of a scenario: variants (``extends``) and overrides (``--set`` of commands)."""
 
 from __future__ import annotations
 
@@ -46,12 +46,13 @@ def with_override(values: Values, text: str, resolve: Callable[[Values], Values]
     notation.
 
     ``resolve`` returns the same tables with all defaults; an element of an array that is not in
-    ``values`` is set in a copy of the default. Raises ScenarioError.
+    ``values`` is set in a copy of the default. Raises ScenarioError, whose lines begin with
+    ``text``.
     """
     values = copy.deepcopy(values)
     path, equals, value = text.partition("=")
     if not equals or not path.strip():
-        raise ScenarioError(f"--set {text}: must be KEY=VALUE, such as camera.width_px=640")
+        raise ScenarioError(f"{text}: must be KEY=VALUE, such as camera.width_px=640")
     keys = path.strip().split(".")
     table: Any = values
     for depth, key in enumerate(keys[:-1]):
@@ -68,7 +69,7 @@ def _parsed(value: str, path: str) -> Any:
     except tomllib.TOMLDecodeError:
         return value.strip()
     except RecursionError:
-        raise ScenarioError(f"--set {path.strip()}: nested too deeply") from None
+        raise ScenarioError(f"{path.strip()}: nested too deeply") from None
 
 
 def _child(table: Any, key: str, text: str) -> Any:
@@ -78,7 +79,7 @@ def _child(table: Any, key: str, text: str) -> Any:
         _drop_alternatives(table, key, None)
         child = table.setdefault(key, {})
     if not isinstance(child, dict | list):
-        raise ScenarioError(f"--set {text}: {key} is a value ({value_text(child)}), not a table")
+        raise ScenarioError(f"{text}: {key} is a value ({value_text(child)}), not a table")
     return child
 
 
@@ -98,7 +99,7 @@ def _element(array: list[Any], key: str, text: str) -> Any:
             if array
             else "is no element: the array is empty"
         )
-        raise ScenarioError(f"--set {text}: {key} {valid}")
+        raise ScenarioError(f"{text}: {key} {valid}")
     return array[int(key)]
 
 

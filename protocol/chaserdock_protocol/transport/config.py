@@ -93,7 +93,7 @@ class Link:
 
 class ReceivedMessage(Struct, frozen=True):
     """A valid message. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped; ``arrived_s``
-    the clock of this host.
+    the clock of this host. ``source``: the sender's session, empty if unknown.
     """
 
     topic: Topic
@@ -101,6 +101,7 @@ class ReceivedMessage(Struct, frozen=True):
     message: Any
     sent_ns: int
     arrived_s: float = 0.0
+    source: str = ""
 
 
 def is_unreachable(error: Exception) -> bool:

@@ -18,13 +18,14 @@ import msgspec
 
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.messages import Message, encoding_of
+from chaserdock_protocol.messages import Message, Presence, Tick, encoding_of
 from chaserdock_protocol.topics import Role, Topic
 
 from .bounded_queue import BoundedQueue
 from .config import Link, ReceivedMessage, TransportError
 from .foreign_publishers import ForeignPublishers
 from .network import Network, Query, RawSample, T, Undo
+from .process_sessions import ProcessSessions
 from .zenoh_network import ZenohNetwork
 
 
@@ -82,6 +83,7 @@ class Node:
         self._queryables: dict[str, Undo] = {}
         self._close_callbacks: list[Callable[[], None]] = []
         self._foreign = ForeignPublishers()
+        self._sessions = ProcessSessions()
         self._newest: Message | None = None
         network: Network = ZenohNetwork(link) if link.network is None else link.network
         self._connection, self.host = network.open(name)
@@ -285,7 +287,10 @@ class Node:
             return received
         delivered = self.message_filter.incoming(topic, place, received.message, raw.payload)
         self._ready.extend(
-            ReceivedMessage(topic, place, m, raw.sent_ns, arrived_s) for m in delivered
+            received
+            if m is received.message
+            else ReceivedMessage(topic, place, m, raw.sent_ns, arrived_s)
+            for m in delivered
         )
         return self._ready.popleft() if self._ready else None
 
@@ -302,10 +307,33 @@ class Node:
             message: Any = self._connection.decode(topic.kind, raw)
             if place is not None and str(getattr(message, "chaser", place)) != place:
                 raise Rejected("chaser", f"message of chaser {message.chaser} on {raw.key}")
+            if place is not None and getattr(message, "process", place) != place:
+                raise Rejected("process", f"message of {message.process} on {raw.key}")
         except Rejected as refusal:
             self.counts.rejected[f"{topic.key}:{refusal.reason}"] += 1
             return None
-        return ReceivedMessage(topic, place, message, raw.sent_ns, arrived_s)
+        received = ReceivedMessage(topic, place, message, raw.sent_ns, arrived_s, raw.source)
+        match message:
+            case Presence(process=process, instance=instance):
+                self._sessions.note(process, instance, raw.source)
+                self._sessions.list_instances(message.heard if process == "world" else {})
+            case Tick():
+                self._sessions.list_instances(message.chaser_instances)
+                self._sessions.list_instances(message.controllers)
+            case _ if self.is_forged(received):
+                return None
+        return received
+
+    def is_forged(self, received: ReceivedMessage) -> bool:
+        """Return whether another session than its process' has sent a message, and count it.
+
+        A message that was received earlier may turn out to be forged when its process is known.
+        """
+        key = received.topic.key_of(received.place)
+        forged = self._sessions.is_foreign(key, received.source)
+        if forged:
+            self.counts.rejected[f"{received.topic.key}:foreign publisher"] += 1
+        return forged
 
     # -- queries and liveliness --------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ exchange messages have received each other's presence.
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 
 from chaserdock_protocol import topics
@@ -38,6 +39,10 @@ from . import Node, ReceivedMessage
 EARLY_PERIOD_S = 0.05
 """Interval of presence before the first tick, s: the discovery barrier ends about two of them after
 the last declaration.
+"""
+_MOST_REPLACED = 256
+"""Instances that are remembered as replaced: more than any mission restarts processes; bounds the
+memory under forged ones.
 """
 STEADY_PERIOD_S = 1.0
 """Interval of presence in flight, s: a fifth of ``stall.SILENT_S``, after which a process counts as
@@ -220,7 +225,8 @@ class Heartbeat:
         """
         self._heard: dict[str, str] = {}
         self._newest: dict[str, str] = {}
-        self._replaced: set[str] = set()
+        self._replaced: deque[str] = deque(maxlen=_MOST_REPLACED)
+        self._listed: dict[str, str] = {}
         self._lock = threading.Lock()
         self.in_flight = threading.Event()
         """Set at the first tick: presence is then published once a second only."""
@@ -235,7 +241,8 @@ class Heartbeat:
         """Record a presence that the process' loop received.
 
         Ignores that of an earlier mission in this namespace, and that of a process that was
-        replaced and goes on.
+        replaced and goes on. Which instance of a process counts is what the world lists, as it has
+        admitted it: a forged presence shuts no process out.
         """
         own = self._node.world_source
         if own and message.world and message.world != own:
@@ -243,11 +250,14 @@ class Heartbeat:
         if message.process == "world":
             self.world_heard()
         with self._lock:
-            if message.instance in self._replaced:
+            if message.process == "world":
+                self._listed = message.heard
+            listed = self._listed.get(message.process)
+            if message.instance != listed and (listed or message.instance in self._replaced):
                 return
             before = self._newest.get(message.process, message.instance)
             if message.instance != before:
-                self._replaced.add(before)
+                self._replaced.append(before)
             self._newest[message.process] = self._heard[message.process] = message.instance
 
     def report_waiting(

@@ -69,7 +69,7 @@ def make_perception(scenario: FlightScenario, single_images: bool = False) -> Pe
             perception.prepare()
             return perception
         case name:
-            return plugins.load("perception", name, PERCEPTIONS)(camera, target)
+            return plugins.make("perception", name, PERCEPTIONS, camera, target)
 
 
 def tracker_mesh(target: FlightTarget) -> TrackerMesh:

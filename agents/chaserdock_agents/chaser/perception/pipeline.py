@@ -10,6 +10,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel
+from chaserdock_protocol.pose_image import UnusableImage
 from numpy.typing import ArrayLike, NDArray
 
 from . import baseline as paper
@@ -97,7 +98,7 @@ class Perception:
                 if isinstance(image, np.ndarray)
                 else type(image).__name__
             )
-            raise ValueError(f"expected a uint8 image of {shape}, got {got}")
+            raise UnusableImage(f"expected a uint8 image of {shape}, got {got}")
         image = np.ascontiguousarray(image)
         if self.method != "default":
             return self._estimate_paper(image)

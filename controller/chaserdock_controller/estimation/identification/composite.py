@@ -161,7 +161,11 @@ class CompositeIdentification:
 
     def load(self, state: CompositeFilterState) -> None:
         """Replace the state by a saved one. Raises ValueError if that belongs to other chasers."""
-        if state.covariance.shape != self.covariance.shape:
+        own, other = self._estimate, state.estimate
+        if state.covariance.shape != self.covariance.shape or any(
+            np.shape(getattr(own, name)) != np.shape(getattr(other, name))
+            for name in ("mounts_m", "mounts_wxyz", "thrusts", "biases")
+        ):
             raise ValueError("the state is of another stack")
         self._estimate, self.covariance, self.ticks = (
             state.estimate,

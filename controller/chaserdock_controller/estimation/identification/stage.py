@@ -189,9 +189,13 @@ class StackIdentification:
         """Replace the state by a saved one. Raises ValueError, and changes nothing, if that belongs
         to another scenario.
         """
-        composite = None
+        composite, known = None, range(len(self._scenario.chasers))
+        if len(state.silent_ticks) != len(known) or not state.reporting <= set(known):
+            raise ValueError("the state is of other chasers")
         if state.composite is not None:
             chasers, saved = state.composite
+            if not chasers or len(set(chasers)) != len(chasers) or not set(chasers) <= set(known):
+                raise ValueError("the state is of other chasers")
             estimate = saved.composite.estimate
             places = zip(chasers, estimate.mounts_m, estimate.mounts_wxyz, strict=True)
             still = BodyState(estimate.position_m, np.zeros(3), estimate.q_wxyz, np.zeros(3))

@@ -14,6 +14,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_protocol.pose_image import UnusableImage
 from numpy.typing import ArrayLike, NDArray
 
 from ..pipeline import GeometryInformation, PerceptionResult
@@ -192,7 +193,7 @@ class ModelPerception:
                 if isinstance(image, np.ndarray)
                 else type(image).__name__
             )
-            raise ValueError(f"expected a uint8 image of {shape}, got {got}")
+            raise UnusableImage(f"expected a uint8 image of {shape}, got {got}")
         if len(self._waiting) >= (
             _MOST_WAITING if self._tracks or predicted is None else _MOST_WAITING_PREDICTED
         ):

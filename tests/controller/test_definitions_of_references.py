@@ -147,6 +147,20 @@ def test_horizon_has_the_references_at_its_times(flight: Flight) -> None:
             )
 
 
+def test_facing_chaser_sees_the_target_where_it_does_from_its_nominal_place(
+    flight: Flight,
+) -> None:
+    found, row = flight.horizon(), KINDS.index("circuit")
+    nominal = flight.scenario.chasers[row]
+    line = matrix(nominal.q_wxyz).T @ -np.array(nominal.position_m)
+    for k in range(STAGES + 1):
+        pose = found.references[row, k]
+        seen = matrix(pose[3:]).T @ (found.target_positions[k] - pose[:3])
+        np.testing.assert_allclose(
+            seen / np.linalg.norm(seen), line / np.linalg.norm(line), atol=1e-9
+        )
+
+
 def test_reference_now_is_the_beginning_of_the_horizon(flight: Flight) -> None:
     _, r, _ = flight.target.at(0.0)
     for c in flight.chasers:

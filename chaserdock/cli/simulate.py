@@ -69,9 +69,9 @@ def simulate(
     from chaserdock.simulation.seeds import (
         SeedOptions,
         UnflownSeed,
-        consistency,
         fly_seeds,
-        inconsistency,
+        inaccuracies,
+        means_over,
     )
 
     _check_writable(out)
@@ -115,13 +115,11 @@ def simulate(
     failed = sum(bool(r.violations) for r in results) + outcomes["not flown"]
     counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common()) or "none flown"
 
-    mean, flights = consistency(results)
-    print(
-        f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 "
-        f"over {flights} flights"
-    )
-
-    if reason := inconsistency(results):
+    print(f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}")
+    for (expected, subject), means in means_over(results).items():
+        mean = sum(means) / len(means)
+        print(f"{subject}: mean {expected.name} {mean:.2f} over {len(means)} flights")
+    for reason in inaccuracies(results):
         print(f"chaserdock: {reason}", file=sys.stderr)
         failed += 1
     raise typer.Exit(STOPPED if stopped else FAILED if failed else DONE)

@@ -7,6 +7,7 @@ import contextlib
 import os
 import tempfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,8 +18,10 @@ from chaserdock_protocol.transport import RawSample
 from chaserdock.toml_text import toml_document
 
 from .checks.check import Violation
-from .checks.estimates import CovarianceConsistency
+from .checks.estimates import NEES, CovarianceConsistency
+from .checks.expectations import LEAST_SAMPLES, Expectation
 from .checks.flight_checks import FlightChecks
+from .checks.tracking import TRACKING, TrackingAccuracy
 from .mission import simulate
 from .swarm import Case
 
@@ -29,8 +32,8 @@ class SimulationResult:
 
     ``outcome``: the first violated invariant, or else the worst final state of the chasers that are
     to dock. ``fingerprint``: digest of all messages and their times, equal for equal flights.
-    ``nees``: normalized squared errors of the estimate, one a second. ``honest``: no sensor lies
-    and the plant is as stated, so that the estimate should be consistent.
+    ``means``: mean of each quantity with an expectation over the flight, by quantity and subject;
+    empty unless no sensor lies and the plant is as stated.
     """
 
     seed: int
@@ -38,8 +41,7 @@ class SimulationResult:
     violations: tuple[Violation, ...]
     outcome: str
     fingerprint: str
-    nees: tuple[float, ...]
-    honest: bool
+    means: Mapping[tuple[Expectation, str], float]
     sim_time_s: float
 
 
@@ -86,10 +88,24 @@ def fly_case(
         violations=tuple(checks.violations),
         outcome=checks.outcome,
         fingerprint=f"{fingerprint:08x}",
-        nees=tuple(checks.find(CovarianceConsistency).nees),
-        honest=checks.view.causes.honest,
+        means=_means(checks),
         sim_time_s=checks.view.time_s,
     )
+
+
+def _means(checks: FlightChecks) -> dict[tuple[Expectation, str], float]:
+    """Return the means of the quantities with an expectation in a flight that should meet it."""
+    if not checks.view.causes.honest:
+        return {}
+    estimates, tracking = checks.find(CovarianceConsistency), checks.find(TrackingAccuracy)
+    found = {(NEES, "target"): estimates.nees}
+    found |= {(NEES, f"chaser/{i}"): values for i, values in estimates.relative_nees.items()}
+    found |= {(TRACKING, f"chaser/{i}"): values for i, values in tracking.values.items()}
+    return {
+        key: sum(values) / len(values)
+        for key, values in found.items()
+        if len(values) >= LEAST_SAMPLES
+    }
 
 
 def memory_folder() -> str | None:

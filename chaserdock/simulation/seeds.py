@@ -18,7 +18,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED
@@ -29,12 +28,7 @@ from chaserdock.exit_codes import STOPPED
 from chaserdock.toml_text import toml_document
 
 from .checks.check import Violation
-from .checks.estimates import (
-    LEAST_FLIGHTS,
-    LEAST_MEAN_NEES,
-    MOST_MEAN_NEES,
-    CovarianceConsistency,
-)
+from .checks.expectations import Expectation
 from .flight import SimulationResult, fly_case
 from .shrinking import shrink
 from .swarm import Case, draw_case
@@ -254,21 +248,21 @@ def write_case(result: SimulationResult, folder: Path) -> Path:
     return path
 
 
-def consistency(results: Iterable[SimulationResult]) -> tuple[float, int]:
-    """Return the mean NEES over the flights without lying sensors, each weighted equally, and the
-    number of these flights.
-    """
-    means = [float(np.mean(r.nees)) for r in results if r.honest and r.nees]
-    return (float(np.mean(means)) if means else float("nan")), len(means)
+def means_over(
+    results: Iterable[SimulationResult],
+) -> dict[tuple[Expectation, str], list[float]]:
+    """Return the means of flights by quantity and subject, in order."""
+    found: dict[tuple[Expectation, str], list[float]] = {}
+    for result in results:
+        for key, mean in result.means.items():
+            found.setdefault(key, []).append(mean)
+    return dict(sorted(found.items(), key=lambda item: (item[0][0].name, item[0][1])))
 
 
-def inconsistency(results: Iterable[SimulationResult]) -> str | None:
-    """Return why the estimate's covariance is inconsistent over an ensemble; None if it is
-    consistent or the ensemble is small.
-    """
-    mean, number = consistency(results)
-    if number < LEAST_FLIGHTS or LEAST_MEAN_NEES <= mean <= MOST_MEAN_NEES:
-        return None
-    allowed = f"{LEAST_MEAN_NEES:g} to {MOST_MEAN_NEES:g}"
-    found = f"mean NEES {mean:.2f} over {number} flights, allowed {allowed}"
-    return f"{CovarianceConsistency.name}: {found}"
+def inaccuracies(results: Iterable[SimulationResult]) -> list[str]:
+    """Return which quantities are not as expected over an ensemble; none if it is small."""
+    found = []
+    for (expected, subject), means in means_over(results).items():
+        if defect := expected.defect_over(means):
+            found.append(f"{expected.invariant}: {subject}: {defect}")
+    return found

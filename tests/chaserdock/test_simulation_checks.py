@@ -30,6 +30,7 @@ from chaserdock_protocol.messages import (
     MissionEnd,
     Plan,
     Reference,
+    RelativeEstimate,
     Sighting,
     TargetEstimate,
     ThrusterPulse,
@@ -52,15 +53,17 @@ from pydantic import ValidationError
 from chaserdock.simulation.checks.check import Violation
 from chaserdock.simulation.checks.commands import ThrustersOpen
 from chaserdock.simulation.checks.docking import DockedOrSafe
-from chaserdock.simulation.checks.estimates import MOST_MEAN_NEES
+from chaserdock.simulation.checks.estimates import FLIGHT_NEES, NEES
+from chaserdock.simulation.checks.expectations import Expectation
 from chaserdock.simulation.checks.flight_checks import CHECKS, FlightChecks
 from chaserdock.simulation.checks.messages import covariance_defect, defects_of
 from chaserdock.simulation.checks.processes import BoundedQueues, queue_limit
+from chaserdock.simulation.checks.tracking import FLIGHT_TRACKING, TRACKING
 from chaserdock.simulation.flight import SimulationResult
 from chaserdock.simulation.links import Traffic
 from chaserdock.simulation.mission import SimulatedFlight
 from chaserdock.simulation.network import EPOCH_NS
-from chaserdock.simulation.seeds import inconsistency, shrink_result
+from chaserdock.simulation.seeds import inaccuracies, shrink_result
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import (
     KINDS,
@@ -1213,15 +1216,104 @@ def test_crashes_stalls_and_early_ends_are_violations(scenario: Scenario) -> Non
     assert early.found == ["liveness"]
 
 
-def result(nees: float, honest: bool = True) -> SimulationResult:
-    return SimulationResult(1, {}, (), "docked", "", (nees,) * 5, honest, 25.0)
+def result(**means: float) -> SimulationResult:
+    """Return a flight with a mean NEES of a chaser and of the target, and a tracking error."""
+    keys = {"chaser": (NEES, "chaser/1"), "target": (NEES, "target")}
+    keys["tracking"] = (TRACKING, "chaser/1")
+    found = {keys[name]: mean for name, mean in means.items()}
+    return SimulationResult(1, {}, (), "docked", "", found, 25.0)
 
 
-def test_covariance_is_judged_over_honest_flights_only() -> None:
-    high = MOST_MEAN_NEES + 1.0
-    assert inconsistency([result(6.0)] * 30 + [result(1e3, honest=False)] * 30) is None
-    assert inconsistency([result(high)] * 3) is None
-    assert "mean NEES 13.00 over 30 flights" in str(inconsistency([result(high)] * 30))
+@pytest.mark.parametrize(
+    ("means", "number", "text"),
+    [
+        ({"target": 6.0, "chaser": 6.0, "tracking": 1.0}, 30, ""),
+        ({"target": 11.0}, 19, ""),
+        ({"target": 11.0}, 30, "covariance consistency: target: mean NEES 11.00 over 30 flights"),
+        ({"target": 6.0, "chaser": 1.5}, 30, "covariance consistency: chaser/1: mean NEES 1.50"),
+        ({"tracking": 3.0}, 30, "tracking accuracy: chaser/1: mean normalized tracking error 3.00"),
+        # The more flights, the closer to the bounds.
+        ({"chaser": 9.0}, 30, ""),
+        ({"chaser": 9.0}, 100, "mean NEES 9.00 over 100 flights, allowed 3.30 to 8.70"),
+    ],
+)
+def test_each_quantity_has_its_expectation_over_many_flights(
+    means: dict[str, float], number: int, text: str
+) -> None:
+    flights = [result(**means)] * number + [result()] * 30
+    found = inaccuracies(flights)
+    assert len(found) == bool(text)
+    assert text in "".join(found)
+
+
+def test_means_of_sound_flights_pass_and_few_values_are_not_judged() -> None:
+    """Ensembles drawn with the expectation's own spread: 4 standard errors."""
+    rng, expected = np.random.default_rng(0), Expectation("check", "size", 6.0, 6.0, 3.0, 28.0)
+    for number in (20, 200):
+        drawn = rng.gamma(4.0, 1.5, (500, number))
+        assert [x for x in drawn.tolist() if expected.defect_over(x)] == []
+        assert all(expected.defect_over((x + 7.0).tolist()) for x in drawn)
+    assert expected.defect_of([28.1] * 4) is None
+    assert expected.defect_of([28.1] * 5) == "mean size 28.1 in one flight, at most 28"
+
+
+def observe_tracking(log: Log, sigma_m: float, estimate_m: float, control_m: float) -> None:
+    """Let chaser 1 hold a place for 15 s around a target that turns, at a distance from where it is
+    estimated and from its reference.
+    """
+    place = np.array([0.3, -1.1, 0.4])
+    q_target = codec.vector(rotations.normalize([0.4, -0.5, 0.6, 0.2]))
+    at = rotations.rotate(np.array(q_target), place)
+    spread = tuple((np.eye(6) * sigma_m**2).ravel().tolist())
+    for tick in range(0, 250, 10):
+        own = msgspec.structs.replace(
+            body("chaser/1", 0.0), position_m=tuple(np.add(at, (2.0, 0.0, 0.0)).tolist())
+        )
+        log.bodies(tick, body("target", 2.0, q_wxyz=q_target), own)
+        head: Any = {"tick": tick, "sim_time_ns": tick * 100_000_000}
+        relative = RelativeEstimate(
+            chaser=1,
+            position_m=tuple(np.add(place, (estimate_m, 0.0, 0.0)).tolist()),
+            q_wxyz=tuple(rotations.conjugate(np.array(q_target)).tolist()),
+            covariance=spread,
+            force_N=(0.0, 0.0, 0.0),
+            torque_N_m=(0.0, 0.0, 0.0),
+        )
+        sample: Any = BY_TYPE[TargetEstimate]
+        estimate = msgspec.structs.replace(
+            sample, position_m=(2.0, 0.0, 0.0), q_wxyz=q_target, relative=(relative,), **head
+        )
+        log.publish(topics.TARGET, estimate, sender="controller")
+        asked = tuple(np.add(place, (0.0, control_m, 0.0)).tolist())
+        reference: Any = msgspec.structs.replace(
+            BY_TYPE[Reference], chaser=1, offset_m=asked, **head
+        )
+        log.publish(topics.REFERENCE, reference, 1, sender="controller")
+
+
+def test_flight_of_each_chaser_has_its_own_bounds(tmp_path: Path) -> None:
+    """Relative NEES and tracking error are those of its pose in the target's turned axes."""
+    sigma_m = 1e-3
+    nees_m = sigma_m * np.sqrt(FLIGHT_NEES)
+    lag_m = FLIGHT_TRACKING * np.sqrt(3 * sigma_m**2 + 1e-6)
+    lying = variant(
+        tmp_path, fault=[{"kind": "lying_sensor", "process": "chaser/0", "offset_m": [1.0, 0, 0],
+                          "at_s": 0.1, "duration_s": 0.1}],
+    )  # fmt: skip
+    for estimate_m, control_m, expected in (
+        (0.98 * nees_m, 0.98 * lag_m, []),
+        (1.02 * nees_m, 0.0, ["covariance consistency"]),
+        (0.0, 1.02 * lag_m, ["tracking accuracy"]),
+    ):
+        log, liar = Log(load_scenario(DRILL)), Log(lying)
+        for flight in (log, liar):
+            observe_tracking(flight, sigma_m, estimate_m, control_m)
+            ended(flight).end()
+        found = {v.invariant: v.text for v in log.checks.violations}
+        accuracy = ("covariance consistency", "tracking accuracy")
+        assert [name for name in accuracy if name in found] == expected
+        assert all(found[name].startswith("chaser/1") for name in expected)
+        assert not set(accuracy) & set(liar.found)
 
 
 # -- shrinking -------------------------------------------------------------------------------------
@@ -1320,7 +1412,7 @@ def test_shrinking_simplifies_errors_of_clocks() -> None:
 
 
 def a_result(case: Case, *violations: Violation) -> SimulationResult:
-    return SimulationResult(1, case, violations, "", "", (), True, 1.0)
+    return SimulationResult(1, case, violations, "", "", {}, 1.0)
 
 
 def shrunk(result: SimulationResult) -> Case:

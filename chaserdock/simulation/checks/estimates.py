@@ -26,6 +26,7 @@ from chaserdock.analysis.pose_errors import (
 from ..mission import SimulatedFlight
 from .causes import keeps_commands
 from .check import Check
+from .expectations import Expectation
 from .reader import reads
 
 ACCURACY_M = 0.01
@@ -48,15 +49,12 @@ one in 14 still decodes and is invalid, so that chance alone reports none in one
 BESIDE_DAMAGE = frozenset({"corrupt", "flood", "duplicate"})
 """Kinds of faults under which the controller still receives sightings, damaged or not."""
 
-LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
-"""Least number of estimates, and largest mean normalized squared error (6 if consistent), of one
-flight. Large, because successive errors are correlated and the mean of one flight scatters.
+LEAST_NEES, MOST_NEES, FLIGHT_NEES = 4.5, 7.5, 28.0
+"""Bounds of the mean normalized squared error of a pose (6 if consistent) over many flights, and
+the largest in one. Successive errors are correlated, so that the means of flights scatter: a gamma
+distribution of mean 6 and standard deviation 3 exceeds the last in one flight of 100,000.
 """
-LEAST_FLIGHTS, LEAST_MEAN_NEES, MOST_MEAN_NEES = 20, 1.5, 12.0
-"""Least number of flights, and bounds of the mean normalized squared error of the target's pose
-over them (6 if consistent): a quarter and twice. Chunks of 40 flights of `fault-drill` have 3.7 to
-6.4 (docs/simulation.md).
-"""
+NEES = Expectation("covariance consistency", "NEES", LEAST_NEES, MOST_NEES, 3.0, FLIGHT_NEES)
 
 
 @dataclass
@@ -159,18 +157,18 @@ class DamageIsNamed(Check):
 
 @dataclass
 class CovarianceConsistency(Check):
-    """The mean NEES (6 if consistent) of the target's pose in a flight, and that of the chasers'
-    relative poses, are at most ``FLIGHT_NEES``. Over all such flights (at least ``LEAST_FLIGHTS``)
-    the mean NEES of the target's pose is ``LEAST_MEAN_NEES`` to ``MOST_MEAN_NEES``.
+    """The mean NEES (6 if consistent) of the target's pose in a flight, and that of each chaser's
+    relative pose, are at most ``FLIGHT_NEES``; over many such flights each is ``LEAST_NEES``
+    to ``MOST_NEES``.
 
-    ``nees``, ``relative_nees``: normalized squared errors so far, one a second.
+    ``nees``, ``relative_nees``: of the target, and by chaser, one a second.
     """
 
-    name = "covariance consistency"
+    name = NEES.invariant
     exceptions = ("in flights with lying sensors, thruster failures or `[truth]`",)
 
     nees: list[float] = field(default_factory=list)
-    relative_nees: list[float] = field(default_factory=list)
+    relative_nees: dict[int, list[float]] = field(default_factory=dict)
 
     @reads(TargetEstimate)
     def measure(self, estimate: TargetEstimate) -> None:
@@ -185,15 +183,16 @@ class CovarianceConsistency(Check):
             if own is None or own.body in self.view.touching:
                 continue
             if own.sim_time_ns == estimate.sim_time_ns:
-                self.relative_nees.append(_relative_nees(relative, own, truth))
+                values = self.relative_nees.setdefault(relative.chaser, [])
+                values.append(_relative_nees(relative, own, truth))
 
     def end(self, flight: SimulatedFlight) -> None:
         if not self.view.causes.honest:
             return
-        chasers = "chasers relative to the target"
-        for name, nees in (("target", self.nees), (chasers, self.relative_nees)):
-            if len(nees) >= LEAST_ESTIMATES and (mean := sum(nees) / len(nees)) > FLIGHT_NEES:
-                self.violate(name, f"mean NEES {mean:.0f} in one flight")
+        chasers = {f"chaser/{i} to the target": x for i, x in self.relative_nees.items()}
+        for name, values in {"target": self.nees, **chasers}.items():
+            if defect := NEES.defect_of(values):
+                self.violate(name, defect)
 
 
 def _damages_sightings(fault: Fault, controller: str) -> bool:

@@ -15,7 +15,7 @@ from chaserdock_protocol.transport import RawSample
 
 from ..mission import SimulatedFlight
 from ..network import decode_once
-from . import bodies, commands, docking, estimates, messages, processes, thrusters
+from . import bodies, commands, docking, estimates, messages, processes, thrusters, tracking
 from .check import Check, Violation
 from .flight_view import FlightView
 
@@ -52,6 +52,7 @@ CHECKS: tuple[type[Check], ...] = (
     processes.NoRecordedDataLost,
     processes.BoundedQueues,
     estimates.CovarianceConsistency,
+    tracking.TrackingAccuracy,
 )
 """All invariants, in the order in which they see a message."""
 

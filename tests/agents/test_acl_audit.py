@@ -31,6 +31,7 @@ from chaserdock_protocol.transport.zenoh_network import zenoh_config
 from harness import chaserdock
 from mission_keys import EVERYONE, NAMESPACE, PATIENCE_S, client, keys_with_owners, make_keys
 
+from chaserdock.exit_codes import STOPPED
 from chaserdock.launch.launcher import free_port
 
 SUBJECT = "on Interface(lo)+CertCommonName(chaser-1)+Transport(Tls)+4fc8"
@@ -198,7 +199,7 @@ def test_every_unauthorized_publication_is_logged_once(
     node.close()
     process.terminate()
     out, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0
+    assert process.returncode == STOPPED
     assert out == b""  # Zenoh's own lines are suppressed
     reported = [line.removeprefix("router: denied: ") for line in err.decode().splitlines()]
     assert Counter(reported[:-2]) == expected

@@ -103,6 +103,6 @@ def test_existing_folder_and_missing_extra_are_one_clear_error(
         export_bag(GOLDEN, tmp_path)
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(
-        MissingPackageError, match=r"rosbags is not installed; install chaserdock\[ros2\]"
+        MissingPackageError, match=r"rosbags, of the extra chaserdock\[ros2\], is not installed"
     ):
         export_bag(GOLDEN, tmp_path / "new")

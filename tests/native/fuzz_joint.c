@@ -80,7 +80,7 @@ static void predict(void) {
     int64_t *alive = block((size_t)n * 8), *latched = block((size_t)n * 8);
     for (int64_t i = 0; i < n; i++) alive[i] = whole(0, 1), latched[i] = whole(0, 1);
     double *mean = means(n), *out = outputs(d * d);
-    NAME(predict)(m, n, d, doubles(144, -1.0, 1.0), covariances(12), doubles(6 * n, -0.1, 0.1),
+    NAME(predict)(m, n, d, doubles(144, -1.0, 1.0), covariances(12), doubles(GIVEN * n, -0.1, 0.1),
                   doubles(6 * n, -0.1, 0.1), doubles(n, 0.0, 1.0), doubles(CHASER - 12, 0.0, 1.0),
                   alive, latched, mean, covariances(d), out,
                   outputs(NAME(predict_workspace)(n, d)));

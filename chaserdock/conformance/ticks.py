@@ -47,21 +47,30 @@ def with_instance(turn: RecordedTick, process: str, instance: str) -> RecordedTi
             return raw
         message = codec.decode(found[0].kind, raw.payload)
         match message:
-            case Tick(controllers=controllers) if process in controllers:
-                message = msgspec.structs.replace(
-                    message, controllers={**controllers, process: instance}
-                )
+            case Tick():
+                message = _with_instance(message, process, instance)
             case Lease(holder=holder) if holder == process:
                 message = msgspec.structs.replace(message, instance=instance)
         return msgspec.structs.replace(raw, payload=codec.encode(message))
 
-    if process not in turn.tick.controllers:
+    tick = _with_instance(turn.tick, process, instance)
+    if tick == turn.tick:
         return turn
-    tick = msgspec.structs.replace(
-        turn.tick, controllers={**turn.tick.controllers, process: instance}
-    )
     opening, answers = ([renamed(raw) for raw in raws] for raws in (turn.opening, turn.answers))
     return replace(turn, tick=tick, opening=opening, answers=answers)
+
+
+def _with_instance(tick: Tick, process: str, instance: str) -> Tick:
+    """Return a tick that lists ``instance`` as that of a controller or chaser, if it lists it."""
+    listed = {
+        name: {**instances, process: instance}
+        for name, instances in (
+            ("controllers", tick.controllers),
+            ("chaser_instances", tick.chaser_instances),
+        )
+        if process in instances
+    }
+    return msgspec.structs.replace(tick, **listed)
 
 
 @dataclass(frozen=True)

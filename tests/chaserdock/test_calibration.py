@@ -7,7 +7,7 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.scenario import load_scenario
-from chaserdock_world.rendering.lens import Lens
+from chaserdock_world.rendering.lens import LensMap
 
 from chaserdock.calibration.intrinsics import (
     BadBoard,
@@ -48,7 +48,7 @@ def board_images(board, count, seed=3):
         origin = 0.03
     drawing = cv2.copyMakeBorder(drawing, 80, 80, 80, 80, cv2.BORDER_CONSTANT, value=255)
     origin += 80 / scale
-    generator, lens, out = np.random.default_rng(seed), Lens(TRUE), {}
+    generator, lens, out = np.random.default_rng(seed), LensMap(TRUE), {}
     for k in range(count):
         turn = rotations.to_matrix(rotations.exp(generator.uniform(-0.5, 0.5, 3)))
         centre = np.array([*generator.uniform(-0.03, 0.03, 2), generator.uniform(0.38, 0.5)])

@@ -180,7 +180,14 @@ def test_a_stack_of_many_chasers_is_stopped(count: int, plan_s: float | None) ->
         chasers.append(chaser.model_copy(update={"position_m": tuple(place)}))
     docking = four.docking.model_copy(update={"ports": tuple(ports)})
     flight = fly_controlled(
-        four.model_copy(update={"docking": docking, "chasers": tuple(chasers)}),
+        four.model_copy(
+            update={
+                "docking": docking,
+                "chasers": tuple(chasers),
+                # Side by side they are latched already: none has to wait for another.
+                "limits": four.limits.model_copy(update={"min_distance_chasers_m": 0.3}),
+            }
+        ),
         5.0 if plan_s is None else 16.0,
     )
     assert flight.time_s is not None

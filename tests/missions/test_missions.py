@@ -29,6 +29,7 @@ from harness import (
 from mcap.reader import make_reader
 
 from chaserdock.analysis.flight import load_flight
+from chaserdock.exit_codes import STOPPED
 
 TWO = "two-chaser-tracking"
 
@@ -139,7 +140,7 @@ def test_waiting_world_names_missing_processes_and_can_be_interrupted() -> None:
         line = next(line for line in world.stdout if b"waiting for" in line)
         world.send_signal(signal.SIGINT)
         rest = world.stdout.read()
-        assert world.wait(timeout=60) == 1
+        assert world.wait(timeout=60) == STOPPED
     finally:
         by_hand.end()
     assert b"waiting for chaser/0, chaser/1, controller, recorder" in line

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_protocol.messages import Reference, TargetEstimate
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import BodyTruth, Reference, TargetEstimate
 
 from ..mission import SimulatedFlight
 from .check import Check
@@ -49,10 +50,14 @@ class TrackingAccuracy(Check):
     """
 
     name = TRACKING.invariant
-    exceptions = ("in flights with lying sensors, thruster failures or `[truth]`",)
+    exceptions = (
+        "in flights with lying sensors, thruster failures or `[truth]`",
+        "for a chaser from when the target or another chaser is on its way to its reference",
+    )
 
     values: dict[int, list[float]] = field(default_factory=dict)
     _estimate: TargetEstimate | None = None
+    _blocked: set[int] = field(default_factory=set)
 
     @reads(TargetEstimate)
     def note(self, estimate: TargetEstimate) -> None:
@@ -76,8 +81,29 @@ class TrackingAccuracy(Check):
         variance_m2 = float(np.trace(np.reshape(relative.covariance, (6, 6))[:3, :3]))
         control_m = CONTROL_M[self.scenario.chaser.actuation]
         expected_m = math.sqrt(variance_m2 + control_m**2)
+        goal_m = rotations.rotate(np.array(target.q_wxyz), np.array(reference.offset_m))
+        if i in self._blocked or self._is_blocked(own, goal_m + np.array(target.position_m)):
+            self._blocked.add(i)
+            self.values.pop(i, None)
+            return
         error_m = math.dist(place_m, reference.offset_m)
         self.values.setdefault(i, []).append(error_m / expected_m)
+
+    def _is_blocked(self, own: BodyTruth, goal_m: Array) -> bool:
+        """Return whether the keep-out of another body is between a chaser and its reference."""
+        limits, start_m = self.scenario.limits, np.array(own.position_m)
+        way_m = goal_m - start_m
+        for name, other in self.view.states.items():
+            if name == own.body:
+                continue
+            apart_m = np.array(other.position_m) - start_m
+            share = float(np.clip(apart_m @ way_m / max(way_m @ way_m, 1e-12), 0.0, 1.0))
+            least_m = (
+                limits.min_distance_target_m if name == "target" else limits.min_distance_chasers_m
+            )
+            if 0.0 < share < 1.0 and np.linalg.norm(apart_m - share * way_m) < least_m:
+                return True
+        return False
 
     def end(self, flight: SimulatedFlight) -> None:
         for i, values in self.values.items() if self.view.causes.honest else ():

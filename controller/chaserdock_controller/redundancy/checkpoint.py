@@ -32,7 +32,7 @@ from chaserdock_controller.ingest.odometry_validation import Known, OdometryVali
 from chaserdock_controller.interfaces import ChaserPlan, PlanningFailure
 
 from .serialization import decode, encode
-from .shapes import MisfitError, Shape, check_fit
+from .shapes import ArrayShape, MisfitError, check_fit
 
 PartT = TypeVar("PartT", bound=Struct)
 
@@ -211,7 +211,7 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     plans: dict[int, Array]
 
 
-OWN_ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {
+OWN_ARRAYS: dict[type, dict[str, tuple[ArrayShape, ...]]] = {
     MachineState: {"position_m": ((3,),)},
     SentState: {"_sent": ((6,),)},
     StackControlState: {"_mean_rates": ((6,),)},

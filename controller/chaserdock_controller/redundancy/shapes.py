@@ -55,13 +55,13 @@ Size = int | str
 name stands for any length, the same everywhere in an object and the objects within; only those in
 ``MAY_BE_ZERO`` may be zero.
 """
-Shape = tuple[Size, ...]
+ArrayShape = tuple[Size, ...]
 
 _3, _4, _6 = (3,), (4,), (6,)
 """Shapes of a vector, a quaternion, and a wrench or two vectors: without unit, by definition."""
-_EACH: Shape = ("chasers",)
+_EACH: ArrayShape = ("chasers",)
 
-ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {
+ARRAYS: dict[type, dict[str, tuple[ArrayShape, ...]]] = {
     Known: {"correction": (_3, _4)},
     Part: {"coefficients": ((6, 3),)},
     Glide: {"from_m": (_3,), "along": (_3,)},
@@ -139,7 +139,7 @@ ARRAYS: dict[type, dict[str, tuple[Shape, ...]]] = {
 }
 """Shapes of the arrays in each field. Those of a field with several arrays repeat in order."""
 
-LENGTHS: dict[type, dict[str, Shape]] = {
+LENGTHS: dict[type, dict[str, ArrayShape]] = {
     Move: {"parts": ("parts",)},
     Glide: {"speeds_m_s": ("holds",), "holds_s": ("holds",), "ramps_s": ("holds+1",)},
     FilterState: {"hypotheses": ("hypotheses",)},
@@ -158,7 +158,7 @@ class MisfitError(ValueError):
 
 
 def check_fit(
-    state: Any, scenario: FlightScenario, own: Mapping[type, dict[str, tuple[Shape, ...]]]
+    state: Any, scenario: FlightScenario, own: Mapping[type, dict[str, tuple[ArrayShape, ...]]]
 ) -> None:
     """Raise MisfitError unless all shapes, chaser numbers and messages in ``state`` fit the
     scenario.
@@ -174,7 +174,10 @@ def check_fit(
 
 
 def _check(
-    value: Any, sizes: dict[str, int], arrays: Mapping[type, dict[str, tuple[Shape, ...]]], at: str
+    value: Any,
+    sizes: dict[str, int],
+    arrays: Mapping[type, dict[str, tuple[ArrayShape, ...]]],
+    at: str,
 ) -> None:
     """Check a value that stands at ``at``, and what it contains. ``sizes``: known by name."""
     if isinstance(value, dict):
@@ -271,7 +274,7 @@ def _lengths(items: Any, depth: int) -> tuple[int, ...]:
     return (len(items), *(inner.pop() if len(inner) == 1 else (-1,) * (depth - 1)))
 
 
-def _match(found: tuple[int, ...], shape: Shape, sizes: dict[str, int], where: str) -> None:
+def _match(found: tuple[int, ...], shape: ArrayShape, sizes: dict[str, int], where: str) -> None:
     """Raise MisfitError unless a shape is as declared. Sets the names in it that are unknown."""
     wanted: list[Size] = list(shape)
     if len(found) == len(shape):

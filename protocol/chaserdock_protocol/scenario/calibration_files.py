@@ -46,14 +46,14 @@ _KALIBR: dict[str, tuple[LensModel, tuple[int, ...]]] = {
     "none": ("perspective", (0,)),
 }
 
-Values = dict[str, Any]
+CalibrationValues = dict[str, Any]
 
 
 class _Bad(Exception):
     """What is wrong with a file, without its name."""
 
 
-def read_calibration(path: Path) -> Values:
+def read_calibration(path: Path) -> CalibrationValues:
     """Return ``camera.intrinsics`` from a calibration file; ``camchain.yaml#cam1`` names one camera
     of several. Raises ScenarioError.
     """
@@ -75,7 +75,7 @@ def read_calibration(path: Path) -> Values:
 # -- Formats ---------------------------------------------------------------------------------------
 
 
-def _parsed(path: Path) -> Values:
+def _parsed(path: Path) -> CalibrationValues:
     """Return the content of a YAML, XML or JSON file."""
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -137,7 +137,7 @@ def _plain(key: str) -> str:
     return key.replace("_", "").lower()
 
 
-def _found(values: Values, names: Sequence[str]) -> tuple[str, Any] | None:
+def _found(values: CalibrationValues, names: Sequence[str]) -> tuple[str, Any] | None:
     """Return the key of a file that has one of these names, and its value."""
     plain = {_plain(key): key for key in reversed(values)}
     for name in names:
@@ -146,7 +146,7 @@ def _found(values: Values, names: Sequence[str]) -> tuple[str, Any] | None:
     return None
 
 
-def _needed(values: Values, what: str, *names: Sequence[str]) -> tuple[str, Any]:
+def _needed(values: CalibrationValues, what: str, *names: Sequence[str]) -> tuple[str, Any]:
     for some in names:
         if (found := _found(values, some)) is not None:
             return found
@@ -186,7 +186,7 @@ def _numbers(key: str, value: Any) -> list[float]:
     return [_number(key, x) for x in flat]
 
 
-def _size(values: Values) -> tuple[int, int]:
+def _size(values: CalibrationValues) -> tuple[int, int]:
     found = _found(values, _SIZE)
     if found is not None and _found(values, _WIDTH) is None:
         key, value = found
@@ -207,7 +207,7 @@ def _size(values: Values) -> tuple[int, int]:
 # -- OpenCV and ROS --------------------------------------------------------------------------------
 
 
-def _from_matrix(values: Values) -> Values:
+def _from_matrix(values: CalibrationValues) -> CalibrationValues:
     """Return intrinsics from a file with a camera matrix: of OpenCV or of ROS."""
     key, value = _needed(values, "camera matrix", _MATRIX)
     matrix = _numbers(key, value)
@@ -227,7 +227,7 @@ def _from_matrix(values: Values) -> Values:
     return _intrinsics(width, height, lens, model, coefficients)
 
 
-def _model(values: Values) -> tuple[str, LensModel, tuple[int, ...]]:
+def _model(values: CalibrationValues) -> tuple[str, LensModel, tuple[int, ...]]:
     """Return the lens model of a file, by its name there, and its numbers of coefficients."""
     found = _found(values, ("fisheye_model",))
     if found is not None and _number(*found):
@@ -242,7 +242,7 @@ def _model(values: Values) -> tuple[str, LensModel, tuple[int, ...]]:
     return name, *_MODELS[name.lower()]
 
 
-def _refuse_parts_of_images(values: Values) -> None:
+def _refuse_parts_of_images(values: CalibrationValues) -> None:
     """Refuse a message of ROS whose image is not the calibrated one."""
     for key in ("binning_x", "binning_y"):
         if (found := _found(values, (key,))) is not None and _number(*found) > 1.0:
@@ -257,11 +257,11 @@ def _refuse_parts_of_images(values: Values) -> None:
 # -- Kalibr ----------------------------------------------------------------------------------------
 
 
-def _is_camchain(values: Values) -> bool:
+def _is_camchain(values: CalibrationValues) -> bool:
     return any(re.fullmatch(r"cam\d+", key) for key in values) or "intrinsics" in values
 
 
-def _from_camchain(values: Values, camera: str | None) -> Values:
+def _from_camchain(values: CalibrationValues, camera: str | None) -> CalibrationValues:
     cameras = {k: v for k, v in values.items() if isinstance(v, dict) and "intrinsics" in v}
     if "intrinsics" in values and camera is None:
         return _from_kalibr("", values)
@@ -274,7 +274,7 @@ def _from_camchain(values: Values, camera: str | None) -> Values:
     return _from_kalibr(f"{camera}.", cameras[camera])
 
 
-def _from_kalibr(place: str, values: Values) -> Values:
+def _from_kalibr(place: str, values: CalibrationValues) -> CalibrationValues:
     if (model := str(values.get("camera_model"))) != "pinhole":
         raise _Bad(f"{place}camera_model {model} is not known; known: pinhole")
     name = str(values.get("distortion_model"))
@@ -304,7 +304,7 @@ def _intrinsics(
     lens: tuple[float, float, float, float],
     model: LensModel,
     coefficients: list[float],
-) -> Values:
+) -> CalibrationValues:
     fx, fy, cx, cy = lens
     if not (fx > 0.0 and fy > 0.0):
         raise _Bad(f"focal lengths must be positive (got {fx:g}, {fy:g}): is it calibrated?")

@@ -37,7 +37,7 @@ def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8
     return np.asarray(blurred, dtype=np.uint8)
 
 
-class Lens:
+class LensMap:
     """Map the ideal image, which renderers draw, to the distorted image of ``camera``.
 
     ``point_spread_px``: standard deviation of the lens' Gaussian blur. ``origin_px`` (2,): ideal

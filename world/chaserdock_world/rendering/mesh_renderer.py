@@ -27,7 +27,7 @@ from chaserdock_models.targets import Box, box_around
 from numpy.typing import ArrayLike, NDArray
 
 from .background import WHITE_LEVEL, Background, Earth, Light
-from .lens import Lens, spread_points
+from .lens import LensMap, spread_points
 from .native import function
 from .scene_geometry import NEAR_M, Frustum, Obstacle
 
@@ -189,7 +189,7 @@ class MeshRenderer:
         self._target = _body_of(mesh)
         self._bodies: dict[tuple[Box, ...], _Body] = {}
         self._threads = threading.local()
-        self._lens = Lens(camera, point_spread_px)
+        self._lens = LensMap(camera, point_spread_px)
         self._point_spread_px = self._lens.canvas_spread_px
         self._size = self._lens.size_px
         self._background = Background(camera, self._lens.origin_px, self._size, earth)

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import textures
 from .background import Background, Earth, Light
 from .dirty_rects import Rectangle, merge_overlapping
-from .lens import Lens, spread_points
+from .lens import LensMap, spread_points
 from .scene_geometry import (
     Frustum,
     Obstacle,
@@ -96,7 +96,7 @@ class Renderer:
             for face in range(6)
         }
         # The canvas is the ideal image; with lens distortion it extends beyond the frame.
-        self._lens = Lens(camera, point_spread_px)
+        self._lens = LensMap(camera, point_spread_px)
         self._point_spread_px = self._lens.canvas_spread_px
         self._origin, self._size = self._lens.origin_px, self._lens.size_px
         self._background = Background(camera, self._origin, self._size, earth)

@@ -133,7 +133,7 @@ def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -
     """
     failure = {"chaser": 0, "thruster": 11, "at_s": 8.0, "kind": "stuck_off"}
     scenario = mission(
-        duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]
+        duration_s=60.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]
     )
     record = record_flight(scenario, measurement_model(scenario, 0))
     reports = [what for _, _, what in record.thruster_events if "limits" not in what]

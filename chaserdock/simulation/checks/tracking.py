@@ -52,7 +52,8 @@ class TrackingAccuracy(Check):
     name = TRACKING.invariant
     exceptions = (
         "in flights with lying sensors, thruster failures or `[truth]`",
-        "for a chaser from when the target or another chaser is on its way to its reference",
+        "for a chaser from when the target is on its way to its reference, or another chaser is "
+        "nearer than twice the distance that they keep",
     )
 
     values: dict[int, list[float]] = field(default_factory=dict)
@@ -90,7 +91,9 @@ class TrackingAccuracy(Check):
         self.values.setdefault(i, []).append(error_m / expected_m)
 
     def _is_blocked(self, own: BodyTruth, goal_m: Array) -> bool:
-        """Return whether the keep-out of another body is between a chaser and its reference."""
+        """Return whether a chaser may have to yield: the target's keep-out is between it and its
+        reference, or another chaser is near.
+        """
         limits, start_m = self.scenario.limits, np.array(own.position_m)
         way_m = goal_m - start_m
         for name, other in self.view.states.items():
@@ -98,11 +101,13 @@ class TrackingAccuracy(Check):
                 continue
             apart_m = np.array(other.position_m) - start_m
             share = float(np.clip(apart_m @ way_m / max(way_m @ way_m, 1e-12), 0.0, 1.0))
-            least_m = (
-                limits.min_distance_target_m if name == "target" else limits.min_distance_chasers_m
-            )
-            if 0.0 < share < 1.0 and np.linalg.norm(apart_m - share * way_m) < least_m:
-                return True
+            if name != "target":
+                if np.linalg.norm(apart_m) < 2.0 * limits.min_distance_chasers_m:
+                    return True
+            elif 0.0 < share < 1.0:
+                gap_m = float(np.linalg.norm(apart_m - share * way_m))
+                if gap_m < limits.min_distance_target_m:
+                    return True
         return False
 
     def end(self, flight: SimulatedFlight) -> None:

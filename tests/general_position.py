@@ -14,6 +14,7 @@ from chaserdock_controller.interfaces import RelativePose, TargetState
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
+from runge_kutta import rk4
 
 BODY = TargetBody(
     43.0,
@@ -109,13 +110,7 @@ def rigid_motion(
             [s[3:6], np.asarray(force_w(s)) / mass_kg, (r @ skew(w)).ravel(), alpha]
         )
 
-    for _ in range(count):
-        k1 = slope(x)
-        k2 = slope(x + h / 2 * k1)
-        k3 = slope(x + h / 2 * k2)
-        k4 = slope(x + h * k3)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return x
+    return rk4(slope, x, h, count)
 
 
 def flown(x13: Array, mass_kg: float, inertia: Array, wrench: Array, duration_s: float) -> Array:

@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
+from chaserdock_protocol.scenario import ScenarioError
+from chaserdock_protocol.scenario.mesh_files import read_mesh
 from numpy.typing import NDArray
 
 BOX_M = (1.0, 0.8, 0.6)
@@ -22,6 +25,16 @@ def box() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return vertices (8, 3), m, and triangles (12, 3) of the sample body."""
     solid = trimesh.creation.box(BOX_M)
     return np.asarray(solid.vertices, dtype=float), np.asarray(solid.faces, dtype=np.int64)
+
+
+def refusal(path: Path) -> str:
+    """Return the one line with which a mesh file is refused; it names the file first."""
+    with pytest.raises(ScenarioError) as caught:
+        read_mesh(path)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
+    return text
 
 
 class GltfSample:

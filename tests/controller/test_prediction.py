@@ -15,6 +15,7 @@ from chaserdock_protocol.scenario.bodies import Body
 from flight_cases import odometry, quick, scenario, start
 from hypothesis import given
 from hypothesis import strategies as st
+from runge_kutta import rk4
 
 LONG = Body(mass_kg=12.0, inertia_kg_m2=(0.1, 0.5, 0.55))
 
@@ -36,12 +37,7 @@ def fine(x: Array, u: Array, body: Body, duration_s: float, steps: int = 4000) -
             ]
         )
 
-    for _ in range(steps):
-        k1 = slope(x)
-        k2 = slope(x + h / 2 * k1)
-        k3 = slope(x + h / 2 * k2)
-        k4 = slope(x + h * k3)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    x = rk4(slope, x, h, steps)
     x[6:10] /= np.linalg.norm(x[6:10])
     return x
 

@@ -12,6 +12,7 @@ from chaserdock_models.arrays import Array
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from runge_kutta import rk4
 
 quick = settings(derandomize=True, deadline=None, max_examples=60)
 
@@ -262,18 +263,12 @@ def test_angle_between_is_a_metric(a: Array, b: Array, c: Array) -> None:
 def test_integrate_agrees_with_the_kinematic_equation(q: Array, omega: Array, dt_s: float) -> None:
     """RK4 on q' = 1/2 q (0, omega), in steps of a hundredth of a radian at most."""
     steps = max(1, int(np.ceil(np.linalg.norm(omega) * dt_s / 0.01)))
-    h, x, rate = dt_s / steps, q, np.array([0.0, *omega])
+    rate = np.array([0.0, *omega])
 
     def slope(at: Array) -> Array:
         return 0.5 * rotations.multiply(at, rate)
 
-    for _ in range(steps):
-        k1 = slope(x)
-        k2 = slope(x + h / 2 * k1)
-        k3 = slope(x + h / 2 * k2)
-        k4 = slope(x + h * k3)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    close(rotations.integrate(q, omega, dt_s), x, 1e-9)
+    close(rotations.integrate(q, omega, dt_s), rk4(slope, q, dt_s / steps, steps), 1e-9)
 
 
 @given(quaternions, vectors, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))

@@ -20,7 +20,7 @@ from chaserdock_protocol.scenario import ScenarioError
 from chaserdock_protocol.scenario.mesh_files import read_mesh
 from chaserdock_protocol.scenario.surface import SUFFIXES
 from chaserdock_world.physics.collision_hulls import collision_hulls
-from gltf_samples import png
+from gltf_samples import png, refusal
 
 BOX = trimesh.creation.box((1.0, 0.8, 0.6))
 
@@ -38,15 +38,6 @@ def obj(tmp_path: Path, lines: list[str], mtl: str = "", name: str = "m") -> Pat
 
 def faces(rows: np.ndarray, end: str = "") -> list[str]:
     return ["f " + " ".join(f"{k + 1}{end}" for k in row) for row in rows.tolist()]
-
-
-def refusal(path: Path) -> str:
-    with pytest.raises(ScenarioError) as caught:
-        read_mesh(path)
-    text = str(caught.value)
-    assert text.startswith(str(path))
-    assert "\n" not in text
-    return text
 
 
 def test_coordinates_of_a_texture_without_image_are_no_material(tmp_path: Path) -> None:

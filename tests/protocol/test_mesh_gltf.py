@@ -20,7 +20,7 @@ import pytest
 from chaserdock_models.meshes import TriangleMesh, volume_m3
 from chaserdock_protocol.scenario import ScenarioError, mesh_sources
 from chaserdock_protocol.scenario.mesh_files import MeshFile, read_mesh
-from gltf_samples import BOX_M, GltfSample, box, png
+from gltf_samples import BOX_M, GltfSample, box, png, refusal
 
 DIELECTRIC: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
 
@@ -28,15 +28,6 @@ DIELECTRIC: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
 def size_m(mesh: TriangleMesh) -> list[float]:
     low, high = mesh.bounds_m()
     return (high - low).tolist()
-
-
-def refusal(path: Path) -> str:
-    with pytest.raises(ScenarioError) as caught:
-        read_mesh(path)
-    text = str(caught.value)
-    assert text.startswith(str(path))
-    assert "\n" not in text
-    return text
 
 
 @pytest.mark.parametrize("kind", ["i1", "u1", "i2", "u2"])

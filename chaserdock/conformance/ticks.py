@@ -37,8 +37,8 @@ class RecordedTick:
 
 
 def with_instance(turn: RecordedTick, process: str, instance: str) -> RecordedTick:
-    """Return the tick with ``instance`` as the instance of controller ``process``, also in the
-    leases that it holds.
+    """Return the tick with ``instance`` as the instance of the controller or chaser ``process``,
+    also in the leases that it holds.
     """
 
     def renamed(raw: RawSample) -> RawSample:

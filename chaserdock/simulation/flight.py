@@ -57,8 +57,8 @@ def fly_case(
             prefix=f"chaserdock-{os.getpid()}-", dir=memory_folder()
         )
         scratch = Path(stack.enter_context(in_memory))
-        path = scratch / "scenario.toml"
-        write_atomically(path, toml_document(case))
+        path, text = scratch / "scenario.toml", toml_document(case)
+        write_atomically(path, text)
         try:
             checks, fingerprint = FlightChecks(load_scenario(path)), 0
         except ScenarioError as error:
@@ -67,7 +67,7 @@ def fly_case(
         if folder is not None:  # only now: a refused case leaves no folder
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / "scenario.toml"
-            write_atomically(path, toml_document(case))
+            write_atomically(path, text)
 
         def tap(sender: str, raw: RawSample) -> None:
             nonlocal fingerprint

@@ -205,22 +205,15 @@ class Valves:
         thruster, begin, end, rise, fall, factor = self._spans()
         out = np.zeros(len(self._thrusters))
         if len(thruster):
-            duration = float(to_ns - from_ns)
+            half_ns = (to_ns - from_ns) / 2.0
 
-            def about_end(at: Array, length: Array) -> Array:
-                # Integral of (to - t) F dt = that of the impulse since `from`, for one edge.
-                before = _ramp(from_ns - at, length) * duration
-                return (
-                    _ramp_integral(to_ns - at, length)
-                    - _ramp_integral(from_ns - at, length)
-                    - before
-                )
+            def moment_of(edge_ns: Array, length_ns: Array) -> Array:
+                # The integral of the impulse J(t) since ``from_ns``, less J(to) T / 2.
+                since, until = from_ns - edge_ns, to_ns - edge_ns
+                area = _ramp_integral(until, length_ns) - _ramp_integral(since, length_ns)
+                return area - half_ns * (_ramp(since, length_ns) + _ramp(until, length_ns))
 
-            def impulse(at: Array, length: Array) -> Array:
-                return _ramp(to_ns - at, length) - _ramp(from_ns - at, length)
-
-            moment = about_end(begin, rise) - about_end(end, fall)
-            moment -= (impulse(begin, rise) - impulse(end, fall)) * duration / 2.0
+            moment = moment_of(begin, rise) - moment_of(end, fall)
             number = thruster.astype(int)
             np.add.at(out, number, factor * moment * (1e-18 * self._thrust_N[number]))
         return out

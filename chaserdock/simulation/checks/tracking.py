@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import BodyTruth, Reference, TargetEstimate
 
 from ..mission import SimulatedFlight
@@ -77,38 +76,33 @@ class TrackingAccuracy(Check):
         relative = next((r for r in known.relative if r.chaser == i), None)
         if not settled or own.body in view.touching or relative is None:
             return
+        if i in self._blocked or self._has_to_yield(own, target, reference):
+            self._blocked.add(i)
+            self.values.pop(i, None)
+            return
         apart_m = np.subtract(own.position_m, target.position_m)
         place_m = rotations.rotate_inverse(np.array(target.q_wxyz), apart_m)
         variance_m2 = float(np.trace(np.reshape(relative.covariance, (6, 6))[:3, :3]))
         control_m = CONTROL_M[self.scenario.chaser.actuation]
         expected_m = math.sqrt(variance_m2 + control_m**2)
-        goal_m = rotations.rotate(np.array(target.q_wxyz), np.array(reference.offset_m))
-        if i in self._blocked or self._is_blocked(own, goal_m + np.array(target.position_m)):
-            self._blocked.add(i)
-            self.values.pop(i, None)
-            return
         error_m = math.dist(place_m, reference.offset_m)
         self.values.setdefault(i, []).append(error_m / expected_m)
 
-    def _is_blocked(self, own: BodyTruth, goal_m: Array) -> bool:
-        """Return whether a chaser may have to yield: the target's keep-out is between it and its
-        reference, or another chaser is near.
+    def _has_to_yield(self, own: BodyTruth, target: BodyTruth, reference: Reference) -> bool:
+        """Return whether another chaser is near, or the target's keep-out is on a chaser's way to
+        its reference.
         """
-        limits, start_m = self.scenario.limits, np.array(own.position_m)
-        way_m = goal_m - start_m
-        for name, other in self.view.states.items():
-            if name == own.body:
-                continue
-            apart_m = np.array(other.position_m) - start_m
-            share = float(np.clip(apart_m @ way_m / max(way_m @ way_m, 1e-12), 0.0, 1.0))
-            if name != "target":
-                if np.linalg.norm(apart_m) < 2.0 * limits.min_distance_chasers_m:
-                    return True
-            elif 0.0 < share < 1.0:
-                gap_m = float(np.linalg.norm(apart_m - share * way_m))
-                if gap_m < limits.min_distance_target_m:
-                    return True
-        return False
+        limits = self.scenario.limits
+        others = [s for n, s in self.view.states.items() if n not in (own.body, target.body)]
+        near_m = 2.0 * limits.min_distance_chasers_m
+        if any(math.dist(own.position_m, other.position_m) < near_m for other in others):
+            return True
+        to_target_m = np.subtract(target.position_m, own.position_m)
+        offset_m = rotations.rotate(np.array(target.q_wxyz), np.array(reference.offset_m))
+        way_m = to_target_m + offset_m
+        share = to_target_m @ way_m / max(way_m @ way_m, 1e-12)
+        gap_m = np.linalg.norm(to_target_m - share * way_m)
+        return bool(0.0 < share < 1.0 and gap_m < limits.min_distance_target_m)
 
     def end(self, flight: SimulatedFlight) -> None:
         for i, values in self.values.items() if self.view.causes.honest else ():

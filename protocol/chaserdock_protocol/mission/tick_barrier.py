@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from chaserdock_models.clock import Timing
+
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import FaultLayer, LostMessage
 from chaserdock_protocol.messages import ActuatorCommand, Event, Presence, RecorderAck

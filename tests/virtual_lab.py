@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock.simulation.mission import SimulatedFlight, simulate
 from chaserdock_agents.gateway import devices
 from chaserdock_agents.gateway import process as gateway
 from chaserdock_agents.gateway.devices import (
@@ -32,6 +31,8 @@ from chaserdock_protocol.pose_image import encode_pose
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.transport import Node
 from scipy.spatial.transform import Rotation
+
+from chaserdock.simulation.mission import SimulatedFlight, simulate
 
 STEP_S = 1e-3
 # Camera axes (x right, y down, z forward) in CRF (x forward, z up), from the frames' definition.
@@ -121,7 +122,7 @@ class VirtualLab:
             for i, body in self.chasers.items():
                 force, torque = self.wrench[i]
                 if self.is_on("robot does not obey", i):
-                    force, torque = np.array([0.3, 0.1, 0.0]), np.array([0.0, 0.0, 0.004])
+                    force, torque = np.array([2.5, 1.0, -0.5]), np.array([0.0, 0.0, 0.004])
                 self._step(body, force, torque)
             self._step(self.target, np.zeros(3), None)
             self.now_ns += step_ns
@@ -158,7 +159,7 @@ class VirtualLab:
                 body = self.chasers[(i + 1) % len(self.chasers)]
             place = body.position + self.rng.normal(0, 3e-4, 3)
             if name != "target" and self.is_on("motion capture jumps", i):
-                place = place + [0.4, -0.3, 0.2]
+                place = place + np.array([0.4, -0.3, 0.2])
             turn = Rotation.from_rotvec(self.rng.normal(0, math.radians(0.03), 3))
             sample = PoseSample(name, stamp_ns, 0, place, wxyz(body.rotation * turn))
             self.poses.append((self.now_ns + delay_ns, sample))
@@ -282,3 +283,75 @@ def fly(
     install(monkeypatch, lab)
     processes = {"world": gateway.main, "operator": arm_when_ready, **others}
     return simulate(scenario, folder, ("simulation.mode='realtime'",), others=processes)
+
+
+SCENARIO = """
+extends = "two-chaser-tracking"
+name = "virtual-lab"
+duration_s = 40.0
+[camera]
+effects.jpeg_quality = 0
+[perception]
+name = "statistical"
+[success]
+steady_position_rms_m = 0.008
+[lab.safety]
+volume = { lower_m = [-2.0, -2.0, -2.0], upper_m = [2.0, 2.0, 2.0] }
+max_speed_m_s = 0.3
+[[lab.odometry]]
+body = "chaser/0"
+address = "virtual:"
+name = "robot0"
+latency_s = 0.004
+[[lab.odometry]]
+body = "chaser/1"
+address = "virtual:"
+name = "robot1"
+latency_s = 0.004
+[[lab.robot]]
+chaser = 0
+address = "virtual:0"
+[[lab.robot]]
+chaser = 1
+address = "virtual:1"
+[[lab.camera]]
+chaser = 0
+address = "virtual:0"
+latency_s = 0.02
+[[lab.camera]]
+chaser = 1
+address = "virtual:1"
+latency_s = 0.02
+"""
+"""Two free flyers that track a turning target, each 1 m from it."""
+
+
+def two_free_flyers(seed: int, faults: Sequence[Fault] = ()) -> VirtualLab:
+    """Return the laboratory of ``SCENARIO``."""
+    target = Body(np.zeros(3), Rotation.identity(), omega=np.array([0.0, 0.0, math.radians(3.0)]))
+    chasers = {
+        0: Body(np.array([-1.2, 0.03, 0.0]), Rotation.from_rotvec([0.2, 0.0, 0.0])),
+        1: Body(
+            np.array([0.02, -1.2, 0.02]),
+            Rotation.from_rotvec([0.0, 0.0, math.pi / 2])
+            * Rotation.from_rotvec([-0.2, 0.03, -0.03]),
+        ),
+    }
+    body = (30.0, (0.1625, 0.1625, 0.3125))
+    return VirtualLab(chasers, target, (0.07, 0.0, 0.075), seed, faults, *body)
+
+
+def tracking_errors_m(lab: VirtualLab, after_s: float) -> dict[int, np.ndarray]:
+    """Return the distance of each chaser from its place beside the target, from ``after_s`` after
+    the first command on.
+    """
+    assert lab.begun_ns is not None
+    places = {0: np.array([-1.0, 0.0, 0.0]), 1: np.array([0.0, -1.0, 0.0])}
+    errors: dict[int, list[float]] = {0: [], 1: []}
+    for time_ns, states in lab.history:
+        if time_ns - lab.begun_ns < after_s * 1e9:
+            continue
+        p, r = states["target"]
+        for i, place in places.items():
+            errors[i].append(float(np.linalg.norm(states[f"chaser/{i}"][0] - p - r.apply(place))))
+    return {i: np.array(e) for i, e in errors.items()}

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.lab import LabSection
@@ -16,7 +18,7 @@ from .actuation import RobotActuation
 from .axes import BodyPose, robot_axes
 from .devices import DeviceHost, DockingLatch, ImageArray, Robot, RobotCommand, open_device
 from .feeds import CameraFeed, PoseFeed, PoseSystem, open_poses
-from .safety import RobotSight, limited_duty, limited_wrench
+from .safety import Obedience, RobotSight, limited_duty, limited_wrench
 
 
 class Laboratory:
@@ -39,6 +41,9 @@ class Laboratory:
         self._turn = {r.chaser: robot_axes(r.body_axes) for r in self.lab.robot}
         feeds = (feed for system in self._systems for feed in system.feeds.values())
         by_body = {feed.device.body: feed for feed in feeds}
+        self.obedience = {
+            i: Obedience(scenario.chaser.mass_kg) for i in range(len(scenario.chasers))
+        }
         self.odometry = {i: by_body[f"chaser/{i}"] for i in range(len(scenario.chasers))}
 
     def _open(self) -> None:
@@ -51,6 +56,12 @@ class Laboratory:
             self.latches[latch.chaser] = open_device("latch", latch.address, latch.options, host)
         for robot in lab.robot:
             self.robots[robot.chaser] = open_device("robot", robot.address, robot.options, host)
+
+    def pose_feeds(self) -> Iterator[tuple[PoseFeed, Counter[str]]]:
+        """Yield the feeds of all bodies, with the names that their device states besides."""
+        for system in (*self._systems, *self._references):
+            for feed in system.feeds.values():
+                yield feed, system.unknown
 
     def read_odometry(self) -> None:
         """Take the poses of the robots that have arrived. Raises DeviceError."""
@@ -84,11 +95,28 @@ class Laboratory:
             if state is not None:
                 speed = float(np.linalg.norm(state.velocity_m_s))
                 rate = float(np.linalg.norm(state.omega_rad_s))
-            found.append(RobotSight(chaser, age_s, age, feed.newest.position_m, speed, rate))
+                self.obedience[chaser].observe(newest_ns, state.velocity_m_s)
+            jumped_m, feed.track.jumped_m = feed.track.jumped_m, 0.0
+            if jumped_m > 0.0:
+                self.obedience[chaser].restart()
+            found.append(
+                RobotSight(
+                    chaser,
+                    age_s,
+                    age,
+                    feed.newest.position_m,
+                    speed,
+                    rate,
+                    jumped_m,
+                    self.obedience[chaser].unexplained_m_s2,
+                )
+            )
         return tuple(found)
 
     def arm(self) -> None:
         """Let the robots obey. Raises DeviceError if one refuses."""
+        for obedience in self.obedience.values():
+            obedience.restart()
         if not self._dry_run:
             for robot in self.robots.values():
                 robot.arm()
@@ -103,7 +131,9 @@ class Laboratory:
             wrench = actuation.matrix @ duty
             force, torque = wrench[:3], wrench[3:]
         force, torque = limited_wrench(force, torque, self.lab.safety)
-        turn = self._turn[chaser]
+        turn, pose = self._turn[chaser], self.odometry[chaser].newest
+        if pose is not None:
+            self.obedience[chaser].command(rotations.rotate(pose.q_wxyz, force))
         if not self._dry_run:
             command = RobotCommand(self._host.now_ns(), turn(force), turn(torque), duty)
             self.robots[chaser].send(command)

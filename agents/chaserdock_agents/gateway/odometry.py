@@ -55,18 +55,25 @@ class MotionBounds:
 
 
 class BodyTrack:
-    """Newest poses of one body. ``rejected``: poses that no motion explains, since the start."""
+    """Newest poses of one body. ``rejected``: poses that no motion explains, since the start.
+    ``jumped_m``: how far the body's poses have jumped for good, until it is set to 0.
+    """
 
     def __init__(self, bounds: MotionBounds) -> None:
         self._bounds = bounds
         self._poses: deque[BodyPose] = deque(maxlen=_MOST_POSES)
         self._jumped: list[BodyPose] = []
         self.rejected = 0
+        self.jumped_m = 0.0
 
     @property
     def newest_ns(self) -> int | None:
         """Return the time of the newest pose, None without one."""
         return self._poses[-1].time_ns if self._poses else None
+
+    def newest_poses(self) -> list[BodyPose]:
+        """Return the poses of the last half second, oldest first."""
+        return [p for p in self._poses if p.time_ns > self._poses[-1].time_ns - 500_000_000]
 
     def add(self, pose: BodyPose) -> bool:
         """Take a pose, in any order of time. Returns False if it is not used: a copy, older than
@@ -82,6 +89,7 @@ class BodyTrack:
             self._jumped.append(pose)
             if len(self._jumped) < _LEAST_JUMPS:
                 return False
+            self.jumped_m = float(np.linalg.norm(pose.position_m - poses[-1].position_m))
             poses.clear()
             poses.extend(self._jumped)
             self._jumped.clear()
@@ -129,17 +137,22 @@ class BodyTrack:
             velocities.append(p.velocity_m_s)
             omegas.append(p.omega_rad_s)
         n, b = len(poses), self._bounds
+        ahead_s = float(np.mean([time_ns - p.time_ns for p in poses])) / 1e9
+        # Velocities of an estimator share their errors: their mean is no better than one.
+        velocity_noise = np.eye(3) * b.velocity_sigma_m_s**2
+        rate_noise = np.eye(3) * b.rate_sigma_rad_s**2
         return BodyState(
             time_ns,
             np.mean(places, axis=0),
             np.mean(velocities, axis=0),
             rotations.multiply(newest.q_wxyz, rotations.exp(np.mean(turns, axis=0))),
             np.mean(omegas, axis=0),
-            np.mean([p.position_covariance_m2 for p in poses], axis=0) / n,
-            # Velocities of an estimator share their errors: their mean is no better than one.
-            np.eye(3) * b.velocity_sigma_m_s**2,
-            np.mean([p.attitude_covariance_rad2 for p in poses], axis=0) / n,
-            np.eye(3) * b.rate_sigma_rad_s**2,
+            np.mean([p.position_covariance_m2 for p in poses], axis=0) / n
+            + velocity_noise * ahead_s**2,
+            velocity_noise,
+            np.mean([p.attitude_covariance_rad2 for p in poses], axis=0) / n
+            + rate_noise * ahead_s**2,
+            rate_noise,
         )
 
 

@@ -18,7 +18,6 @@ from chaserdock_protocol.messages import (
     ArmingCommand,
     ArmingReply,
     DockingStatus,
-    Image,
     Kill,
     Latch,
     Message,
@@ -34,6 +33,7 @@ from chaserdock_protocol.transport import Node
 from .actuation import RobotActuation
 from .arming import ArmingRequests, listen_to_keys
 from .devices import DeviceError, DeviceHost, ImageArray
+from .images import image_message
 from .lab import Laboratory
 from .odometry import BodyState
 from .safety import SafetyGate
@@ -193,22 +193,7 @@ class Gateway:
         exposed_ns = time_ns - self._start_ns
         if exposed_ns <= 0 or chaser not in self._barrier.chasers:
             return
-        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        quality = self._scenario.camera.effects.jpeg_quality
-        data = gray
-        if quality:
-            _, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        # The tick that can use it: the first one at or after the exposure.
-        tick = -(-exposed_ns * self._timing.rate_hz // 1_000_000_000)
-        message = Image(
-            tick=tick,
-            sim_time_ns=exposed_ns,
-            chaser=chaser,
-            width_px=gray.shape[1],
-            height_px=gray.shape[0],
-            encoding="jpeg" if quality else "mono8",
-            data=data.tobytes(),
-        )
+        message = image_message(self._scenario, chaser, image, exposed_ns)
         self._node.publish(topics.IMAGE, message, chaser)
 
     def _publish_odometry(self, tick: int) -> None:

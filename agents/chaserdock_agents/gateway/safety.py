@@ -24,7 +24,8 @@ class RobotSight:
     """What the gateway knows of a robot when it decides.
 
     Ages in s: of its newest pose, and of its newest command, infinite before the first one.
-    position_m (3,) in WRF; None before the first odometry.
+    position_m (3,) in WRF; None before the first odometry. ``jumped_m``: how far its odometry has
+    jumped since the last look. ``unexplained_m_s2``: see ``Obedience``.
     """
 
     chaser: int
@@ -33,10 +34,12 @@ class RobotSight:
     position_m: Array | None = None
     speed_m_s: float = 0.0
     rate_rad_s: float = 0.0
+    jumped_m: float = 0.0
+    unexplained_m_s2: float = 0.0
 
 
 def violations(robot: RobotSight, limits: LabSafety) -> list[str]:
-    """Return what forbids a robot to move, a stale command apart."""
+    """Return what forbids a robot to move, whether it is commanded or not."""
     name, found = f"chaser {robot.chaser}", []
     if robot.position_m is None or not robot.odometry_age_s <= limits.stale_s:
         age = f"{robot.odometry_age_s:.2f} s old" if math.isfinite(robot.odometry_age_s) else "none"
@@ -53,7 +56,49 @@ def violations(robot: RobotSight, limits: LabSafety) -> list[str]:
     rate = math.degrees(robot.rate_rad_s)
     if not rate <= limits.max_rate_deg_s:
         found.append(f"{name}: turns too fast, {rate:.1f} deg/s (limit {limits.max_rate_deg_s:g})")
+    if robot.jumped_m > 0.0:
+        found.append(f"{name}: odometry jumped by {robot.jumped_m:.2f} m")
     return found
+
+
+class Obedience:
+    """Compare a robot's motion with its commands: the mean acceleration of the last
+    ``MEMORY_S`` that they do not explain, m/s².
+    """
+
+    MEMORY_S = 3.0
+    """Time constant: noise of a velocity of 5 mm/s then counts as less than 2 mm/s²."""
+
+    def __init__(self, mass_kg: float) -> None:
+        self._mass_kg = mass_kg
+        self._expected_m_s: Array | None = None
+        self._force_N: Array = np.zeros(3)
+        self._time_ns = 0
+        self.unexplained_m_s2 = 0.0
+
+    def command(self, force_N: Array) -> None:
+        """Note the force (3,) that acts from now on, WRF."""
+        self._force_N = force_N
+
+    def observe(self, time_ns: int, velocity_m_s: Array) -> None:
+        """Take a measured velocity (3,), WRF."""
+        if self._expected_m_s is None or time_ns - self._time_ns > self.MEMORY_S * 1e9:
+            self._expected_m_s, self._time_ns = velocity_m_s.copy(), time_ns
+            return
+        step_s = (time_ns - self._time_ns) / 1e9
+        if step_s <= 0.0:
+            return
+        self._time_ns = time_ns
+        moved = self._expected_m_s + self._force_N / self._mass_kg * step_s
+        share = math.exp(-step_s / self.MEMORY_S)
+        self._expected_m_s = velocity_m_s + share * (moved - velocity_m_s)
+        residual = float(np.linalg.norm(velocity_m_s - self._expected_m_s))
+        self.unexplained_m_s2 = residual / self.MEMORY_S
+
+    def restart(self) -> None:
+        """Forget the past, as when robots are armed."""
+        self._expected_m_s, self.unexplained_m_s2 = None, 0.0
+        self._force_N = np.zeros(3)
 
 
 class SafetyGate:
@@ -97,6 +142,13 @@ class SafetyGate:
             f"{self._limits.stale_s:g} s)"
             for r in robots
             if self._limits.stale_s < r.command_age_s < math.inf
+        ]
+        limit = self._limits.max_unexplained_m_s2
+        found += [
+            f"chaser {r.chaser}: does not obey, {r.unexplained_m_s2:.3f} m/s² that no command "
+            f"explains (limit {limit:g})"
+            for r in robots
+            if not r.unexplained_m_s2 <= limit
         ]
         return self.trip("; ".join(found)) if found else ""
 

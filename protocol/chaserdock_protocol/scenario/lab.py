@@ -148,6 +148,11 @@ class LabSafety(Section):
         le=5.0,
         description="Age of the odometry, or of the command, of a robot at which it is stopped, s.",
     )
+    max_unexplained_m_s2: Positive = Field(
+        default=0.05,
+        description="Largest acceleration of a robot, averaged over 3 s, that its commands do not "
+        "explain, m/s²: it does not obey, or is pushed.",
+    )
     jump_m: Positive = Field(
         default=0.05,
         description="Difference of a position from where the body can have got that counts as a "

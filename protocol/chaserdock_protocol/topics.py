@@ -125,7 +125,9 @@ STATE = _topic(
 )
 OPERATED = _topic("controller/operated", m.OperatorCommand, "controller", set(), "event", "event")
 ACK = _topic("recorder/ack", m.RecorderAck, "recorder", {"world"}, "tick", "command")
-KILL = _topic("operator/kill", m.Kill, "operator", {"world"}, "event", "command")
+KILL = Topic(
+    "operator/kill", m.Kill, "operator", (_OBSERVERS - {"operator"}) | {"world"}, "event", "command"
+)
 EVENT = _topic("{process}/event", m.Event, "any", set(), "event", "event")
 HEALTH = _topic("{process}/health", m.Health, "any", set(), "second", "event")
 PRESENCE = _topic("{process}/presence", m.Presence, "any", _EVERYONE, "presence", "event")

@@ -16,6 +16,7 @@ from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario.bodies import Body
 
 _NS = 1_000_000_000
+"""Nanoseconds of a second."""
 
 
 class RobotActuation:

@@ -16,6 +16,7 @@ from collections import deque
 from dataclasses import dataclass
 
 _NS = 1_000_000_000
+"""Nanoseconds of a second."""
 
 
 @dataclass(frozen=True)

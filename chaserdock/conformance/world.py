@@ -35,7 +35,7 @@ from chaserdock_protocol.transport.session import EARLY_PERIOD_S
 
 from chaserdock.launch.launcher import open_hub
 
-from .harness import Checked, end_process, start_process
+from .harness import SILENT_TICKS, Checked, end_process, start_process
 from .rules import WORDS, Finding
 
 _LEASE_MS = 60_000
@@ -81,6 +81,7 @@ class WorldStand:
         self._numbers: Counter[str] = Counter()
         self._next: Counter[str] = Counter()
         self._presence_sent_s = 0.0
+        self._silent = 0
         self.scenario: FlightScenario | None = None
         self.mission: JoinReply | None = None
         self.findings: dict[tuple[str, str], Finding] = {}
@@ -187,6 +188,10 @@ class WorldStand:
             for key in due if not complete else ():
                 if self._came.get(key, -1) < tick.tick:
                     self.report(key, f"not published within {self._patience_s:g} s of its tick")
+            self._silent = 0 if complete else self._silent + 1
+            if self._silent == SILENT_TICKS:
+                self.report("world", f"stopped after {SILENT_TICKS} incomplete ticks")
+                return False
         withheld = lockstep and tick.tick == _WITHHELD_TICK
         if withheld and self._wait(lambda: self.tick is not tick, ended, _WITHHELD_S):
             self.report(topics.TICK.key_of(), "does not wait for all replies in lock-step")

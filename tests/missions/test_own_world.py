@@ -29,7 +29,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def checked(program: Path, flight: Path, ticks: int = 100) -> list[str]:
     command = [sys.executable, str(program), str(flight), "connect", "{endpoint}", "{namespace}"]
-    result = check_world(command, ticks, start_s=60.0, patience_s=8.0)
+    result = check_world(command, ticks, start_s=60.0, patience_s=3.0)
     return [f"{f.where}: {f.what}" for f in result.findings]
 
 
@@ -40,7 +40,7 @@ def test_own_world_conforms_to_its_end(flight: Path) -> None:
 def test_the_shipped_world_conforms(flight: Path) -> None:
     world = [sys.executable, "-m", "chaserdock", "world", "docking-contact", "-e", "{endpoint}"]
     command = [*world, "--namespace", "{namespace}", "--no-recorder", "--set", "duration_s=1.0"]
-    result = check_world(command, 100, start_s=60.0, patience_s=8.0)
+    result = check_world(command, 100, start_s=60.0, patience_s=3.0)
     assert result.findings == []
     assert result.ticks == 15
 

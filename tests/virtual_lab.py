@@ -73,6 +73,7 @@ class _Camera(_Device):
             pixels = encode_pose(e.target_m, e.q_wxyz, (e.number, self.chaser))
             image = np.frombuffer(pixels, dtype=np.uint8).reshape(1, -1)
             found.append(CameraFrame(image, e.stamp_ns, at_ns))
+            LATENCIES_S.append((now_ns - at_ns) / 1e9)
         return found
 
 
@@ -83,7 +84,7 @@ class _Robot(_Device):
             self.lab.command(self.chaser, command.force_N, command.torque_N_m, now_ns)
         except ConnectionError as error:
             raise DeviceError(str(error)) from None
-        SENT.append((self.host.now_ns(), self.chaser))
+        SENT.append((now_ns, self.chaser))
 
     def stop(self) -> None:
         self.lab.stop(self.chaser, self.host.now_ns())
@@ -93,6 +94,8 @@ class _Robot(_Device):
 
 SENT: list[tuple[int, int]] = []
 """Times and chasers of the commands that robots have got in the present flight."""
+LATENCIES_S: list[float] = []
+"""Times from the arrival of an image, s, until the gateway has read it, in the present flight."""
 
 
 @dataclass
@@ -118,6 +121,7 @@ def install(monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
 
     monkeypatch.setattr(devices, "entry_points", found)
     SENT.clear()
+    LATENCIES_S.clear()
 
 
 def arm_when_ready(options: ProcessOptions, give_up_s: float = 20.0) -> int:

@@ -2,7 +2,7 @@
 """A laboratory of free flyers: bodies, thruster response, motion capture and cameras, each with a
 clock, latency and faults of its own.
 
-Shares nothing with chaserdock: rigid bodies as scipy rotations, stepped at 1 kHz. `advance` takes
+Shares nothing with chaserdock: rigid bodies as scipy rotations, stepped at 500 Hz. `advance` takes
 any clock, so that it flies in virtual and in real time.
 """
 
@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-STEP_S = 1e-3
+STEP_S = 2e-3
 RESPONSE_S = 0.02  # time constant of the thrusters
 STOP_PER_S = 1.5  # how fast a body that is switched off comes to rest, as on a floor without air
 # Camera axes (x right, y down, z forward) in body axes (x forward, z up).
@@ -158,12 +158,12 @@ class Laboratory:
             self._step()
             self.now_ns += step_ns
             number = self.now_ns // step_ns
-            if number % 10 == 3:
+            if number % 5 == 3:  # 100 Hz
                 self._capture()
             for i in self.chasers:
-                if number % 33 == 5 * i:
+                if number % 17 == 5 * i:  # 29.4 Hz
                     self._expose(i)
-            if number % 100 == 0:
+            if number % 50 == 0:
                 self._note()
 
     def _step(self) -> None:
@@ -181,7 +181,8 @@ class Laboratory:
 
     def _move(self, body: Body, force: np.ndarray, torque: np.ndarray) -> None:
         body.velocity = body.velocity + body.rotation.apply(force) / self.mass_kg * STEP_S
-        gyro = np.cross(body.omega, self.inertia * body.omega)
+        (x, y, z), (a, b, c) = body.omega, self.inertia
+        gyro = np.array([(c - b) * y * z, (a - c) * z * x, (b - a) * x * y])
         body.omega = body.omega + (torque - gyro) / self.inertia * STEP_S
         if not body.is_on:
             kept = max(0.0, 1.0 - STOP_PER_S * STEP_S)

@@ -81,9 +81,7 @@ for _service in (GOTO, SELECT_THRUSTER):
         _service, (INTERFACES / f"srv/{_service.rpartition('/')[2]}.srv").read_text("utf-8")
     )
 for _message in sorted(Path(__file__).with_name("px4_msgs").glob("*.msg")):
-    TYPES.register(
-        get_types_from_msg(_message.read_text("utf-8"), f"px4_msgs/msg/{_message.stem}")
-    )
+    TYPES.register(get_types_from_msg(_message.read_text("utf-8"), f"px4_msgs/msg/{_message.stem}"))
 
 
 @cache

@@ -375,7 +375,11 @@ def peer(network: Peer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
     use_entry_points(monkeypatch)
     yield network
     network.end_test()
-    assert ros2_network._NETWORKS._users == {}  # every test closes its devices
+    left = list(ros2_network._NETWORKS._users.values())
+    ros2_network._NETWORKS._users.clear()
+    for shared, _ in left:
+        shared.close()  # an open session would keep the process
+    assert left == []  # every test closes its devices
 
 
 def poll_until(source: Any, number: int, publish: Any = lambda: None) -> list[Any]:
@@ -563,6 +567,7 @@ def test_wrench_arrives_after_arming_only_and_ceases_with_the_commands(
     def forces() -> list[Any]:
         return [components(message.wrench.force) for message in read]
 
+    wait_for(lambda: robot._endpoints.has_peer)
     for _ in range(3):
         robot.send(sent)
     robot.arm()

@@ -102,7 +102,7 @@ def message_of(type_name: str, fields: dict[str, Any]) -> Any:
 
 
 def test_odometry_is_passed_on_in_its_axes_with_the_velocity_in_the_world() -> None:
-    sample = ros2_poses.of_odometry(message_of(ODOMETRY, odometry()), 7)
+    sample: Any = ros2_poses.of_odometry(message_of(ODOMETRY, odometry()), 7)
     assert (sample.body, sample.stamp_ns, sample.arrived_ns) == ("atmos", STAMP_NS, 7)
     np.testing.assert_array_equal(sample.position_m, POSITION)
     np.testing.assert_array_equal(sample.q_wxyz, Q)
@@ -113,7 +113,7 @@ def test_odometry_is_passed_on_in_its_axes_with_the_velocity_in_the_world() -> N
 def test_covariance_of_ros_has_its_rotation_turned_into_the_body() -> None:
     """A rotation by theta about world axes is one by R^T theta about the body's."""
     cov = covariance()
-    sample = ros2_poses.of_odometry(message_of(ODOMETRY, odometry(cov)), 0)
+    sample: Any = ros2_poses.of_odometry(message_of(ODOMETRY, odometry(cov)), 0)
     assert sample.covariance is not None
     rng = np.random.default_rng(8)
     for _ in range(5):
@@ -124,7 +124,7 @@ def test_covariance_of_ros_has_its_rotation_turned_into_the_body() -> None:
 
 @pytest.mark.parametrize("twist", ["world", "none"])
 def test_twist_of_other_axes_is_declared(twist: Any) -> None:
-    sample = ros2_poses.of_odometry(message_of(ODOMETRY, odometry()), 0, twist)
+    sample: Any = ros2_poses.of_odometry(message_of(ODOMETRY, odometry()), 0, twist)
     if twist == "none":
         assert sample.velocity_m_s is None
         assert sample.omega_rad_s is None
@@ -136,12 +136,12 @@ def test_twist_of_other_axes_is_declared(twist: Any) -> None:
 
 def test_what_is_not_stated_is_none() -> None:
     unknown = odometry(np.zeros((6, 6)), (0.1, math.nan, 0.2), stamp_ns=0)
-    sample = ros2_poses.of_odometry(message_of(ODOMETRY, unknown), 0)
+    sample: Any = ros2_poses.of_odometry(message_of(ODOMETRY, unknown), 0)
     assert (sample.stamp_ns, sample.velocity_m_s, sample.covariance) == (None, None, None)
     minus_one = covariance()
     minus_one[0, 0] = -1.0
     assert ros2_poses.of_odometry(message_of(ODOMETRY, odometry(minus_one)), 0).covariance is None
-    plain = ros2_poses.of_pose(message_of(POSE, {"header": header(), "pose": pose()}), 0)
+    plain: Any = ros2_poses.of_pose(message_of(POSE, {"header": header(), "pose": pose()}), 0)
     assert (plain.body, plain.velocity_m_s, plain.omega_rad_s, plain.covariance) == (
         "",
         None,
@@ -151,7 +151,7 @@ def test_what_is_not_stated_is_none() -> None:
 
 
 def test_vehicle_odometry_keeps_ned_and_frd_and_the_time_of_the_sample() -> None:
-    sample = ros2_poses.of_vehicle_odometry(message_of(PX4, vehicle_odometry()), 3)
+    sample: Any = ros2_poses.of_vehicle_odometry(message_of(PX4, vehicle_odometry()), 3)
     assert sample.stamp_ns == 20_000_123_000
     np.testing.assert_allclose(sample.position_m, POSITION, rtol=1e-7)
     np.testing.assert_allclose(sample.velocity_m_s, matrix(Q) @ LINEAR, atol=1e-7)
@@ -172,7 +172,7 @@ def test_vehicle_odometry_keeps_ned_and_frd_and_the_time_of_the_sample() -> None
     ],
 )
 def test_velocity_of_px4_is_in_the_frame_that_it_states(changes: Any, velocity: Any) -> None:
-    sample = ros2_poses.of_vehicle_odometry(message_of(PX4, vehicle_odometry(**changes)), 0)
+    sample: Any = ros2_poses.of_vehicle_odometry(message_of(PX4, vehicle_odometry(**changes)), 0)
     if velocity is None:
         assert sample.velocity_m_s is None
     else:

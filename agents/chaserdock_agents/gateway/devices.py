@@ -14,15 +14,21 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any, Literal, Protocol
 
+import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.messages import Latch
+from numpy.typing import NDArray
 
-DeviceKind = Literal["camera", "pose", "robot"]
+ImageArray = NDArray[np.uint8]
+
+DeviceKind = Literal["camera", "pose", "robot", "latch"]
 
 GROUPS: dict[DeviceKind, str] = {
     "camera": "chaserdock.cameras",
     "pose": "chaserdock.poses",
     "robot": "chaserdock.robots",
+    "latch": "chaserdock.latches",
 }
 """Groups of entry points, by kind of device. ``pose``: odometry and motion capture."""
 
@@ -38,6 +44,33 @@ class DeviceHost:
     """What a driver may use of its process. ``now_ns``: monotonic clock of all arrival times."""
 
     now_ns: Callable[[], int]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFrame:
+    """An image as a camera gave it.
+
+    image (h, w) or (h, w, 3) in OpenCV's order, uint8. ``stamp_ns``: middle of the exposure by the
+    device's clock, None without one. ``arrived_ns``: by the host's clock.
+    """
+
+    image: ImageArray
+    stamp_ns: int | None
+    arrived_ns: int
+
+
+class CameraSource(Protocol):
+    """A camera."""
+
+    def poll(self) -> Sequence[CameraFrame]:
+        """Return what has arrived since the last call, oldest first, without waiting. Raises
+        DeviceError if the device is gone.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release the device."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +143,37 @@ class Robot(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class LatchReading:
+    """What a docking sensor and its latch state; fields as in ``DockingStatus``."""
+
+    contact: bool
+    armed: bool
+    latched: bool
+
+
+class DockingLatch(Protocol):
+    """Docking sensor and latch of one chaser."""
+
+    def poll(self) -> LatchReading | None:
+        """Return the newest reading, with any contact since the last call; None before the first
+        one. Raises DeviceError if the device is gone.
+        """
+        ...
+
+    def command(self, latch: Latch) -> None:
+        """Command the latch. Raises DeviceError if the device is gone."""
+        ...
+
+    def close(self) -> None:
+        """Release the device."""
+        ...
+
+
 def open_device(
     kind: DeviceKind, address: str, options: Mapping[str, Any], host: DeviceHost
 ) -> Any:
-    """Open the device at ``SCHEME:REST``: a CameraSource, PoseSource or Robot, by its kind.
+    """Open the device at ``SCHEME:REST``: a CameraSource, PoseSource, Robot or DockingLatch.
 
     Raises DeviceError for a scheme without a driver, an option that the driver does not know, and
     what the driver raises.

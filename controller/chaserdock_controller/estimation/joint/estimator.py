@@ -3,8 +3,8 @@
 and disturbances.
 
 Mathematics: docs/estimation.md. Every tick is recorded with its inputs. A sighting that arrives
-late is inserted at its exposure, and the later ticks are processed again. The state therefore does
-not depend on the order of arrival.
+late is inserted at its exposure, also between two ticks, and the later ticks are processed again.
+The state therefore does not depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from chaserdock_controller.estimation.types import (
 )
 from chaserdock_controller.interfaces import RelativePose, TargetState
 
+from .between_ticks import split_tick
 from .hypotheses import FilterState, is_lost, mixture_covariance, target_state
 from .measurements import mounting_of
 from .parameters import JointParameters, TargetParameters, rows_of
@@ -241,13 +242,16 @@ class JointEstimator(Estimator):
         return p if target is p.target else dataclasses.replace(p, target=target)
 
     def _insert(self, sighting: Sighting) -> int:
-        """Add a sighting to the record of its exposure. Returns the index of that record, or of the
-        newest one if nothing was added.
+        """Add a sighting to the record of its exposure, or of the first tick after it. Returns the
+        index of that record, or of the newest one if nothing was added.
         """
-        newest = len(self._buffer.records) - 1
+        records = self._buffer.records
         i, record = self._buffer.find(sighting.sim_time_ns)
-        if record is None or sighting.chaser in record.sightings:
-            return newest
+        if record is None:
+            is_buffered = 0 < i < len(records)
+            return i if is_buffered and records[i].insert_between(sighting) else len(records) - 1
+        if sighting.chaser in record.sightings:
+            return len(records) - 1
         record.sightings[sighting.chaser] = sighting
         return i
 
@@ -264,6 +268,21 @@ class JointEstimator(Estimator):
         return i
 
     def _process(
+        self, before: FilterState | None, record: FilterTick
+    ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
+        if before is None or not record.between:
+            return self._process_part(before, record)
+        state, events = before, ()
+        seen, rejected = set[int](), set[int]()
+        for part in split_tick(before.time_ns, record):
+            state, own = self._process_part(state, part)
+            events += own
+            seen.update(state.seen)
+            rejected.update(state.rejected)
+        seen_in_tick, rejected_in_tick = tuple(sorted(seen)), tuple(sorted(rejected - seen))
+        return msgspec.structs.replace(state, seen=seen_in_tick, rejected=rejected_in_tick), events
+
+    def _process_part(
         self, before: FilterState | None, record: FilterTick
     ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
         return process_tick(

@@ -238,7 +238,6 @@ def test_silent_vehicle_is_gone_and_noise_is_ignored(lab: Lab) -> None:
     vehicle = lab.vehicle()
     poll_one(source, vehicle.odometry)
     vehicle.link.port.sendto(b"\xfd\x09noise\x00\xff" * 9, ("127.0.0.1", lab.port))
-    complains(source, "states no pose", lambda: vehicle.odometry(q=[math.nan] * 4))
     poll_one(source, vehicle.odometry)
     vehicle.close()
     lab._vehicles.clear()
@@ -256,8 +255,9 @@ def test_tcp_is_closed_by_the_other_side(lab: Lab) -> None:
         address = f"mavlink:tcp://127.0.0.1:{server.getsockname()[1]}"
         source = open_device("pose", address, {})
         side, _ = server.accept()
-        packet = mavutil.mavlink.MAVLink(None, 5, 1)
-        message = mavutil.mavlink.MAVLink_att_pos_mocap_message(1, Q, *POSITION)
+        dialect: Any = mavutil.mavlink
+        packet = dialect.MAVLink(None, 5, 1)
+        message = dialect.MAVLink_att_pos_mocap_message(1, Q, *POSITION)
         side.sendall(message.pack(packet))
         assert source.poll() == []  # another message
         side.close()
@@ -300,6 +300,11 @@ def test_wrench_is_deflection_after_arming_and_neutral_when_commands_cease(
     robot = open_device("robot", lab.address, {"system": 2, **options})
     assert (robot.body_axes, robot.thrusters) == ("frd", 0)
     vehicle = lab.vehicle(2, kind)
+    wait_for(lambda: vehicle.of("HEARTBEAT"))
+    robot.send(command())
+    robot.stop()
+    time.sleep(0.1)
+    assert {m.get_type() for m in vehicle.read} == {"HEARTBEAT"}
     robot.arm()
     sent = command((0.9, -4.0, 0.5), (-0.04, 0.05, 0.058))
     asked = [(c.target_system, c.command, c.param1, c.param2) for c in vehicle.of("COMMAND_LONG")]
@@ -354,8 +359,7 @@ def test_robot_that_refuses_or_is_silent_is_named(
     robot = open_device("robot", lab.address, PLANAR)
     with pytest.raises(DeviceError, match="no heartbeat of an autopilot with system 1"):
         robot.arm()
-    with pytest.raises(DeviceError, match="system 1 was not heard on udp://"):
-        robot.send(command())
+    robot.send(command())  # nothing is sent before it is armed
     robot.stop()  # never raises
     monkeypatch.setattr(mavlink, "_GONE_S", 3.0)
     monkeypatch.setattr(acknowledgements, "_REPLY_S", 0.1)
@@ -383,7 +387,8 @@ def test_command_that_is_not_finite_is_refused_and_not_repeated(lab: Lab) -> Non
 
 
 def test_poses_and_robot_share_a_port(lab: Lab) -> None:
-    source, robot = (open_device(k, lab.address, o) for k, o in (("pose", {}), ("robot", PLANAR)))
+    source = open_device("pose", lab.address, {})
+    robot = open_device("robot", lab.address, PLANAR)
     vehicle = lab.vehicle()
     assert poll_one(source, vehicle.odometry).body == "1"
     robot.arm()

@@ -14,7 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from chaserdock_agents.gateway.devices import DeviceError
+from chaserdock_agents.gateway import devices
+from chaserdock_agents.gateway.devices import DeviceError, DeviceHost
 from chaserdock_agents.gateway.drivers import command_stream, ros2_camera, ros2_network, ros2_poses
 from chaserdock_agents.ros2.types import TYPES, type_hash
 from chaserdock_models.camera import Camera
@@ -269,7 +270,7 @@ def test_image_that_its_header_does_not_fit_is_refused(changes: Any, said: str) 
     message = image("mono8", GREY)
     for name, value in changes.items():
         setattr(message, name, value)
-    with pytest.raises(DeviceError, match=said):
+    with pytest.raises(ros2_camera.UnreadableMessage, match=said):
         ros2_camera.grey_of_image(message)
 
 
@@ -443,17 +444,16 @@ def test_poses_of_a_peer_arrive_as_the_conversion_states(
     source.close()
 
 
-def test_message_without_a_pose_is_an_error_and_the_next_is_used(peer: Peer) -> None:
-    topic = peer.topic()
-    publisher = peer.publisher(topic, PX4)
-    source = open_device("pose", f"ros2:{topic}", {"type": PX4, **peer.options})
-    nothing = vehicle_odometry(q=np.full(4, np.nan, np.float32))
-    complains(source, f"{topic} states no pose", lambda: publisher.publish(**nothing))
-    source._arrived.clear()
-    publisher.publish(**vehicle_odometry())
-    wait_for(lambda: source._arrived and source._arrived[-1][0].q[0] == np.float32(Q[0]))
-    assert len(source.poll()) == 1
-    source.close()
+def test_message_without_a_pose_is_passed_on_with_nan() -> None:
+    nothing = vehicle_odometry(q=np.full(4, np.nan, np.float32), velocity_frame=3)
+    sample: Any = ros2_poses.of_vehicle_odometry(message_of(PX4, nothing), 0)
+    assert np.isnan(sample.q_wxyz).all()
+    assert sample.velocity_m_s is None
+    zero = odometry()
+    zero["pose"].pose.orientation.__init__(0.0, 0.0, 0.0, 0.0)
+    sample = ros2_poses.of_odometry(message_of(ODOMETRY, zero), 0)
+    assert (sample.velocity_m_s, sample.covariance) == (None, None)
+    np.testing.assert_array_equal(sample.q_wxyz, np.zeros(4))
 
 
 def test_another_hash_or_type_is_named_before_and_after_opening(peer: Peer) -> None:
@@ -521,11 +521,11 @@ def test_camera_passes_images_on_and_refuses_another_calibration(peer: Peer) -> 
     base = peer.topic()
     images = peer.publisher(f"{base}/image", "sensor_msgs/msg/Image")
     infos = peer.publisher(f"{base}/camera_info", "sensor_msgs/msg/CameraInfo")
-    options = {**peer.options, "calibration": CAMERA}
-    camera = open_device("camera", f"ros2:{base}/image", options)
+    host = DeviceHost(time.monotonic_ns, CAMERA)
+    camera = devices.open_device("camera", f"ros2:{base}/image", peer.options, host)
     (frame, *_) = poll_until(camera, 1, lambda: images.publish(**vars(image("mono8", GREY))))
     assert frame.stamp_ns == STAMP_NS
-    np.testing.assert_array_equal(frame.grey, GREY)
+    np.testing.assert_array_equal(frame.image, GREY)
     narrow = vars(image("mono8", GREY[:, :10], 10))
     complains(camera, "images of 10 x 12 px, the sc", lambda: images.publish(**narrow))
     wide = vars(camera_info(width=41))
@@ -542,8 +542,12 @@ def test_compressed_images_are_decoded(peer: Peer) -> None:
     def publish(data: Any) -> None:
         publisher.publish(header=header(), format="bgr8; png compressed bgr8", data=data)
 
-    np.testing.assert_array_equal(poll_until(camera, 1, lambda: publish(png))[0].grey, GREY)
-    complains(camera, "with 3 bytes: no JPEG or PNG image", lambda: publish(png[:3]))
+    np.testing.assert_array_equal(poll_until(camera, 1, lambda: publish(png))[0].image, GREY)
+    complains(
+        camera,
+        "10 images in a row: format 'bgr8; png compressed bgr8' with 3 bytes: no JPEG",
+        lambda: publish(png[:3]),
+    )
     camera.close()
 
 
@@ -568,8 +572,10 @@ def test_wrench_arrives_after_arming_only_and_ceases_with_the_commands(
         return [components(message.wrench.force) for message in read]
 
     wait_for(lambda: robot._endpoints.has_peer)
-    for _ in range(3):
-        robot.send(sent)
+    robot.send(sent)
+    robot.stop()
+    time.sleep(0.1)
+    assert read == []
     robot.arm()
     wait_for(lambda: len(read) >= 5)  # zeros go on without commands
     assert set(forces()) == {(0.0, 0.0, 0.0)}
@@ -598,6 +604,19 @@ def test_wrench_arrives_after_arming_only_and_ceases_with_the_commands(
     assert len(read) <= number + 1
     with pytest.raises(DeviceError, match="closed"):
         robot.send(sent)
+
+
+def test_wrench_that_is_not_finite_is_refused(peer: Peer) -> None:
+    topic = peer.topic()
+    read = peer.subscribe(topic, "geometry_msgs/msg/WrenchStamped")
+    robot = open_device("robot", f"ros2:{topic}", peer.options)
+    wait_for(lambda: robot._endpoints.has_peer)
+    robot.arm()
+    with pytest.raises(DeviceError, match="cannot send: force or torque is not finite"):
+        robot.send(command(torque=(0.1, np.inf, 0.1)))
+    wait_for(lambda: len(read) >= 3)
+    assert {components(m.wrench.torque) for m in read} == {(0.0, 0.0, 0.0)}
+    robot.close()
 
 
 def test_robot_without_a_subscription_does_not_arm(peer: Peer) -> None:
@@ -673,6 +692,10 @@ def open_px4(peer: Peer, **options: Any) -> Any:
 def test_px4_gets_the_wrench_as_shares_of_the_maxima(peer: Peer, px4: EmulatedPx4) -> None:
     robot = open_px4(peer, **WRENCH, system=3)
     assert (robot.body_axes, robot.thrusters) == ("frd", 0)
+    robot.send(command())
+    robot.stop()
+    time.sleep(0.2)
+    assert all(messages == [] for messages in px4.read.values())
     robot.arm()
     assert px4.commands() == [(176, 1.0, 6.0), (400, 1.0, 0.0)]
     asked = px4.read["VehicleCommand"][0]

@@ -22,7 +22,8 @@ HOLD_S = 0.25
 
 class CommandStream:
     """Publishes the newest command, again if nothing else was published for a period, and zero
-    (None) without a fresh command or while it is not armed. Safe to call from several threads.
+    (None) without a fresh command or while it is not armed. Publishes nothing before ``start``.
+    Safe to call from several threads.
     """
 
     def __init__(
@@ -33,11 +34,10 @@ class CommandStream:
         self._last: RobotCommand | None = None
         self._last_ns = self._published_ns = now_ns()
         self._armed = False
-        self._failure: Exception | None = None
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Publish from now on, until ``close``."""
+        """Publish from now on, zero until ``arm``."""
         with self._lock:
             if self._thread is None and not self._wake.is_set():
                 self._thread = threading.Thread(target=self._run, daemon=True)
@@ -48,9 +48,10 @@ class CommandStream:
         with self._lock:
             if self._wake.is_set():
                 raise DeviceError("the robot is closed")
+            if self._thread is None:
+                return
             self._last, self._last_ns = command, self._now_ns()
-            self._publish_now()
-            failure, self._failure = self._failure, None
+            failure = self._publish_now()
             if failure is not None:
                 self._last = None  # a command that cannot be sent is not repeated
         if failure is not None:
@@ -65,7 +66,7 @@ class CommandStream:
         """Publish zero, now and until armed again. Never raises."""
         with self._lock:
             self._armed, self._last = False, None
-            if not self._wake.is_set():
+            if self._thread is not None and not self._wake.is_set():
                 self._publish_now()
 
     def close(self) -> None:
@@ -75,13 +76,15 @@ class CommandStream:
         if self._thread is not None:
             self._thread.join()
 
-    def _publish_now(self) -> None:
+    def _publish_now(self) -> Exception | None:
+        """Publish what is due; return why it failed."""
         self._published_ns = self._now_ns()
         fresh = self._published_ns - self._last_ns < HOLD_S * 1e9
         try:
             self._publish(self._last if self._armed and fresh else None)
-        except Exception as error:  # of a session or a socket; the next `put` raises it
-            self._failure = error
+        except Exception as error:  # of a session or a socket; `put` raises its own
+            return error
+        return None
 
     def _run(self) -> None:
         wait_s = 0.0

@@ -33,10 +33,10 @@ from .acknowledgements import (
     FORCE,
     Acknowledgements,
 )
-from .actuation import Maxima, wrench_shares
 from .command_stream import CommandStream
 from .options import read_options
-from .ros2_poses import KEPT, is_finite, is_pose, stated, turned
+from .pose_samples import KEPT, is_finite, stated, turned
+from .shares import Maxima, wrench_shares
 from .sharing import Shared
 
 SOURCE = (255, 190)
@@ -320,15 +320,9 @@ class MavlinkPoses:
             message, arrived_ns = self._arrived.popleft()
             body = "" if self._options.system else str(message.get_srcSystem())
             samples.append(self._read(message, arrived_ns, body, self._options.axes))
-        poses = [sample for sample in samples if is_pose(sample)]
-        if samples and not poses:
-            raise DeviceError(
-                f"{self._options.message} states no pose: position {samples[-1].position_m}, "
-                f"quaternion {samples[-1].q_wxyz}"
-            )
         if not samples:
             self._link.check(self._options.system)
-        return poses
+        return samples
 
     def close(self) -> None:
         """See `PoseSource`."""
@@ -380,6 +374,7 @@ class MavlinkRobot:
         self._kind = (-1, -1)
         self._end = self._link.listen(("HEARTBEAT", "COMMAND_ACK"), self._take)
         self._stream = CommandStream(self._publish, host.now_ns)
+        self._was_armed = False
 
     def _take(self, message: Any, arrived_ns: int) -> None:
         if message.get_srcSystem() != self._options.system:
@@ -400,7 +395,7 @@ class MavlinkRobot:
         self._link.send(options.system, message)
 
     def send(self, command: RobotCommand) -> None:
-        """See `Robot`. Sends zero unless the robot is armed."""
+        """See `Robot`. Sends nothing before `arm`, and zero after `stop`."""
         self._stream.put(command)
         self._link.check(self._options.system)
 
@@ -414,6 +409,7 @@ class MavlinkRobot:
                 f"{_GONE_S:g} s"
             )
         mode = manual_mode(*self._kind, self._options)
+        self._was_armed = True
         self._stream.start()
         time.sleep(_LEAD_S)
         self._ask(DO_SET_MODE, "manual mode", CUSTOM_MODE_ENABLED, mode)
@@ -421,8 +417,10 @@ class MavlinkRobot:
         self._stream.arm()
 
     def stop(self) -> None:
-        """Command zero and disarm, in motion too. Does not wait for the answer."""
+        """Command zero and disarm, in motion too, if this driver has armed. Does not wait."""
         self._stream.disarm()
+        if not self._was_armed:
+            return
         try:
             self._command(COMPONENT_ARM_DISARM, 0, 0.0, FORCE)
         except Exception:  # it was never heard, or is gone

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 from chaserdock_models.arrays import Array
+from numpy.typing import NDArray
 
 from chaserdock_agents.ros2.types import TYPES
 
@@ -28,10 +29,10 @@ from .acknowledgements import (
     FORCE,
     Acknowledgements,
 )
-from .actuation import Maxima, wrench_shares
 from .command_stream import CommandStream
 from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
+from .shares import Maxima, wrench_shares
 
 _MOTORS = 12
 """Length of ``ActuatorMotors.control``."""
@@ -53,14 +54,14 @@ class Px4Options(RosOptions, frozen=True, kw_only=True):
     system: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
 
 
-def motors(duty: Array, thrusters: tuple[int, ...]) -> Array:
+def motors(duty: Array, thrusters: tuple[int, ...]) -> NDArray[np.float32]:
     """Return ``ActuatorMotors.control`` (12,) of the duty (n,) of each thruster; NaN, which stops a
     motor, for motors that are no thruster. Raises DeviceError for another number of thrusters and
     a duty that is not from 0 to 1.
     """
     if len(duty) != len(thrusters):
         raise DeviceError(f"{len(duty)} duties for {len(thrusters)} thrusters (option thrusters)")
-    if not all(0.0 <= d <= 1.0 for d in duty):
+    if not all(0.0 <= d <= 1.0 for d in duty):  # nor NaN
         raise DeviceError(f"duty {list(map(float, duty))}: must be from 0 to 1")
     control = np.full(_MOTORS, np.nan, np.float32)
     control[[number - 1 for number in thrusters]] = duty
@@ -68,13 +69,13 @@ def motors(duty: Array, thrusters: tuple[int, ...]) -> Array:
 
 
 class Px4Robot:
-    """A robot with PX4. Nothing that is sent has an effect before PX4 is armed in offboard mode."""
+    """A robot with PX4. Nothing is sent before it is armed: others may use it until then."""
 
     body_axes = "frd"
 
     def __init__(self, namespace: str, options: Px4Options, host: DeviceHost) -> None:
         self.thrusters = len(options.thrusters)
-        self._options, self._host = options, host
+        self._options = options
         self._endpoints = RosEndpoints(options)
         self._acknowledgements = Acknowledgements()
         try:
@@ -96,9 +97,8 @@ class Px4Robot:
         except BaseException:
             self._endpoints.close()
             raise
-        self._started_ns = host.now_ns()
         self._stream = CommandStream(self._publish, host.now_ns)
-        self._stream.start()
+        self._was_armed = False
 
     def _put(self, kind: str, *fields: Any) -> None:
         self._publishers[kind].publish(TYPES.types[f"px4_msgs/msg/{kind}"](*fields))
@@ -107,7 +107,9 @@ class Px4Robot:
         options, wrench = self._options, not self.thrusters
         no = (False,) * 5  # position, velocity, acceleration, attitude, body rate
         if wrench:
-            maxima = (options.force_max_N or (0.0,) * 3, options.torque_max_N_m or (0.0,) * 3)
+            assert options.force_max_N is not None
+            assert options.torque_max_N_m is not None
+            maxima = options.force_max_N, options.torque_max_N_m
             force, torque = wrench_shares(command, *maxima)
             setpoints = {"VehicleThrustSetpoint": force, "VehicleTorqueSetpoint": torque}
         else:
@@ -119,7 +121,7 @@ class Px4Robot:
             self._put(kind, 0, 0, *reversible, np.asarray(values, np.float32))
 
     def send(self, command: RobotCommand) -> None:
-        """See `Robot`. Publishes zero unless the robot is armed."""
+        """See `Robot`. Sends nothing before `arm`, and zero after `stop`."""
         self._stream.put(command)
         self._endpoints.check()
 
@@ -128,16 +130,19 @@ class Px4Robot:
         answer.
         """
         self._endpoints.check()
-        left_s = _LEAD_S - (self._host.now_ns() - self._started_ns) / 1e9
-        if left_s > 0.0:
-            time.sleep(left_s)
+        if not self._was_armed:
+            self._was_armed = True
+            self._stream.start()
+            time.sleep(_LEAD_S)
         self._ask(DO_SET_MODE, "PX4, offboard mode", CUSTOM_MODE_ENABLED, _OFFBOARD)
         self._ask(COMPONENT_ARM_DISARM, "PX4, arming", 1.0, 0.0)
         self._stream.arm()
 
     def stop(self) -> None:
-        """Command zero and disarm, in motion too. Does not wait for the answer."""
+        """Command zero and disarm, in motion too, if this driver has armed. Does not wait."""
         self._stream.disarm()
+        if not self._was_armed:
+            return
         try:
             self._command(COMPONENT_ARM_DISARM, 0, 0.0, FORCE)
         except Exception:  # the session is gone: the stream has ended, too, and PX4 notices

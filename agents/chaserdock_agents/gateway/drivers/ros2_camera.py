@@ -9,17 +9,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 
-from ..devices import DeviceError, DeviceHost
+from ..devices import CameraFrame, DeviceError, DeviceHost, ImageArray
 from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
+from .ros2_poses import stamp_of
 
 KEPT = 4
 """Images kept between two polls: the newest count, and one takes up to some megabytes."""
@@ -29,6 +28,8 @@ which calibrations repeat.
 """
 COEFFICIENT = 1e-4
 """Difference of lens coefficients that are the same: below 0.1 px in an image 1000 px wide."""
+UNREADABLE = 10
+"""Unreadable images in a row that are a fault of the camera: single ones are damaged on the way."""
 _INFO = "sensor_msgs/msg/CameraInfo"
 # Conversion to grey and channels, by encoding; ROS and OpenCV name Bayer patterns differently.
 _TO_GREY: dict[str, tuple[int | None, int]] = {
@@ -47,41 +48,34 @@ _TO_GREY: dict[str, tuple[int | None, int]] = {
 _WIDE = ("mono16", "16UC1")
 
 
+class UnreadableMessage(ValueError):
+    """An image message that cannot be decoded."""
+
+
 class RosCameraOptions(RosOptions, frozen=True, kw_only=True):
     """Options of a camera on ROS 2. ``camera_info``: topic of its calibration; ``""`` for none;
-    default: ``camera_info`` beside the images. ``calibration``: the scenario's camera, given by
-    the gateway; without it nothing is compared.
+    default: ``camera_info`` beside the images.
     """
 
     type: Literal["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"] = (
         "sensor_msgs/msg/Image"
     )
     camera_info: str | None = None
-    calibration: Camera | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class GreyImage:
-    """Image of a camera: ``grey`` (h, w) of uint8. Times as in `PoseSample`."""
-
-    stamp_ns: int | None
-    arrived_ns: int
-    grey: Array
-
-
-def grey_of_image(message: Any) -> Array:
-    """Return ``sensor_msgs/msg/Image`` as grey levels (h, w). Raises DeviceError for an encoding
-    that is not known, and for bytes that do not fit it.
+def grey_of_image(message: Any) -> ImageArray:
+    """Return ``sensor_msgs/msg/Image`` as grey levels (h, w). Raises UnreadableMessage for an
+    encoding that is not known, and for bytes that do not fit it.
     """
     height, width, step = message.height, message.width, message.step
     wide = message.encoding in _WIDE
     if not wide and message.encoding not in _TO_GREY:
-        raise DeviceError(
+        raise UnreadableMessage(
             f"encoding {message.encoding!r} is not one of: {', '.join((*_TO_GREY, *_WIDE))}"
         )
     code, channels = (None, 2) if wide else _TO_GREY[message.encoding]
     if not (height and width and step >= width * channels and len(message.data) == step * height):
-        raise DeviceError(
+        raise UnreadableMessage(
             f"{len(message.data)} bytes in rows of {step} for {width} x {height} pixels of "
             f"{message.encoding}"
         )
@@ -93,16 +87,20 @@ def grey_of_image(message: Any) -> Array:
         if channels == 1
         else rows.reshape(height, width, channels)
     )
-    return rows if code is None else np.asarray(cv2.cvtColor(rows, code))
+    return rows if code is None else np.asarray(cv2.cvtColor(rows, code), np.uint8)
 
 
-def grey_of_compressed(message: Any) -> Array:
-    """Return ``sensor_msgs/msg/CompressedImage`` as grey levels (h, w). Raises DeviceError."""
+def grey_of_compressed(message: Any) -> ImageArray:
+    """Return ``sensor_msgs/msg/CompressedImage`` as grey levels (h, w). Raises
+    UnreadableMessage.
+    """
     data = np.asarray(message.data, np.uint8)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = cv2.imdecode(data, flags) if data.size else None
     if pixels is None:
-        raise DeviceError(f"format {message.format!r} with {data.size} bytes: no JPEG or PNG image")
+        raise UnreadableMessage(
+            f"format {message.format!r} with {data.size} bytes: no JPEG or PNG image"
+        )
     return np.asarray(pixels, np.uint8)
 
 
@@ -139,8 +137,9 @@ class RosCamera:
     """Images of one topic."""
 
     def __init__(self, topic: str, options: RosCameraOptions, host: DeviceHost) -> None:
-        self._topic, self._camera = topic, options.calibration
-        self._compressed = options.type.endswith("CompressedImage")
+        self._camera, self._unreadable = host.camera, 0
+        compressed = options.type.endswith("CompressedImage")
+        self._grey = grey_of_compressed if compressed else grey_of_image
         self._arrived: deque[tuple[Any, int]] = deque(maxlen=KEPT)
         self._info: Any = None
         info = options.camera_info
@@ -160,31 +159,39 @@ class RosCamera:
     def _take_info(self, info: Any) -> None:
         self._info = info
 
-    def poll(self) -> Sequence[GreyImage]:
-        """Return the newest images since the last call, oldest first, without waiting. Raises
-        DeviceError if the camera is gone, or its images or calibration are others than declared.
+    def poll(self) -> Sequence[CameraFrame]:
+        """See `CameraSource`. Raises DeviceError, too, for images or a calibration that differ from
+        the scenario's, and for several unreadable images in a row.
         """
-        images: list[GreyImage] = []
         if self._info is not None and self._camera is not None:
             difference = difference_of_calibration(self._info, self._camera)
             if difference:
                 raise DeviceError(difference)
             self._info = None
+        frames: list[CameraFrame] = []
         while self._arrived:
             message, arrived_ns = self._arrived.popleft()
-            grey = (grey_of_compressed if self._compressed else grey_of_image)(message)
-            size, camera = grey.shape[::-1], self._camera
-            if camera is not None and size != (camera.width_px, camera.height_px):
-                raise DeviceError(
-                    f"images of {size[0]} x {size[1]} px, the scenario's calibration is of "
-                    f"{camera.width_px} x {camera.height_px} px"
-                )
-            stamp = message.header.stamp
-            stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec or None
-            images.append(GreyImage(stamp_ns, arrived_ns, grey))
-        if not images:
+            try:
+                grey = self._grey(message)
+            except UnreadableMessage as error:
+                self._unreadable += 1
+                if self._unreadable >= UNREADABLE:
+                    raise DeviceError(f"{self._unreadable} images in a row: {error}") from None
+                continue
+            self._unreadable = 0
+            self._check_size(grey)
+            frames.append(CameraFrame(grey, stamp_of(message.header), arrived_ns))
+        if not frames:
             self._endpoints.check()
-        return images
+        return frames
+
+    def _check_size(self, grey: ImageArray) -> None:
+        camera, (height, width) = self._camera, grey.shape
+        if camera is not None and (width, height) != (camera.width_px, camera.height_px):
+            raise DeviceError(
+                f"images of {width} x {height} px, the scenario's calibration is of "
+                f"{camera.width_px} x {camera.height_px} px"
+            )
 
     def close(self) -> None:
         """Release the camera."""

@@ -2,7 +2,7 @@
 """Read poses from topics of ROS 2: odometry and motion capture.
 
 Native axes: those of REP 103 (``enu``, ``flu``) for messages of ROS, ``ned`` and ``frd`` for
-PX4's. Every message is passed on; one whose position or attitude is not finite is an error.
+PX4's. Every message is passed on, with NaN where it states NaN.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from chaserdock_models.arrays import Array
 
 from ..devices import DeviceError, DeviceHost, PoseSample
 from .options import read_options
+from .pose_samples import KEPT, is_finite, is_pose, stated, to_body_rotation, turned
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 
 Twist = Literal["child", "world", "none"]
 Reader = Callable[[Any, int, Twist], PoseSample]
 
-KEPT = 1000
-"""Messages kept between two polls: 10 s of motion capture at 100 Hz; older ones are dropped."""
 # px4_msgs/msg/VehicleOdometry
 _UNKNOWN, _NED, _FRD, _BODY_FRD = 0, 1, 2, 3
 
@@ -39,40 +38,11 @@ class RosPoseOptions(RosOptions, frozen=True, kw_only=True):
     twist: Twist = "child"
 
 
-def turned(q_wxyz: Array, vector: Array) -> Array | None:
-    """Return a body-axes vector (3,) in world axes; None if either is not finite."""
-    return rotations.rotate(rotations.normalize(q_wxyz), vector) if is_finite(vector) else None
-
-
-def is_finite(values: Array) -> bool:
-    """Test whether all values are finite."""
-    return bool(np.isfinite(values).all())
-
-
-def is_pose(sample: PoseSample) -> bool:
-    """Test whether a sample states a position and an attitude."""
-    q = sample.q_wxyz
-    return is_finite(sample.position_m) and is_finite(q) and bool(np.any(q))
-
-
-def stated(covariance: Array) -> bool:
-    """Test whether a covariance is one: ROS leaves zeros, or -1 first, where none is known."""
-    return is_finite(covariance) and bool(np.any(covariance)) and covariance.flat[0] >= 0.0
-
-
-def to_body_rotation(covariance: Array, q_wxyz: Array) -> Array:
-    """Return a pose's covariance (6, 6) with the rotation about body axes, from one with the
-    rotation about world axes, as ROS states it: a rotation theta_w is R theta_b.
-    """
-    to_body = np.eye(6)
-    to_body[3:, 3:] = rotations.to_matrix(rotations.normalize(q_wxyz)).T
-    return to_body @ covariance @ to_body.T
-
-
 # -- messages --------------------------------------------------------------------------------------
 
 
-def _stamp_ns(header: Any) -> int | None:
+def stamp_of(header: Any) -> int | None:
+    """Return the stamp of a header, ns; None for 0, which is none."""
     return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec or None
 
 
@@ -92,7 +62,7 @@ def _sample(
     q = pose.orientation
     sample = PoseSample(
         body,
-        _stamp_ns(header),
+        stamp_of(header),
         arrived_ns,
         _xyz(pose.position),
         np.array([q.w, q.x, q.y, q.z], dtype=float),
@@ -177,11 +147,12 @@ class RosPoses:
     """Poses of one topic."""
 
     def __init__(self, topic: str, options: RosPoseOptions, host: DeviceHost) -> None:
-        self._read, self._twist = READERS[options.type], options.twist
+        self._read = READERS[options.type]
+        self._twist: Twist = options.twist
         px4 = options.type.startswith("px4_msgs/")
         self.world_axes, self.body_axes = ("ned", "frd") if px4 else ("enu", "flu")
         self._arrived: deque[tuple[Any, int]] = deque(maxlen=KEPT)
-        self._topic, self._endpoints = topic, RosEndpoints(options)
+        self._endpoints = RosEndpoints(options)
         try:
             self._endpoints.subscribe(
                 topic, options.type, lambda m: self._arrived.append((m, host.now_ns()))
@@ -195,15 +166,9 @@ class RosPoses:
         samples: list[PoseSample] = []
         while self._arrived:
             samples.append(self._read(*self._arrived.popleft(), self._twist))
-        poses = [sample for sample in samples if is_pose(sample)]
-        if samples and not poses:
-            raise DeviceError(
-                f"{self._topic} states no pose: position {samples[-1].position_m}, "
-                f"quaternion {samples[-1].q_wxyz}"
-            )
         if not samples:
             self._endpoints.check()
-        return poses
+        return samples
 
     def close(self) -> None:
         """See `PoseSource`."""

@@ -19,6 +19,7 @@ from ..devices import DeviceError, DeviceHost, RobotCommand
 from .command_stream import CommandStream
 from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
+from .shares import wrench_of
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 
@@ -54,11 +55,7 @@ class RosRobot:
         header = ros.std_msgs__msg__Header(
             time_of(wall_ns(command.time_ns if command else now_ns, self._host.now_ns)), self._frame
         )
-        zero = (0.0, 0.0, 0.0)
-        force, torque = (
-            ros.geometry_msgs__msg__Vector3(*map(float, v))
-            for v in ((command.force_N, command.torque_N_m) if command else (zero, zero))
-        )
+        force, torque = (ros.geometry_msgs__msg__Vector3(*v.tolist()) for v in wrench_of(command))
         self._publisher.publish(
             ros.geometry_msgs__msg__WrenchStamped(
                 header, ros.geometry_msgs__msg__Wrench(force, torque)
@@ -66,7 +63,7 @@ class RosRobot:
         )
 
     def send(self, command: RobotCommand) -> None:
-        """See `Robot`. Publishes zero unless the robot is armed."""
+        """See `Robot`. Sends nothing before `arm`, and zero after `stop`."""
         self._stream.put(command)
         self._endpoints.check()
 
@@ -75,8 +72,8 @@ class RosRobot:
         self._endpoints.check()
         if not self._endpoints.has_peer:
             raise DeviceError(f"nobody subscribes to {self._topic} ({WRENCH})")
-        self._stream.arm()
         self._stream.start()
+        self._stream.arm()
 
     def stop(self) -> None:
         """See `Robot`."""

@@ -24,14 +24,21 @@ def shares(values: Array, maxima: Maxima) -> Array:
     return np.where(limit > 0.0, np.clip(np.asarray(values, float) / safe, -1.0, 1.0), 0.0)
 
 
-def wrench_shares(
-    command: RobotCommand | None, force_max_N: Maxima, torque_max_N_m: Maxima
-) -> tuple[Array, Array]:
-    """Return force and torque (3,) as shares of their maxima; zeros without a command. Raises
-    DeviceError for a command that is not finite.
+def wrench_of(command: RobotCommand | None) -> tuple[Array, Array]:
+    """Return force and torque (3,), zeros without a command. Raises DeviceError for values that are
+    not finite.
     """
     if command is None:
         return np.zeros(3), np.zeros(3)
-    if not (np.isfinite(command.force_N).all() and np.isfinite(command.torque_N_m).all()):
+    force, torque = np.asarray(command.force_N, float), np.asarray(command.torque_N_m, float)
+    if not (np.isfinite(force).all() and np.isfinite(torque).all()):
         raise DeviceError("force or torque is not finite")
-    return shares(command.force_N, force_max_N), shares(command.torque_N_m, torque_max_N_m)
+    return force, torque
+
+
+def wrench_shares(
+    command: RobotCommand | None, force_max_N: Maxima, torque_max_N_m: Maxima
+) -> tuple[Array, Array]:
+    """Return force and torque (3,) as shares of their maxima. Raises DeviceError."""
+    force, torque = wrench_of(command)
+    return shares(force, force_max_N), shares(torque, torque_max_N_m)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import tomllib
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,7 +23,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_protocol.transport.zenoh_network import PlainSession
 from device_cases import Clock, command, open_device, use_entry_points, wait_for
 from general_position import matrix
-from harness import free_port
+from harness import ROOT, free_port
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.session import ZenohSession
 
@@ -767,6 +768,14 @@ def test_px4_that_refuses_or_is_silent_is_named(
     time.sleep(0.05)
     assert all(not np.any(m.xyz) for m in px4.read["VehicleThrustSetpoint"])
     robot.close()
+
+
+def test_devices_of_the_docs_are_valid(peer: Peer) -> None:
+    page = (ROOT / "docs" / "devices.md").read_text(encoding="utf-8")
+    lab = tomllib.loads(page.split("```toml\n")[1].split("```")[0])["lab"]
+    for kind, found in (("pose", lab["odometry"]), ("robot", lab["robot"])):
+        for device in found:
+            open_device(kind, device["address"], {**device["options"], **peer.options}).close()
 
 
 # -- invalid input ---------------------------------------------------------------------------------

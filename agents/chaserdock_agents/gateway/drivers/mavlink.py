@@ -94,6 +94,7 @@ class _Port:
         try:
             if self._streams:
                 self.socket = socket.create_connection((host, int(port)), _CONNECT_S)
+                self.socket.settimeout(_WAIT_S)  # of sending to a side that does not read
             else:
                 self.socket = opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
                 (opened.bind if self._listens else opened.connect)((host, int(port)))

@@ -395,6 +395,31 @@ def devices() -> None:
     )
 
 
+def laboratory() -> None:
+    diagram(
+        "laboratory",
+        {
+            "cameras": Box(0, 2, "cameras", "person", 0.8),
+            "capture": Box(0, 1, "motion\ncapture", "person", 0.8),
+            "robots": Box(0, 0, "robots,\nlatches", "person", 0.8),
+            "gateway": Box(2, 1, "gateway\nclocks, axes, arming,\nlimits", "real", 1.0, 0.75),
+            "mission": Box(4, 1, "chasers,\ncontroller"),
+            "recorder": Box(2, 0, "recorder, viewer", "file", 0.9),
+            "operator": Box(2, 2, "operator:\narm, kill", "person", 0.8),
+        },
+        [
+            ("cameras", "gateway", "images"),
+            ("capture", "gateway", "poses"),
+            ("gateway", "robots", "forces or pulses"),
+            ("gateway", "mission", "odometry, images", -0.2),
+            ("mission", "gateway", "commands", -0.2),
+            ("gateway", "recorder", "references"),
+            ("mission", "recorder", ""),
+            ("operator", "gateway", ""),
+        ],
+    )
+
+
 def frames() -> None:
     """World, chaser, target and image frame."""
     with styled("frames"):
@@ -789,6 +814,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "processes": processes, "simulation": simulation, "redundancy": redundancy,
     "perception": perception, "errors": errors, "hosts": hosts, "limits": limits,
     "extend": extend, "knowledge": knowledge, "ros2": ros2, "devices": devices, "frames": frames,
+    "laboratory": laboratory,
     "controller": controller, "estimation": estimation, "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,
     "results": results, "thrusters": thrusters,

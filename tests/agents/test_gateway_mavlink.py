@@ -144,8 +144,17 @@ def test_odometry_of_a_vehicle_is_passed_on_in_ned_and_frd(lab: Lab) -> None:
     clock = Clock()
     source = open_device("pose", lab.address, {"system": 7}, clock)
     assert (source.world_axes, source.body_axes) == ("ned", "frd")
-    vehicle = lab.vehicle(7)
-    sample = poll_one(source, vehicle.odometry)
+    vehicle, other = lab.vehicle(7), lab.vehicle(8)
+
+    def both() -> None:
+        other.odometry(x=99.0)
+        vehicle.odometry()
+
+    sample = poll_one(source, both)
+    for _ in range(5):
+        both()
+        time.sleep(0.01)
+        assert all(s.position_m[0] != 99.0 for s in source.poll())
     assert (sample.body, sample.stamp_ns, sample.arrived_ns) == ("", 20_000_123_000, clock.time_ns)
     np.testing.assert_allclose(sample.position_m, POSITION, rtol=1e-7)
     np.testing.assert_allclose(sample.q_wxyz, Q_WXYZ, rtol=1e-6)

@@ -552,6 +552,19 @@ def test_compressed_images_are_decoded(peer: Peer) -> None:
     camera.close()
 
 
+def test_single_damaged_images_are_skipped(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros2_camera, "KEPT", 100)
+    camera = open_device("camera", f"ros2:{peer.topic()}", peer.options)
+    damaged, right = image("8UC7", GREY), image("mono8", GREY)
+    for _ in range(ros2_camera.UNREADABLE):
+        camera._arrived.extend([(damaged, 0)] * (ros2_camera.UNREADABLE - 1) + [(right, 5)])
+    assert len(camera.poll()) == ros2_camera.UNREADABLE
+    camera._arrived.extend([(damaged, 0)] * ros2_camera.UNREADABLE)
+    with pytest.raises(DeviceError, match="10 images in a row: encoding '8UC7'"):
+        camera.poll()
+    camera.close()
+
+
 # -- robots ----------------------------------------------------------------------------------------
 
 
@@ -626,6 +639,32 @@ def test_robot_without_a_subscription_does_not_arm(peer: Peer) -> None:
     with pytest.raises(DeviceError, match=f"nobody subscribes to {topic}"):
         robot.arm()
     robot.close()
+
+
+def test_nothing_but_zero_follows_a_stop_whoever_commands() -> None:
+    published: list[bool] = []
+    stream = command_stream.CommandStream(lambda c: published.append(c is not None), lambda: 0)
+    stream.start()
+    stream.arm()
+    over = threading.Event()
+
+    def send() -> None:
+        while not over.is_set():
+            stream.put(command())
+
+    threads = [threading.Thread(target=send) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    wait_for(lambda: len(published) > 100)
+    stream.disarm()
+    number = len(published)
+    wait_for(lambda: len(published) > number + 100)
+    over.set()
+    for thread in threads:
+        thread.join()
+    stream.close()
+    assert any(published[:number])
+    assert not any(published[number:])
 
 
 class EmulatedPx4:

@@ -320,16 +320,21 @@ def test_wrench_is_deflection_after_arming_and_neutral_when_commands_cease(
     assert asked == [(2, 176, 1.0, mode), (2, 400, 1.0, 0.0)]
     assert {deflection(m) for m in vehicle.of("MANUAL_CONTROL")} == {NEUTRAL}
 
-    def obeys() -> bool:
-        robot.send(sent)
-        return deflection(vehicle.of("MANUAL_CONTROL")[-1]) != NEUTRAL
+    def send_until_obeyed() -> Any:
+        number = len(vehicle.of("MANUAL_CONTROL"))
 
-    wait_for(obeys)
-    newest = vehicle.of("MANUAL_CONTROL")[-1]
+        def obeyed() -> list[Any]:
+            new = vehicle.of("MANUAL_CONTROL")[number:]
+            return [message for message in new if deflection(message) != NEUTRAL]
+
+        wait_for(lambda: robot.send(sent) or obeyed())
+        return obeyed()[-1]
+
+    newest = send_until_obeyed()
     assert (newest.target, newest.enabled_extensions, newest.buttons) == (2, 3, 0)
     assert deflection(newest) == expected
     wait_for(lambda: deflection(vehicle.of("MANUAL_CONTROL")[-1]) == NEUTRAL)  # by itself
-    wait_for(obeys)
+    send_until_obeyed()
     robot.stop()
     wait_for(lambda: vehicle.of("COMMAND_LONG")[-1].param2 == 21196.0)
     assert vehicle.of("COMMAND_LONG")[-1].param1 == 0.0

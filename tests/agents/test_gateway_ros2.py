@@ -594,12 +594,17 @@ def test_wrench_arrives_after_arming_only_and_ceases_with_the_commands(
     wait_for(lambda: len(read) >= 5)  # zeros go on without commands
     assert set(forces()) == {(0.0, 0.0, 0.0)}
 
-    def send_again() -> bool:
-        robot.send(sent)
-        return any(forces()[-1])
+    def send_until_obeyed() -> None:
+        number = len(read)
+
+        def obeys() -> bool:
+            robot.send(sent)
+            return any(any(force) for force in forces()[number:])
+
+        wait_for(obeys)
 
     before_ns = time.time_ns()
-    wait_for(send_again)
+    send_until_obeyed()
     newest = next(message for message in read if message.wrench.force.x != 0.0)
     assert components(newest.wrench.force) == tuple(sent.force_N)
     assert components(newest.wrench.torque) == tuple(sent.torque_N_m)
@@ -607,7 +612,7 @@ def test_wrench_arrives_after_arming_only_and_ceases_with_the_commands(
     stamp_ns = newest.header.stamp.sec * 10**9 + newest.header.stamp.nanosec
     assert abs(stamp_ns - before_ns) < 5_000_000_000  # wall clock
     wait_for(lambda: not any(forces()[-1]))  # by itself
-    wait_for(send_again)
+    send_until_obeyed()
     robot.stop()
     wait_for(lambda: not any(forces()[-1]))
     robot.send(sent)
@@ -741,20 +746,19 @@ def test_px4_gets_the_wrench_as_shares_of_the_maxima(peer: Peer, px4: EmulatedPx
     asked = px4.read["VehicleCommand"][0]
     assert (asked.target_system, asked.target_component, asked.from_external) == (3, 1, True)
     thrusts = [m.xyz.tolist() for m in px4.read["VehicleThrustSetpoint"]]
-    assert len(thrusts) > 5  # the stream ran for a second before
+    assert len(thrusts) >= 3  # the stream ran for a second before
     assert all(not any(t) for t in thrusts)
 
     def arrived() -> bool:
         robot.send(command((0.9, -4.0, 0.5), (0.2, 0.05, 0.058)))
-        return bool(np.any(px4.read["VehicleTorqueSetpoint"][-1].xyz))
+        return bool(moving("VehicleTorqueSetpoint") and moving("VehicleThrustSetpoint"))
+
+    def moving(kind: str) -> list[Any]:
+        return [message.xyz for message in px4.read[kind] if np.any(message.xyz)]
 
     wait_for(arrived)
-    np.testing.assert_allclose(
-        px4.read["VehicleThrustSetpoint"][-1].xyz, [0.3, -1.0, 0.0], rtol=1e-6
-    )
-    np.testing.assert_allclose(
-        px4.read["VehicleTorqueSetpoint"][-1].xyz, [0.0, 0.5, 0.2], rtol=1e-6
-    )
+    np.testing.assert_allclose(moving("VehicleThrustSetpoint")[0], [0.3, -1.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(moving("VehicleTorqueSetpoint")[0], [0.0, 0.5, 0.2], rtol=1e-6)
     mode = px4.read["OffboardControlMode"][-1]
     assert (mode.thrust_and_torque, mode.direct_actuator, mode.timestamp) == (True, False, 0)
     robot.stop()
@@ -770,12 +774,15 @@ def test_px4_gets_the_duty_of_each_thruster_at_its_motor(peer: Peer, px4: Emulat
 
     def arrived() -> bool:
         robot.send(command(duty=(0.25, 1.0, 0.625)))
-        return bool(px4.read["ActuatorMotors"][-1].control[1])
+        return bool(moving())
+
+    def moving() -> list[Any]:
+        return [m.control for m in px4.read["ActuatorMotors"] if m.control[1] > 0.0]
 
     wait_for(arrived)
     expected = np.full(12, np.nan)
     expected[[4, 1, 11]] = 0.25, 1.0, 0.625
-    np.testing.assert_array_equal(px4.read["ActuatorMotors"][-1].control, expected)
+    np.testing.assert_array_equal(moving()[0], expected)
     mode = px4.read["OffboardControlMode"][-1]
     assert (mode.thrust_and_torque, mode.direct_actuator) == (False, True)
     with pytest.raises(DeviceError, match="2 duties for 3 thrusters"):

@@ -819,8 +819,9 @@ def test_px4_that_refuses_or_is_silent_is_named(
 def test_devices_of_the_docs_are_valid(peer: Peer) -> None:
     page = (ROOT / "docs" / "devices.md").read_text(encoding="utf-8")
     lab = tomllib.loads(page.split("```toml\n")[1].split("```")[0])["lab"]
-    for kind, found in (("pose", lab["odometry"]), ("robot", lab["robot"])):
-        for device in found:
+    kinds: dict[str, devices.DeviceKind] = {"odometry": "pose", "robot": "robot"}
+    for section, kind in kinds.items():
+        for device in lab[section]:
             open_device(kind, device["address"], {**device["options"], **peer.options}).close()
 
 

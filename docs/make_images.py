@@ -378,6 +378,23 @@ def ros2() -> None:
     )
 
 
+def devices() -> None:
+    diagram(
+        "devices",
+        {
+            "camera": Box(0, 1.2, "camera", "real", 0.7),
+            "pose": Box(0, 0.6, "odometry,\nmotion capture", "real", 0.7, 0.5),
+            "robot": Box(0, 0.0, "robot", "real", 0.7),
+            "gateway": Box(2.4, 0.6, "chaserdock\ngateway", "real", 0.8, 0.75),
+        },
+        [
+            ("camera", "gateway", "ros2:", 0.0),
+            ("pose", "gateway", "ros2:  mavlink:", 0.0),
+            ("gateway", "robot", "ros2:  px4:  mavlink:", 0.0),
+        ],
+    )
+
+
 def laboratory() -> None:
     diagram(
         "laboratory",
@@ -796,7 +813,7 @@ def log_info() -> None:
 PICTURES: dict[str, Callable[[], None]] = {
     "processes": processes, "simulation": simulation, "redundancy": redundancy,
     "perception": perception, "errors": errors, "hosts": hosts, "limits": limits,
-    "extend": extend, "knowledge": knowledge, "ros2": ros2, "frames": frames,
+    "extend": extend, "knowledge": knowledge, "ros2": ros2, "devices": devices, "frames": frames,
     "laboratory": laboratory,
     "controller": controller, "estimation": estimation, "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,

@@ -16,6 +16,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Latch
 from numpy.typing import NDArray
@@ -41,9 +42,12 @@ class DeviceError(ChaserdockError):
 
 @dataclass(frozen=True)
 class DeviceHost:
-    """What a driver may use of its process. ``now_ns``: monotonic clock of all arrival times."""
+    """What a driver may use of its process. ``now_ns``: monotonic clock of all arrival times.
+    ``camera``: the scenario's calibration, for a camera that states one to compare.
+    """
 
     now_ns: Callable[[], int]
+    camera: Camera | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,13 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.flight import flight_scenario
 from chaserdock_protocol.scenario.lab import LabSection
 
 from .actuation import RobotActuation
@@ -28,6 +30,7 @@ class Laboratory:
         assert scenario.lab is not None
         self.lab: LabSection = scenario.lab
         self._host, self._dry_run = host, dry_run
+        self._camera = flight_scenario(scenario).camera_model()
         self._systems: Sequence[PoseSystem] = []
         self._references: Sequence[PoseSystem] = []
         self.cameras: list[CameraFeed] = []
@@ -51,7 +54,7 @@ class Laboratory:
         self._systems = open_poses(lab.odometry, lab, host)
         self._references = open_poses(lab.reference, lab, host)
         for camera in lab.camera:
-            self.cameras.append(CameraFeed(camera, host))
+            self.cameras.append(CameraFeed(camera, replace(host, camera=self._camera)))
         for latch in lab.latch:
             self.latches[latch.chaser] = open_device("latch", latch.address, latch.options, host)
         for robot in lab.robot:

@@ -42,7 +42,6 @@ _LEASE_MS = 60_000
 """Time, ms, after which a silent world counts as lost: long, so that a slow one does not."""
 _WITHHELD_TICK, _WITHHELD_S = 3, 0.5
 """Tick in which one reply comes late, and by how much: a world in lock-step waits for it."""
-_ZERO = (0.0, 0.0, 0.0)
 
 
 def check_world(command: list[str], ticks: int, start_s: float, patience_s: float) -> Checked:
@@ -225,9 +224,10 @@ class WorldStand:
             **head, chaser=chaser, holder="controller", instance=self._instances["controller"],
             term=1, from_tick=tick.tick, until_tick=tick.tick + scenario.time.rate_hz,
         )  # fmt: skip
+        zero = (0.0, 0.0, 0.0)
         command = ActuatorCommand(
             **head, chaser=chaser, effective_time_ns=scenario.timing.effective_ns(tick.tick),
-            source="brake", force_N=_ZERO, torque_N_m=_ZERO, instance=instance,
+            source="brake", force_N=zero, torque_N_m=zero, instance=instance,
         )  # fmt: skip
         self._publish(topics.LEASE, lease, chaser)
         self._publish(topics.ACTUATORS, command, chaser)

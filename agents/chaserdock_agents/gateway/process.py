@@ -273,18 +273,18 @@ class Gateway:
             self._barrier.publish_warning("disarmed", reason)
 
     def _arm_robots(self, reason: str) -> tuple[bool, str]:
-        self._commanded_ns.clear()  # ages count from now on
         try:
             self._lab.arm()
         except DeviceError as error:
+            self._lab.stop()
             return False, self._gate.trip(str(error))
+        self._commanded_ns.clear()  # ages count from now on
         return True, reason
 
     def _trip(self, reason: str) -> None:
-        was_armed = self._gate.is_armed
-        self._gate.trip(reason)
-        self._lab.stop()
-        if was_armed:
+        if self._gate.is_armed or reason != self._gate.reason:
+            self._gate.trip(reason)
+            self._lab.stop()
             self._barrier.publish_warning("disarmed", reason)
 
     def _take_other(self, message: Message) -> None:

@@ -23,6 +23,7 @@ from chaserdock_controller.estimation.joint.replay import FilterTick
 from chaserdock_controller.estimation.joint.state import (
     CENTRE,
     CHASER,
+    FORCE,
     POSITION_DRIFT,
     TARGET,
     JointState,
@@ -121,16 +122,65 @@ def test_relative_poses_and_their_covariance(seed: int) -> None:
         np.testing.assert_allclose(pose.covariance, j @ s.covariance @ j.T, rtol=1e-5, atol=1e-10)
 
 
+def acceleration_of(s: JointState, i: int) -> Array:
+    """Acceleration by the disturbance, WRF."""
+    return matrix(s.attitudes_wxyz[i]) @ s.of(i, FORCE) / MASS_KG
+
+
 @SEEDS
-def test_covariance_of_the_motion_relative_to_the_target(seed: int) -> None:
-    s = joint_state(np.random.default_rng(seed))
+def test_what_disturbs_a_coast_is_the_estimated_force_with_the_errors_of_the_motion(
+    seed: int,
+) -> None:
+    """Without a limit of its own the force lasts; derivatives are central differences."""
+    s, e = joint_state(np.random.default_rng(seed)), 1e-5
     for i in range(2):
-        j = np.zeros((6, len(s.covariance)))
-        own = TARGET + CHASER * i
-        j[:, own : own + 6], j[:, 0:6] = np.eye(6), -np.eye(6)
-        found = estimator_of(s).motion_covariance(i)
+        columns = []
+        for d in np.eye(len(s.covariance)):
+            values = []
+            for sign in (1, -1):
+                t = inject(s, sign * e * d)
+                relative = [t.positions_m[i] - t.position_m, t.velocities_m_s[i] - t.velocity_m_s]
+                values.append(np.concatenate([*relative, acceleration_of(t, i)]))
+            columns.append((values[0] - values[1]) / (2 * e))
+        j = np.column_stack(columns)
+        found = estimator_of(s).disturbed_motion(i)
         assert found is not None
-        np.testing.assert_allclose(found, j @ s.covariance @ j.T, atol=1e-15)
+        np.testing.assert_allclose(found.acceleration_m_s2, acceleration_of(s, i), atol=1e-12)
+        np.testing.assert_allclose(found.covariance, j @ s.covariance @ j.T, rtol=1e-6, atol=1e-12)
+
+
+@SEEDS
+def test_force_that_lasts_is_what_the_estimate_says_of_a_part_of_it(seed: int) -> None:
+    """The estimated force is the sum of one that lasts and one by thrust: normal distributions,
+    conditioned.
+    """
+    rng, lasting_N = np.random.default_rng(seed), 0.004
+    s = joint_state(rng)
+    estimator = estimator_of(s)
+    p = changed(estimator.parameters, lasting_force_N=lasting_N)
+    estimator.parameters, whole_N = p, p.disturbance_force_N
+    found = estimator.disturbed_motion(1)
+    assert found is not None
+    own = TARGET + CHASER
+    known = s.covariance[own + 12 : own + 15, own + 12 : own + 15]
+    # Given the whole d, the lasting part is normal: joint covariance of (part, whole), conditioned.
+    joint = np.array([[lasting_N**2, lasting_N**2], [lasting_N**2, whole_N**2]])
+    gain = joint[0, 1] / joint[1, 1]
+    left = joint[0, 0] - gain * joint[1, 0]
+    r = matrix(s.attitudes_wxyz[1])
+    mean, spread = gain * s.of(1, FORCE), gain * gain * known + left * np.eye(3)
+    np.testing.assert_allclose(found.acceleration_m_s2, r @ mean / MASS_KG, atol=1e-14)
+    turn = s.covariance[own + 6 : own + 9, own + 6 : own + 9]
+    cross = s.covariance[own + 12 : own + 15, own + 6 : own + 9]
+    lever = -gain * skew(s.of(1, FORCE))
+    both = spread + lever @ turn @ lever.T + gain * (cross @ lever.T + lever @ cross.T)
+    np.testing.assert_allclose(
+        found.covariance[6:, 6:], r @ both @ r.T / MASS_KG**2, rtol=1e-9, atol=1e-16
+    )
+    # Positions and velocities are those without the limit.
+    free = estimator_of(s).disturbed_motion(1)
+    assert free is not None
+    np.testing.assert_array_equal(found.covariance[:6, :6], free.covariance[:6, :6])
 
 
 @SEEDS

@@ -31,6 +31,7 @@ from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, NmpcSolver
 from chaserdock_controller.nmpc import stage as planning
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.passive_safety import disturbed
 from flight_cases import odometry, scenario, tick_inputs
 from general_position import (
     INERTIA,
@@ -265,9 +266,11 @@ def test_guidance_knows_position_and_velocity_relative_to_the_target() -> None:
     mission, estimator = scenario(limits={"passive_safety": "enforce"}), Uniform(rng)
     target, own = estimator.estimate_at(10**9), odometry(0, 10, 10**9)
     motion = OwnMotion(own, np.zeros(13), np.zeros(6))
-    estimate = ChaserEstimate(0, motion, motion_covariance=np.eye(6))
+    pushed = disturbed(np.eye(6), 0.02)
+    estimate = ChaserEstimate(0, motion, disturbed=pushed)
     known = GuidanceStage(mission)._relative(estimate, target)
     assert known is not None
     apart = np.array(own.position_m) - target.position_m
     np.testing.assert_allclose(known.state[:3], apart, atol=1e-15)
+    assert known.disturbed is pushed
     np.testing.assert_allclose(known.state[3:], own.velocity_m_s - estimator.velocity, atol=1e-15)

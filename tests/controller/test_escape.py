@@ -20,6 +20,7 @@ from chaserdock_controller.guidance.trajectories import Escape, move_to, stay
 from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.orbit import OrbitalElements, propagate, state_of
+from chaserdock_models.passive_safety import disturbed
 from chaserdock_models.relative_motion import propagate_relative
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario, flight_scenario, parse_scenario
@@ -31,7 +32,7 @@ from hypothesis import strategies as st
 from chaserdock.experiments.in_process import InProcessMission
 
 GOOD = np.diag([2e-3**2] * 3 + [2e-5**2] * 3)
-KEEP_OUT_M = 2.0
+KEEP_OUT_M, FORCE_N = 2.0, 1e-8
 
 
 def scenario(**changes: Any) -> Scenario:
@@ -45,8 +46,10 @@ def scenario(**changes: Any) -> Scenario:
             "omega_rad_s": [0.0, 0.0, 0.0],
         },
         "approach": {"max_speed_m_s": 0.1},
+        "estimator": {"target_acceleration_noise": 1e-8},
         "limits": {
             "passive_safety": "enforce",
+            "passive_safety_force_N": FORCE_N,
             "min_distance_target_m": KEEP_OUT_M,
             "max_reference_distance_m": 300.0,
         },
@@ -67,7 +70,7 @@ def planner(**changes: Any) -> EscapePlanner:
 
 
 def relative(state: np.ndarray, covariance: np.ndarray = GOOD) -> RelativeState:
-    return RelativeState(state, covariance, at_rest())
+    return RelativeState(state, disturbed(covariance, FORCE_N / 17.8), at_rest())
 
 
 @pytest.mark.slow
@@ -147,6 +150,7 @@ def test_final_corridor_is_exempt() -> None:
     state = np.array([0.0, -30.0, 0.0, 0.0, 0.0, 0.0])
     limits = {
         "passive_safety": "enforce",
+        "passive_safety_force_N": FORCE_N,
         "min_distance_target_m": KEEP_OUT_M,
         "max_reference_distance_m": 300.0,
         "final_corridor_m": 31.0,
@@ -187,6 +191,7 @@ def test_unsafe_chaser_aborts_onto_a_safe_coast_and_takes_commands_from_there() 
 def test_unsafe_chaser_in_the_final_corridor_continues() -> None:
     limits = {
         "passive_safety": "enforce",
+        "passive_safety_force_N": FORCE_N,
         "min_distance_target_m": KEEP_OUT_M,
         "max_reference_distance_m": 300.0,
         "final_corridor_m": 40.0,

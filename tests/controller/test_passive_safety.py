@@ -14,7 +14,7 @@ from chaserdock_controller.nmpc import rti
 from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
 from chaserdock_controller.nmpc.terms import coast as coast_term
 from chaserdock_controller.nmpc.types import CoastSafety, NmpcPlan
-from chaserdock_models.passive_safety import CoastModel
+from chaserdock_models.passive_safety import CoastModel, CoastNoise, DisturbedMotion, disturbed
 from chaserdock_protocol.scenario import (
     FlightScenario,
     ScenarioError,
@@ -29,7 +29,7 @@ def mission(limits: dict[str, Any], **changes: Any) -> FlightScenario:
         "name": "test",
         "duration_s": 10.0,
         "target": {"velocity_m_s": [0.0, 0.0, 0.0]},
-        "limits": limits,
+        "limits": {"passive_safety_force_N": 1e-6} | limits,
         "chasers": [{"position_m": [-5.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],
     }
     return flight_scenario(parse_scenario(values | changes, "x"))
@@ -39,8 +39,8 @@ def estimation(latched: bool = False) -> TargetEstimation:
     target = SimpleNamespace(
         position_m=np.array([1.0, 0.0, 0.0]), velocity_m_s=np.array([0.1, 0.0, 0.0])
     )
-    covariance = np.diag([1e-6] * 3 + [1e-10] * 3)
-    chaser = ChaserEstimate(0, motion_covariance=covariance, latched=latched)
+    motion = disturbed(np.diag([1e-6] * 3 + [1e-10] * 3))
+    chaser = ChaserEstimate(0, disturbed=motion, latched=latched)
     values = SimpleNamespace(at_effect=target, chasers=(chaser,))
     return cast(TargetEstimation, values)
 
@@ -121,7 +121,7 @@ def fly(
     coast: CoastModel,
     start: np.ndarray,
     goal: np.ndarray,
-    covariance: np.ndarray,
+    motion: DisturbedMotion,
     ticks: int,
     enforced: bool,
 ) -> tuple[np.ndarray, list[float]]:
@@ -129,14 +129,14 @@ def fly(
     plan at each tick.
     """
     solver, state, margins = fresh("rti", 1, WITH_COASTS), at_rest(start), []
-    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: covariance})
+    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: motion})
     for tick in range(ticks):
         problem = replace(
             fixed_problem(state[None], goal[None], d_target=0.0),
             coast_safety=safety if enforced else None,
         )
         found = solver.solve(problem, PARAMS.dt_s if tick else 0.0)
-        margins.append(coast.certify(found.states[0, :, :6], covariance, 0.75).margin_sigmas)
+        margins.append(coast.certify(found.states[0, :, :6], motion, 0.75).margin_sigmas)
         state = found.states[0, 1]
     return state[:3], margins
 
@@ -146,10 +146,10 @@ def test_plan_to_a_place_on_v_bar_is_bent_so_that_its_coasts_stay_outside() -> N
     leaves none.
     """
     coast, goal = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S), np.array([0.0, -119.0, 0.0])
-    covariance = np.diag([4e-3] * 3 + [1e-7] * 3)
+    motion = disturbed(np.diag([4e-3] * 3 + [1e-7] * 3))
     start = np.array([0.0, -120.0, 0.0])
-    end, free = fly(coast, start, goal, covariance, 140, enforced=False)
-    bent_end, bent = fly(coast, start, goal, covariance, 140, enforced=True)
+    end, free = fly(coast, start, goal, motion, 140, enforced=False)
+    bent_end, bent = fly(coast, start, goal, motion, 140, enforced=True)
     assert min(free) < 0.0
     assert min(bent) > SIGMAS
     np.testing.assert_allclose(end, goal, atol=0.15)
@@ -158,10 +158,10 @@ def test_plan_to_a_place_on_v_bar_is_bent_so_that_its_coasts_stay_outside() -> N
 
 def test_plan_that_heads_for_the_target_in_free_space_is_bent_aside_or_slowed() -> None:
     coast = CoastModel(0.0, 600.0)
-    covariance = np.diag([1e-6] * 3 + [1e-8] * 3)
+    motion = disturbed(np.diag([1e-6] * 3 + [1e-8] * 3))
     start, goal = np.array([-5.0, 0.02, 0.0]), np.array([-2.0, 0.0, 0.0])
-    _, free = fly(coast, start, goal, covariance, 60, enforced=False)
-    _, bent = fly(coast, start, goal, covariance, 60, enforced=True)
+    _, free = fly(coast, start, goal, motion, 60, enforced=False)
+    _, bent = fly(coast, start, goal, motion, 60, enforced=True)
     assert max(free[1:]) < 0.0
     assert min(bent[10:]) > SIGMAS
 
@@ -172,15 +172,15 @@ def test_only_plans_that_are_not_safe_without_them_have_rows(
     """A safe plan is that of the unrestricted problem to the last bit, and its certificate need not
     be computed again.
     """
-    coast, covariance = CoastModel(0.0, 600.0), np.diag([1e-6] * 3 + [1e-8] * 3)
+    coast, motion = CoastModel(0.0, 600.0), disturbed(np.diag([1e-6] * 3 + [1e-8] * 3))
     rows, restricted = coast_term.coast_rows, []
 
     def counted(safety: CoastSafety, *rest: Any) -> np.ndarray:
-        restricted.append(sorted(safety.covariances))
+        restricted.append(sorted(safety.motions))
         return rows(safety, *rest)
 
     monkeypatch.setattr(rti, "coast_rows", counted)
-    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: covariance, 1: covariance})
+    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: motion, 1: motion})
     starts, aside = (
         np.array([[-5.0, 0.0, 0.0], [0.0, 9.0, 0.0]]),
         np.array([[-5.0, 0.5, 0.0], [0.0, 9.5, 0.0]]),
@@ -194,11 +194,11 @@ def test_only_plans_that_are_not_safe_without_them_have_rows(
     safe, free = solved(aside, safety), solved(aside, None)
     assert restricted == []
     np.testing.assert_array_equal(safe.inputs, free.inputs)
-    assert safe.coasts[1] == coast.certify(safe.states[1, :, :6], covariance, 0.75)
+    assert safe.coasts[1] == coast.certify(safe.states[1, :, :6], motion, 0.75)
     towards = np.array([[-2.0, 0.0, 0.0], [0.0, 9.5, 0.0]])
     bent, free = solved(towards, safety), solved(towards, None)
     assert restricted == [[0]]
-    unbent = coast.certify(free.states[0, :, :6], covariance, 0.75)
+    unbent = coast.certify(free.states[0, :, :6], motion, 0.75)
     assert bent.coasts[0].margin_sigmas > unbent.margin_sigmas + SIGMAS
     np.testing.assert_array_equal(bent.inputs[1], free.inputs[1])
 
@@ -208,13 +208,16 @@ def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:
     certified margin.
     """
     rng = np.random.default_rng(3)
-    coast = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S)
-    covariance = np.diag([1e-2] * 3 + [1e-8] * 3)
+    coast = CoastModel(
+        ORBIT_RAD_S, TWO_ORBITS_S, noise=CoastNoise(1e-6, varying_m_s2=4e-8, varying_s=200.0)
+    )
+    whole = rng.normal(size=(9, 9)) * np.repeat([0.05, 5e-5, 3e-8], 3)[:, None]
+    motion = DisturbedMotion(rng.normal(0.0, 1e-7, 3), whole @ whole.T)
     states = np.concatenate(
         [rng.normal(0.0, 60.0, (40, 3)), rng.normal(0.0, 0.05, (40, 3))], axis=1
     )
     planes, wider = (
-        coast.tangent_planes(states, covariance, 0.75, k, coast_term.COASTS) for k in (0.0, 1.0)
+        coast.tangent_planes(states, motion, 0.75, k, coast_term.COASTS) for k in (0.0, 1.0)
     )
     used = np.abs(planes[..., :6]).max(axis=2) > 0.0
     assert used[:, 0].all()
@@ -223,7 +226,7 @@ def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:
         used, room / np.where(used, wider[..., 6] - planes[..., 6], 1.0), np.inf
     ).min(axis=1)
     np.testing.assert_allclose(
-        margins, coast.closest(states, covariance, 0.75).margin_sigmas, rtol=1e-3
+        margins, coast.closest(states, motion, 0.75).margin_sigmas, rtol=1e-3
     )
 
 
@@ -239,7 +242,7 @@ def test_chasers_are_restricted_where_safety_is_enforced_once_they_count() -> No
     )
     found = monitor.restriction((1, 0), {0}, both)
     assert found is not None
-    assert set(found.covariances) == {1}
+    assert set(found.motions) == {1}
     np.testing.assert_array_equal(found.target_velocity_m_s, [0.1, 0.0, 0.0])
     assert monitor.restriction((0,), set(), estimation()) is None
 

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.messages import Level, Odometry, Sighting
 
 from chaserdock_controller.bodies.body_shape import BodyShape
@@ -93,8 +94,7 @@ class ChaserMotion:
     position_m, velocity_m_s (3,): WRF. q_wxyz (4,): CRF to WRF. omega_rad_s (3,): CRF. disturbance
     (6,): force and torque besides the commanded ones, body axes; zero on a latched chaser, whose
     motion is the target's. relative: pose relative to the target, while that is known.
-    motion_covariance (6, 6): of position and velocity relative to the target, WRF, likewise.
-    camera: once its errors are estimated.
+    disturbed: what else decides where it coasts, likewise. camera: once its errors are estimated.
     """
 
     chaser: int
@@ -104,7 +104,7 @@ class ChaserMotion:
     omega_rad_s: Array
     disturbance: Array
     relative: RelativePose | None
-    motion_covariance: Array | None
+    disturbed: DisturbedMotion | None
     camera: CameraError | None
 
 

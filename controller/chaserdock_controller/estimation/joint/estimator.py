@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array, IntArray
+from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, Sighting
 
@@ -40,8 +41,10 @@ from .parameters import JointParameters, TargetParameters, rows_of
 from .prediction import disturbance, predict_target
 from .replay import FilterTick, ReplayBuffer
 from .state import (
+    ATTITUDE,
     CHASER,
     FOCAL,
+    FORCE,
     POSE,
     POSITION_DRIFT,
     TARGET,
@@ -194,7 +197,7 @@ class JointEstimator(Estimator):
                     s, i, inputs.chasers[i].impulse.impulse / inputs.covered_s, self.parameters
                 ),
                 relative.get(i),
-                self.motion_covariance(i),
+                self.disturbed_motion(i),
                 cameras.get(i),
             )
             for i in np.flatnonzero(s.alive).tolist()
@@ -210,17 +213,29 @@ class JointEstimator(Estimator):
         chasers = np.flatnonzero(s.alive).tolist()
         return dict(zip(chasers, relative_poses(s, chasers), strict=True))
 
-    def motion_covariance(self, chaser: int) -> Array | None:
-        """Return the covariance (6, 6) of a chaser's position and velocity relative to the target,
-        WRF; None if either is unknown.
+    def disturbed_motion(self, chaser: int) -> DisturbedMotion | None:
+        """Return what decides where a chaser coasts besides its position and velocity; None if it
+        or the target is unknown.
+
+        Part of the estimated force is one that thrust causes, and ends with it. Before any
+        measurement, the force that lasts has the standard deviation ``lasting_force_N`` and the
+        estimated one ``disturbance_force_N``. Both parts have the mean that these imply.
         """
-        s = self.state
+        s, p = self.state, self.parameters
         if s is None or not s.target_known or not s.alive[chaser]:
             return None
-        size = VELOCITY.stop
-        own, target = slice(block(chaser).start, block(chaser).start + size), slice(0, size)
-        p, cross = s.covariance, s.covariance[own, target]
-        return p[own, own] + p[target, target] - cross - cross.T
+        estimated_N2, lasting_N2 = p.disturbance_force_N**2, p.lasting_force_N**2
+        share, axes = min(1.0, lasting_N2 / estimated_N2), so3.to_matrix(s.attitudes_wxyz[chaser])
+        per_N = share / p.body.mass_kg * axes
+        force, first, motion = s.of(chaser, FORCE), block(chaser).start, VELOCITY.stop
+        j = np.zeros((9, len(s.covariance)))
+        j[:motion, :motion], j[:motion, first : first + motion] = -np.eye(motion), np.eye(motion)
+        j[motion:, first + FORCE.start : first + FORCE.stop] = per_N
+        j[motion:, first + ATTITUDE.start : first + ATTITUDE.stop] = -per_N @ so3.skew(force)
+        covariance = j @ s.covariance @ j.T
+        unseen_N2 = lasting_N2 - share * share * estimated_N2
+        covariance[range(6, 9), range(6, 9)] += unseen_N2 / p.body.mass_kg**2
+        return DisturbedMotion(per_N @ force, covariance)
 
     def cameras(self) -> dict[int, CameraError]:
         """Return the estimated calibration errors of the cameras after the newest tick, by

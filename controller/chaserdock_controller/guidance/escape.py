@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.passive_safety import DisturbedMotion
+from chaserdock_models.passive_safety import STEP_S, DisturbedMotion
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import TargetState
@@ -26,7 +26,9 @@ from chaserdock_controller.nmpc.passive_safety import coast_duration_s, coast_mo
 from .trajectories import Escape, Motion
 
 _COARSE_STEP_S = 60.0
-"""Step of coasts, s, when moves and aborts are selected. The monitor uses a shorter one."""
+"""Step of coasts in an orbit, s, when moves and aborts are selected. The monitor uses a shorter
+one.
+"""
 _SPEED_SHARES = 0.7 ** np.arange(14)
 _MOVE_SAMPLES, _TURN_SAMPLES = 33, 12
 """Number of states of a move, and of one turn of the target after it, from which coasts are
@@ -68,7 +70,7 @@ class EscapePlanner:
         orbit, limits, body = scenario.orbit, scenario.limits, scenario.chaser
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self.duration_s = coast_duration_s(scenario)
-        self._coast = coast_model(scenario, _COARSE_STEP_S)
+        self._coast = coast_model(scenario, STEP_S if orbit is None else _COARSE_STEP_S)
         self._keep_out_m, self._final_m = limits.min_distance_target_m, limits.final_corridor_m
         self.sigmas = limits.estimate_margin_sigmas
         self._acceleration_m_s2 = _FORCE_SHARE * float(body.wrench_max[:3].min()) / body.mass_kg

@@ -110,9 +110,9 @@ class CoastModel:
         self._times_s = np.arange(round(duration_s / self._step_s) + 1) * self._step_s
         self._transitions = cw_transition(mean_motion_rad_s, self._times_s)
         self._responses = cw_response(mean_motion_rad_s, self._times_s)
-        self._by_axis = np.ascontiguousarray(self._transitions[:, :3].transpose(1, 0, 2))
         # Positions (T, 3, 9) by state and acceleration, and their covariance (T, 3, 3) by noise.
         self._rows = np.concatenate([self._transitions[:, :3], self._responses[:, :3]], axis=2)
+        self._by_axis = np.ascontiguousarray(self._rows.transpose(1, 0, 2))
         self._noise = coast_covariance(mean_motion_rad_s, self._step_s, len(self._times_s), noise)
         # With these the trace of a position's covariance is one product.
         self._squares = (self._rows.transpose(0, 2, 1) @ self._rows).reshape(-1, 81)
@@ -159,7 +159,8 @@ class CoastModel:
         deviations from the keep-out at that moment. c is zero where a coast has fewer approaches.
         Other arguments as in ``certify``.
         """
-        coasts = (self._by_axis @ states.T).transpose(2, 1, 0) + self._drift(motion)[:, :3]
+        pushed = np.tile(motion.acceleration_m_s2, (len(states), 1))
+        coasts = (self._by_axis @ np.hstack([states, pushed]).T).transpose(2, 1, 0)
         distances = np.sqrt(np.square(coasts).sum(axis=2))
         lines = coasts / np.maximum(distances, 1e-9)[..., None]
         spread = self._spread(np.arange(len(self._times_s)), motion)
@@ -220,12 +221,14 @@ class CoastModel:
 
     def _drift(self, motion: DisturbedMotion) -> Array:
         """Return the states (T, 6) that the disturbance adds to a coast."""
-        return self._responses @ motion.acceleration_m_s2
+        moved = self._responses.reshape(-1, 3) @ motion.acceleration_m_s2
+        return moved.reshape(-1, 6)
 
     def _spread(self, samples: IntArray, motion: DisturbedMotion) -> Array:
         """Return the covariances (K, 3, 3) of the position at samples (K,) of a coast."""
         rows = self._rows[samples]
-        return rows @ motion.covariance @ rows.transpose(0, 2, 1) + self._noise[samples]
+        moved = (rows.reshape(-1, 9) @ motion.covariance).reshape(rows.shape)
+        return np.einsum("kin,kjn->kij", moved, rows) + self._noise[samples]
 
     def _candidates(self, states: Array, motion: DisturbedMotion, keep_out_m: float) -> IntArray:
         """Return the steps that can contain the smallest margin of the coasts from all states.

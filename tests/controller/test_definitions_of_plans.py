@@ -443,4 +443,6 @@ def test_coast_rows_bound_the_closest_approach_of_each_stage(seed: int) -> None:
         assert slack == pytest.approx(away[at] - 0.75 - sigmas * sigma_m, abs=2e-3)
         line = coast_of(relative, motion, times_s[at : at + 1])[0][0] / away[at]
         np.testing.assert_allclose(row[:3] * scale, line, atol=1e-2)
-        np.testing.assert_allclose(row[3:6] * scale, times_s[at] * line, atol=0.01 * times_s[at] + 0.5)
+        np.testing.assert_allclose(
+            row[3:6] * scale, times_s[at] * line, atol=0.01 * times_s[at] + 0.5
+        )

@@ -6,6 +6,7 @@ chaser does without them.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -20,7 +21,7 @@ from chaserdock_controller.guidance.trajectories import Escape, move_to, stay
 from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.orbit import OrbitalElements, propagate, state_of
-from chaserdock_models.passive_safety import disturbed
+from chaserdock_models.passive_safety import DisturbedMotion, disturbed
 from chaserdock_models.relative_motion import propagate_relative
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario, flight_scenario, parse_scenario
@@ -106,6 +107,52 @@ def test_small_burn_is_preferred_and_an_uncertain_state_needs_a_larger_one() -> 
     rough = planner().escape(relative(state, np.diag([0.5**2] * 3 + [4e-2**2] * 3)), 0.0)
     assert small[0].burn_s < rough[0].burn_s
     assert small[1] >= 4.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_abort_stays_out_under_a_known_force_that_would_push_it_in(seed: int) -> None:
+    """In free space, 3 mN on 17.8 kg: the abort that is best without it comes back."""
+    rng, keep_out_m, duration_s = np.random.default_rng(seed), 0.75, 250.0
+    limits = {"passive_safety_s": duration_s, "min_distance_target_m": keep_out_m}
+    base = scenario().model_dump(exclude_unset=True) | {"name": "free"}
+    base.pop("orbit")
+    base["limits"] = base["limits"] | limits
+    found = EscapePlanner(flight_scenario(parse_scenario(base, "test")), 0.05)
+    away, aside = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
+    state = np.concatenate([3.0 * away, 1e-3 * aside])
+    best = found.escape(relative(state), 0.0)[0]
+    # Against the burn of the best abort, with a turn-round of its coast at the target.
+    end, speed_m_s = best.burnt_out(), best.impulse_m_s
+    back_s = float(np.linalg.norm(end[:3])) / speed_m_s * 2.0
+    push = -2.0 * (end[:3] + back_s * end[3:]) / back_s**2
+    assert back_s < duration_s
+    motion = DisturbedMotion(push, disturbed(GOOD, 1e-6).covariance)
+    escape, margin = found.escape(replace(relative(state), disturbed=motion), 0.0)
+    assert margin >= found.sigmas
+    times = np.linspace(0.0, duration_s, 5001)
+    nearest = []
+    for chosen in (best, escape):
+        x = chosen.burnt_out()
+        coast = x[:3] + times[:, None] * x[3:] + 0.5 * times[:, None] ** 2 * push
+        nearest.append(float(np.linalg.norm(coast, axis=1).min()))
+    assert nearest[0] < 0.1
+    assert nearest[1] > keep_out_m
+
+
+def test_force_of_unknown_direction_needs_a_larger_burn_and_rules_out_near_goals() -> None:
+    """0.3 uN/kg for two orbits is tens of metres along V-bar."""
+    state = np.array([1.0, -12.0, -2.0, 0.0, 0.0, 0.0])
+    small = EscapePlanner(flight_scenario(scenario()), 0.005)
+    still = relative(state)
+    unsure = replace(still, disturbed=disturbed(GOOD, 3e-7))
+    least, larger = (small.escape(x, 0.0)[0].impulse_m_s for x in (still, unsure))
+    assert larger > 1.5 * least
+
+    def near(v: float) -> Any:
+        return move_to(stay(state[:3], 0.0), (0.0, -11.0, 0.0), 0.0, v)
+
+    assert planner().limited(still, near, 0.2, 0.0) is not None
+    assert planner().limited(unsure, near, 0.2, 0.0) is None
 
 
 def test_escape_is_a_continuous_motion_that_needs_its_acceleration_only_while_it_burns() -> None:

@@ -10,8 +10,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from chaserdock_controller.interfaces import ChaserEstimate, TargetEstimation
-from chaserdock_controller.nmpc import rti
+from chaserdock_controller.nmpc import kernels, rti
 from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
+from chaserdock_controller.nmpc.problem import check_input, model_of
+from chaserdock_controller.nmpc.rti import RtiSolver
 from chaserdock_controller.nmpc.terms import coast as coast_term
 from chaserdock_controller.nmpc.types import CoastSafety, NmpcPlan
 from chaserdock_models.passive_safety import CoastModel, CoastNoise, DisturbedMotion, disturbed
@@ -21,7 +23,9 @@ from chaserdock_protocol.scenario import (
     flight_scenario,
     parse_scenario,
 )
+from general_position import attitude
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh, with_settings
+from nmpc_kernels import build_rows
 
 
 def mission(limits: dict[str, Any], **changes: Any) -> FlightScenario:
@@ -250,3 +254,84 @@ def test_chasers_are_restricted_where_safety_is_enforced_once_they_count() -> No
 def test_enforcing_needs_the_solver_that_keeps_it() -> None:
     with pytest.raises(ScenarioError, match=r"limits\.passive_safety: .*needs controller\.solver"):
         mission({"passive_safety": "enforce"}, controller={"solver": "ipopt"})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_coast_row_that_a_full_reversal_of_thrust_can_reach_is_dropped(seed: int) -> None:
+    """The rollout flies at full thrust, in a turned attitude; the reversed one breaks the rows of
+    its velocity by a little.
+    """
+    rng, force_N = np.random.default_rng(seed), PARAMS.force_max_N
+    q = attitude(rng)
+    start = at_rest(rng.uniform(4.0, 6.0, 3), q)
+    problem = fixed_problem(start[None], start[None, :3], q, d_target=0.0)
+    problem = check_input(problem, PARAMS, 1)
+    inputs = np.zeros((PARAMS.stages, 6))
+    inputs[:, :3] = force_N * rng.choice([-1.0, 1.0], 3)
+    x, reversed_x = (np.tile(start, (1, PARAMS.stages + 1, 1)) for _ in range(2))
+    for rollout, u in ((x, inputs), (reversed_x, -inputs)):
+        kernels.roll(model_of(PARAMS, PARAMS.dt_s), rollout, u[None])
+    reach_m = force_N * RtiSolver(PARAMS, 1)._reach
+    coasts = np.zeros((1, PARAMS.stages + 1, 1, 7))
+    change = x[0, 1:, 3:6] - reversed_x[0, 1:, 3:6]
+    coasts[0, 1:, 0, 3:6] = change / np.linalg.norm(change, axis=1)[:, None]
+    kept = np.einsum("kj,kj->k", coasts[0, 1:, 0, 3:6], reversed_x[0, 1:, 3:6])
+    coasts[0, 1:, 0, 6] = kept + 0.01 * np.linalg.norm(change, axis=1)
+    problem = replace(problem, coasts=coasts)
+    rows = build_rows(problem, PARAMS, x, reach_m[None])
+    of_velocity = np.abs(rows.a[0, : rows.n_rows[0], 3:]).sum(axis=1) > 0.0
+    stages = rows.stage[0, : rows.n_rows[0]][of_velocity]
+    np.testing.assert_array_equal(stages, np.arange(1, PARAMS.stages + 1))
+
+
+def pushed(force_N: float, sigma_N: float, mass_kg: float = 30.0) -> TargetEstimation:
+    """As ``estimation``, with a force along X: towards the target, 5 m ahead, where positive."""
+    found = estimation()
+    (chaser,) = found.chasers
+    assert chaser.disturbed is not None
+    motion = DisturbedMotion(
+        np.array([force_N / mass_kg, 0.0, 0.0]),
+        disturbed(chaser.disturbed.covariance[:6, :6], sigma_N / mass_kg).covariance,
+    )
+    values = SimpleNamespace(
+        at_effect=found.at_effect, chasers=(replace(chaser, disturbed=motion),)
+    )
+    return cast(TargetEstimation, values)
+
+
+def test_chaser_at_rest_is_unsafe_once_the_filter_sees_a_force_towards_the_target() -> None:
+    monitor = PassiveSafetyMonitor(mission({"passive_safety": "enforce"}))
+    for known, safe in (
+        (pushed(0.0, 0.0), True),
+        (pushed(3e-3, 1e-4), False),
+        (pushed(-3e-3, 1e-4), True),  # away from it
+        (pushed(0.0, 2e-3), False),  # of unknown direction
+    ):
+        monitor.update((0,), plan(0.0), known)
+        certificate = monitor.chasers[0].certificate
+        assert certificate is not None
+        assert certificate.safe is safe
+
+
+def test_force_that_may_begin_in_a_coast_counts_as_the_filter_assumes() -> None:
+    """Without a stated force, 10 mN per axis: no certificate over 600 s near the target."""
+    stated, default = (
+        PassiveSafetyMonitor(mission({"passive_safety": "monitor"} | limits))
+        for limits in ({}, {"passive_safety_force_N": None})
+    )
+    for monitor, safe in ((stated, True), (default, False)):
+        monitor.update((0,), plan(0.0), pushed(0.0, 0.0))
+        certificate = monitor.chasers[0].certificate
+        assert certificate is not None
+        assert certificate.safe is safe
+
+
+def test_plan_of_a_chaser_that_is_pushed_to_the_target_is_bent_aside() -> None:
+    """Its coasts under the known force keep the margin; without the rows they enter."""
+    coast, goal = CoastModel(0.0, 300.0), np.array([-5.0, 0.1, 0.0])
+    covariance = disturbed(np.diag([1e-6] * 3 + [1e-8] * 3), 1e-7).covariance
+    motion = DisturbedMotion(np.array([1.5e-4, 1e-6, 0.0]), covariance)
+    _, free = fly(coast, goal, goal, motion, 60, enforced=False)
+    _, bent = fly(coast, goal, goal, motion, 60, enforced=True)
+    assert max(free[1:]) < 0.0
+    assert min(bent[10:]) > SIGMAS

@@ -533,3 +533,17 @@ def test_published_estimate_is_that_of_the_filter() -> None:
     np.testing.assert_array_equal(message.relative[0].torque_N_m, pushed[3:])
     np.testing.assert_array_equal(message.velocity_m_s, target.velocity_m_s)
     np.testing.assert_array_equal(message.covariance, target.covariance.ravel())
+
+
+def test_force_varies_in_a_coast_as_its_random_walk_does_at_first_and_stays_as_large_as_stated() -> (
+    None
+):
+    """The density of the white noise behind it is that of the walk, scaled with the force."""
+    p = changed(parameters(scenario(chaser=CHASER_BODY), navigation("lab")), lasting_force_N=0.002)
+    noise = p.coast_noise
+    assert noise.varying_m_s2 == pytest.approx(0.002 / MASS_KG)
+    density = 2.0 * noise.varying_m_s2**2 / noise.varying_s
+    walk = (p.disturbance_force_N_sqrt_s / MASS_KG) ** 2
+    assert density == pytest.approx(walk * (0.002 / p.disturbance_force_N) ** 2)
+    target = process_noise(2.0, *(x * x for x in p.target_noise[p.target.motion_model]))
+    assert noise.white_m_s2_sqrt_s**2 * 2.0 == pytest.approx(target[3, 3])

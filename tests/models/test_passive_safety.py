@@ -44,7 +44,7 @@ def test_distance_bounds_the_densely_sampled_coast(
     if n == 0.0:
         found = model.certify(state[None], disturbed(covariance), 0.35)
         assert found.distance_m <= away.min() + 1e-9
-        assert found.distance_m >= away.min() - 0.5 * 0.25 * float(np.linalg.norm(velocity)) - 1e-9
+        assert found.distance_m >= away.min() - 0.25 * float(np.linalg.norm(velocity)) - 1e-9
     else:
         found = model.certify(state[None], disturbed(covariance), 0.0)
         index = int(found.time_s / 0.5)

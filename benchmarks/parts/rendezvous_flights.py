@@ -88,7 +88,8 @@ def aborts(options: Options) -> Figures:
     the nonlinear relative motion with J2, under random disturbances of the stated size.
     """
     count = options.flights or (50 if options.quick else 1000)
-    found = study(load_shipped(options.abort_scenario), count, seed=options.first)
+    scenario = load_shipped(options.abort_scenario, *options.set)
+    found = study(scenario, count, seed=options.first)
     return {
         "aborts": found.aborts,
         "certified": found.certified,

@@ -150,37 +150,42 @@ def test_what_disturbs_a_coast_is_the_estimated_force_with_the_errors_of_the_mot
 
 
 @SEEDS
-def test_force_that_lasts_is_what_the_estimate_says_of_a_part_of_it(seed: int) -> None:
-    """The estimated force is the sum of one that lasts and one by thrust: normal distributions,
-    conditioned.
+def test_force_that_lasts_has_its_own_prior_in_place_of_the_filters(seed: int) -> None:
+    """Bayes' rule in information form: the filter's prior is taken out of its result, and another
+    one is put in.
     """
     rng, lasting_N = np.random.default_rng(seed), 0.004
-    s = joint_state(rng)
-    estimator = estimator_of(s)
-    p = changed(estimator.parameters, lasting_force_N=lasting_N)
-    estimator.parameters, whole_N = p, p.disturbance_force_N
-    found = estimator.disturbed_motion(1)
+    s, estimator = joint_state(rng), estimator_of(joint_state(np.random.default_rng(seed)))
+    p = estimator.parameters = changed(estimator.parameters, lasting_force_N=lasting_N)
+    found, free = estimator.disturbed_motion(1), estimator_of(s).disturbed_motion(1)
     assert found is not None
-    own = TARGET + CHASER
-    known = s.covariance[own + 12 : own + 15, own + 12 : own + 15]
-    # Given the whole d, the lasting part is normal: joint covariance of (part, whole), conditioned.
-    joint = np.array([[lasting_N**2, lasting_N**2], [lasting_N**2, whole_N**2]])
-    gain = joint[0, 1] / joint[1, 1]
-    left = joint[0, 0] - gain * joint[1, 0]
-    r = matrix(s.attitudes_wxyz[1])
-    mean, spread = gain * s.of(1, FORCE), gain * gain * known + left * np.eye(3)
-    np.testing.assert_allclose(found.acceleration_m_s2, r @ mean / MASS_KG, atol=1e-14)
-    turn = s.covariance[own + 6 : own + 9, own + 6 : own + 9]
-    cross = s.covariance[own + 12 : own + 15, own + 6 : own + 9]
-    lever = -gain * skew(s.of(1, FORCE))
-    both = spread + lever @ turn @ lever.T + gain * (cross @ lever.T + lever @ cross.T)
-    np.testing.assert_allclose(
-        found.covariance[6:, 6:], r @ both @ r.T / MASS_KG**2, rtol=1e-9, atol=1e-16
-    )
-    # Positions and velocities are those without the limit.
-    free = estimator_of(s).disturbed_motion(1)
     assert free is not None
-    np.testing.assert_array_equal(found.covariance[:6, :6], free.covariance[:6, :6])
+    own, r = TARGET + CHASER, matrix(s.attitudes_wxyz[1])
+    force, turn = (slice(own + k, own + k + 3) for k in (12, 6))
+    information = np.linalg.inv(s.covariance[force, force])
+    total = information + np.eye(3) * (1.0 / lasting_N**2 - 1.0 / p.disturbance_force_N**2)
+    mean = np.linalg.solve(total, information @ s.of(1, FORCE))
+    np.testing.assert_allclose(found.acceleration_m_s2, r @ mean / MASS_KG, atol=1e-12)
+    # Errors of the force are those of a regression on the filter's, those of the attitude its own.
+    gain, lever = np.linalg.solve(total, information), -skew(mean)
+    cross = gain @ s.covariance[force, turn] @ lever.T
+    spread = np.linalg.inv(total) + lever @ s.covariance[turn, turn] @ lever.T + cross + cross.T
+    np.testing.assert_allclose(
+        found.covariance[6:, 6:], r @ spread @ r.T / MASS_KG**2, rtol=1e-6, atol=1e-14
+    )
+    np.testing.assert_allclose(found.covariance[:6, :6], free.covariance[:6, :6], atol=1e-15)
+    assert np.linalg.eigvalsh(found.covariance).min() > -1e-12
+
+
+def test_stated_force_bounds_what_is_assumed_of_a_coast_whatever_is_estimated() -> None:
+    s = joint_state(np.random.default_rng(4))
+    estimator = estimator_of(s)
+    estimator.parameters = changed(estimator.parameters, lasting_force_N=1e-6)
+    found = estimator.disturbed_motion(0)
+    assert found is not None
+    sigmas = np.sqrt(np.diag(found.covariance)[6:])
+    np.testing.assert_allclose(sigmas, 1e-6 / MASS_KG, rtol=1e-3)
+    assert np.abs(found.acceleration_m_s2).max() < 1e-8 / MASS_KG
 
 
 @SEEDS
@@ -193,7 +198,7 @@ def test_camera_errors_are_given_in_the_chasers_axes(seed: int) -> None:
         rng.normal(size=3), rng.normal(size=3), float(rng.normal()), covariance(rng, sigmas)
     )
     still = np.zeros(3)
-    motion = ChaserMotion(1, still, still, q, still, np.zeros(6), None, None, error)
+    motion = ChaserMotion(1, still, still, q, still, np.zeros(6), None, error)
     found, r = camera_calibrations([motion], camera)[1], matrix(q)
     np.testing.assert_allclose(found.turn_rad, r @ error.turn_rad, atol=1e-12)
     np.testing.assert_allclose(found.shift_m, r @ error.shift_m, atol=1e-12)
@@ -262,9 +267,7 @@ def test_state_at_effect_is_flown_under_commands_disturbance_and_orbit(seed: int
     state, pushed = np.zeros(13), rng.uniform(-0.02, 0.02, 6)
     state[:3], state[3:6] = rng.uniform(-90.0, 90.0, 3), rng.uniform(-0.3, 0.3, 3)
     state[6:10], state[10:] = attitude(rng), rng.uniform(-0.2, 0.2, 3)
-    motion = ChaserMotion(
-        0, state[:3], state[3:6], state[6:10], state[10:], pushed, None, None, None
-    )
+    motion = ChaserMotion(0, state[:3], state[3:6], state[6:10], state[10:], pushed, None, None)
     commands = rng.uniform(-0.5, 0.5, (2, 6))
     ahead = ((0.07, commands[0]), (0.12, commands[1]))
     found = EstimationStage(mission, Fixed(target, (motion,))).run(
@@ -535,9 +538,7 @@ def test_published_estimate_is_that_of_the_filter() -> None:
     np.testing.assert_array_equal(message.covariance, target.covariance.ravel())
 
 
-def test_force_varies_in_a_coast_as_its_random_walk_does_at_first_and_stays_as_large_as_stated() -> (
-    None
-):
+def test_force_varies_in_a_coast_as_its_random_walk_begins_and_stays_as_large_as_stated() -> None:
     """The density of the white noise behind it is that of the walk, scaled with the force."""
     p = changed(parameters(scenario(chaser=CHASER_BODY), navigation("lab")), lasting_force_N=0.002)
     noise = p.coast_noise

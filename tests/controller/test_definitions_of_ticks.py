@@ -90,7 +90,7 @@ class Uniform(Estimator):
         for i in range(2):
             x = self.chaser(i, inputs.time_ns / 1e9)
             parts = x[:3], x[3:6], x[6:10], x[10:]
-            motions.append(ChaserMotion(i, *parts, self.pushed[i], self.relative[i], None, None))
+            motions.append(ChaserMotion(i, *parts, self.pushed[i], self.relative[i], None))
         return Estimate(self.estimate_at(inputs.time_ns), tuple(motions))
 
 

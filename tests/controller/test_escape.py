@@ -23,7 +23,7 @@ from chaserdock_models import rotations
 from chaserdock_models.orbit import OrbitalElements, propagate, state_of
 from chaserdock_models.passive_safety import DisturbedMotion, disturbed
 from chaserdock_models.relative_motion import propagate_relative
-from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.messages import OperatorCommand, PassiveSafety
 from chaserdock_protocol.scenario import Scenario, flight_scenario, parse_scenario
 from flight_cases import drain, fleet_of, known, order
 from flights.measured_poses import measurement_model
@@ -111,12 +111,15 @@ def test_small_burn_is_preferred_and_an_uncertain_state_needs_a_larger_one() -> 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_abort_stays_out_under_a_known_force_that_would_push_it_in(seed: int) -> None:
-    """In free space, 3 mN on 17.8 kg: the abort that is best without it comes back."""
+    """In free space: the coast of the abort that is best without it would come back."""
     rng, keep_out_m, duration_s = np.random.default_rng(seed), 0.75, 250.0
-    limits = {"passive_safety_s": duration_s, "min_distance_target_m": keep_out_m}
-    base = scenario().model_dump(exclude_unset=True) | {"name": "free"}
+    limits: dict[str, Any] = {
+        "passive_safety_s": duration_s,
+        "min_distance_target_m": keep_out_m,
+    }
+    base: dict[str, Any] = scenario().model_dump(exclude_unset=True)
     base.pop("orbit")
-    base["limits"] = base["limits"] | limits
+    base["limits"] |= limits
     found = EscapePlanner(flight_scenario(parse_scenario(base, "test")), 0.05)
     away, aside = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
     state = np.concatenate([3.0 * away, 1e-3 * aside])
@@ -294,3 +297,35 @@ def test_flight_publishes_certificates_and_its_abort_coasts() -> None:
     assert last.abort_margin_sigmas is not None
     assert max(forces[60:80]) > 0.5
     assert np.mean(forces[-30:]) < 0.1
+
+
+@pytest.mark.slow
+def test_flight_3_m_away_under_3_mN_is_not_certified_although_it_holds_its_place() -> None:
+    """It hardly moves, and without thrust it would be in the keep-out of 0.75 m within 200 s: the
+    filter's estimate of the force tells.
+    """
+    limits = {
+        "passive_safety": "monitor",
+        "passive_safety_s": 200.0,
+        "passive_safety_force_N": 3e-3,
+        "min_distance_target_m": 0.75,
+    }
+    chaser = {"position_m": [-2.7, 1.1, -0.7], "look_at": "target"}
+    found: list[PassiveSafety] = []
+    for newtons in (3e-3, 0.0):
+        towards = [newtons, 0.0, 0.0]  # body axes: the camera looks along X
+        base: dict[str, Any] = scenario(
+            duration_s=40.0, limits=limits, chasers=[chaser],
+            truth={"values": [{"chaser": 0, "force_N": towards}]},
+        ).model_dump(exclude_unset=True)  # fmt: skip
+        base.pop("orbit")
+        s = parse_scenario(base, "test")
+        with InProcessMission(s, measurement_model(s, 1, 1e-3, 1e-3)) as mission:
+            records = [mission.step() for _ in range(s.ticks)]
+        outputs = records[-1].outputs
+        assert outputs is not None
+        found.append(outputs.safety[0])
+    pushed, free = found
+    assert not pushed.safe
+    assert pushed.margin_sigmas < free.margin_sigmas - 0.5
+    assert pushed.distance_m < free.distance_m - 1.0

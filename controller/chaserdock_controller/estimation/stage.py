@@ -134,7 +134,7 @@ class EstimationStage:
             own = OwnMotion(state, at_effect, disturbance)
             relative = None if motion is None else motion.relative
             if motion is not None and known and self._passive_safety:
-                disturbed = motion.disturbed
+                disturbed = self.estimator.disturbed_motion(i)
         return ChaserEstimate(
             chaser=i,
             own=own,

@@ -94,7 +94,7 @@ class ChaserMotion:
     position_m, velocity_m_s (3,): WRF. q_wxyz (4,): CRF to WRF. omega_rad_s (3,): CRF. disturbance
     (6,): force and torque besides the commanded ones, body axes; zero on a latched chaser, whose
     motion is the target's. relative: pose relative to the target, while that is known.
-    disturbed: what else decides where it coasts, likewise. camera: once its errors are estimated.
+    camera: once its errors are estimated.
     """
 
     chaser: int
@@ -104,7 +104,6 @@ class ChaserMotion:
     omega_rad_s: Array
     disturbance: Array
     relative: RelativePose | None
-    disturbed: DisturbedMotion | None
     camera: CameraError | None
 
 
@@ -146,6 +145,12 @@ class Estimator(Protocol):
     def reinitialisations(self) -> int:
         """Return how often the target's estimate was restarted, for statistics."""
         return 0
+
+    def disturbed_motion(self, chaser: int) -> DisturbedMotion | None:
+        """Return what decides where a chaser coasts besides its position and velocity, after the
+        newest tick; None if it or the target is unknown. Needed for passive safety only.
+        """
+        return None
 
     def without_drift(self, odometry: Odometry) -> Odometry:
         """Return odometry less the drift of its position, as estimated up to now."""

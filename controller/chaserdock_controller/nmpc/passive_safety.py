@@ -93,6 +93,7 @@ class PassiveSafetyMonitor:
         limits = scenario.limits
         self.duration_s = coast_duration_s(scenario)
         self._coast = coast_model(scenario)
+        self._force_N = parameters_of(scenario).lasting_force_N
         self._keep_out_m, self._step_s = limits.min_distance_target_m, scenario.controller.dt_s
         self._sigmas = limits.estimate_margin_sigmas
         self.chasers = tuple(ChaserSafety() for _ in scenario.chasers)
@@ -172,5 +173,6 @@ class PassiveSafetyMonitor:
             "target after "
             f"{found.time_s:.0f} s, {found.margin_sigmas:.1f} sigmas from the keep-out of "
             f"{self._keep_out_m:g} m, in a coast of "
-            f"{self.duration_s:.0f} s"
+            f"{self.duration_s:.0f} s under forces of {self._force_N:g} N "
+            "(limits.passive_safety_force_N)"
         )

@@ -261,8 +261,7 @@ class Limits(Section):
         default=None,
         description="Disturbance force on a chaser without thrust, N: standard deviation along "
         "each axis. Coasts are predicted with it. Without it: the estimator's 10 mN, far too much "
-        "for a coast of orbits. State what the environment exerts (drag, sunlight, plumes); what "
-        "is estimated beyond it counts as an error of thrust and ends with it.",
+        "for a coast of orbits. State what the environment exerts (drag, sunlight, plumes).",
     )
 
 

@@ -197,7 +197,6 @@ class JointEstimator(Estimator):
                     s, i, inputs.chasers[i].impulse.impulse / inputs.covered_s, self.parameters
                 ),
                 relative.get(i),
-                self.disturbed_motion(i),
                 cameras.get(i),
             )
             for i in np.flatnonzero(s.alive).tolist()
@@ -217,25 +216,32 @@ class JointEstimator(Estimator):
         """Return what decides where a chaser coasts besides its position and velocity; None if it
         or the target is unknown.
 
-        Part of the estimated force is one that thrust causes, and ends with it. Before any
-        measurement, the force that lasts has the standard deviation ``lasting_force_N`` and the
-        estimated one ``disturbance_force_N``. Both parts have the mean that these imply.
+        The force that lasts without thrust is known by the estimate and by its own size: in Bayes'
+        rule the prior ``lasting_force_N`` takes the place of ``disturbance_force_N``.
         """
         s, p = self.state, self.parameters
         if s is None or not s.target_known or not s.alive[chaser]:
             return None
-        estimated_N2, lasting_N2 = p.disturbance_force_N**2, p.lasting_force_N**2
-        share, axes = min(1.0, lasting_N2 / estimated_N2), so3.to_matrix(s.attitudes_wxyz[chaser])
-        per_N = share / p.body.mass_kg * axes
-        force, first, motion = s.of(chaser, FORCE), block(chaser).start, VELOCITY.stop
-        j = np.zeros((9, len(s.covariance)))
-        j[:motion, :motion], j[:motion, first : first + motion] = -np.eye(motion), np.eye(motion)
-        j[motion:, first + FORCE.start : first + FORCE.stop] = per_N
-        j[motion:, first + ATTITUDE.start : first + ATTITUDE.stop] = -per_N @ so3.skew(force)
-        covariance = j @ s.covariance @ j.T
-        unseen_N2 = lasting_N2 - share * share * estimated_N2
-        covariance[range(6, 9), range(6, 9)] += unseen_N2 / p.body.mass_kg**2
-        return DisturbedMotion(per_N @ force, covariance)
+        own = np.r_[: VELOCITY.stop, ATTITUDE, FORCE] + block(chaser).start
+        known = np.concatenate([np.arange(VELOCITY.stop), own])
+        # Of the target's position and velocity, then the chaser's, its attitude, its force.
+        covariance = s.covariance[np.ix_(known, known)]
+        prior, lasting = (
+            p.disturbance_force_N**2,
+            min(p.lasting_force_N, p.disturbance_force_N) ** 2,
+        )
+        share = np.linalg.solve(
+            lasting * prior * np.eye(3) + (prior - lasting) * covariance[15:, 15:],
+            lasting * prior * np.eye(3),
+        ).T
+        covariance[15:] = share @ covariance[15:]
+        covariance[:15, 15:] = covariance[15:, :15].T
+        force, per_N = share @ s.of(chaser, FORCE), so3.to_matrix(s.attitudes_wxyz[chaser])
+        per_N = per_N / p.body.mass_kg
+        j = np.zeros((9, 18))
+        j[:6, :6], j[:6, 6:12] = -np.eye(6), np.eye(6)
+        j[6:, 12:15], j[6:, 15:] = -per_N @ so3.skew(force), per_N
+        return DisturbedMotion(per_N @ force, j @ covariance @ j.T)
 
     def cameras(self) -> dict[int, CameraError]:
         """Return the estimated calibration errors of the cameras after the newest tick, by

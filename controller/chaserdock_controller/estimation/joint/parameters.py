@@ -176,7 +176,7 @@ class JointParameters:
     """Density of the random walk of this force."""
     disturbance_torque_N_m_sqrt_s: float = 1e-4
     lasting_force_N: float = disturbance_force_N
-    """Part of this force that remains without thrust: sigma at the start."""
+    """Size of this force without thrust, as far as it is known beforehand: sigma."""
     centre_of_mass_m: float = 0.005
     """Sigma of a chaser's centre of mass from the origin of CRF, per axis."""
     latched_acceleration_m_s2: float = 0.05

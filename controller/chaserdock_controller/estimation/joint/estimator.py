@@ -226,18 +226,14 @@ class JointEstimator(Estimator):
         known = np.concatenate([np.arange(VELOCITY.stop), own])
         # Of the target's position and velocity, then the chaser's, its attitude, its force.
         covariance = s.covariance[np.ix_(known, known)]
-        prior, lasting = (
-            p.disturbance_force_N**2,
-            min(p.lasting_force_N, p.disturbance_force_N) ** 2,
-        )
-        share = np.linalg.solve(
-            lasting * prior * np.eye(3) + (prior - lasting) * covariance[15:, 15:],
-            lasting * prior * np.eye(3),
-        ).T
+        prior_N2 = p.disturbance_force_N**2
+        lasting_N2 = min(p.lasting_force_N**2, prior_N2)
+        stated = lasting_N2 * prior_N2 * np.eye(3)
+        share = np.linalg.solve(stated + (prior_N2 - lasting_N2) * covariance[15:, 15:], stated)
         covariance[15:] = share @ covariance[15:]
         covariance[:15, 15:] = covariance[15:, :15].T
-        force, per_N = share @ s.of(chaser, FORCE), so3.to_matrix(s.attitudes_wxyz[chaser])
-        per_N = per_N / p.body.mass_kg
+        force = share @ s.of(chaser, FORCE)
+        per_N = so3.to_matrix(s.attitudes_wxyz[chaser]) / p.body.mass_kg
         j = np.zeros((9, 18))
         j[:6, :6], j[:6, 6:12] = -np.eye(6), np.eye(6)
         j[6:, 12:15], j[6:, 15:] = -per_N @ so3.skew(force), per_N

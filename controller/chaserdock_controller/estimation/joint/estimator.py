@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array, IntArray
+from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, Sighting
 
@@ -41,8 +42,10 @@ from .parameters import JointParameters, TargetParameters, rows_of
 from .prediction import disturbance, predict_target
 from .replay import FilterTick, ReplayBuffer
 from .state import (
+    ATTITUDE,
     CHASER,
     FOCAL,
+    FORCE,
     POSE,
     POSITION_DRIFT,
     TARGET,
@@ -195,7 +198,6 @@ class JointEstimator(Estimator):
                     s, i, inputs.chasers[i].impulse.impulse / inputs.covered_s, self.parameters
                 ),
                 relative.get(i),
-                self.motion_covariance(i),
                 cameras.get(i),
             )
             for i in np.flatnonzero(s.alive).tolist()
@@ -211,17 +213,32 @@ class JointEstimator(Estimator):
         chasers = np.flatnonzero(s.alive).tolist()
         return dict(zip(chasers, relative_poses(s, chasers), strict=True))
 
-    def motion_covariance(self, chaser: int) -> Array | None:
-        """Return the covariance (6, 6) of a chaser's position and velocity relative to the target,
-        WRF; None if either is unknown.
+    def disturbed_motion(self, chaser: int) -> DisturbedMotion | None:
+        """Return what decides where a chaser coasts besides its position and velocity; None if it
+        or the target is unknown.
+
+        The force that lasts without thrust is known by the estimate and by its own size: in Bayes'
+        rule the prior ``lasting_force_N`` takes the place of ``disturbance_force_N``.
         """
-        s = self.state
+        s, p = self.state, self.parameters
         if s is None or not s.target_known or not s.alive[chaser]:
             return None
-        size = VELOCITY.stop
-        own, target = slice(block(chaser).start, block(chaser).start + size), slice(0, size)
-        p, cross = s.covariance, s.covariance[own, target]
-        return p[own, own] + p[target, target] - cross - cross.T
+        own = np.r_[: VELOCITY.stop, ATTITUDE, FORCE] + block(chaser).start
+        known = np.concatenate([np.arange(VELOCITY.stop), own])
+        # Of the target's position and velocity, then the chaser's, its attitude, its force.
+        covariance = s.covariance[np.ix_(known, known)]
+        prior_N2 = p.disturbance_force_N**2
+        lasting_N2 = min(p.lasting_force_N**2, prior_N2)
+        stated = lasting_N2 * prior_N2 * np.eye(3)
+        share = np.linalg.solve(stated + (prior_N2 - lasting_N2) * covariance[15:, 15:], stated)
+        covariance[15:] = share @ covariance[15:]
+        covariance[:15, 15:] = covariance[15:, :15].T
+        force = share @ s.of(chaser, FORCE)
+        per_N = so3.to_matrix(s.attitudes_wxyz[chaser]) / p.body.mass_kg
+        j = np.zeros((9, 18))
+        j[:6, :6], j[:6, 6:12] = -np.eye(6), np.eye(6)
+        j[6:, 12:15], j[6:, 15:] = -per_N @ so3.skew(force), per_N
+        return DisturbedMotion(per_N @ force, j @ covariance @ j.T)
 
     def cameras(self) -> dict[int, CameraError]:
         """Return the estimated calibration errors of the cameras after the newest tick, by

@@ -12,10 +12,10 @@ import pytest
 from chaser_cases import deliver
 from chaserdock_agents.chaser.core import ChaserCore
 from chaserdock_agents.chaser.perception import PerceptionResult, TargetPose, make_perception
-from chaserdock_agents.chaser.perception_watch import FAILURES_TO_ERROR
 from chaserdock_agents.chaser.sighting import apply_geometry
 from chaserdock_agents.chaser.vision import Vision
 from chaserdock_protocol import codec, plugins, topics
+from chaserdock_protocol.failure_watch import FAILURES_TO_ERROR
 from chaserdock_protocol.messages import Event, GeometryEstimate, Image, Sighting
 from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import Scenario, load_scenario
@@ -153,7 +153,7 @@ def fails(camera: Any, target: Any) -> None:
     ("factory", "text"),
     [
         ("fails", "perception 'own' does not start: RuntimeError: no weights"),
-        ("returns_nothing", "perception 'own' has no method estimate"),
+        ("returns_nothing", "perception 'own' has no member estimate"),
     ],
 )
 def test_perception_that_does_not_start_is_refused_in_one_line(

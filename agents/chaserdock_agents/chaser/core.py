@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
+from chaserdock_protocol.failure_watch import FailureWatch
 from chaserdock_protocol.fault_injection import LostMessage
 from chaserdock_protocol.messages import (
     ActuatorCommand,
@@ -35,7 +36,6 @@ from .fallback_control import FallbackControl
 from .inbox import ChaserInbox
 from .outbox import ChaserOutputs, Outbox
 from .perception import make_perception
-from .perception_watch import PerceptionWatch, Trouble
 from .thrusters.controller import ThrusterController
 from .thrusters.failure_reports import FailureReports
 from .vision import Vision
@@ -64,7 +64,7 @@ class ChaserCore:
         self.outbox = Outbox(number)
         self.inbox = ChaserInbox()
         self.vision = vision or Vision(make_perception(scenario))
-        self._perception_watch = PerceptionWatch(scenario.perception.name)
+        self._perception_watch = FailureWatch(scenario.perception.name)
         self.gate = CommandGate(scenario, number, realtime, self.outbox)
         self.fallback = FallbackControl(scenario, number, self.outbox)
         has_thrusters = scenario.chaser.actuation == "thrusters"
@@ -185,7 +185,7 @@ class ChaserCore:
         self._watch_perception("perception late", late if took_s > valid_s else "", image)
         return self.outbox.take()
 
-    def _watch_perception(self, what: Trouble, detail: str, image: Image) -> None:
+    def _watch_perception(self, what: str, detail: str, image: Image) -> None:
         """Count, and report, what went wrong in an image; nothing if ``detail`` is empty."""
         if detail:
             self.outbox.count_rejected(f"image:{what}")

@@ -8,12 +8,14 @@ arrival or on the wall clock. Real time: the wall clock ends a tick.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.fault_injection import create_fault_layer
 from chaserdock_protocol.messages import (
+    JoinReply,
     JoinRequest,
     MissionEnd,
     ScenarioReply,
@@ -143,9 +145,12 @@ class World:
         node.watch_liveliness(membership.set_alive)
         full = ScenarioReply(run_id=membership.run_id, scenario_json=scenario.model_dump_json())
         node.declare_queryable(topics.SCENARIO_KEY, ScenarioRequest, lambda _, reply: reply(full))
-        node.declare_queryable(
-            topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request))
-        )
+
+        def join(request: JoinRequest, reply: Callable[[JoinReply], None]) -> None:
+            if (answer := membership.admit(request)) is not None:
+                reply(answer)
+
+        node.declare_queryable(topics.JOIN_KEY, JoinRequest, join)
 
         for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD, topics.TRUTH_DRAWN):
             node.advertise(topic)

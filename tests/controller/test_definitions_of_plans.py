@@ -27,11 +27,12 @@ from chaserdock_controller.interfaces import (
     TargetEstimation,
     TickOutputs,
 )
-from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, NmpcSolver, make_solver
+from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, NmpcSolver, make_solver, rti
 from chaserdock_controller.nmpc import stage as planning
+from chaserdock_controller.nmpc.kernels import roll, solve_tick
 from chaserdock_controller.nmpc.terms.coast import COASTS, SPARE_SHARE, coast_rows
 from chaserdock_controller.nmpc.types import CoastSafety
-from chaserdock_controller.nmpc.warm_start import shift_inputs
+from chaserdock_controller.nmpc.warm_start import Frame, shift_inputs
 from chaserdock_controller.output.stage import OutputStage
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_models import rotations
@@ -424,3 +425,51 @@ def test_coast_rows_bound_the_closest_approach_of_each_stage(seed: int) -> None:
         scale = max(1.0, t / (STAGES * STEP_S))
         slack = float(row[:3] @ x[:3] + row[3:6] @ x[3:6] - row[6]) * scale
         assert slack == pytest.approx(float(np.linalg.norm(r + t * v)) - kept_m, abs=1e-6)
+
+
+@pytest.mark.parametrize("far", [0.3, 40.0, 900.0])
+def test_price_of_distances_exceeds_the_pull_of_the_last_reference(
+    far: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By differences of the last stage's cost at the distance of a chaser from where it is to be.
+
+    The references move by as much as they are away, so that each stage has its own distance.
+    """
+    tick = Tick(0)
+    params = nmpc_parameters(tick.mission)
+    prices: list[Array] = []
+
+    def keep(*arguments: Any) -> Any:
+        prices.append(arguments[5])
+        return solve_tick(*arguments)
+
+    monkeypatch.setattr(rti, "solve_tick", keep)
+    problem = solved(0)[0]
+    steps = far * np.arange(STAGES + 1)[:, None] / STAGES
+    references = problem.references.copy()
+    references[0, :, :3] += steps * [0.6, -0.64, 0.48]
+    references[1, :, :3] -= 0.5 * steps * [0.0, 0.6, 0.8]
+    make_solver("rti", params, 2).solve(replace(problem, references=references), 0.0)
+    c = mission().controller
+    weight, h = c.weight_position + c.weight_final_position, 1e-3
+    for row, price in enumerate(prices[-1]):
+        distance_m = math.dist(problem.states[row, :3], references[row, -1, :3])
+        slope = weight * ((distance_m + h) ** 2 - (distance_m - h) ** 2) / (2 * h)
+        assert price == pytest.approx(max(1e5, 10.0 * slope))
+
+
+def test_reach_is_the_displacement_by_a_full_reversal_of_all_inputs() -> None:
+    """From -1 to +1 N on each axis of a body at rest, with the stated factor of safety."""
+    params = nmpc_parameters(mission())
+    model = Frame(params, 1).model
+    inputs = np.zeros((1, STAGES, 6))
+    inputs[0, :, :3] = 1.0
+    q = attitude(np.random.default_rng(1))
+    states = np.zeros((2, 1, STAGES + 1, 13))
+    states[:, 0, 0, 6:10] = q
+    for x, sign in zip(states, (-1.0, 1.0), strict=True):
+        roll(model, x, sign * inputs)
+    moved_m = np.linalg.norm(states[1, 0, :, :3] - states[0, 0, :, :3], axis=1)
+    np.testing.assert_allclose(
+        rti.RtiSolver(params, 1)._reach, rti.REACH_SAFETY * moved_m, rtol=1e-9
+    )

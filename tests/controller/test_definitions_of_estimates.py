@@ -23,7 +23,7 @@ from chaserdock_controller.estimation.joint.measurements import (
     sighting_covariance,
 )
 from chaserdock_controller.estimation.joint.motion_models import process_noise, steady_motion
-from chaserdock_controller.estimation.joint.prediction import disturbance, predict_target
+from chaserdock_controller.estimation.joint.prediction import disturbance, predict, predict_target
 from chaserdock_controller.estimation.joint.replay import FilterTick
 from chaserdock_controller.estimation.joint.state import (
     CENTRE,
@@ -36,6 +36,7 @@ from chaserdock_controller.estimation.joint.state import (
 )
 from chaserdock_controller.estimation.joint.tick import process_tick
 from chaserdock_controller.estimation.stage import EstimationStage, camera_calibrations
+from chaserdock_controller.estimation.target_shape import seen_place
 from chaserdock_controller.estimation.types import (
     CameraError,
     ChaserMotion,
@@ -55,7 +56,7 @@ from chaserdock_controller.interfaces import (
 from chaserdock_controller.output.message_builders import expected_pose, target_message
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import DockingStatus, PoseSolution
+from chaserdock_protocol.messages import DockingStatus, GeometryMeasurement, PoseSolution
 from flight_cases import scenario
 from general_position import (
     BODY,
@@ -425,6 +426,64 @@ def test_unknown_command_is_uncertain_by_what_a_wrench_of_its_size_can_do(seed: 
     own = TARGET + CHASER
     added[own + 3 : own + 6], added[own + 9 : own + 12] = velocity**2, rate**2
     np.testing.assert_allclose(covariances[1] - covariances[0], np.diag(added), rtol=1e-3)
+
+
+@SEEDS
+def test_impulse_acts_in_the_time_that_it_covers(seed: int) -> None:
+    """A prediction in one step moves as in two, of which the second has the impulse."""
+    rng = np.random.default_rng(seed)
+    state, p = joint_state(rng), parameters(scenario(chaser=CHASER_BODY), navigation("lab"))
+    given = [AppliedImpulse(j, 0.02 * j[::-1], np.abs(j)) for j in rng.uniform(-0.05, 0.05, (2, 6))]
+    nothing = [AppliedImpulse.steady(np.zeros(6))] * 2
+    whole_ns, first_ns = 300_000_000, 200_000_000
+    moved = []
+    for impulses in (given, nothing):
+        once = predict(state, state.time_ns + whole_ns, impulses, p, nominal_s=0.1)
+        twice = predict(state, state.time_ns + first_ns, nothing, p)
+        twice = predict(twice, state.time_ns + whole_ns, impulses, p)
+        moved.append((once.positions_m, twice.positions_m))
+    (once_m, twice_m), (still_once_m, still_twice_m) = moved
+    acted_m = np.abs(twice_m - still_twice_m).max()
+    np.testing.assert_allclose(
+        once_m - still_once_m, twice_m - still_twice_m, atol=0.05 * float(acted_m)
+    )
+
+
+@SEEDS
+def test_place_of_a_view_has_the_covariance_of_its_pose(seed: int) -> None:
+    """By differences of the lens' place in TRF by position (IRF) and rotation (TRF)."""
+    rng, h = np.random.default_rng(seed), 1e-6
+    q, position = attitude(rng), rng.uniform(-2, 2, 3)
+    turning = covariance(rng, [1e-3, 4e-3, 9e-3])
+    placing = covariance(rng, [2e-3, 5e-3, 1e-2])
+    pose = PoseSolution(
+        position_m=tuple(position.tolist()), q_wxyz=tuple(q.tolist()),
+        covariance=tuple(np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), turning]])
+                         .ravel().tolist()),
+        reprojection_rms_px=0.1,
+    )  # fmt: skip
+    measured = GeometryMeasurement(
+        information=(1.0,), vector=(0.0,), position_m=pose.position_m,
+        position_by_errors=tuple(rng.normal(size=3).tolist()),
+        position_covariance_m2=tuple(placing.ravel().tolist()),
+    )  # fmt: skip
+    found = seen_place(pose, measured, 1)
+    assert found is not None
+    r = matrix(q)
+    np.testing.assert_allclose(found.place_m, -r.T @ position, atol=1e-12)
+    np.testing.assert_allclose(
+        found.by_errors[:, 0], -r.T @ np.array(measured.position_by_errors), atol=1e-12
+    )
+    by_turn = np.column_stack(
+        [
+            -(matrix(so3.multiply(q, so3.exp(h * e))) - matrix(so3.multiply(q, so3.exp(-h * e)))).T
+            @ position
+            / (2 * h)
+            for e in np.eye(3)
+        ]
+    )
+    expected = r.T @ placing @ r + by_turn @ turning @ by_turn.T
+    np.testing.assert_allclose(found.covariance, expected, atol=1e-9)
 
 
 def tumbling_in_orbit(start: tuple[Array, ...], dt_s: float, n: float) -> tuple[Array, ...]:

@@ -207,6 +207,20 @@ def test_problem_starts_at_effect_and_leaves_room_for_the_disturbance(planned: P
             assert (np.abs(flown_input) <= tick.observation.chasers[i].input_limits + 1e-12).all()
 
 
+def test_attached_chaser_has_the_inputs_that_follow_the_target_at_all_stages() -> None:
+    tick = Tick(5)
+    stage = planning.PlanningStage(
+        tick.mission, nmpc_parameters(tick.mission), lambda: 0.0, realtime=False
+    )
+    horizon = replace(tick.horizon, attached=frozenset({1}))
+    limits = np.tile(tick.limits, (2, 1))
+    found = stage.problem(horizon, np.zeros((2, 13)), limits).input_max
+    np.testing.assert_array_equal(found[0], limits[0])
+    for axis in range(6):
+        most = max(abs(float(u[axis])) for u in horizon.u_ref[1])
+        assert found[1, axis] == pytest.approx(min(limits[1, axis], 1.2 * most + 1e-3))
+
+
 def test_lost_chaser_coasts_from_its_last_odometry_to_the_stages(planned: Planned) -> None:
     tick, solver, _ = planned
     problem, last = solver.asked[0][0], tick.lost
@@ -473,3 +487,31 @@ def test_reach_is_the_displacement_by_a_full_reversal_of_all_inputs() -> None:
     np.testing.assert_allclose(
         rti.RtiSolver(params, 1)._reach, rti.REACH_SAFETY * moved_m, rtol=1e-9
     )
+
+
+@pytest.mark.parametrize("violates", [False, True])
+def test_plan_at_the_iteration_limit_is_flown_if_it_is_better_than_its_start(
+    violates: bool,
+) -> None:
+    """By its cost and the price of the deepest violation, which a cheap plan may have: its last
+    stage is nearer to the target than that of the start.
+    """
+    problem, plan, params = solved(1)
+    frame = Frame(params, 2)
+    task = frame.begin(problem, 0.0, None)
+    start, ends = task.start.copy(), frame.rolled(task, task.start)[:, -1, :3]
+    here = plan.states[0, -1, :3]
+    apart_m = math.dist(here, ends[0])
+    targets = problem.target_positions + 50.0
+    targets[-1] = here + 0.5 * (here - ends[0]) / apart_m
+    kept_m = 0.5 + 0.5 * apart_m if violates else 0.4
+    close = replace(
+        problem, target_positions=targets, min_distance_target_m=np.array([kept_m, 0.0])
+    )
+    task = frame.begin(close, 0.0, None)
+    old_cost = frame.evaluate(task, frame.rolled(task, start), start)[0]
+    assert (plan.cost < old_cost).all()
+    assert 1e5 * 0.5 * apart_m > old_cost[0]
+    found = frame.finish(task, plan.inputs.copy(), ["iteration_limit"] * 2, np.array([40, 40]))
+    np.testing.assert_array_equal(found.inputs[0], start[0] if violates else plan.inputs[0])
+    np.testing.assert_array_equal(found.inputs[1], plan.inputs[1])

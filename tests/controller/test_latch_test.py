@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.guidance import latch_test
-from chaserdock_controller.guidance.latch_test import motion_between
+from chaserdock_controller.guidance.latch_test import motion_between, why_untold
 from chaserdock_controller.guidance.parameters import GUIDANCE
 from chaserdock_controller.interfaces import RelativePose
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from docking_cases import DT_S, Pilot, scenario, senses
 from flight_cases import at, drain, step
+from general_position import attitude, covariance, matrix
 from scipy.stats import chi
 
 SHIPPED = (0.52e-3, 0.05)
@@ -85,6 +86,17 @@ def test_an_open_latch_is_found_or_the_test_says_that_it_cannot_tell() -> None:
     phase, event = outcome_of(lambda _: np.zeros(3), wide)
     assert phase == "retreat"
     assert event.endswith("err by 35.36 mm along the pull, which moves an open latch by 28.09 mm")
+
+
+def test_what_hides_an_open_latch_is_the_error_along_the_pull() -> None:
+    """Along X of the chaser, in the target's axes."""
+    rng, mission = np.random.default_rng(4), scenario(docking={"pull_N": 0.37})
+    q = attitude(rng)
+    one, other = (covariance(rng, [0.02, 0.05, 0.09, 1.0, 1.0, 1.0]) for _ in range(2))
+    before, now = (RelativePose(np.zeros(3), q, c) for c in (one, other))
+    along = matrix(q)[:, 0]
+    error_m = GUIDANCE.pull_sigmas * math.sqrt(along @ (one + other)[:3, :3] @ along)
+    assert f"may err by {error_m * 1e3:.2f} mm along" in why_untold(before, now, mission)
 
 
 def test_the_rate_of_false_alarms_is_the_stated_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,7 +97,8 @@ the session has not yet learnt who answers it. Repeat it until a reply arrives, 
 1. Query `{topics.JOIN_KEY}` with a `JoinRequest`: the process' name (`controller`, `chaser/0` …)
    and its *instance*, a unique id of each start. Repeat until the world replies with a `JoinReply`:
    the flight scenario as JSON ([flight_scenario.md](flight_scenario.md)), or the reason of a
-   rejection. Recorder, operator, viewer and analysis get the full scenario, with ground truth, on
+   rejection. It does not reply while another process joins by the same name, for at most 5 s.
+   Recorder, operator, viewer and analysis get the full scenario, with ground truth, on
    `{topics.SCENARIO_KEY}`.
 2. Declare the liveliness token `{topics.LIVE_KEY.format(process="NAME")}`. The world detects by it
    that the process is alive or lost.

@@ -8,7 +8,7 @@ from typing import Any
 from chaserdock_agents.chaser.core import ChaserCore
 from chaserdock_agents.chaser.outbox import ChaserOutputs
 from chaserdock_protocol.fault_injection import LostMessage
-from chaserdock_protocol.messages import DockingStatus, Odometry, Tick
+from chaserdock_protocol.messages import DockingStatus, Odometry, Tick, WrenchCommand
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import ReceivedMessage
@@ -47,6 +47,26 @@ def docking(scenario: Scenario, tick: int, latched: bool = False) -> DockingStat
     now_ns = scenario.timing.tick_time_ns(tick)
     return DockingStatus(
         tick=tick, sim_time_ns=now_ns, chaser=0, contact=latched, armed=latched, latched=latched
+    )
+
+
+def wrench(scenario: Scenario, tick: int, **values: Any) -> WrenchCommand:
+    now_ns = scenario.timing.tick_time_ns(tick)
+    given = {
+        "commander": "controller",
+        "instance": "c",
+        "term": 1,
+        "mode": "nmpc",
+        "force_N": (0.1, 0.0, 0.0),
+        "torque_N_m": ZERO,
+    } | values
+    return WrenchCommand(
+        tick=tick,
+        sim_time_ns=now_ns,
+        chaser=0,
+        effective_time_ns=scenario.timing.effective_ns(tick),
+        expires_ns=now_ns + 500_000_000,
+        **given,
     )
 
 

@@ -424,6 +424,10 @@ class SimulatedHost:
         run()
         return end
 
+    def worker(self, call: Callable[[Any], None]) -> tuple[Callable[[Any], None], Undo]:
+        """Handle each item at once, as virtual time has no background."""
+        return call, lambda: None
+
     # -- the process -------------------------------------------------------------------------------
 
     def finish_startup(self) -> None:

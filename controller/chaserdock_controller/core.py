@@ -9,6 +9,8 @@ from chaserdock_protocol.messages import TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 
 from .estimation.estimators import make_estimator
+from .estimation.guarded import FAILED as ESTIMATOR_FAILED
+from .estimation.guarded import GuardedEstimator
 from .estimation.stage import EstimationStage
 from .estimation.types import Estimator
 from .guidance.stage import GuidanceStage
@@ -63,6 +65,12 @@ class ControllerCore:
         """Return whether the odometry of a chaser may be wrong, judged by the last tick."""
         consistency = self.estimation.consistency
         return chaser < len(consistency) and consistency[chaser].doubtful
+
+    def failed_parts(self) -> tuple[str, ...]:
+        """Return the parts that failed in the last tick, as they are counted."""
+        estimator, planning = self.estimation.estimator, self.planning
+        found = isinstance(estimator, GuardedEstimator) and estimator.failed
+        return (*((ESTIMATOR_FAILED,) if found else ()), *planning.failed)
 
     @property
     def estimator(self) -> Estimator:

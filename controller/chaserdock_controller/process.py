@@ -252,6 +252,8 @@ class ControllerProcess:
         operated = tuple(command for command, _ in requests)
         commands = self.standby.take_leader_commands(tick.tick) + operated
         out = self.core.step(self.inputs.take(tick, commands))
+        for part in self.core.failed_parts():
+            self.node.counts.rejected[f"tick:{part}"] += 1
         if leads:
             replies = out.replies[len(out.replies) - len(requests) :]
             for (command, reply), message in zip(requests, replies, strict=True):

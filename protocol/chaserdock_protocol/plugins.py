@@ -20,8 +20,20 @@ _GROUPS: dict[Kind, str] = {
     "solver": "chaserdock.solvers",
 }
 
-_METHODS: dict[Kind, str] = {"perception": "estimate", "estimator": "update", "solver": "solve"}
-"""Method that is called first in a flight."""
+_MEMBERS: dict[Kind, tuple[str, ...]] = {
+    "perception": ("estimate",),
+    "estimator": (
+        "update",
+        "estimate_at",
+        "shape",
+        "reinitialisations",
+        "without_drift",
+        "disturb",
+        "change_body",
+    ),
+    "solver": ("solve",),
+}
+"""Methods and properties that are used in a flight."""
 
 
 class PluginError(ChaserdockError):
@@ -54,14 +66,15 @@ def make(kind: Kind, name: str, own: tuple[str, ...], *arguments: Any) -> Any:
     factory = load(kind, name, own)
     try:
         part = factory(*arguments)
+        missing = [name for name in _MEMBERS[kind] if not hasattr(part, name)]
     except ChaserdockError:
         raise
     except Exception as error:  # a plugin may raise anything
         raise PluginError(
             f"{kind} {name!r} does not start: {type(error).__name__}: {error}"
         ) from error
-    if not callable(getattr(part, _METHODS[kind], None)):
-        raise PluginError(f"{kind} {name!r} has no method {_METHODS[kind]}, which it must have")
+    if missing:
+        raise PluginError(f"{kind} {name!r} has no member {missing[0]}, which it must have")
     return part
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_agents.chaser.thrusters.allocation import allocator_of
+from chaserdock_agents.chaser.thrusters.allocation import Allocator, allocator_of
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from hypothesis import given, settings
@@ -40,6 +40,27 @@ def test_exact_to_a_billionth_inside_the_feasible_set(body: str) -> None:
         assert np.abs(error).max() <= 1e-9 * np.abs(wrench / limits).max() + 1e-12
         # No dearer than the thrusts that the wrench was made of.
         assert got.thrusts_N.sum() <= feasible.sum() * (1 + 1e-9) + 1e-12
+
+
+@pytest.mark.parametrize("times", [1e2, 1e4, 1e9, 1e12])
+def test_a_main_engine_beside_small_thrusters_is_allocated_like_them(times: float) -> None:
+    """Whichever it is, and with one thruster out; wrenches that are feasible are exact."""
+    body, rng = mission("tetra12").chaser, np.random.default_rng(2)
+    for k in range(len(body.thrusters)):
+        strong = [
+            t.model_copy(update={"thrust_N": t.thrust_N * (times if j == k else 1.0)})
+            for j, t in enumerate(body.thrusters)
+        ]
+        allocator = Allocator(strong, body.wrench_max)
+        for _ in range(20):
+            allowed = thrusts_max(strong) * rng.uniform(0.2, 1.0, len(strong))
+            allowed[rng.integers(len(strong))] = 0.0
+            small = np.minimum(allowed, 1.5) * rng.uniform(0.0, 1.0, len(strong))
+            wrench = allocator.matrix @ small
+            got = allocator.allocate(wrench, allowed)
+            assert got.exact
+            assert np.abs(allocator.matrix @ got.thrusts_N - wrench).max() < 1e-7
+            allocator.allocate(rng.normal(size=6) * body.wrench_max, allowed)  # raises nothing
 
 
 @given(st.sampled_from(BODIES), st.integers(0, 2**31), st.sets(st.integers(0, 11), max_size=2))

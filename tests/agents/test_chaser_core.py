@@ -8,11 +8,11 @@ from typing import Any
 
 import msgspec
 import pytest
-from chaser_cases import ZERO, deliver, docking, lost, odometry, step, tick_of
+from chaser_cases import ZERO, deliver, docking, lost, odometry, step, tick_of, wrench
 from chaserdock_agents.chaser.core import ChaserCore
 from chaserdock_agents.chaser.outbox import ChaserOutputs
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import Event, Image, Plan, TargetEstimate, WrenchCommand
+from chaserdock_protocol.messages import Event, Image, Plan, TargetEstimate
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import ReceivedMessage
@@ -33,26 +33,6 @@ def capture() -> Scenario:
 @pytest.fixture
 def chaser(scenario: Scenario) -> ChaserCore:
     return ChaserCore(scenario, 0)
-
-
-def wrench(scenario: Scenario, tick: int, **values: Any) -> WrenchCommand:
-    now_ns = scenario.timing.tick_time_ns(tick)
-    given = {
-        "commander": "controller",
-        "instance": "c",
-        "term": 1,
-        "mode": "nmpc",
-        "force_N": (0.1, 0.0, 0.0),
-        "torque_N_m": ZERO,
-    } | values
-    return WrenchCommand(
-        tick=tick,
-        sim_time_ns=now_ns,
-        chaser=0,
-        effective_time_ns=scenario.timing.effective_ns(tick),
-        expires_ns=now_ns + 500_000_000,
-        **given,
-    )
 
 
 def actuated(published: list[tuple[Topic, Any]]) -> list[tuple[int, str]]:

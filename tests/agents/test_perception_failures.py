@@ -3,23 +3,28 @@
 
 from __future__ import annotations
 
+import threading
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
-from chaser_cases import deliver
+from chaser_cases import deliver, odometry, tick_of, wrench
+from chaserdock_agents.chaser import process
 from chaserdock_agents.chaser.core import ChaserCore
 from chaserdock_agents.chaser.perception import PerceptionResult, TargetPose, make_perception
-from chaserdock_agents.chaser.perception_watch import FAILURES_TO_ERROR
 from chaserdock_agents.chaser.sighting import apply_geometry
 from chaserdock_agents.chaser.vision import Vision
 from chaserdock_protocol import codec, plugins, topics
+from chaserdock_protocol.failure_watch import FAILURES_TO_ERROR
 from chaserdock_protocol.messages import Event, GeometryEstimate, Image, Sighting
 from chaserdock_protocol.plugins import PluginError
+from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.transport import ReceivedMessage
+from chaserdock_protocol.transport.network import Machine
 
 SCENARIO = Path(__file__).resolve().parents[2] / "scenarios" / "single.toml"
 
@@ -153,7 +158,7 @@ def fails(camera: Any, target: Any) -> None:
     ("factory", "text"),
     [
         ("fails", "perception 'own' does not start: RuntimeError: no weights"),
-        ("returns_nothing", "perception 'own' has no method estimate"),
+        ("returns_nothing", "perception 'own' has no member estimate"),
     ],
 )
 def test_perception_that_does_not_start_is_refused_in_one_line(
@@ -179,3 +184,110 @@ def test_sighting_of_a_working_perception_is_unchanged(scenario: Scenario) -> No
         "",
         (0.0, 0.0, 2.0),
     )
+
+
+class Waiting:
+    """A perception that begins an image when it gets one and ends it when it may."""
+
+    def __init__(self) -> None:
+        self.begun, self.may_end = threading.Event(), threading.Event()
+        self.corrected: list[bool] = []
+
+    def estimate(self, image: Any, predicted: Any = None) -> Any:
+        self.begun.set()
+        assert self.may_end.wait(60)
+        return result()
+
+    def correct_geometry(self, mean: Any, covariance: Any) -> None:
+        self.corrected.append(self.may_end.is_set())
+        if mean[0] < 0.0:
+            raise ValueError("too small")
+
+
+GEOMETRY = GeometryEstimate(
+    names=("scale",), values=(0.0,), sigmas=(1.0,), covariance=(1.0,), views=1, coverage=0.1
+)
+
+
+class QuietNode(ReplayNode):
+    """A node whose process needs no network."""
+
+    def advertise(self, *_: Any) -> None: ...
+    def subscribe(self, *_: Any, **__: Any) -> None: ...
+    def on_close(self, stop: Any) -> None:
+        self.stop = stop
+
+
+@pytest.fixture
+def realtime(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, QuietNode, Waiting]:
+    """A chaser's process in real time, its node and its perception."""
+    monkeypatch.setattr(process, "Heartbeat", lambda *_: SilentHeartbeat())
+    node, perception = QuietNode("chaser/0"), Waiting()
+    core = ChaserCore(scenario, 0, realtime=True, vision=Vision(perception))
+    return process.ChaserProcess(cast(Any, node), core), node, perception
+
+
+def receive(chaser: Any, node: QuietNode, topic: Any, message: Any) -> None:
+    place = str(chaser.core.number) if "{" in topic.key else None
+    node.put(ReceivedMessage(topic, place, message, 0, node.host.now_s()))
+    chaser.listen()
+
+
+def test_commands_do_not_wait_for_a_slow_image_in_real_time(
+    scenario: Scenario, realtime: tuple[Any, QuietNode, Waiting]
+) -> None:
+    chaser, node, perception = realtime
+    receive(chaser, node, topics.TICK, tick_of(scenario, 0, (0,)))
+    receive(chaser, node, topics.ODOMETRY, odometry(scenario, 0, 0))
+    receive(chaser, node, topics.IMAGE, image(0))
+    assert perception.begun.wait(60)
+    for tick in (1, 2):  # of these images the newer one is looked at
+        receive(chaser, node, topics.IMAGE, image(tick))
+    node.take_published()
+    receive(chaser, node, topics.WRENCH, wrench(scenario, 0))
+    published = {t for t, _, _ in node.take_published()}
+    assert topics.ACTUATORS in published
+    assert topics.SIGHTING not in published
+
+    perception.begun.clear()
+    perception.may_end.set()
+    assert perception.begun.wait(60)
+    chaser._end_looking()
+    sightings = [m for t, _, m in node.take_published() if t is topics.SIGHTING]
+    assert [m.tick for m in sightings] == [0, 2]
+
+
+def test_geometry_that_comes_during_an_image_is_used_after_it(
+    scenario: Scenario, realtime: tuple[Any, QuietNode, Waiting]
+) -> None:
+    chaser, node, perception = realtime
+    receive(chaser, node, topics.TICK, tick_of(scenario, 0, (0,)))
+    receive(chaser, node, topics.ODOMETRY, odometry(scenario, 0, 0))
+    receive(chaser, node, topics.IMAGE, image(0))
+    assert perception.begun.wait(60)
+    wrong = msgspec.structs.replace(GEOMETRY, values=(-1.0,))
+    receive(chaser, node, topics.WRENCH, wrench(scenario, 0, geometry=wrong))
+    assert perception.corrected == []
+    perception.begun.clear()
+    receive(chaser, node, topics.IMAGE, image(1))
+    perception.may_end.set()
+    assert perception.begun.wait(60)
+    chaser._end_looking()
+    assert perception.corrected == [True]
+    events = [m for _, _, m in node.take_published() if isinstance(m, Event)]
+    assert [(m.what, m.detail) for m in events] == [("geometry refused", "too small")]
+
+
+def test_what_a_worker_raises_the_next_item_raises() -> None:
+    called = threading.Event()
+
+    def call(item: str) -> None:
+        called.set()
+        raise ValueError(item)
+
+    put, end = Machine().worker(call)
+    put("first")
+    assert called.wait(60)
+    end()
+    with pytest.raises(ValueError, match="first"):
+        put("second")

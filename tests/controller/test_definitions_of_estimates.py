@@ -12,13 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chaserdock_controller.bodies.body_shape import SHAPE, BodyShape
 from chaserdock_controller.bodies.target_body import TargetBody
 from chaserdock_controller.estimation.composite_body import CompositeBody
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.hypotheses import FilterState, mixture_covariance
-from chaserdock_controller.estimation.joint.measurements import odometry_noise, sighting_covariance
+from chaserdock_controller.estimation.joint.measurements import (
+    mounting_of,
+    odometry_noise,
+    sighting_covariance,
+)
 from chaserdock_controller.estimation.joint.motion_models import process_noise, steady_motion
-from chaserdock_controller.estimation.joint.prediction import disturbance
+from chaserdock_controller.estimation.joint.prediction import disturbance, predict, predict_target
 from chaserdock_controller.estimation.joint.replay import FilterTick
 from chaserdock_controller.estimation.joint.state import (
     CENTRE,
@@ -30,13 +35,16 @@ from chaserdock_controller.estimation.joint.state import (
     empty_state,
     inject,
 )
+from chaserdock_controller.estimation.joint.tick import process_tick
 from chaserdock_controller.estimation.stage import EstimationStage, camera_calibrations
+from chaserdock_controller.estimation.target_shape import seen_place
 from chaserdock_controller.estimation.types import (
     CameraError,
     ChaserMotion,
     Estimate,
     Estimator,
     EstimatorInputs,
+    MeasuredChaser,
     Shock,
 )
 from chaserdock_controller.ingest.latency_compensation import CommandHistory, predict_state
@@ -49,7 +57,7 @@ from chaserdock_controller.interfaces import (
 from chaserdock_controller.output.message_builders import expected_pose, target_message
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import DockingStatus, PoseSolution
+from chaserdock_protocol.messages import DockingStatus, GeometryMeasurement, PoseSolution
 from flight_cases import scenario
 from general_position import (
     BODY,
@@ -66,6 +74,7 @@ from general_position import (
 )
 from joint_cases import navigation, parameters
 from msgspec.structs import replace
+from runge_kutta import rk4
 
 MASS_KG = 17.8
 CHASER_BODY = {"mass_kg": MASS_KG, "inertia_kg_m2": list(INERTIA)}
@@ -439,6 +448,157 @@ def test_estimate_at_a_time_continues_the_newest_tick_before_it(seed: int) -> No
         np.testing.assert_allclose(
             found.covariance, j @ s.covariance @ j.T + noise, rtol=1e-5, atol=1e-11
         )
+
+
+@SEEDS
+def test_unknown_command_is_uncertain_by_what_a_wrench_of_its_size_can_do(seed: int) -> None:
+    """The rate is that of the worst of all directions, on a body whose lightest axis is its
+    second.
+    """
+    rng, inertia, period_s = np.random.default_rng(seed), np.array([0.42, 0.31, 0.53]), 0.1
+    body = {"mass_kg": MASS_KG, "inertia_kg_m2": inertia.tolist()}
+    p = parameters(scenario(chaser=body), navigation("lab"))
+    state, wrench = joint_state(rng), rng.uniform(-0.5, 0.5, 6)
+    covariances = []
+    for command in (None, wrench):
+        chasers = (
+            MeasuredChaser(0, AppliedImpulse.steady(np.zeros(6))),
+            MeasuredChaser(1, AppliedImpulse.steady(np.zeros(6)), last_command=command),
+        )
+        record = FilterTick(
+            time_ns=state.time_ns + 10**8, parameters=p.target, covered_s=period_s, chasers=chasers
+        )
+        before, camera = FilterState(state.time_ns, (state,)), mounting_of(p.camera)
+        (after,) = process_tick(before, record, 2, camera, p)[0].hypotheses
+        covariances.append(after.covariance)
+    directions = rng.normal(size=(20_000, 3))
+    torques = directions / np.linalg.norm(directions, axis=1)[:, None] * np.linalg.norm(wrench[3:])
+    rate = float(np.linalg.norm(torques / inertia, axis=1).max()) * period_s
+    velocity = float(np.linalg.norm(wrench[:3])) * period_s / MASS_KG
+    added = np.zeros(len(state.covariance))
+    own = TARGET + CHASER
+    added[own + 3 : own + 6], added[own + 9 : own + 12] = velocity**2, rate**2
+    np.testing.assert_allclose(covariances[1] - covariances[0], np.diag(added), rtol=1e-3)
+
+
+@SEEDS
+def test_impulse_acts_in_the_time_that_it_covers(seed: int) -> None:
+    """A prediction in one step moves as in two, of which the second has the impulse."""
+    rng = np.random.default_rng(seed)
+    state, p = joint_state(rng), parameters(scenario(chaser=CHASER_BODY), navigation("lab"))
+    given = [AppliedImpulse(j, 0.02 * j[::-1], np.abs(j)) for j in rng.uniform(-0.05, 0.05, (2, 6))]
+    nothing = [AppliedImpulse.steady(np.zeros(6))] * 2
+    whole_ns, first_ns = 300_000_000, 200_000_000
+    moved = []
+    for impulses in (given, nothing):
+        once = predict(state, state.time_ns + whole_ns, impulses, p, nominal_s=0.1)
+        twice = predict(state, state.time_ns + first_ns, nothing, p)
+        twice = predict(twice, state.time_ns + whole_ns, impulses, p)
+        moved.append((once.positions_m, twice.positions_m))
+    (once_m, twice_m), (still_once_m, still_twice_m) = moved
+    acted_m = np.abs(twice_m - still_twice_m).max()
+    np.testing.assert_allclose(
+        once_m - still_once_m, twice_m - still_twice_m, atol=0.05 * float(acted_m)
+    )
+
+
+@SEEDS
+def test_place_of_a_view_has_the_covariance_of_its_pose(seed: int) -> None:
+    """By differences of the lens' place in TRF by position (IRF) and rotation (TRF)."""
+    rng, h = np.random.default_rng(seed), 1e-6
+    q, position = attitude(rng), rng.uniform(-2, 2, 3)
+    turning = covariance(rng, [1e-3, 4e-3, 9e-3])
+    placing = covariance(rng, [2e-3, 5e-3, 1e-2])
+    pose = PoseSolution(
+        position_m=tuple(position.tolist()), q_wxyz=tuple(q.tolist()),
+        covariance=tuple(np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), turning]])
+                         .ravel().tolist()),
+        reprojection_rms_px=0.1,
+    )  # fmt: skip
+    measured = GeometryMeasurement(
+        information=(1.0,), vector=(0.0,), position_m=pose.position_m,
+        position_by_errors=tuple(rng.normal(size=3).tolist()),
+        position_covariance_m2=tuple(placing.ravel().tolist()),
+    )  # fmt: skip
+    found = seen_place(pose, measured, 1)
+    assert found is not None
+    r = matrix(q)
+    np.testing.assert_allclose(found.place_m, -r.T @ position, atol=1e-12)
+    np.testing.assert_allclose(
+        found.by_errors[:, 0], -r.T @ np.array(measured.position_by_errors), atol=1e-12
+    )
+    by_turn = np.column_stack(
+        [
+            -(matrix(so3.multiply(q, so3.exp(h * e))) - matrix(so3.multiply(q, so3.exp(-h * e)))).T
+            @ position
+            / (2 * h)
+            for e in np.eye(3)
+        ]
+    )
+    expected = r.T @ placing @ r + by_turn @ turning @ by_turn.T
+    np.testing.assert_allclose(found.covariance, expected, atol=1e-9)
+
+
+def tumbling_in_orbit(start: tuple[Array, ...], dt_s: float, n: float) -> tuple[Array, ...]:
+    """``BODY`` in a frame that turns at ``n`` about its Z axis, X away from the Earth: Euler's
+    equations with the gravity gradient in inertial axes; its centre of mass moves uniformly there.
+    """
+    p, v, q, w = start
+    r, c, inertia = matrix(q), BODY.centre_trf_m, BODY.inertia_kg_m2
+
+    def frame(time_s: float) -> Array:
+        cos, sin = math.cos(n * time_s), math.sin(n * time_s)
+        return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+    def slope(s: Array) -> Array:
+        body, rate = s[:9].reshape(3, 3), s[9:12]
+        up = body.T @ frame(s[12])[:, 0]
+        torque = 3 * n * n * np.cross(up, inertia @ up)
+        alpha = np.linalg.solve(inertia, torque - np.cross(rate, inertia @ rate))
+        return np.concatenate([(body @ skew(rate)).ravel(), alpha, [1.0]])
+
+    begin = np.concatenate([r.ravel(), w + n * r[2], [0.0]])
+    end = rk4(slope, begin, dt_s / 14, 14)
+    moved = frame(dt_s).T @ end[:9].reshape(3, 3)
+    rate = end[9:12] - n * moved[2]
+    velocity = v + r @ np.cross(w, c)
+    centre = p + r @ c + velocity * dt_s
+    return centre - moved @ c, velocity - moved @ np.cross(rate, c), moved, rate
+
+
+@SEEDS
+def test_tumble_in_orbit_is_predicted_in_the_frame_that_turns(seed: int) -> None:
+    """Mean and covariance, in an orbit of five minutes, of a body whose shape is known."""
+    rng, dt_s, n = np.random.default_rng(seed), 0.7, 0.02
+    p = changed(parameters(scenario(), navigation("lab")), mean_motion_rad_s=n)
+    trace = float(np.trace(BODY.inertia_kg_m2))
+    s = joint_state(rng)
+    of_motion = s.covariance[:TARGET, :TARGET]
+    size = len(s.covariance) + SHAPE
+    s = replace(
+        s, shape=BodyShape(BODY.inertia_kg_m2 / trace, BODY.centre_trf_m),
+        covariance=np.pad(of_motion, (0, size - TARGET)),
+    )  # fmt: skip
+    moved, found = predict_target(s, s.time_ns + round(dt_s * 1e9), p)
+    here = tumbling_in_orbit((s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s), dt_s, n)
+    np.testing.assert_allclose(moved.position_m, here[0], atol=1e-7)
+    np.testing.assert_allclose(moved.velocity_m_s, here[1], atol=1e-7)
+    np.testing.assert_allclose(matrix(moved.q_wxyz), here[2], atol=1e-7)
+    np.testing.assert_allclose(moved.omega_rad_s, here[3], atol=1e-7)
+    columns, e = [], 1e-5
+    for d in np.eye(size)[:TARGET]:
+        ends = []
+        for sign in (1.0, -1.0):
+            m = inject(s, sign * e * d)
+            start = (m.position_m, m.velocity_m_s, m.q_wxyz, m.omega_rad_s)
+            end = tumbling_in_orbit(start, dt_s, n)
+            ends.append(np.concatenate([*end[:2], turn_between(here[2], end[2]), end[3]]))
+        columns.append((ends[0] - ends[1]) / (2 * e))
+    j = np.column_stack(columns)
+    linear, angular = p.target_noise[p.target.motion_model]
+    noise = process_noise(dt_s, linear**2, angular**2)
+    expected = j @ of_motion @ j.T + noise
+    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
 
 
 @SEEDS

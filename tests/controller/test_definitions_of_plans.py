@@ -28,11 +28,12 @@ from chaserdock_controller.interfaces import (
     TargetEstimation,
     TickOutputs,
 )
-from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, NmpcSolver, make_solver
+from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, NmpcSolver, make_solver, rti
 from chaserdock_controller.nmpc import stage as planning
+from chaserdock_controller.nmpc.kernels import roll, solve_tick
 from chaserdock_controller.nmpc.terms.coast import COASTS, SPARE_SHARE, coast_rows
 from chaserdock_controller.nmpc.types import CoastSafety
-from chaserdock_controller.nmpc.warm_start import shift_inputs
+from chaserdock_controller.nmpc.warm_start import Frame, shift_inputs
 from chaserdock_controller.output.stage import OutputStage
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_models import rotations
@@ -210,6 +211,20 @@ def test_problem_starts_at_effect_and_leaves_room_for_the_disturbance(planned: P
         for sign in (-1.0, 1.0):
             flown_input = sign * problem.input_max[i] - cancelled(tick, i)
             assert (np.abs(flown_input) <= tick.observation.chasers[i].input_limits + 1e-12).all()
+
+
+def test_attached_chaser_has_the_inputs_that_follow_the_target_at_all_stages() -> None:
+    tick = Tick(5)
+    stage = planning.PlanningStage(
+        tick.mission, nmpc_parameters(tick.mission), lambda: 0.0, realtime=False
+    )
+    horizon = replace(tick.horizon, attached=frozenset({1}))
+    limits = np.tile(tick.limits, (2, 1))
+    found = stage.problem(horizon, np.zeros((2, 13)), limits).input_max
+    np.testing.assert_array_equal(found[0], limits[0])
+    for axis in range(6):
+        most = max(abs(float(u[axis])) for u in horizon.u_ref[1])
+        assert found[1, axis] == pytest.approx(min(limits[1, axis], 1.2 * most + 1e-3))
 
 
 def test_lost_chaser_coasts_from_its_last_odometry_to_the_stages(planned: Planned) -> None:
@@ -446,3 +461,79 @@ def test_coast_rows_bound_the_closest_approach_of_each_stage(seed: int) -> None:
         np.testing.assert_allclose(
             row[3:6] * scale, times_s[at] * line, atol=0.01 * times_s[at] + 0.5
         )
+
+
+@pytest.mark.parametrize("far", [0.3, 40.0, 900.0])
+def test_price_of_distances_exceeds_the_pull_of_the_last_reference(
+    far: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By differences of the last stage's cost at the distance of a chaser from where it is to be.
+
+    The references move by as much as they are away, so that each stage has its own distance.
+    """
+    tick = Tick(0)
+    params = nmpc_parameters(tick.mission)
+    prices: list[Array] = []
+
+    def keep(*arguments: Any) -> Any:
+        prices.append(arguments[5])
+        return solve_tick(*arguments)
+
+    monkeypatch.setattr(rti, "solve_tick", keep)
+    problem = solved(0)[0]
+    steps = far * np.arange(STAGES + 1)[:, None] / STAGES
+    references = problem.references.copy()
+    references[0, :, :3] += steps * [0.6, -0.64, 0.48]
+    references[1, :, :3] -= 0.5 * steps * [0.0, 0.6, 0.8]
+    make_solver("rti", params, 2).solve(replace(problem, references=references), 0.0)
+    c = mission().controller
+    weight, h = c.weight_position + c.weight_final_position, 1e-3
+    for row, price in enumerate(prices[-1]):
+        distance_m = math.dist(problem.states[row, :3], references[row, -1, :3])
+        slope = weight * ((distance_m + h) ** 2 - (distance_m - h) ** 2) / (2 * h)
+        assert price == pytest.approx(max(1e5, 10.0 * slope))
+
+
+def test_reach_is_the_displacement_by_a_full_reversal_of_all_inputs() -> None:
+    """From -1 to +1 N on each axis of a body at rest, with the stated factor of safety."""
+    params = nmpc_parameters(mission())
+    model = Frame(params, 1).model
+    inputs = np.zeros((1, STAGES, 6))
+    inputs[0, :, :3] = 1.0
+    q = attitude(np.random.default_rng(1))
+    states = np.zeros((2, 1, STAGES + 1, 13))
+    states[:, 0, 0, 6:10] = q
+    for x, sign in zip(states, (-1.0, 1.0), strict=True):
+        roll(model, x, sign * inputs)
+    moved_m = np.linalg.norm(states[1, 0, :, :3] - states[0, 0, :, :3], axis=1)
+    np.testing.assert_allclose(
+        rti.RtiSolver(params, 1)._reach, rti.REACH_SAFETY * moved_m, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("violates", [False, True])
+def test_plan_at_the_iteration_limit_is_flown_if_it_is_better_than_its_start(
+    violates: bool,
+) -> None:
+    """By its cost and the price of the deepest violation, which a cheap plan may have: its last
+    stage is nearer to the target than that of the start.
+    """
+    problem, plan, params = solved(1)
+    frame = Frame(params, 2)
+    task = frame.begin(problem, 0.0, None)
+    start, ends = task.start.copy(), frame.rolled(task, task.start)[:, -1, :3]
+    here = plan.states[0, -1, :3]
+    apart_m = math.dist(here, ends[0])
+    targets = problem.target_positions + 50.0
+    targets[-1] = here + 0.5 * (here - ends[0]) / apart_m
+    kept_m = 0.5 + 0.5 * apart_m if violates else 0.4
+    close = replace(
+        problem, target_positions=targets, min_distance_target_m=np.array([kept_m, 0.0])
+    )
+    task = frame.begin(close, 0.0, None)
+    old_cost = frame.evaluate(task, frame.rolled(task, start), start)[0]
+    assert (plan.cost < old_cost).all()
+    assert 1e5 * 0.5 * apart_m > old_cost[0]
+    found = frame.finish(task, plan.inputs.copy(), ["iteration_limit"] * 2, np.array([40, 40]))
+    np.testing.assert_array_equal(found.inputs[0], start[0] if violates else plan.inputs[0])
+    np.testing.assert_array_equal(found.inputs[1], plan.inputs[1])

@@ -12,7 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_controller.guidance.chaser_machine import ChaserMachine
+from chaserdock_controller.guidance.docking import dock_of
 from chaserdock_controller.guidance.horizon import ReferenceBuilder
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.pointing import calibration_turns, turning_wrench
@@ -33,6 +35,7 @@ from chaserdock_models.docking_geometry import view_of
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.docking import Port
+from docking_cases import scenario as docking_scenario
 from flight_cases import fleet_of, scenario
 from general_position import (
     BODY,
@@ -338,3 +341,18 @@ def test_target_is_where_a_moving_reference_says() -> None:
     one, other = (flight.builder.pose(c, t, NOW_S) for t in (flight.start, turned))
     np.testing.assert_allclose(one[0], other[0], atol=1e-12)
     assert np.linalg.norm(one[2] - other[2]) > 0.1
+
+
+def test_corridor_to_a_port_is_wide_enough_at_its_end_for_twice_the_lateral_error() -> None:
+    """About the axis of a port that does not point away from the target's centre."""
+    mission, axis = docking_scenario(), np.array([2.0, -1.0, 2.0]) / 3.0
+    port = Port(chaser=0, position_m=(0.23, -0.08, 0.17), axis=(2 / 3, -1 / 3, 2 / 3))
+    docking = mission.docking.model_copy(update={"ports": (port,)})
+    mission = mission.model_copy(update={"docking": docking})
+    cone, dock = cone_of(mission, 0), dock_of(mission, 0)
+    assert dock is not None
+    end = np.asarray(dock.offset(-mission.docking.overdrive_m))
+    along = float(end @ axis)
+    outwards = (end - along * axis) / np.linalg.norm(end - along * axis)
+    widest = end + 2.0 * mission.docking.corridor.lateral_m * outwards
+    assert cone.room_m(widest) == pytest.approx(0.0, abs=1e-9)

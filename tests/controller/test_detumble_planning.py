@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +25,11 @@ from chaserdock_controller.guidance.detumble.planning import (
 from chaserdock_controller.guidance.detumble.port_loads import fire_in_turn, load_model
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.wrench_set import wrench_matrix
 from detumble_cases import BODY, PORTS, mounted, stack_of, stack_thrusters, target_alone, tumble
+from general_position import BODY as STACK
+from general_position import INERTIA, attitude, matrix
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -204,6 +209,33 @@ def loads(seed: int, force_limit_N: float = np.inf):
         wrenches,
         load_model(body, omega, wrenches, chasers, rows, BODY, tips, limits),
     )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_load_of_a_port_is_what_accelerates_its_chaser_less_its_own_thrust(seed: int) -> None:
+    """Newton and Euler for a chaser in any attitude, with three different moments of inertia."""
+    rng = np.random.default_rng(seed)
+    chaser: Any = SimpleNamespace(mass_kg=17.8, inertia=INERTIA)
+    place, q, tip = rng.uniform(0.5, 1.0, 3), attitude(rng), rng.uniform(0.2, 0.5, 3)
+    omega, thrusts = rng.uniform(-0.3, 0.3, 3), rng.uniform(0.0, 1.5, 4)
+    wrenches, unit = rng.normal(size=(6, 4)), rng.normal(size=(6, 2))
+    stack = STACK
+    own = {0: (slice(1, 3), unit)}
+    mount = {0: MountedChaser(place, q)}
+    model = load_model(stack, omega, wrenches, mount, own, chaser, {0: tip}, {})
+    total, r = wrenches @ thrusts, matrix(q)
+    spinning = np.cross(omega, stack.inertia_kg_m2 @ omega)
+    alpha = np.linalg.solve(stack.inertia_kg_m2, total[3:] - spinning)
+    arm = place - stack.centre_trf_m
+    acceleration = (
+        total[:3] / stack.mass_kg + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
+    )
+    inertia, pushed = r @ np.diag(INERTIA) @ r.T, unit @ thrusts[1:3]
+    force = r @ pushed[:3] - chaser.mass_kg * acceleration
+    turned = inertia @ alpha + np.cross(omega, inertia @ omega)
+    torque = r @ pushed[3:] - turned + np.cross(place - tip, force)
+    found = (model.constant + model.by_thrust @ thrusts)[0]
+    np.testing.assert_allclose(found, np.concatenate([force, torque]), atol=1e-12)
 
 
 @settings(deadline=None, max_examples=10)

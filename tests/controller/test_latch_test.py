@@ -4,19 +4,22 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from chaserdock_controller.guidance import latch_test
-from chaserdock_controller.guidance.latch_test import motion_between
+from chaserdock_controller.guidance.latch_test import motion_between, why_untold
 from chaserdock_controller.guidance.parameters import GUIDANCE
 from chaserdock_controller.interfaces import RelativePose
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.scenario import ScenarioError
 from docking_cases import DT_S, Pilot, scenario, senses
 from flight_cases import at, drain, step
+from general_position import attitude, covariance, matrix
 from scipy.stats import chi
 
 SHIPPED = (0.52e-3, 0.05)
@@ -87,6 +90,17 @@ def test_an_open_latch_is_found_or_the_test_says_that_it_cannot_tell() -> None:
     assert event.endswith("err by 35.36 mm along the pull, which moves an open latch by 28.09 mm")
 
 
+def test_what_hides_an_open_latch_is_the_error_along_the_pull() -> None:
+    """Along X of the chaser, in the target's axes."""
+    rng, mission = np.random.default_rng(4), scenario(docking={"pull_N": 0.37})
+    q = attitude(rng)
+    one, other = (covariance(rng, [0.02, 0.05, 0.09, 1.0, 1.0, 1.0]) for _ in range(2))
+    before, now = (RelativePose(np.zeros(3), q, c) for c in (one, other))
+    along = matrix(q)[:, 0]
+    error_m = GUIDANCE.pull_sigmas * math.sqrt(along @ (one + other)[:3, :3] @ along)
+    assert f"may err by {error_m * 1e3:.2f} mm along" in why_untold(before, now, mission)
+
+
 def test_the_rate_of_false_alarms_is_the_stated_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors drawn from covariances of any shape exceed three sigmas no more often than a chi of
     three degrees of freedom; at five sigmas that is one test of 1000.
@@ -107,3 +121,32 @@ def test_the_rate_of_false_alarms_is_the_stated_one(monkeypatch: pytest.MonkeyPa
         alarms += motion.moved_m > motion.most_m
     assert 0.001 * count < alarms < (chi.sf(3.0, 3) + 0.006) * count
     assert chi.sf(GUIDANCE.pull_sigmas, 3) * 2.0 * 30 < 1e-3
+
+
+@pytest.mark.parametrize(("mass_kg", "pull_N"), [(120.0, 0.5), (400.0, 1.9), (17.8, 0.13)])
+def test_pull_that_cannot_tell_an_open_latch_is_refused_with_the_one_that_can(
+    mass_kg: float, pull_N: float
+) -> None:
+    """The one that can moves a free chaser by more than the tolerance, in small steps."""
+    heavy = {"mass_kg": mass_kg, "inertia_kg_m2": [8.0, 9.0, 10.0], "force_max_N": 9.0}
+    with pytest.raises(ScenarioError, match=f"docking.pull_N: {pull_N:g} N moves a chaser") as no:
+        scenario(chaser=heavy, docking={"pull_N": pull_N})
+    stated_mm, needed_N = (
+        float(re.findall(pattern, str(no.value))[0])
+        for pattern in (r"open by ([\d.]+) mm", r"([\d.]+) N$")
+    )
+    moved = []
+    for force_N in (pull_N, needed_N):
+        place, speed, count = 0.0, 0.0, 20_000
+        for k in range(count):
+            push_m_s2 = (1.0 if 2 * k < count else -1.0) * force_N / mass_kg
+            place, speed = place + speed * 2.0 / count, speed + push_m_s2 * 2.0 / count
+        moved.append(place)
+    assert moved[0] * 1e3 == pytest.approx(stated_mm, rel=1e-2)
+    assert moved[1] == pytest.approx(1.5 * scenario().docking.verify_position_m, rel=1e-2)
+    scenario(chaser=heavy, docking={"pull_N": 1.01 * needed_N})
+
+
+def test_pull_beyond_the_chasers_force_is_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"more than chaser.force_max_N \(0.3 N\)"):
+        scenario(chaser={"force_max_N": 0.3}, docking={"pull_N": 0.4})

@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock_controller.nmpc import BACK_ENDS, NmpcInput, make_solver
+from chaserdock_controller.nmpc import BACK_ENDS, NmpcInput, make_solver, open_backend
 from chaserdock_controller.nmpc.problem import check_input
+from chaserdock_protocol.errors import ChaserdockError, MissingPackageError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nmpc_cases import (
@@ -50,6 +51,12 @@ def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
     )
 
 
+def test_back_end_without_its_tools_is_one_line_for_users(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(open_backend, "missing_part", lambda: "solver 'open' needs cargo")
+    with pytest.raises(ChaserdockError, match="needs cargo"):
+        make_solver("open", SHORT_HORIZON, 1)
+
+
 # Compiling OpEn's solver takes minutes the first time.
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n == "open" else n for n in BACK_ENDS]
@@ -58,7 +65,7 @@ def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
 def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
     """Cost within 2 % of IPOPT's optimum, input bounds exact, distance constraints within 5 mm."""
     if not installed(name):
-        with pytest.raises(ValueError, match=rf"'{name}' needs"):
+        with pytest.raises(MissingPackageError, match=rf"'{name}' needs"):
             make_solver(name, SHORT_HORIZON, 1)
         pytest.skip(f"{name} is not installed")
     problem_at, states = far_start(1)

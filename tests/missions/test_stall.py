@@ -144,9 +144,11 @@ def world_and_intruder(endpoint: str) -> Iterator[tuple[Node, Node]]:
     world, intruder = (Node("world", "world", Link("forged", (endpoint,))) for _ in range(2))
     try:
         mission = Membership(1, "forged", "lockstep", "{}", source=world.source)
-        world.declare_queryable(
-            topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(mission.admit(request))
-        )
+
+        def join(request: JoinRequest, reply: Callable[[Any], None]) -> None:
+            reply(mission.admit(request))
+
+        world.declare_queryable(topics.JOIN_KEY, JoinRequest, join)
         world.declare_liveliness()
         yield world, intruder
     finally:

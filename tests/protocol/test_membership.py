@@ -10,8 +10,9 @@ from collections.abc import Callable
 import msgspec
 import pytest
 from chaserdock_protocol import codec, topics
-from chaserdock_protocol.messages import JoinRequest, Presence, encoding_of
-from chaserdock_protocol.mission.membership import Membership
+from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence, encoding_of
+from chaserdock_protocol.mission import membership as membership_module
+from chaserdock_protocol.mission.membership import JOIN_TIMEOUT_S, Membership
 from chaserdock_protocol.scenario.simulation import SimulationSection
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.network import RawSample
@@ -34,9 +35,19 @@ def first(*names: str) -> dict[str, str]:
 
 def joined(members: Membership, *names: str) -> Membership:
     for name in names:
-        assert members.admit(JoinRequest(process=name, instance=f"{name}-1")).accepted
+        assert answer(members, name, f"{name}-1").accepted
         members.set_alive(name, True)
     return members
+
+
+def answer(members: Membership, name: str, instance: str) -> JoinReply:
+    reply = members.admit(JoinRequest(process=name, instance=instance))
+    assert reply is not None
+    return reply
+
+
+def accepted(reply: JoinReply | None) -> bool:
+    return reply is not None and reply.accepted
 
 
 def announce(members: Membership, name: str, *heard: str, instance: str | None = None) -> bool:
@@ -47,7 +58,7 @@ def announce(members: Membership, name: str, *heard: str, instance: str | None =
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_admitted_process_receives_the_mission(mode: str) -> None:
     for name in ("chaser/0", "chaser/1", "controller", "recorder"):
-        reply = membership(mode=mode).admit(JoinRequest(process=name, instance="i"))
+        reply = answer(membership(mode=mode), name, "i")
         assert (reply.accepted, reply.reason) == (True, "")
         assert (reply.run_id, reply.mode, reply.scenario_json) == ("run-1", mode, '{"a": 1}')
 
@@ -68,7 +79,7 @@ def test_admitted_process_receives_the_mission(mode: str) -> None:
 )
 def test_refused_process_receives_the_reason(name: str, reason: str) -> None:
     members = membership()
-    reply = members.admit(JoinRequest(process=name, instance="i"))
+    reply = answer(members, name, "i")
     assert not reply.accepted
     assert reason in reply.reason
     assert reply.scenario_json == ""
@@ -77,15 +88,13 @@ def test_refused_process_receives_the_reason(name: str, reason: str) -> None:
 
 def test_running_process_blocks_a_second_instance_until_it_departs() -> None:
     members = joined(membership(), "chaser/0")
-    twin = JoinRequest(process="chaser/0", instance="another")
-    assert members.admit(twin).reason == "chaser/0 is already running in this mission"
-    assert members.admit(
-        JoinRequest(process="chaser/0", instance="chaser/0-1")
-    ).accepted  # asked again
+    twin = ("chaser/0", "another")
+    assert answer(members, *twin).reason == "chaser/0 is already running in this mission"
+    assert answer(members, "chaser/0", "chaser/0-1").accepted  # asked again
     members.set_alive("chaser/0", False)
     assert members.take_departed() == ["chaser/0"]
     assert members.take_departed() == []
-    assert members.admit(twin).accepted
+    assert answer(members, *twin).accepted
     assert not announce(members, "chaser/0", "world")  # the old instance is ignored
     assert announce(members, "chaser/0", "world", instance="another")
 
@@ -140,7 +149,7 @@ def test_discovery_of_an_earlier_instance_does_not_count() -> None:
     announce(members, "chaser/0", "world", "controller")
     announce(members, "controller", "world", "chaser/0")
     members.set_alive("chaser/0", False)
-    assert members.admit(JoinRequest(process="chaser/0", instance="chaser/0-2")).accepted
+    assert answer(members, "chaser/0", "chaser/0-2").accepted
     members.set_alive("chaser/0", True)
     announce(members, "chaser/0", "world", "controller", instance="chaser/0-2")
     again = {**first("controller"), "chaser/0": "chaser/0-2"}
@@ -168,7 +177,7 @@ def flying(chasers: int = 2) -> tuple[Membership, dict[str, str]]:
 def again(members: Membership, name: str, *heard: str) -> None:
     """A process that crashed has started again, and announces whom it has received."""
     members.set_alive(name, False)
-    assert members.admit(JoinRequest(process=name, instance=f"{name}-2")).accepted
+    assert answer(members, name, f"{name}-2").accepted
     members.set_alive(name, True)
     assert announce(members, name, *heard, instance=f"{name}-2")
 
@@ -222,17 +231,55 @@ def test_full_discovery_is_required_again_after_loss_of_all() -> None:
     assert members.connected(heard) == {"chaser/0", "controller"}
 
 
-def test_second_of_two_simultaneous_joins_is_refused() -> None:
+def join(members: Membership, instance: str, name: str = "chaser/0") -> JoinReply | None:
+    return members.admit(JoinRequest(process=name, instance=instance))
+
+
+def test_second_of_two_simultaneous_joins_waits_and_is_refused() -> None:
+    members = membership(1)
+    assert accepted(join(members, "a"))
+    assert join(members, "b") is None  # it asks again
+    assert accepted(join(members, "a"))
+    members.set_alive("chaser/0", True)
+    reply = answer(members, "chaser/0", "b")
+    assert reply.reason == "chaser/0 is already running in this mission"
+    assert not announce(members, "chaser/0", "world", instance="b")
+    assert announce(members, "chaser/0", "world", instance="a")
+
+
+def test_forged_joins_turn_no_process_away_and_delay_it_once() -> None:
     now_s = [100.0]
     members = membership(1)
     members.now_s = lambda: now_s[0]
-    assert members.admit(JoinRequest(process="chaser/0", instance="a")).accepted
-    assert (
-        "another chaser/0 is joining"
-        in members.admit(JoinRequest(process="chaser/0", instance="b")).reason
-    )
-    now_s[0] += 6.0  # the first never came
-    assert members.admit(JoinRequest(process="chaser/0", instance="b")).accepted
+    replies = []
+    for k in range(100):  # a forged one before each that the process sends
+        now_s[0] += 0.1
+        join(members, "forged")
+        join(members, f"forged-{k}")
+        replies.append(join(members, "own"))
+        assert replies[-1] is None or replies[-1].accepted
+    assert [r is None for r in replies].index(False) * 0.1 <= JOIN_TIMEOUT_S + 0.2
+    members.set_alive("chaser/0", True)
+    assert announce(members, "chaser/0", "world", instance="own")
+    assert members.instance_of("chaser/0") == "own"
+    for forged in ("forged", "forged-99", "never-admitted"):
+        assert not announce(members, "chaser/0", "world", instance=forged)
+    members.set_alive("chaser/0", False)  # lost, and restarted: at once
+    assert accepted(join(members, "own-2"))
+    assert not announce(members, "chaser/0", "world", instance="own")
+
+
+def test_forged_joins_are_remembered_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(membership_module, "_MOST_JOINING", 50)
+    now_s = [0.0]
+    members = membership(3)
+    members.now_s = lambda: now_s[0]
+    for k in range(200):
+        now_s[0] += 1.0
+        join(members, f"forged-{k}", f"chaser/{k % 3}")
+    assert len(members._admitted) == 50
+    reply = answer(members, "chaser/0", "x" * 101)
+    assert reply.reason == "an instance has at most 100 characters"
 
 
 def test_heartbeat_ends_with_its_node() -> None:

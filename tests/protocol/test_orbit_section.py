@@ -56,6 +56,7 @@ def test_without_the_section_there_is_no_orbit() -> None:
         ),
         ({"orbit": {"altitude_m": 5e4}}, "orbit: the perigee is at 50.0 km, inside the atmosphere"),
         ({"orbit": {"altitude_m": -5.0}}, "orbit.altitude_m: "),
+        ({"orbit": {"altitude_m": 1e12}}, "semi-major axis is 1.00001e+09 km; at most 100000 km"),
         (
             {"orbit": {"altitude_m": 4e5, "eccentricity": 0.01}},
             "altitude_m: is of a circular orbit",

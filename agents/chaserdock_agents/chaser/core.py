@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
+from chaserdock_protocol.failure_watch import FailureWatch
 from chaserdock_protocol.fault_injection import LostMessage
 from chaserdock_protocol.messages import (
     ActuatorCommand,
@@ -35,7 +36,6 @@ from .fallback_control import FallbackControl
 from .inbox import ChaserInbox
 from .outbox import ChaserOutputs, Outbox
 from .perception import make_perception
-from .perception_watch import PerceptionWatch, Trouble
 from .thrusters.controller import ThrusterController
 from .thrusters.failure_reports import FailureReports
 from .vision import Vision
@@ -61,10 +61,10 @@ class ChaserCore:
     ) -> None:
         self.scenario, self.number = scenario, number
         self.realtime, self.instance = realtime, instance
-        self.outbox = Outbox(number)
+        self.outbox, self._seen = Outbox(number), Outbox(number)
         self.inbox = ChaserInbox()
         self.vision = vision or Vision(make_perception(scenario))
-        self._perception_watch = PerceptionWatch(scenario.perception.name)
+        self._perception_watch = FailureWatch(scenario.perception.name)
         self.gate = CommandGate(scenario, number, realtime, self.outbox)
         self.fallback = FallbackControl(scenario, number, self.outbox)
         has_thrusters = scenario.chaser.actuation == "thrusters"
@@ -90,7 +90,7 @@ class ChaserCore:
                 if self._is_new(inbox.add_docking(message)):
                     self._observe_thrusters()
             case Image():
-                self._look(message)
+                return self.look(message)
             case Plan():
                 self._is_new(self.fallback.add_plan(message))
             case TargetEstimate():
@@ -165,32 +165,38 @@ class ChaserCore:
         elif topic is topics.WRENCH and lost.sender in ("", self.gate.leases.holder):
             self._mark_uncommanded(lost.tick)
 
-    def _look(self, image: Image) -> None:
+    def look(self, image: Image) -> ChaserOutputs:
+        """Look for the target in an image. It may run in a thread beside ``step``, with
+        ``note_duration``.
+        """
         before = self.vision.sighting
         sighting = self.vision.look(image)
+        if self.vision.refused:
+            self._seen.warn("geometry refused", self.vision.refused, image.tick, image.sim_time_ns)
         if sighting is None:
-            self.outbox.count_stale()
-            return
+            self._seen.count_stale()
+            return self._seen.take()
         if sighting.status == "bad_image" and (before is None or before.status != "bad_image"):
-            self.outbox.warn("bad image", sighting.detail, image.tick, image.sim_time_ns)
+            self._seen.warn("bad image", sighting.detail, image.tick, image.sim_time_ns)
         self._watch_perception("perception failed", self.vision.failure, image)
-        self.outbox.publish(topics.SIGHTING, sighting)
+        self._seen.publish(topics.SIGHTING, sighting)
+        return self._seen.take()
 
     def note_duration(self, image: Image, took_s: float) -> ChaserOutputs:
         """Return what to publish of the time that an image took, in real time: a warning if no
-        command stayed valid meanwhile.
+        command would stay valid as long.
         """
         valid_s = self.scenario.controller.command_lifetime_s
         late = f"{took_s:.2f} s for an image, longer than a command is valid ({valid_s:g} s)"
         self._watch_perception("perception late", late if took_s > valid_s else "", image)
-        return self.outbox.take()
+        return self._seen.take()
 
-    def _watch_perception(self, what: Trouble, detail: str, image: Image) -> None:
+    def _watch_perception(self, what: str, detail: str, image: Image) -> None:
         """Count, and report, what went wrong in an image; nothing if ``detail`` is empty."""
         if detail:
-            self.outbox.count_rejected(f"image:{what}")
+            self._seen.count_rejected(f"image:{what}")
         if (report := self._perception_watch.update(what, detail)) is not None:
-            self.outbox.event(*report, image.tick, image.sim_time_ns)
+            self._seen.event(*report, image.tick, image.sim_time_ns)
 
     def _observe_thrusters(self) -> None:
         """Publish the thrusters' capability and the events of fault detection.

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+
 import cv2
 import msgspec
 from chaserdock_protocol import topics
@@ -71,6 +74,11 @@ class ChaserProcess:
             node.subscribe(topic, i)
         for topic in (topics.TARGET, topics.TICK, topics.END):
             node.subscribe(topic)
+        self._end_looking: Callable[[], None] = lambda: None
+        if core.realtime:
+            self._put_image, self._end_looking = node.host.worker(self._look)
+            node.on_close(self._end_looking)
+        self._publishing = threading.Lock()
         self.heartbeat = Heartbeat(node, core.instance, stall_s)
 
     def listen(self) -> None:
@@ -86,6 +94,8 @@ class ChaserProcess:
                 self.ended = True
             case Tick() as tick:
                 self._begin_tick(tick, received)
+            case Image() as image if self.core.realtime:
+                self._put_image(image)
             case _:
                 self._step(received)
 
@@ -102,25 +112,33 @@ class ChaserProcess:
             self.node.publish(topics.HEALTH, health, self.node.name)
 
     def _step(self, received: ReceivedMessage) -> None:
-        node = self.node
-        started_s = node.host.now_s()
+        started_s = self.node.host.now_s()
         outputs = self.core.step(received, started_s)
-        took_s = node.host.now_s() - started_s
+        self._publish(outputs, self.node.host.now_s() - started_s)
+
+    def _look(self, image: Image) -> None:
+        """Look for the target in an image, in real time: beside the messages, as commands must not
+        wait for it.
+        """
+        started_s = self.node.host.now_s()
+        outputs = self.core.look(image)
+        took_s = self.node.host.now_s() - started_s
         self._publish(outputs, took_s)
-        if self.core.realtime and isinstance(received.message, Image):
-            self._publish(self.core.note_duration(received.message, took_s), took_s)
+        self._publish(self.core.note_duration(image, took_s), took_s)
 
     def _publish(self, outputs: ChaserOutputs, took_s: float) -> None:
         node = self.node
-        node.counts.stale += outputs.stale
-        if outputs.rejected:
-            node.counts.rejected[outputs.rejected] += 1
-        for topic, place, message in outputs.messages:
-            if isinstance(message, Sighting):
-                message = msgspec.structs.replace(message, wall_estimate_s=took_s)
-            node.publish(topic, message, place)
+        with self._publishing:
+            node.counts.stale += outputs.stale
+            if outputs.rejected:
+                node.counts.rejected[outputs.rejected] += 1
+            for topic, place, message in outputs.messages:
+                if isinstance(message, Sighting):
+                    message = msgspec.structs.replace(message, wall_estimate_s=took_s)
+                node.publish(topic, message, place)
 
     def publish_farewell(self) -> None:
-        """Publish the last messages of this process."""
+        """Publish the last messages of this process, once the image in hand has been looked at."""
+        self._end_looking()
         tick = self.core.inbox.tick
         self.heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from chaserdock_protocol import codec
 from chaserdock_protocol.codec import vector
+from chaserdock_protocol.failure_watch import LONGEST_TEXT, text_of
 from chaserdock_protocol.messages import (
     ExpectedPose,
     GeometryEstimate,
@@ -41,10 +42,6 @@ _EXPECTED_FOR_NS = 300_000_000
 """Age above which an expected pose is not used, ns: four images at 15 Hz, in which a target that
 turns by 10 degrees/s has turned by 3, the reach of a start (``tracking``).
 """
-
-
-_LONGEST_TEXT = 400
-"""Longest reason, characters, so that a message has room for it and for what failed."""
 
 
 class BadImage(Exception):
@@ -114,10 +111,9 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         sighting = _measure(perception, pixels, image.ranging, predicted, header)
         codec.decode(Sighting, codec.encode(sighting))  # raises what a reader would refuse
     except (BadImage, UnusableImage) as error:
-        return Sighting(**header, status="bad_image", **_EMPTY, detail=str(error)[:_LONGEST_TEXT])
+        return Sighting(**header, status="bad_image", **_EMPTY, detail=str(error)[:LONGEST_TEXT])
     except Exception as error:  # an installed perception may raise or return anything
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        raise PerceptionFailed(text[:_LONGEST_TEXT]) from error
+        raise PerceptionFailed(text_of(error)) from error
     return sighting
 
 

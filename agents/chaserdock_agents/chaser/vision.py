@@ -3,9 +3,16 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 
-from chaserdock_protocol.messages import ExpectedPose, Image, Sighting, WrenchCommand
+from chaserdock_protocol.messages import (
+    ExpectedPose,
+    GeometryEstimate,
+    Image,
+    Sighting,
+    WrenchCommand,
+)
 
 from .perception import PerceptionMethod
 from .sighting import (
@@ -26,14 +33,18 @@ class Vision:
     """Turn the images of one chaser into sightings.
 
     Each image is searched near the last ``sighting``, or where the controller expects the target.
-    A perception that fails gives a sighting of nothing, and ``failure`` says why.
+    A perception that fails gives a sighting of nothing, and ``failure`` says why. ``refused``: why
+    a geometry that came during an image was refused after it. ``look`` may run in a thread beside
+    the other methods.
     ``perception``: None for a chaser that gets no images, as in studies with drawn sightings.
     """
 
     def __init__(self, perception: PerceptionMethod | None) -> None:
         self.perception = perception
         self.sighting: Sighting | None = None
-        self.failure = ""
+        self.failure = self.refused = ""
+        self._looking = threading.Lock()
+        self._geometry: GeometryEstimate | None = None
         self._expected: ExpectedPose | None = None
         self._processed: deque[tuple[int, int]] = deque(maxlen=REMEMBERED_IMAGES)
 
@@ -41,6 +52,12 @@ class Vision:
         """Return the sighting in an image; None if the image of its exposure was processed
         before.
         """
+        with self._looking:
+            geometry, self._geometry = self._geometry, None
+            self.refused = apply_geometry(self.perception, geometry) or ""
+            return self._sighting_in(image)
+
+    def _sighting_in(self, image: Image) -> Sighting | None:
         exposure = (image.tick, image.sim_time_ns)
         if exposure in self._processed:
             return None
@@ -57,12 +74,19 @@ class Vision:
 
     def has_processed(self, tick: int) -> bool:
         """Return whether an image of a tick was processed."""
-        return any(processed == tick for processed, _ in self._processed)
+        processed = tuple(self._processed)  # a copy: ``look`` appends
+        return any(known == tick for known, _ in processed)
 
     def inform(self, command: WrenchCommand) -> str | None:
         """Pass on what a command states about the target: its geometry and its expected pose.
 
-        Return why the geometry was refused, or None.
+        Return why the geometry was refused, or None. During an image it waits for its end.
         """
         self._expected = command.expected
-        return apply_geometry(self.perception, command.geometry)
+        if not self._looking.acquire(blocking=False):
+            self._geometry = command.geometry or self._geometry
+            return None
+        try:
+            return apply_geometry(self.perception, command.geometry)
+        finally:
+            self._looking.release()

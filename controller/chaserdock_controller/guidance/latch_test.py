@@ -60,13 +60,14 @@ def motion_between(before: RelativePose, now: RelativePose, scenario: FlightScen
 
 
 def why_untold(before: RelativePose, now: RelativePose, scenario: FlightScenario) -> str:
-    """Return why an open latch could not be told from an error of the estimate; empty if it
-    could, or if the tolerance of the procedure hides it anyway.
+    """Return why an open latch could not be told from an error of the estimate; empty if it could.
+
+    Its motion exceeds the tolerance of the procedure in any valid scenario.
     """
     along = rotations.rotate(now.q_wxyz, (1.0, 0.0, 0.0))
     most_m = _most(along, (before.covariance + now.covariance)[:3, :3])
-    open_m = _open_latch_motion_m(scenario)
-    if most_m <= max(open_m, scenario.docking.verify_position_m):
+    open_m = scenario.docking.open_latch_motion_m(scenario.chaser.mass_kg)
+    if most_m <= open_m:
         return ""
     return (
         f"the estimate may err by {most_m * 1e3:.2f} mm along the pull, which moves an open latch "
@@ -81,12 +82,3 @@ def _most(change: Array, covariance: Array) -> float:
         return 0.0
     direction = change / length
     return GUIDANCE.pull_sigmas * math.sqrt(max(0.0, float(direction @ covariance @ direction)))
-
-
-def _open_latch_motion_m(scenario: FlightScenario) -> float:
-    """Return how far pull and push move a chaser whose latch is open, at least, m.
-
-    Two equal and opposite pulses leave it at rest, ``pull_s`` x its highest speed away.
-    """
-    docking = scenario.docking
-    return docking.pull_N * docking.pull_s**2 / scenario.chaser.mass_kg

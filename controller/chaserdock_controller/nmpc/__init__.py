@@ -26,8 +26,8 @@ def make_solver(
     counted by the back end.
 
     ``name`` is a built-in back end or an installed ``chaserdock.solvers`` entry point: a function
-    of (params, n, max_iterations). Raises PluginError for an unknown name, ValueError for n < 1 or
-    a package that is not installed.
+    of (params, n, max_iterations). Raises PluginError for an unknown name, ValueError for n < 1,
+    MissingPackageError for a package that is not installed.
     """
     # Imports are local to avoid the start-up time of unused back ends.
     if name == "rti":

@@ -28,7 +28,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from chaserdock_protocol.errors import how_to_install
+from chaserdock_protocol.errors import MissingPackageError, how_to_install
 
 from .casadi_nlp import SingleShootingSolver
 from .casadi_problem import Nlp, build_nlp
@@ -69,7 +69,7 @@ class OpenSolver(SingleShootingSolver):
     """Solve with OpEn for up to ``n_chasers`` chasers, warm-started from the last plans.
 
     ``max_iterations`` bounds the iterations of a solve, MAX_INNER if None. Raises ValueError for
-    n_chasers < 1 or where opengen or cargo is not installed.
+    n_chasers < 1, MissingPackageError where opengen or cargo is not installed.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class OpenSolver(SingleShootingSolver):
     ) -> None:
         missing = missing_part()
         if missing is not None:
-            raise ValueError(missing)
+            raise MissingPackageError(missing)
         inner = MAX_INNER if max_iterations is None else max_iterations
 
         def program(n: int) -> tuple[Nlp, Any]:

@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 from chaserdock_models.arrays import Array, limited
 from chaserdock_models.shape_distance import box_table
+from chaserdock_protocol.failure_watch import FailureWatch, text_of
 from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import FlightScenario
 
@@ -36,7 +37,7 @@ from .passive_safety import PassiveSafetyMonitor
 from .plan_monitor import PlanMonitor
 from .problem import NmpcParameters
 from .types import FAILED, NmpcInput, NmpcPlan
-from .warm_start import check_plan
+from .warm_start import checked_plan
 
 _ATTACHED_FACTOR = 1.2
 """Input limit of an attached chaser, relative to the largest input that follows the target; the
@@ -47,6 +48,8 @@ _ATTACHED_MARGIN = 1e-3
 """Added to that limit, N and N m, because the solver needs a positive one where the target does not
 move.
 """
+FAILED_SOLVER = "solver failed"
+"""Name of an exception of the solver, or of a result that cannot be used, in counts."""
 _CANCELLED_SHARE = 0.5
 """Largest share of an input limit that may cancel a disturbance."""
 
@@ -72,7 +75,7 @@ class PlanHistory(PlanningHistory):
 
 class PlanningStage:
     """Runs the solver with its warm starts and, in real time, its budget; keeps the plans of the
-    last ticks.
+    last ticks. ``failed``: names the solver's failure in this tick, as it is counted.
 
     Raises PluginError for an installed solver that cannot be held to a budget when there is one.
     """
@@ -97,6 +100,8 @@ class PlanningStage:
             self._passive_safety = PassiveSafetyMonitor(scenario)
         self.history = PlanHistory(self.monitors, self._passive_safety)
         self._last_solve_ns: int | None = None
+        self._watch = FailureWatch(c.solver)
+        self.failed: tuple[str, ...] = ()
         self._budget: SolveBudget | None = None
         if realtime and c.solve_budget_s is not None:
             self._budget = SolveBudget(c.solve_budget_s, c.max_iterations)
@@ -114,6 +119,7 @@ class PlanningStage:
         The problem is solved for the input plus the estimated disturbance, which is subtracted
         afterwards. The input cost thus keeps its reference, and the disturbance causes no offset.
         """
+        self.failed = ()
         horizon = guidance.horizon
         if horizon is None:
             for monitor in self.monitors:
@@ -145,14 +151,19 @@ class PlanningStage:
 
         plan: NmpcPlan | None = None
         events: tuple[LogEntry, ...] = ()
+        failure = ""
         start_s = self._now_s()
         try:
             plan = self.solver.solve(problem, since_ns / 1e9, (*horizon.chasers, *lost))
-            check_plan(plan, len(problem.states), self._parameters.stages)
+            plan = checked_plan(plan, len(problem.states), self._parameters.stages)
             self._last_solve_ns = observation.time_ns
         except Exception as error:  # an installed solver may raise anything
             plan = None
-            events = (("error", f"solver error: {type(error).__name__}: {error}"),)
+            failure = text_of(error)
+        report = self._watch.update(FAILED_SOLVER, failure)
+        if report is not None:  # an error at once: what is flown instead is old or no plan
+            events = (("error", f"solver error: {report.detail}"),)
+        self.failed = (FAILED_SOLVER,) if failure else ()
         wall_s = self._now_s() - start_s
 
         if self._budget is not None and plan is not None:

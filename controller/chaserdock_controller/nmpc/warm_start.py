@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from chaserdock_models.passive_safety import CoastCertificate
 
 from .kernels import plan_cost, plan_violation, roll, shifted
 from .native import function
@@ -19,6 +20,7 @@ from .types import (
     INFEASIBLE_RELAXED,
     ITERATION_LIMIT,
     SOLVED,
+    STATUSES,
     VIOLATION_TOLERANCE_M,
     Array,
     IntArray,
@@ -120,17 +122,24 @@ def status_of(usable: bool, at_limit: bool) -> str:
     return FAILED if not usable else (ITERATION_LIMIT if at_limit else SOLVED)
 
 
-def check_plan(plan: NmpcPlan, n: int, d: int) -> None:
-    """Raise ValueError unless a plan is of ``n`` chasers and ``d`` stages and all its values are
-    finite.
+def checked_plan(plan: NmpcPlan, n: int, d: int) -> NmpcPlan:
+    """Return a plan of ``n`` chasers and ``d`` stages with its values as arrays. Raises ValueError
+    for another shape, an unknown status, or a value that is not finite.
     """
-    for name, value, shape in (
-        ("inputs", plan.inputs, (n, d, 6)),
-        ("states", plan.states, (n, d + 1, 13)),
-    ):
-        checked_array(name, value, shape, negative=True)
-    if len(plan.status) != n:
-        raise ValueError(f"status must be of {n} chasers, not {len(plan.status)}")
+    if not isinstance(plan, NmpcPlan):
+        raise ValueError(f"solve() returned {type(plan).__name__}, not an NmpcPlan")
+    if len(plan.status) != n or not set(plan.status) <= set(STATUSES):
+        raise ValueError(f"status must be {n} of {STATUSES}, not {plan.status}")
+    if not all(isinstance(coast, CoastCertificate) for coast in plan.coasts.values()):
+        raise ValueError("coasts must be certificates")
+    return replace(
+        plan,
+        inputs=checked_array("inputs", plan.inputs, (n, d, 6), negative=True),
+        states=checked_array("states", plan.states, (n, d + 1, 13), negative=True),
+        iterations=checked_array("iterations", plan.iterations, (n,)).astype(np.int64),
+        cost=checked_array("cost", plan.cost, (n,), negative=True),
+        max_violation_m=checked_array("max_violation_m", plan.max_violation_m, (n,), negative=True),
+    )
 
 
 def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:

@@ -4,11 +4,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import create_fault_layer
-from chaserdock_protocol.messages import JoinRequest, MissionEnd, ScenarioReply, ScenarioRequest
+from chaserdock_protocol.messages import (
+    JoinReply,
+    JoinRequest,
+    MissionEnd,
+    ScenarioReply,
+    ScenarioRequest,
+)
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import (
     Scenario,
@@ -115,9 +122,12 @@ def open_mission(
     node.watch_liveliness(membership.set_alive)
     full = ScenarioReply(run_id=membership.run_id, scenario_json=scenario.model_dump_json())
     node.declare_queryable(topics.SCENARIO_KEY, ScenarioRequest, lambda _, reply: reply(full))
-    node.declare_queryable(
-        topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request))
-    )
+
+    def join(request: JoinRequest, reply: Callable[[JoinReply], None]) -> None:
+        if (answer := membership.admit(request)) is not None:
+            reply(answer)
+
+    node.declare_queryable(topics.JOIN_KEY, JoinRequest, join)
     for topic in (topics.TICK, topics.END):
         node.advertise(topic)
     heartbeat = Heartbeat(node, membership.instance)

@@ -16,12 +16,25 @@ from chaserdock_protocol.transport.session import required_peers
 from .stall import WaitReport
 
 JOIN_TIMEOUT_S = 5.0
-"""Time, s, for which an admitted process keeps its name before its liveliness token appears."""
+"""Time, s, for which the first process that joins by a free name has it to itself: several times
+what a process takes to its liveliness token, of which a second one then learns.
+"""
+_MOST_JOINING = 50_000
+"""Most instances that are remembered as admitted: what a flood of joins brings in the seconds in
+which a process starts, in 10 MB.
+"""
+_LONGEST_INSTANCE = 100
+"""Characters of an instance; ours have 32."""
 
 
 @dataclass
 class Membership:
     """Track the processes of a mission as the world knows them.
+
+    A join alone proves nothing, as anybody on a network without keys may ask for any name. So it
+    turns no other process away: the first that joins by a free name keeps it for `JOIN_TIMEOUT_S`,
+    in which others get no reply and ask again; after that all who ask are admitted until one of
+    them is alive. The instance of a name is the first admitted one that publishes its presence.
 
     Thread-safe: called from Zenoh's threads and the main loop. ``instance`` and ``source``: the
     world's own instance and session. ``flying``: set at the first tick; from then on connected
@@ -40,8 +53,9 @@ class Membership:
     now_s: Callable[[], float] = time.monotonic
     flying: bool = False
     _alive: set[str] = field(default_factory=set)
-    _admitted: dict[str, str] = field(default_factory=dict)
-    _admitted_s: dict[str, float] = field(default_factory=dict)
+    _admitted: dict[tuple[str, str], None] = field(default_factory=dict)
+    _asked_s: dict[str, float] = field(default_factory=dict)
+    _instances: dict[str, str] = field(default_factory=dict)
     _heard: dict[str, dict[str, str]] = field(default_factory=dict)
     _reports: dict[str, tuple[tuple[str, ...], float]] = field(default_factory=dict)
     _departed: list[str] = field(default_factory=list)
@@ -53,14 +67,26 @@ class Membership:
         """Whether the wall clock ends a tick."""
         return self.mode == "realtime"
 
-    def admit(self, request: JoinRequest) -> JoinReply:
-        """Admit a process and return the mission, or refuse it with a reason."""
+    def admit(self, request: JoinRequest) -> JoinReply | None:
+        """Admit a process and return the mission, or refuse it with a reason. None: it is to ask
+        again, because another process is joining by its name.
+        """
         reason = self._refusal(request)
         if reason:
             return JoinReply(accepted=False, reason=reason, source=self.source)
+        name, instance = request.process, request.instance
         with self._lock:
-            self._admitted[request.process] = request.instance
-            self._admitted_s[request.process] = self.now_s()
+            if instance != self._instances.get(name) and (name, instance) not in self._admitted:
+                if name in self._alive:
+                    text = f"{name} is already running in this mission"
+                    return JoinReply(accepted=False, reason=text, source=self.source)
+                if self.now_s() - self._asked_s.get(name, -math.inf) < JOIN_TIMEOUT_S:
+                    return None
+                self._asked_s.setdefault(name, self.now_s())
+                self._instances.pop(name, None)  # it was lost, and is replaced
+                self._admitted[name, instance] = None
+                if len(self._admitted) > _MOST_JOINING:
+                    del self._admitted[next(iter(self._admitted))]
         return JoinReply(
             accepted=True,
             reason="",
@@ -79,12 +105,8 @@ class Membership:
             return "this mission has a world already; choose another --namespace for a second one"
         if name.startswith("chaser/") and int(name.partition("/")[2]) >= self.chasers:
             return f"there is no {name} in this mission; its chasers are 0 to {self.chasers - 1}"
-        with self._lock:
-            if self._admitted.get(name, request.instance) != request.instance:
-                if name in self._alive:
-                    return f"{name} is already running in this mission"
-                if self.now_s() - self._admitted_s.get(name, -math.inf) < JOIN_TIMEOUT_S:
-                    return f"another {name} is joining this mission"
+        if len(request.instance) > _LONGEST_INSTANCE:
+            return f"an instance has at most {_LONGEST_INSTANCE} characters"
         return ""
 
     def set_alive(self, name: str, alive: bool) -> None:
@@ -97,19 +119,27 @@ class Membership:
                 self._heard.pop(name, None)
                 self._reports.pop(name, None)
                 self._connected.discard(name)
-                self._admitted_s.pop(name, None)
+                self._forget_joining(name)
                 self._departed.append(name)
 
     def update_presence(self, message: Presence) -> bool:
         """Record which processes a process has heard; return False if that instance is not
-        admitted.
+        admitted, or another one was first.
         """
         with self._lock:
-            if self._admitted.get(message.process) != message.instance:
-                return False
+            name, instance = message.process, message.instance
+            if self._instances.get(name) != instance:
+                if name in self._instances or (name, instance) not in self._admitted:
+                    return False
+                self._instances[name] = instance
             self._heard[message.process] = dict(message.heard)
             self._reports[message.process] = (message.waiting_for, self.now_s())
             return True
+
+    def _forget_joining(self, name: str) -> None:
+        """Forget who has joined by a name, so that the next one has it to itself."""
+        self._asked_s.pop(name, None)
+        self._admitted = {key: None for key in self._admitted if key[0] != name}
 
     def progress(self) -> dict[str, WaitReport]:
         """Return what each living process waits for by its last presence, and the age of that
@@ -138,7 +168,7 @@ class Membership:
         another one joins.
         """
         with self._lock:
-            current = {**self._admitted, "world": self.instance}
+            current = {**self._instances, "world": self.instance}
             heard = {
                 name: {
                     other for other, instance in others.items() if current.get(other) == instance
@@ -168,6 +198,6 @@ class Membership:
             return connected
 
     def instance_of(self, name: str) -> str:
-        """Return the instance of a process that was admitted last, empty if none was."""
+        """Return the instance of a process, empty before its first presence."""
         with self._lock:
-            return self._admitted.get(name, "")
+            return self._instances.get(name, "")

@@ -554,12 +554,32 @@ def _largest_sum(vectors: Array) -> float:
     return float(np.maximum(directions @ vectors, 0.0).sum(axis=1).max() / math.cos(0.15))
 
 
+def _check_pull(scenario: FlightScenario) -> None:
+    """Check that the pull test moves a chaser whose latch is open by more than it tolerates."""
+    docking, chaser = scenario.docking, scenario.chaser
+    moved_m = docking.open_latch_motion_m(chaser.mass_kg)
+    needed_m = docking.pull_clearance * docking.verify_position_m
+    if moved_m < needed_m:
+        raise ValueError(
+            f"docking.pull_N: {docking.pull_N:g} N moves a chaser of {chaser.mass_kg:g} kg whose "
+            f"latch is open by {moved_m * 1e3:.3g} mm; to tell it from the "
+            f"{docking.verify_position_m * 1e3:g} mm that are tolerated takes "
+            f"{needed_m * 1e3:g} mm, and {docking.pull_N * needed_m / moved_m:.3g} N"
+        )
+    if docking.pull_N > chaser.force_max_N:
+        raise ValueError(
+            f"docking.pull_N: {docking.pull_N:g} N is more than chaser.force_max_N "
+            f"({chaser.force_max_N:g} N)"
+        )
+
+
 def _check_capture(scenario: FlightScenario) -> None:
     if scenario.target.motion != "torque_free":
         raise ValueError(
             f"target.motion: docking by capture needs torque_free, which contact forces can move, "
             f"not {scenario.target.motion}"
         )
+    _check_pull(scenario)
     nearest_m = scenario.limits.min_distance_target_m
     for k, port in enumerate(scenario.docking.ports):
         entry_m = math.hypot(

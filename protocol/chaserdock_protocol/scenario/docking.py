@@ -129,10 +129,13 @@ class Docking(Section):
     settle_s: ClassVar[float] = 2.0
     """Wait between the latch and the pull test, s: 30 ticks of the default rate for estimates."""
     pull_s: ClassVar[float] = 1.0
-    """Duration of the pull, and of the push that follows it, s: 0.5 N move 30 kg by 8 mm if the
+    """Duration of the pull, and of the push that follows it, s: 0.5 N move 30 kg by 17 mm if the
     latch is open, more than `verify_position_m`."""
     verify_position_m: ClassVar[float] = 0.005
     """Largest displacement in the pull test, m: half of the lateral tolerance at contact."""
+    pull_clearance: ClassVar[float] = 1.5
+    """Least motion of an open latch in the pull test, over `verify_position_m`: beyond it by three
+    standard deviations of a change of the estimate in `docking-contact` (0.74 mm)."""
     verify_angle_deg: ClassVar[float] = 0.5
     """Largest rotation in the pull test, degrees: a sixth of the tolerance at contact."""
 
@@ -194,6 +197,13 @@ class Docking(Section):
                 f"approach_speed_m_s ({self.approach_speed_m_s:g})"
             )
         return self
+
+    def open_latch_motion_m(self, mass_kg: float) -> float:
+        """Return how far pull and push move a chaser whose latch is open, at least, m.
+
+        Two equal and opposite pulses leave it at rest, ``pull_s`` x its highest speed away.
+        """
+        return self.pull_N * self.pull_s**2 / mass_kg
 
     def port_of(self, chaser: int) -> Port | None:
         """Return the port where a chaser is to be captured, or None."""

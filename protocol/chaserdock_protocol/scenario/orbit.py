@@ -14,6 +14,10 @@ from .fields import Positive, Section
 
 LOWEST_ALTITUDE_M = 100e3
 """Where the table of the atmosphere begins; below, no orbit lasts for a revolution."""
+LARGEST_SEMI_AXIS_M = 1e8
+"""Longest semi-major axis, m: more than twice a geostationary orbit's. Coasts of two orbits, which
+passive safety samples, then last a week; far beyond, they fill the memory.
+"""
 Angle = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
 
 
@@ -95,6 +99,12 @@ class Orbit(Section):
             raise ValueError(
                 f"the perigee is at {lowest_m / 1e3:.1f} km, inside the atmosphere; at least "
                 f"{LOWEST_ALTITUDE_M / 1e3:g} km are needed"
+            )
+
+        if self.elements.semi_major_axis_m > LARGEST_SEMI_AXIS_M:
+            raise ValueError(
+                f"the semi-major axis is {self.elements.semi_major_axis_m / 1e3:.6g} km; at most "
+                f"{LARGEST_SEMI_AXIS_M / 1e3:g} km"
             )
 
         drag = (self.target_ballistic_coefficient_kg_m2, self.chaser_ballistic_coefficient_kg_m2)

@@ -16,6 +16,7 @@ import subprocess
 import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
@@ -48,6 +49,14 @@ class Host(Protocol):
 
     def repeat(self, call: Callable[[], float]) -> Undo:
         """Call ``call`` in the background, now and each time after the seconds that it returned."""
+        ...
+
+    def worker(self, call: Callable[[Any], None]) -> tuple[Callable[[Any], None], Undo]:
+        """Return a function that has ``call`` handle an item in the background, one at a time, and
+        one that ends this.
+
+        An item replaces one that still waits. What ``call`` raises, the next item raises.
+        """
         ...
 
     def finish_startup(self) -> None:
@@ -204,6 +213,38 @@ class Machine:
             thread.join()
 
         return end
+
+    def worker(self, call: Callable[[Any], None]) -> tuple[Callable[[Any], None], Undo]:
+        """Call ``call`` from a daemon thread; the end joins it."""
+        waiting: deque[Any] = deque(maxlen=1)
+        ready, stop = threading.Event(), threading.Event()
+        errors: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                while not stop.is_set():
+                    ready.wait()
+                    ready.clear()
+                    while waiting and not stop.is_set():
+                        call(waiting.popleft())
+            except BaseException as error:
+                errors.append(error)
+
+        thread = threading.Thread(target=run, name="worker", daemon=True)
+        thread.start()
+
+        def put(item: Any) -> None:
+            if errors:
+                raise errors[0]
+            waiting.append(item)
+            ready.set()
+
+        def end() -> None:
+            stop.set()
+            ready.set()
+            thread.join()
+
+        return put, end
 
     def finish_startup(self) -> None:
         """Exclude the objects created so far from garbage collection.

@@ -29,6 +29,10 @@ _SMALL = 1e-6
 """Weight of the norm beside the distance to the wrench, 1 per axis. Makes the solution unique, and
 changes the wrench by a millionth.
 """
+_BEYOND = 10.0
+"""Thrust of the largest unit, over the scale of the axes on which it acts most: with units of 100,
+as of a main engine beside small thrusters, the solver fails in one case of twenty.
+"""
 # daqp's codes for an equality constraint and for success
 _EQUALITY, _SOLVED = 5, 1
 
@@ -49,10 +53,13 @@ class Allocator:
     def __init__(self, thrusters: Sequence[Thruster], scale: Array) -> None:
         self.matrix = wrench_matrix(thrusters)
         self._full_N = thrusts_max(thrusters)
-        # In units of the axes and of full thrust, all numbers are near one.
-        self._rows = self.matrix * self._full_N / scale[:, None]
+        # In units of the axes and of full thrust, or of what is far beyond them, all numbers are
+        # near one.
+        most_N = _BEYOND / np.abs(self.matrix / scale[:, None]).max(axis=0)
+        self._unit_N = np.minimum(thrusts_max(thrusters), most_N)
+        self._rows = self.matrix * self._unit_N / scale[:, None]
         self._scale = scale
-        self._cost = self._full_N / self._full_N.max()
+        self._cost = self._unit_N / self._unit_N.max()
 
     def allocate(
         self, wrench: Array, thrusts_max_N: Array, cost_factors: Array | None = None
@@ -65,7 +72,7 @@ class Allocator:
         Raises ValueError for numbers that are not finite, RuntimeError if the solver fails.
         """
         target = wrench / self._scale
-        limits = thrusts_max_N / self._full_N
+        limits = thrusts_max_N / self._unit_N
         if not (np.isfinite(target).all() and np.isfinite(limits).all() and (limits >= 0.0).all()):
             raise ValueError("wrench and limits must be finite, limits not negative")
         thrusts = np.zeros(len(limits))
@@ -82,7 +89,7 @@ class Allocator:
                 raise RuntimeError(
                     f"thruster allocation: daqp failed with flag {flag} for wrench {wrench}"
                 )
-        thrusts[able] = np.clip(x, 0.0, most) * self._full_N[able]
+        thrusts[able] = np.clip(x, 0.0, most) * self._unit_N[able]
         return Allocation(thrusts, exact)
 
 

@@ -25,7 +25,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 from numpy.typing import NDArray
 
-from .lens import MarkerFrames, native_lens
+from .lens import MarkerFrames, native_lens, strong_stretch
 from .native import LIBRARY, function
 
 
@@ -110,6 +110,41 @@ class Refined:
             others.relative_sigma,
         )
         return Refined(corners, good, sigma)
+
+
+@dataclass(frozen=True)
+class SmallMarkers:
+    """Errors of the corners of markers too small for the fit, and of those that it refuses.
+
+    Measured by benchmarks/perception.py (markers-corners).
+    """
+
+    # Width of a cell or border, px, below which the error of fitted corners grows with the square
+    # of the inverse, beyond what their relative sigma states.
+    wide_px: float = 3.0
+    # Error of a detector's corner, px, least and as a share of the marker's side.
+    coarse_px: float = 1.0
+    coarse_share: float = 0.06
+
+
+SMALL = SmallMarkers()
+
+
+def small_factor(finest_px: Array) -> Array:
+    """Return the factor (n,), at least 1, of the relative sigma of fitted corners of small markers.
+
+    ``finest_px`` (n,): width of the finer of cell and border.
+    """
+    return np.maximum(1.0, SMALL.wide_px / np.maximum(finest_px, 1e-3)) ** 2
+
+
+def coarse_sigma_px(camera: Camera, corners_ideal_px: Array) -> Array:
+    """Return the standard deviation (n,), ideal px, of corners (n, 4, 2) as the detector finds
+    them.
+    """
+    stretch = strong_stretch(camera, corners_ideal_px.mean(axis=1))
+    side = np.linalg.norm(np.roll(corners_ideal_px, -1, axis=1) - corners_ideal_px, axis=-1)
+    return np.maximum(SMALL.coarse_px * stretch, SMALL.coarse_share * side.max(axis=1))
 
 
 def inside_border(corners_px: Array, margin_share: Array) -> Array:

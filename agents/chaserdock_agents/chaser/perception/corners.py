@@ -119,9 +119,14 @@ class SmallMarkers:
     Measured by benchmarks/perception.py (markers-corners).
     """
 
-    # Width of a cell or border, px, below which the error of fitted corners grows with the square
-    # of the inverse, beyond what their relative sigma states.
-    wide_px: float = 3.0
+    # Width of the finer of cell and border, px, below which the error of fitted corners exceeds
+    # what their relative sigma states, by a power of the inverse,
+    wide_px: float = 3.2
+    power: float = 2.5
+    # with a border that ends alike on all sides by a lower power,
+    outlined_power: float = 1.4
+    # up to this factor, half a pixel.
+    most: float = 13.0
     # Error of a detector's corner, px, least and as a share of the marker's side.
     coarse_px: float = 1.0
     coarse_share: float = 0.06
@@ -130,12 +135,13 @@ class SmallMarkers:
 SMALL = SmallMarkers()
 
 
-def small_factor(finest_px: Array) -> Array:
+def small_factor(finest_px: Array, outlined: NDArray[np.bool_]) -> Array:
     """Return the factor (n,), at least 1, of the relative sigma of fitted corners of small markers.
 
-    ``finest_px`` (n,): width of the finer of cell and border.
+    ``finest_px`` (n,): width of the finer of cell and border; ``outlined`` (n,) as for `refine`.
     """
-    return np.maximum(1.0, SMALL.wide_px / np.maximum(finest_px, 1e-3)) ** 2
+    power = np.where(outlined, SMALL.outlined_power, SMALL.power)
+    return np.clip((SMALL.wide_px / np.maximum(finest_px, 1e-3)) ** power, 1.0, SMALL.most)
 
 
 def coarse_sigma_px(camera: Camera, corners_ideal_px: Array) -> Array:

@@ -91,11 +91,12 @@ class _Further:
             fitted = refined.part(refined.good)
             coarse = np.concatenate([rows, coarse[left]])
             px = np.concatenate([fitted.corners_px, px[left]])
-            own = fitted.relative_sigma * corners.small_factor(read.finest_px[rows])
-            sigma = np.concatenate([own, sigma[left]])
+            factor = corners.small_factor(read.finest_px[rows], table.outlined[rows])
+            sigma = np.concatenate([fitted.relative_sigma * factor, sigma[left]])
         self._rows, self._px = coarse, px
-        finest_px = read.finest_px[used]
-        small = corners.small_factor(finest_px) if finest_px.max() < corners.SMALL.wide_px else None
+        finest_px, small = read.finest_px[used], None
+        if finest_px.max() < corners.SMALL.wide_px:
+            small = corners.small_factor(finest_px, table.outlined[used])
         return FurtherMarkers(coarse, px, sigma, small)
 
     def after(self, rows: NDArray[np.intp], px: Array) -> tuple[NDArray[np.intp], Array]:

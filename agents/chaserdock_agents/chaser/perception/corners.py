@@ -149,14 +149,22 @@ def coarse_sigma_px(camera: Camera, corners_ideal_px: Array) -> Array:
     them.
     """
     stretch = strong_stretch(camera, corners_ideal_px.mean(axis=1))
-    side = np.linalg.norm(np.roll(corners_ideal_px, -1, axis=1) - corners_ideal_px, axis=-1)
-    return np.maximum(SMALL.coarse_px * stretch, SMALL.coarse_share * side.max(axis=1))
+    return np.maximum(
+        SMALL.coarse_px * stretch, SMALL.coarse_share * mean_side_px(corners_ideal_px)
+    )
+
+
+def mean_side_px(corners_px: Array) -> Array:
+    """Return the mean length (n,) of the sides of quadrilaterals (n, 4, 2)."""
+    sides = np.roll(corners_px, -1, axis=1) - corners_px
+    return np.linalg.norm(sides, axis=-1).mean(axis=1)
 
 
 def inside_border(corners_px: Array, margin_share: Array) -> Array:
     """Return the corners (n, 4, 2) of black squares from the outer corners of their white borders.
 
-    ``margin_share`` (n,): width of the border over the side of the square.
+    ``margin_share`` (n,): width of the border over the side of the square; negative for a square
+    outside the given corners.
     """
     inner = [
         cv2.perspectiveTransform(

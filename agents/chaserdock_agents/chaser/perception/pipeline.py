@@ -62,6 +62,9 @@ class PerceptionResult:
     acquiring: bool = False
 
 
+_INNER_PX = (3.5, 7.0, 10.5)
+"""Distances inside a marker's side, px, of a contour that a threshold window finds there: half a
+window, of up to 23 px, in steps that the fit of sides reaches."""
 _NO_COARSE = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), np.zeros(0)
 
 
@@ -180,10 +183,14 @@ class Perception:
         coarse = _NO_COARSE
         if not refined.good.all():
             # The detector may have mistaken the outer edge of the white border for that of the
-            # marker.
-            lost = ~refined.good
-            inner = corners.inside_border(px[lost], self.table.margin_share[rows[lost]])
-            refined = refined.with_others(lost, self.refined(image, inner, rows[lost]))
+            # marker, or the inner edge of what a threshold window leaves of its black border.
+            side_px = corners.mean_side_px(px)
+            shares = [self.table.margin_share[rows]]
+            shares += [-d / (side_px + 2.0 * d) for d in (_INNER_PX if thorough else ())]
+            for share in shares:
+                lost = ~refined.good
+                shifted = corners.inside_border(px[lost], share[lost])
+                refined = refined.with_others(lost, self.refined(image, shifted, rows[lost]))
             lost = ~refined.good
             sigma = corners.coarse_sigma_px(self.camera, px[lost]) / pnp.SIGMA_FLOOR_PX
             coarse = rows[lost], px[lost], sigma

@@ -121,7 +121,7 @@ class SmallMarkers:
 
     # Width of the finer of cell and border, px, below which the error of fitted corners exceeds
     # what their relative sigma states, by a power of the inverse,
-    wide_px: float = 3.2
+    wide_px: float = 3.4
     power: float = 2.5
     # with a border that ends alike on all sides by a lower power,
     outlined_power: float = 1.4

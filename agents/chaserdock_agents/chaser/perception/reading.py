@@ -38,10 +38,9 @@ class _ReadLimits(Structure):
     ]  # fmt: skip
 
 
-# Cosine, as below it the fit of sides fails (chosen); cells of less than a pixel are not read by
-# OpenCV either; the sides need a pixel beyond them; the middle half of a cell is sampled; contrast
-# as for sides.
-LIMITS = _ReadLimits(0.15, 1.0, 1.0, 0.25, 8.0)
+# OpenCV reads no marker at a smaller cosine or with cells of less than a pixel; the sides need a
+# pixel beyond them; four places within the middle of a cell are sampled; contrast as for sides.
+LIMITS = _ReadLimits(0.08, 1.0, 1.0, 0.2, 8.0)
 
 
 @dataclass(frozen=True)

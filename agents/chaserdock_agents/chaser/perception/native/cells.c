@@ -4,8 +4,8 @@
 #include "lens.h"
 
 /* Limits of a marker that is read: least cosine of its viewing angle, least width of a cell, least
- * distance of its corners from the border of the image, px; part of a cell that is sampled, from
- * the centre to either side; least contrast, grey levels. */
+ * distance of its corners from the border of the image, px; distance of the four samples of a cell
+ * from its centre, along both axes, as a share of it; least contrast, grey levels. */
 typedef struct {
     double cosine, cell_px, frame_px, sampled, contrast;
 } ReadLimits;
@@ -36,16 +36,16 @@ static double correlation(const Image *p, const ReadLimits *limits, const double
     for (int64_t row = 0; row < cells; row++)
         for (int64_t column = 0; column < cells; column++) {
             double level = 0.0;
-            for (int k = 0; k < 9; k++) {
-                double u = (column + 0.5 + (k % 3 - 1) * limits->sampled) / cells,
-                       v = (row + 0.5 + (k / 3 - 1) * limits->sampled) / cells;
+            for (int k = 0; k < 4; k++) {
+                double u = (column + 0.5 + (k & 1 ? 1.0 : -1.0) * limits->sampled) / cells,
+                       v = (row + 0.5 + (k & 2 ? 1.0 : -1.0) * limits->sampled) / cells;
                 double scale = 1.0 / ((g * u + h * v) + 1.0);
                 double x = ((ax * u + bx * v) + px[0]) * scale,
                        y = ((ay * u + by * v) + px[1]) * scale;
                 if (p->lens) distort(p, &x, &y);
                 level += level_at(p, x, y);
             }
-            level /= 9.0;
+            level *= 0.25;
             int is_white = white[row * cells + column] != 0;
             sum[is_white] += level;
             count[is_white] += 1.0;

@@ -116,7 +116,7 @@ class Refined:
 class SmallMarkers:
     """Errors of the corners of markers too small for the fit, and of those that it refuses.
 
-    Measured by benchmarks/perception.py (markers-corners).
+    Fitted to rendered images; checked by benchmarks/perception.py (markers-small).
     """
 
     # Width of the finer of cell and border, px, below which the error of fitted corners exceeds

@@ -199,7 +199,8 @@ class Perception:
         further = _Further(self, image, coarse)
         solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma, further.markers)
         if not solutions and thorough and len(coarse[0]):
-            rows, px, sigma = map(np.concatenate, zip((rows, px, sigma), coarse, strict=True))
+            rows, px = np.concatenate([rows, coarse[0]]), np.concatenate([px, coarse[1]])
+            sigma = np.concatenate([sigma, coarse[2]])
             further = _Further(self, image, _NO_COARSE)
             solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma, further.markers)
         rows, px = further.after(rows, px)

@@ -71,7 +71,11 @@ class CellReader:
             self._white[row, 1:-1, 1:-1] = bits
 
     def read(
-        self, image: NDArray[np.uint8], camera: Camera, pose: PoseInCamera, known: Array
+        self,
+        image: NDArray[np.uint8],
+        camera: Camera,
+        pose: PoseInCamera,
+        known: NDArray[np.intp],
     ) -> ReadMarkers:
         """Read the markers that a pose shows in the distorted grey image, except ``known`` rows."""
         m = len(self._table.ids)

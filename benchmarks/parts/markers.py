@@ -23,6 +23,7 @@ from chaserdock_agents.chaser.perception import (
     make_perception,
 )
 from chaserdock_agents.chaser.perception.corners import SETTINGS
+from chaserdock_agents.chaser.perception.detect import dictionary_of
 from chaserdock_agents.chaser.sighting import decode_image, look
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -423,6 +424,44 @@ def bearing(count: int) -> Figures:
     return out
 
 
+def small(count: int) -> Figures:
+    """Return NEES (of two poses the nearer) and number of markers, beside those that OpenCV's
+    detector finds with its defaults, in random views by range.
+    """
+    out: Figures = {}
+    for target, near_m, far_m in (
+        ("servicer", 0.5, 1.5), ("servicer", 1.5, 4.0), ("servicer", 4.0, 5.5),
+        ("paper", 0.5, 1.5), ("paper", 1.5, 3.0),
+    ):  # fmt: skip
+        views, squares = Views(target, 640, 480), []
+        perception, ours, theirs, fewer, missed = views.perception(), 0, 0, 0, 0
+        detector = cv2.aruco.ArucoDetector(dictionary_of(views.model.dictionary))
+        for view in views.random_views(count, near_m, far_m, 3):
+            sighting, ids = perception.estimate(view.image), detector.detectMarkers(view.image)[1]
+            right = 0 if ids is None else len(set(ids.ravel().tolist()))
+            used = len(sighting.marker_ids)
+            ours, theirs, fewer = ours + used, theirs + right, fewer + (used < right)
+            missed += not sighting.solutions
+            each = [
+                (
+                    pose_error(view.position, view.q, s.position_irf_m, s.q_irf_trf_wxyz),
+                    s.covariance,
+                )
+                for s in sighting.solutions
+            ]
+            if each:
+                squares.append(min(float(e @ np.linalg.solve(c, e)) for e, c in each))
+        at = f"small_{target}_{near_m:g}_to_{far_m:g}_m_"
+        out |= {
+            f"{at}nees_mean": float(np.mean(squares)),
+            f"{at}without_a_pose": missed,
+            f"{at}markers": ours,
+            f"{at}markers_by_opencv": theirs,
+            f"{at}views_with_fewer": fewer,
+        }
+    return out
+
+
 COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "rendering": (rendering, 200, 20),
     "speed": (speed, 200, 30),
@@ -431,6 +470,7 @@ COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "metre": (at_one_metre, 1000, 30),
     "accuracy": (accuracy, 10_000, 60),
     "far": (far, 80, 4),
+    "small": (small, 200, 10),
     "bearing": (bearing, 80, 8),
 }
 """Number of views of each part, and number with ``--quick``."""

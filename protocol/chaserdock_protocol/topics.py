@@ -125,9 +125,8 @@ STATE = _topic(
 )
 OPERATED = _topic("controller/operated", m.OperatorCommand, "controller", set(), "event", "event")
 ACK = _topic("recorder/ack", m.RecorderAck, "recorder", {"world"}, "tick", "command")
-KILL = Topic(
-    "operator/kill", m.Kill, "operator", (_OBSERVERS - {"operator"}) | {"world"}, "event", "command"
-)
+_KILL_READERS: frozenset[Role] = frozenset({"world", "recorder", "analysis", "viewer", "bridge"})
+KILL = Topic("operator/kill", m.Kill, "operator", _KILL_READERS, "event", "command")
 EVENT = _topic("{process}/event", m.Event, "any", set(), "event", "event")
 HEALTH = _topic("{process}/health", m.Health, "any", set(), "second", "event")
 PRESENCE = _topic("{process}/presence", m.Presence, "any", _EVERYONE, "presence", "event")

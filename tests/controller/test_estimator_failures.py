@@ -113,7 +113,6 @@ FAILURES: dict[str, dict[str, Any]] = {
     "a motion that is NaN": {"update": chaser_with(disturbance=np.full(6, np.nan))},
     "a motion of another chaser": {"update": chaser_with(chaser=2)},
     "a relative pose of another type": {"update": chaser_with(relative=np.zeros(7))},
-    "a safety covariance of 3": {"update": chaser_with(motion_covariance=np.eye(3))},
     "an event without level": {
         "update": lambda found: replace(found, events=(EstimatorEvent(0, cast(Any, ""), ""),))
     },
@@ -166,6 +165,7 @@ def test_result_that_cannot_be_used_is_a_failure(kind: str) -> None:
 CALLS: dict[str, Any] = {
     "estimate_at": lambda time_ns: no_estimate(time_ns + 1),
     "shape": lambda: "a sphere",
+    "disturbed_motion": lambda _: np.zeros(3),
     "without_drift": raises,
     "disturb": raises,
     "change_body": raises,
@@ -182,6 +182,7 @@ def test_every_call_of_an_estimator_is_guarded(call: str) -> None:
     results: dict[str, Callable[[], Any]] = {
         "estimate_at": lambda: guarded.estimate_at(10**8).status,
         "shape": lambda: guarded.shape,
+        "disturbed_motion": lambda: guarded.disturbed_motion(0),
         "without_drift": lambda: guarded.without_drift(odometry()) == odometry(),
         "disturb": lambda: guarded.disturb(Shock(0.1, 0.1)),
         "change_body": lambda: guarded.change_body(cast(Any, None), np.eye(9)),

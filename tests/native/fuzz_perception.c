@@ -83,6 +83,31 @@ static void refine_corners(void) {
     }
 }
 
+static void read_markers(void) {
+    const int64_t height = whole(2, 40), width = whole(2, 40), n = whole(1, 3), cells = whole(3, 8);
+    const uint8_t *image = image_of(height, width), *white = bytes(n * cells * cells);
+    const int distorted = (int)whole(0, 1);
+    Lens lens = any_lens();
+    ReadLimits limits = {value(-1.0, 0.5), value(0.0, 2.0), value(-1.0, 4.0), value(0.0, 0.5),
+                         value(0.0, 20.0)};
+    double *camera = outputs(4), *surface = doubles(18 * n, -1.0, 1.0),
+           *position = doubles(3, -0.5, 3.0), *px = outputs(8 * n), *finest = outputs(n),
+           *found = outputs(n);
+    uint8_t *skip = bytes(n);
+    for (int i = 0; i < 2; i++) camera[i] = value(20.0, 60.0), camera[2 + i] = value(0.0, 40.0);
+    for (int64_t m = 0; m < n; m++) {
+        skip[m] = (uint8_t)whole(0, 1);
+        if (chance(0.5)) /* flat and ahead */
+            for (int i = 0; i < 4; i++) surface[12 * m + 3 * i + 2] = 0.0;
+    }
+    NAME(read_markers)(image, height, width, camera, distorted ? &lens : NULL, &limits, surface,
+                       position, doubles(n, 0.0, 0.3), n, white, cells, skip, px, finest, found);
+    for (int64_t m = 0; m < n; m++) {
+        CHECK(found[m] >= 0.0 && found[m] < 1.0 + 1e-9);
+        if (skip[m] || !finite(finest[m])) CHECK(found[m] == 0.0);
+    }
+}
+
 static void refine_pose(void) {
     const int64_t n = whole(0, 8);
     double *lens = lens_of_camera(), *points = doubles(3 * n, -0.3, 0.3),
@@ -301,6 +326,7 @@ static void measure_pose(void) {
 
 static const Target TARGETS[] = {
     {"refine_corners", refine_corners},
+    {"read_markers", read_markers},
     {"refine_pose", refine_pose},
     {"squared_errors", squared_errors},
     {"marker_errors", marker_errors},

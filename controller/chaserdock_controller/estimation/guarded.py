@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.codec import MAX_MAGNITUDE, UNIT_QUATERNION_TOLERANCE
 from chaserdock_protocol.failure_watch import FailureWatch, text_of
 from chaserdock_protocol.messages import Odometry
@@ -58,6 +59,7 @@ _SHAPES: dict[type, dict[str, tuple[int, ...]]] = {
     RelativePose: {"position_m": _3, "q_wxyz": _4, "covariance": _6x6},
     CameraError: {"turn_rad": _3, "shift_m": _3, "covariance": (7, 7)},
     BodyShape: {"inertia": (3, 3), "centre_m": _3},
+    DisturbedMotion: {"acceleration_m_s2": _3, "covariance": (9, 9)},
 }
 """Shapes of the arrays that an estimator returns."""
 
@@ -123,6 +125,17 @@ class GuardedEstimator(Estimator):
             return found
 
         return self._guarded("shape", checked, None)
+
+    def disturbed_motion(self, chaser: int) -> DisturbedMotion | None:
+        """Return what the estimator knows of a coast; None if it fails: nothing is certified."""
+
+        def checked() -> DisturbedMotion | None:
+            found = self._inner.disturbed_motion(chaser)
+            if found is not None:
+                _check("disturbed_motion", found, DisturbedMotion)
+            return found
+
+        return self._guarded("disturbed_motion", checked, None)
 
     @property
     def reinitialisations(self) -> int:
@@ -197,8 +210,6 @@ def _check_estimate(found: Any, time_ns: int, chasers: int) -> None:
                 _check_covariance(
                     f"{name}, random_covariance", motion.relative.random_covariance, _6x6
                 )
-        if motion.motion_covariance is not None:
-            _check_covariance(f"{name}, motion_covariance", motion.motion_covariance, _6x6)
         if motion.camera is not None:
             _check(f"{name}, camera", motion.camera, CameraError)
             _check_values(f"{name}, focal_share", np.array(motion.camera.focal_share), ())

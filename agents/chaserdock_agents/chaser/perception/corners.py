@@ -25,7 +25,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 from numpy.typing import NDArray
 
-from .lens import MarkerFrames, native_lens
+from .lens import MarkerFrames, native_lens, strong_stretch
 from .native import LIBRARY, function
 
 
@@ -112,10 +112,59 @@ class Refined:
         return Refined(corners, good, sigma)
 
 
+@dataclass(frozen=True)
+class SmallMarkers:
+    """Errors of the corners of markers too small for the fit, and of those that it refuses.
+
+    Fitted to rendered images; checked by benchmarks/perception.py (markers-small).
+    """
+
+    # Width of the finer of cell and border, px, below which the error of fitted corners exceeds
+    # what their relative sigma states, by a power of the inverse,
+    wide_px: float = 3.4
+    power: float = 2.5
+    # with a border that ends alike on all sides by a lower power,
+    outlined_power: float = 1.4
+    # up to this factor, half a pixel.
+    most: float = 13.0
+    # Error of a detector's corner, px, least and as a share of the marker's side.
+    coarse_px: float = 1.0
+    coarse_share: float = 0.06
+
+
+SMALL = SmallMarkers()
+
+
+def small_factor(finest_px: Array, outlined: NDArray[np.bool_]) -> Array:
+    """Return the factor (n,), at least 1, of the relative sigma of fitted corners of small markers.
+
+    ``finest_px`` (n,): width of the finer of cell and border; ``outlined`` (n,) as for `refine`.
+    """
+    power = np.where(outlined, SMALL.outlined_power, SMALL.power)
+    return np.clip((SMALL.wide_px / np.maximum(finest_px, 1e-3)) ** power, 1.0, SMALL.most)
+
+
+def coarse_sigma_px(camera: Camera, corners_ideal_px: Array) -> Array:
+    """Return the standard deviation (n,), ideal px, of corners (n, 4, 2) as the detector finds
+    them.
+    """
+    stretch = strong_stretch(camera, corners_ideal_px.mean(axis=1))
+    return np.maximum(
+        SMALL.coarse_px * stretch, SMALL.coarse_share * mean_side_px(corners_ideal_px)
+    )
+
+
+def mean_side_px(corners_px: Array) -> Array:
+    """Return the mean length (n,) of the sides of quadrilaterals (n, 4, 2)."""
+    sides = np.roll(corners_px, -1, axis=1) - corners_px
+    return np.linalg.norm(sides, axis=-1).mean(axis=1)
+
+
 def inside_border(corners_px: Array, margin_share: Array) -> Array:
     """Return the corners (n, 4, 2) of black squares from the outer corners of their white borders.
 
-    ``margin_share`` (n,): width of the border over the side of the square.
+    ``margin_share`` (n,): width of the border over the side of the square; negative for a square
+    outside the given corners.
     """
     inner = [
         cv2.perspectiveTransform(

@@ -16,8 +16,6 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, cuboid_corners
 from numpy.typing import ArrayLike, NDArray
 
-# Least perimeter of a marker, px. Smaller: markers farther away, and more false candidates.
-_MIN_PERIMETER_PX = 40.0
 # Margin around a predicted target: share of its size in the image, and px. Wider: a less accurate
 # prediction suffices; narrower: less time.
 _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
@@ -46,20 +44,25 @@ class _Windows(NamedTuple):
     """Sizes of the threshold windows: least, largest and step, px.
 
     ``distance_rate``: distance below which two candidates are one, over a marker's perimeter.
+    ``perimeter_px``: least perimeter of a marker. Smaller: markers farther away, and more false
+    candidates. ``border_share``: largest share of wrong cells in a marker's black border.
     """
 
     least_px: int
     most_px: int
     step_px: int
     distance_rate: float
+    perimeter_px: float
+    border_share: float
 
 
 # OpenCV's own distance is 0.125.
-_WINDOWS = (_Windows(7, 7, 16, 0.125), _Windows(7, 23, 16, 0.125))
+_WINDOWS = (_Windows(7, 7, 16, 0.125, 40.0, 0.15), _Windows(7, 23, 16, 0.125, 40.0, 0.15))
 # Settings of a second look, where nothing was found, at twice the cost (9.5 instead of 4.4 ms at
 # 1280 x 960). A window of 3 px finds small markers; the small distance keeps candidates inside each
-# other apart, such as the outer edge of a white border.
-_THOROUGH = _Windows(3, 23, 10, 0.01)
+# other apart, such as the outer edge of a white border. The perimeter (3 % of 640 px) and the share
+# of the border are OpenCV's own.
+_THOROUGH = _Windows(3, 23, 10, 0.01, 19.0, 0.35)
 
 NOTHING = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
 
@@ -120,10 +123,10 @@ def _detector(
     parameters.adaptiveThreshWinSizeStep = windows.step_px
     parameters.minMarkerDistanceRate = windows.distance_rate
     # Relative to the size of the image passed in, which may be a region.
-    parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_px
+    parameters.minMarkerPerimeterRate = windows.perimeter_px / longer_px
     # Relative to the longer side; a marker that fills the image must be accepted.
     parameters.maxMarkerPerimeterRate = 8.0
-    parameters.maxErroneousBitsInBorderRate = 0.15
+    parameters.maxErroneousBitsInBorderRate = windows.border_share
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return cv2.aruco.ArucoDetector(dictionary, parameters)
 

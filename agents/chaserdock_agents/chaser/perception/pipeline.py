@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import baseline as paper
 from . import corners, detect, pnp
-from .pnp import TargetPose
+from .pnp import FurtherMarkers, TargetPose
+from .reading import CellReader
+from .refine import PoseInCamera
 
 _ENOUGH = 6
 """Markers in one image beyond which further ones hardly improve the pose."""
@@ -60,6 +62,53 @@ class PerceptionResult:
     acquiring: bool = False
 
 
+_INNER_PX = (3.5, 7.0, 10.5)
+"""Distances inside a marker's side, px, of a contour that a threshold window finds there: half a
+window, of up to 23 px, in steps that the fit of sides reaches."""
+_NO_COARSE = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), np.zeros(0)
+
+
+class _Further:
+    """Markers to be added to a pose: ``coarse`` detections, whose sides cannot be fitted, with row,
+    corners (ideal px) and relative sigma, and missed ones that are read by their cells.
+    """
+
+    def __init__(
+        self,
+        perception: Perception,
+        image: NDArray[np.uint8],
+        coarse: tuple[NDArray[np.intp], Array, Array],
+    ) -> None:
+        self._perception, self._image, self._coarse = perception, image, coarse
+        self._rows, self._px, _ = _NO_COARSE
+
+    def markers(self, pose: PoseInCamera, used: NDArray[np.intp]) -> FurtherMarkers:
+        """Return the markers that the image shows beside the ``used`` rows at a pose."""
+        by, table = self._perception, self._perception.table
+        read = by.reader.read(self._image, by.camera, pose, used)
+        rows, (coarse, px, sigma) = read.rows, self._coarse
+        if len(rows):
+            refined = by.refined(self._image, read.corners_px[rows], rows)
+            rows = rows[refined.good]
+            left = ~np.isin(coarse, rows)  # a fitted marker replaces a coarse one
+            fitted = refined.part(refined.good)
+            coarse = np.concatenate([rows, coarse[left]])
+            px = np.concatenate([fitted.corners_px, px[left]])
+            factor = corners.small_factor(read.finest_px[rows], table.outlined[rows])
+            sigma = np.concatenate([fitted.relative_sigma * factor, sigma[left]])
+        self._rows, self._px = coarse, px
+        finest_px, small = read.finest_px[used], None
+        if finest_px.max() < corners.SMALL.wide_px:
+            small = corners.small_factor(finest_px, table.outlined[used])
+        return FurtherMarkers(coarse, px, sigma, small)
+
+    def after(self, rows: NDArray[np.intp], px: Array) -> tuple[NDArray[np.intp], Array]:
+        """Return rows and corners of detections, followed by those of `markers`."""
+        if not len(self._rows):
+            return rows, px
+        return np.concatenate([rows, self._rows]), np.concatenate([px, self._px])
+
+
 class Perception:
     """Estimates the pose of one target model in the images of one camera.
 
@@ -77,10 +126,11 @@ class Perception:
         self.model = model
         self.method: Method = method
         self._dictionary = detect.dictionary_of(model.dictionary)
-        self._table = pnp.MarkerTable.of(model)
+        self.table = pnp.MarkerTable.of(model)
         # Targets with many markers per face do not need the small ones that are lost at half size.
         self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
-        self._rows = {int(i): row for row, i in enumerate(self._table.ids)}
+        self._rows = {int(i): row for row, i in enumerate(self.table.ids)}
+        self.reader = CellReader(self.table, self._dictionary)
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
@@ -129,21 +179,38 @@ class Perception:
         px, rows = self.camera.undistort(found.corners_px[known]), rows[known]
         imaged = np.isfinite(px).all(axis=(1, 2))
         px, rows = px[imaged], rows[imaged]
-        cells = self._dictionary.markerSize + 2
-        margin, outlined = self._table.margin_share[rows], self._table.outlined[rows]
-        refined = corners.refine(image, self.camera, px, cells, margin, outlined)
+        refined = self.refined(image, px, rows)
+        coarse = _NO_COARSE
         if not refined.good.all():
             # The detector may have mistaken the outer edge of the white border for that of the
-            # marker.
+            # marker, or the inner edge of what a threshold window leaves of its black border.
+            side_px = corners.mean_side_px(px)
+            shares = [self.table.margin_share[rows]]
+            shares += [-d / (side_px + 2.0 * d) for d in (_INNER_PX if thorough else ())]
+            for share in shares:
+                lost = ~refined.good
+                shifted = corners.inside_border(px[lost], share[lost])
+                refined = refined.with_others(lost, self.refined(image, shifted, rows[lost]))
             lost = ~refined.good
-            inner = corners.inside_border(px[lost], margin[lost])
-            refined = refined.with_others(
-                lost, corners.refine(image, self.camera, inner, cells, margin[lost], outlined[lost])
-            )
+            sigma = corners.coarse_sigma_px(self.camera, px[lost]) / pnp.SIGMA_FLOOR_PX
+            coarse = rows[lost], px[lost], sigma
             refined, rows = refined.part(refined.good), rows[refined.good]
         px, sigma = refined.corners_px, refined.relative_sigma
-        solutions, used = pnp.solve(self.camera, self._table, rows, px, sigma)
-        return self._sighting(found.ids, solutions, self._table.ids[rows[used]], px[used])
+        further = _Further(self, image, coarse)
+        solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma, further.markers)
+        if not solutions and thorough and len(coarse[0]):
+            rows, px = np.concatenate([rows, coarse[0]]), np.concatenate([px, coarse[1]])
+            sigma = np.concatenate([sigma, coarse[2]])
+            further = _Further(self, image, _NO_COARSE)
+            solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma, further.markers)
+        rows, px = further.after(rows, px)
+        return self._sighting(found.ids, solutions, self.table.ids[rows[used]], px[used])
+
+    def refined(
+        self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp]
+    ) -> corners.Refined:
+        margin, outlined = self.table.margin_share[rows], self.table.outlined[rows]
+        return corners.refine(image, self.camera, px, self.reader.cells, margin, outlined)
 
     def _estimate_paper(self, image: NDArray[np.uint8]) -> PerceptionResult:
         found = paper.detect(image, self.camera, self._dictionary)
@@ -153,7 +220,7 @@ class Perception:
         ids, px = found.ids[kept], found.corners_px[kept]
         rows = np.array([self._rows[int(i)] for i in ids], dtype=np.intp)
         solutions = paper.solve(
-            self.camera, self._table.corners[rows], px, iterative=self.method != "paper"
+            self.camera, self.table.corners[rows], px, iterative=self.method != "paper"
         )
         if not solutions:
             ids, px = ids[:0], px[:0]
@@ -168,7 +235,8 @@ class Perception:
     ) -> PerceptionResult:
         rejected = found_ids.tolist()
         for i in ids.tolist():
-            rejected.remove(i)
+            if i in rejected:  # it may have been found by its cells only
+                rejected.remove(i)
         return PerceptionResult(
             solutions, ids, self.camera.distort(ideal_px), tuple(sorted(rejected))
         )

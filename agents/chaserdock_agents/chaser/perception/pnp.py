@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -54,6 +54,8 @@ _PLANE_RMS_PX = 1.0
 # Of a plane's two coarse poses, one counts as the refined pose if its angle to that is this share
 # of the other's.
 _SAME_POSE_SHARE = 0.25
+# Markers from which on the residuals of the first ones tell the noise, without the further ones.
+_TELLING_MARKERS = 3
 # A single marker counts as a false id if this many others should be as visible and none is
 # detected.
 _MAX_MISSING = 2
@@ -169,18 +171,34 @@ class _DetectedMarkers:
         )
 
 
+@dataclass(frozen=True)
+class FurtherMarkers:
+    """k markers that fewer or worse corners than those of a pose show, to be added to it.
+
+    ``which`` (k,), ``corners_px`` (k, 4, 2), ideal, and ``relative_sigma`` (k,) as for `solve`.
+    ``small`` (n,): factor of the relative sigma of the markers of the pose, if all are small.
+    """
+
+    which: Indices
+    corners_px: Array
+    relative_sigma: Array
+    small: Array | None
+
+
 def solve(
     camera: Camera,
     table: MarkerTable,
     which: Indices,
     corners_ideal_px: Array,
     relative_sigma: Array,
+    further: Callable[[PoseInCamera, Indices], FurtherMarkers] | None = None,
 ) -> tuple[tuple[TargetPose, ...], Indices]:
     """Return the poses, best first, that explain the detections, and the indices of those used.
 
     ``which`` (n,): row of ``table`` of each detection; a row may occur more than once.
     ``corners_ideal_px`` (n, 4, 2). ``relative_sigma`` (n,): uncertainty of a detection's corners,
-    relative to the best.
+    relative to the best. ``further``: markers to be added to a pose from given rows of ``table``;
+    their indices follow those of the detections.
 
     Returns no pose and no indices if nothing is explained well, if a single marker is seen at a
     grazing angle or without others that its pose would show, or if two equally large groups of
@@ -203,18 +221,21 @@ def solve(
         return nothing
     pose, used = found
     if len(which) >= 2 * len(used):
-        others = set(range(len(which))).difference(used)
-        rival = _consensus(seen.part(sorted(others)))
+        others = sorted(set(range(len(which))).difference(used, _seen_twice(seen, used)))
+        rival = _consensus(seen.part(others)) if others else None
         if rival is not None and len(rival[1]) >= len(used):
             return nothing
 
-    seen = seen.part(used)
+    seen = first = seen.part(used)
+    if further is not None:
+        seen, pose, added = _with_further(first, pose, further(pose, first.which))
+        used = used + [len(which) + k for k in added]
     poses = [pose]
     # Coplanar corners, as those of a single marker, may have a second pose.
     if len(used) == 1 or np.ptp(seen.points @ seen.normals[0]) < 1e-6:
-        poses += _other_than(pose, seen.plane_poses)
+        poses += _other_than(pose, first.plane_poses)
     floor = SIGMA_FLOOR_SINGLE_PX if len(used) == 1 else SIGMA_FLOOR_PX
-    solutions = _solutions(seen, poses, floor)
+    solutions = _solutions(seen, poses, floor, len(first.which))
     if not solutions or solutions[0].reprojection_rms_px > MAX_RMS_PX:
         return nothing
     if len(used) == 1:
@@ -232,13 +253,14 @@ def pose_covariance(
     floor_px: float,
     sigma: Array,
     common: float = 1.0,
+    telling: int | None = None,
 ) -> tuple[Array, float] | None:
     """Return the covariance (6, 6) of a pose, as in `TargetPose`, and its weighted sum of squares.
 
     The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma``
     (n,). The covariance is s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of
-    which the part above the floor counts ``common`` times. None if the pose is not observable or
-    has points behind the camera.
+    which the part above the floor counts ``common`` times; of the first ``telling`` points if
+    given. None if the pose is not observable or has points behind the camera.
     """
     pose = PoseInCamera(position, rotation)
     found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
@@ -251,7 +273,9 @@ def pose_covariance(
     information = jacobian.T @ jacobian
     if not (math.isfinite(rss) and math.isfinite(float(information.sum()))):
         return None
-    variance = floor_px**2 + common * max(0.0, rss / (len(residual) - 6) - floor_px**2)
+    told = residual if telling is None else residual[: 2 * telling]
+    excess = float(told @ told) / (len(told) - 6) - floor_px**2
+    variance = floor_px**2 + common * max(0.0, excess)
     # Metres and radians are scaled to comparable size before the condition number is checked.
     each = [1.0 / math.sqrt(max(d, 1e-300)) for d in information.diagonal().tolist()]
     scale = np.array([[a * b for b in each] for a in each])
@@ -391,10 +415,58 @@ def _angle(a: Array, b: Array) -> float:
     return 2.0 * math.asin(min(math.sqrt(float(difference @ difference) / 8.0), 1.0))
 
 
+def _seen_twice(seen: _DetectedMarkers, used: list[int]) -> set[int]:
+    """Return the detections that are second ones of a used marker, such as the outer edge of its
+    white border: of the same id, with the centre inside it.
+    """
+    centres = seen.pixels.mean(axis=1)
+    reach = np.linalg.norm(seen.pixels - centres[:, None], axis=-1).min(axis=1)
+    return {
+        k
+        for k in range(len(seen.which))
+        for u in used
+        if seen.which[k] == seen.which[u] and math.dist(centres[k], centres[u]) < 0.5 * reach[u]
+    }
+
+
+def _with_further(
+    seen: _DetectedMarkers, pose: PoseInCamera, further: FurtherMarkers
+) -> tuple[_DetectedMarkers, PoseInCamera, list[int]]:
+    """Return the markers of a pose with those ``further`` ones that agree with it, the pose of all,
+    and the indices of these in ``further``.
+    """
+    table, which = seen.table, further.which
+    if further.small is None and not len(which):
+        return seen, pose, []
+    sigma = seen.sigma if further.small is None else seen.sigma * further.small
+    kept: list[int] = []
+    if len(which):
+        points, normals = table.corners[which], table.normals[which]
+        error = marker_errors(seen.camera, points, normals, further.corners_px, pose)
+        gate = np.clip(
+            _FINE_GATE_SIGMAS * SIGMA_FLOOR_PX * further.relative_sigma,
+            _FINE_GATE_PX,
+            _COARSE_GATE_PX,
+        )
+        near = [e if e < g else math.inf for e, g in zip(error, gate.tolist(), strict=True)]
+        kept = _one_of_each(which.tolist(), near, _COARSE_GATE_PX)
+    if further.small is None and not kept:
+        return seen, pose, []
+    rows = np.concatenate([seen.which, which[kept]])
+    pixels = np.concatenate([seen.pixels, further.corners_px[kept]])
+    sigma = np.concatenate([sigma, further.relative_sigma[kept]])
+    joined = _DetectedMarkers(seen.camera, table, rows, table.corners[rows], pixels, sigma)
+    refined = _refined(joined, pose)
+    return (seen, pose, []) if refined is None else (joined, refined, kept)
+
+
 def _solutions(
-    seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: float
+    seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: float, first: int
 ) -> list[TargetPose]:
-    """Return refined, distinct poses, best first; later ones are about as likely as the first."""
+    """Return refined, distinct poses, best first; later ones are about as likely as the first.
+
+    The noise is that of the ``first`` markers if these tell it.
+    """
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     sigma = np.repeat(seen.sigma, 4)
     found: list[tuple[float, TargetPose]] = []
@@ -405,8 +477,9 @@ def _solutions(
             continue
         position, rotation = refined.position, refined.rotation
         common = COMMON_PER_MARKER if len(seen.which) > 1 else 1.0
+        telling = 4 * first if first >= _TELLING_MARKERS else None
         result = pose_covariance(
-            seen.camera, points, pixels, position, rotation, floor_px, sigma, common
+            seen.camera, points, pixels, position, rotation, floor_px, sigma, common, telling
         )
         if result is None:
             continue

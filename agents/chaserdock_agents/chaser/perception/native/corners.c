@@ -291,6 +291,8 @@ typedef struct {
     int count, columns, column[PIXELS_MOST];
     double inside[COLUMNS_MOST], offset[PIXELS_MOST], along[PIXELS_MOST], border[PIXELS_MOST],
         level[PIXELS_MOST];
+    /* Of the edge in work, and of a border's outer edge: place in sigmas, distribution, density. */
+    double z[2][PIXELS_MOST], distribution[2][PIXELS_MOST], density[2][PIXELS_MOST];
 } Band;
 
 /* Return up to which offset from a side, pixels, its surroundings are used at `at` pixels along it:
@@ -355,7 +357,9 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
 static double limited(double value, double limit) { return min_of(max_of(value, -limit), limit); }
 
 /* Adds one row of a least-squares problem with n unknowns to its normal equations. */
-static void add_row(const double *row, double value, double weight, int n, double *a, double *b) {
+static inline __attribute__((always_inline)) void add_row(const double *row, double value,
+                                                          double weight, int n, double *a,
+                                                          double *b) {
     for (int i = 0; i < n; i++) {
         double w = weight * row[i];
         for (int j = i; j < n; j++) a[n * i + j] += w * row[j];
@@ -376,8 +380,9 @@ static int solve_normal(double *a, double *b, int n) {
  * slope * along. The levels are by least squares, sigma has a prior. Columns that do not fit, as
  * where something hides the side, are left out. Writes the outward offsets of the line's two ends,
  * pixels, and the rise and the fall in grey levels; returns whether the side is usable. */
-static int fit_band(const Settings *set, const Edge *edge, const Band *band, int outer,
-                    int iterations, double *ends, double *change) {
+static inline __attribute__((always_inline)) int fit_band_of(
+    const Settings *set, const Edge *edge, Band *band, int outer, int iterations,
+    double *ends, double *change) {
     double offset = 0.0, slope = 0.0, log_sigma = set->log_edge_sigma, weight[COLUMNS_MOST],
            levels[3] = {0.0};
     /* An assumed error of 2 grey levels sets the weight of the prior of sigma. */
@@ -387,9 +392,13 @@ static int fit_band(const Settings *set, const Edge *edge, const Band *band, int
     for (int step = 0; step < iterations; step++) {
         double sigma = exponential(log_sigma), a[36] = {0.0}, b[6] = {0.0}, row[6] = {1.0};
         for (int i = 0; i < band->count; i++) {
-            double s = band->offset[i] - (offset + slope * band->along[i]), unused;
-            edge_at(edge, s / sigma, row + 1, &unused);
-            if (outer) edge_at(edge, (s - band->border[i]) / sigma, row + 2, &unused);
+            double s = band->offset[i] - (offset + slope * band->along[i]);
+            for (int k = 0; k < count - 1; k++) {
+                double z = (k ? s - band->border[i] : s) / sigma;
+                edge_at(edge, z, row + 1 + k, band->density[k] + i);
+                band->z[k][i] = z;
+                band->distribution[k][i] = row[1 + k];
+            }
             add_row(row, band->level[i], weight[band->column[i]], count, a, b);
         }
         if (!solve_normal(a, b, count)) return 0;
@@ -398,11 +407,11 @@ static int fit_band(const Settings *set, const Edge *edge, const Band *band, int
         zero(a, 36);
         zero(b, 6);
         for (int i = 0; i < band->count; i++) {
-            double s = band->offset[i] - (offset + slope * band->along[i]), density[2] = {0.0};
-            double z[2] = {s / sigma, (s - band->border[i]) / sigma},
-                   residual = band->level[i] - levels[0];
+            double z[2] = {0.0}, density[2] = {0.0}, residual = band->level[i] - levels[0];
             for (int k = 0; k < count - 1; k++) {
-                edge_at(edge, z[k], row + 1 + k, density + k);
+                z[k] = band->z[k][i];
+                density[k] = band->density[k][i];
+                row[1 + k] = band->distribution[k][i];
                 residual -= levels[1 + k] * row[1 + k];
             }
             double rise = levels[1] * density[0], fall = levels[2] * density[1];
@@ -432,6 +441,13 @@ static int fit_band(const Settings *set, const Edge *edge, const Band *band, int
     change[1] = -levels[2];
     return levels[1] >= set->min_contrast && used >= set->min_rows_share * band->columns &&
            finite(ends[0]) && finite(ends[1]);
+}
+
+/* `fit_band_of` in two copies, whose sizes the compiler knows. */
+static int fit_band(const Settings *set, const Edge *edge, Band *band, int outer,
+                    int iterations, double *ends, double *change) {
+    return outer ? fit_band_of(set, edge, band, 1, iterations, ends, change)
+                 : fit_band_of(set, edge, band, 0, iterations, ends, change);
 }
 
 /* Fits a side's line and its contrast, grey levels. The outer edge of a border, used in the last

@@ -3,6 +3,7 @@
 #include "base.h"
 #include "elementary.h"
 #include "corners.c"
+#include "cells.c"
 #include "pose.c"
 #include "views.c"
 #include "mesh.c"

@@ -48,8 +48,8 @@ def report_of(log: Path) -> str:
     """Return the report as HTML. Raise LogError for an unreadable log."""
     flight = load_flight(log)
     result = summary_of_run(flight, log)
-    every = decimation(flight.world.ticks)
-    traces = load_traces(log, range(len(flight.scenario.chasers)), every)
+    every = decimation(flight.ticks)
+    traces = load_traces(log, flight.scenario, every)
 
     missing: list[str] = []
     figures = []
@@ -65,7 +65,7 @@ def report_of(log: Path) -> str:
         )
 
     replay, script = "", ""
-    if "target" in flight.truth:
+    if flight.shown:
         data = replay_data(flight, traces, small_images(log, flight))
         replay = _replay(data)
         # "</" would end the script element.
@@ -74,7 +74,10 @@ def report_of(log: Path) -> str:
         stored = f'<script type="application/json" id="replay-data">{text}</script>'
         script = f"{stored}\n<script>\n{code}</script>"
     else:
-        missing.insert(0, "3-D replay: the log holds no ground truth of the target.")
+        missing.insert(
+            0,
+            "3-D replay: the log holds neither ground truth nor a reference of target and chaser.",
+        )
 
     body = [
         _head(flight, result),
@@ -124,7 +127,7 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
         ("scenario", "Scenario"),
         ("versions", "Versions"),
     ]
-    if "target" in flight.truth:
+    if flight.shown:
         where.insert(0, ("replay-section", "Replay"))
     links = "".join(f'<a href="#{anchor}">{name}</a>' for anchor, name in where)
     mode = {"lockstep": "lock-step", "realtime": "real time"}.get(result["mode"]) or "unknown mode"
@@ -143,7 +146,7 @@ def _outcome(result: dict[str, Any]) -> str:
 
 def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     if not result["chasers"]:
-        return "<h2>Chasers</h2><p>The log holds no motion of a chaser.</p>"
+        return "<h2>Chasers</h2><p>The log holds no chaser.</p>"
     degree = math.degrees(1.0)
     at_distance = any("capture" not in c for c in result["chasers"].values())
     relative = any("relative_estimate" in c for c in result["chasers"].values())
@@ -403,7 +406,7 @@ aria-label="target and chasers in three dimensions"></canvas>{views}</div>
 <th>position error</th><th>image</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
 <p class="faint">Drag to rotate, wheel to zoom; or arrow keys, + and −; space starts and stops. \
-Ground truth.
+{data["motion"]}.
 A camera frustum is bright while its image is used. Chasers have the colours of the figures.</p>
 </div>"""  # noqa: RUF001
 

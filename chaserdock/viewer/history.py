@@ -15,6 +15,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    BodyReference,
     BodyTruth,
     CommandReply,
     Event,
@@ -31,6 +32,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.topics import Topic
 
 from chaserdock.analysis.mass_properties import values_of
+from chaserdock.analysis.motion import MotionCollector
 
 from .snapshot import TARGET, keep_newest
 
@@ -131,7 +133,7 @@ class History:
         self.rejected: dict[str, int] = {}
         self._odometry: dict[int, OrderedDict[int, Odometry]] = defaultdict(OrderedDict)
         self._exposed: dict[int, OrderedDict[int, int]] = defaultdict(OrderedDict)
-        self._truth: OrderedDict[int, BodyTruth] = OrderedDict()
+        self._truth: OrderedDict[int, BodyTruth | BodyReference] = OrderedDict()
         self._target: TargetEstimate | None = None
 
     def add_exposure(self, chaser: int, tick: int, sent_ns: int) -> None:
@@ -159,7 +161,7 @@ class History:
             case TargetEstimate() if message.status != "none":
                 self._target = message
                 self._add_estimation_error(message)
-            case BodyTruth() if message.body == TARGET:
+            case BodyTruth() | BodyReference() if message.body == TARGET:
                 keep_newest(self._truth, message.sim_time_ns, message)
             case PortLoad():
                 self.series["port_load_N", message.chaser].add(
@@ -244,12 +246,18 @@ class History:
         )
 
     def _add_estimation_error(self, estimate: TargetEstimate) -> None:
-        true = self._truth.get(estimate.sim_time_ns)
-        if true is None:
+        # The states just before and after the estimate: a reference has times of its own.
+        times = sorted(self._truth)
+        after = bisect_right(times, estimate.sim_time_ns)
+        around, time_s = MotionCollector(), estimate.sim_time_ns / 1e9
+        for time_ns in times[max(0, after - 2) : after + 1]:
+            around.add(self._truth[time_ns])
+        motion = around.finish(np.array([time_s]))
+        rows, true = motion.at(TARGET, np.array([time_s])) if TARGET in motion else ((), None)
+        if true is None or not len(rows):
             return
-        time_s = estimate.sim_time_ns / 1e9
-        away_m = float(np.linalg.norm(np.subtract(true.position_m, estimate.position_m)))
-        turned = float(rotations.angle_between(true.q_wxyz, estimate.q_wxyz))
+        away_m = float(np.linalg.norm(true.position_m[0] - estimate.position_m))
+        turned = float(rotations.angle_between(true.q_wxyz[0], estimate.q_wxyz))
         self.series["estimate_error_mm", None].add(time_s, away_m * 1e3)
         self.series["estimate_error_deg", None].add(time_s, float(np.degrees(turned)))
 

@@ -286,16 +286,16 @@ def test_figures_are_written_in_the_requested_format(tmp_path: Path) -> None:
 
 
 def test_forces_are_impulses_divided_by_tick_durations(tmp_path: Path) -> None:
-    given = load_traces(made_log(tmp_path / "a.mcap", 5), [0]).inputs[0]
+    given = load_traces(made_log(tmp_path / "a.mcap", 5), ONE).inputs[0]
     assert given.edges_s.shape == (5,)
     np.testing.assert_allclose(given.force_N, np.tile([1.5, 0.0, 0.0], (4, 1)), rtol=1e-6)
     assert given.thruster_duty.shape == (4, 0)
 
 
 def test_every_image_has_an_outcome(tmp_path: Path) -> None:
-    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).image_outcomes[0]
+    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), ONE).image_outcomes[0]
     assert {OUTCOMES[code] for code in nothing.code} == {"not seen"}
-    seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).image_outcomes[0]
+    seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), ONE).image_outcomes[0]
     assert list(seen.intervals()) == [(0.0, 3 * TICK_NS / 1e9, "used")]
     np.testing.assert_array_equal(seen.time_s, [k * TICK_NS / 1e9 for k in range(4)])
 
@@ -313,7 +313,7 @@ def test_intervals_end_at_changes_and_gaps() -> None:
 
 def test_forces_over_several_ticks_are_means(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8)
-    one, three = (load_traces(log, [0], every).inputs[0] for every in (1, 3))
+    one, three = (load_traces(log, ONE, every).inputs[0] for every in (1, 3))
     np.testing.assert_array_equal(three.edges_s, one.edges_s[::3])
     np.testing.assert_allclose(
         three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12
@@ -322,7 +322,7 @@ def test_forces_over_several_ticks_are_means(tmp_path: Path) -> None:
 
 def test_thruster_figure_shows_duty_cycles(tmp_path: Path) -> None:
     flight = load_flight(made_log(tmp_path / "a.mcap", 5))
-    traces = load_traces(tmp_path / "a.mcap", [0])
+    traces = load_traces(tmp_path / "a.mcap", ONE)
     with pytest.raises(MissingData, match="no thrusters"):
         thrusters(flight, traces)
     duty = np.linspace(0.0, 1.0, 24).reshape(2, 12)
@@ -352,7 +352,7 @@ def test_docking_figure_draws_the_limits_of_each_moment(tmp_path: Path) -> None:
     limits = flight.scenario.docking
     expected = [(5.0, 10.0, limits.corridor.closing_m_s), (10.0, 15.0, limits.final.closing_m_s)]
     assert speed_limits(flight, 0) == expected
-    figure = docking(flight, load_traces(tmp_path / "a.mcap", [0]))
+    figure = docking(flight, load_traces(tmp_path / "a.mcap", ONE))
     # The distance at which chasers without a port hold does not apply to this one.
     assert not [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
 
@@ -363,7 +363,7 @@ def test_docking_figure_draws_the_docking_distance_of_chasers_without_a_port(
     flight = with_references(
         tmp_path / "a.mcap", "four-chaser-docking", [(0.0, "hold"), (5.0, "approach")]
     )
-    figure = docking(flight, load_traces(tmp_path / "a.mcap", [0]))
+    figure = docking(flight, load_traces(tmp_path / "a.mcap", ONE))
     assert [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
     ((begin_s, _, limit),) = speed_limits(flight, 0)
     assert (begin_s, limit) == (5.0, flight.scenario.approach.max_speed_m_s)

@@ -19,7 +19,7 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.bodies import Body
 from numpy.typing import NDArray
 
-from .actuation import OutputSource, TickOutput, commanded_output, true_output
+from .actuation import TickOutput, commanded_output, true_output
 from .columns import Columns
 
 ImageOutcome = Literal["used", "rejected", "not seen", "bad image", "not processed"]
@@ -65,12 +65,11 @@ class ActuatorHistory:
 
 @dataclass
 class Traces:
-    """Time series of each chaser, by number. ``inputs_are``: true, or as commanded. ``latency``:
-    rows of exposure time (s) and wall-clock time from the exposure to the actuators' command (s).
+    """Time series of each chaser, by number. ``latency``: rows of exposure time (s) and wall-clock
+    time from the exposure to the actuators' command (s).
     """
 
     inputs: dict[int, ActuatorHistory]
-    inputs_are: OutputSource
     latency: dict[int, Array]
     image_outcomes: dict[int, ImageOutcomes]
 
@@ -180,7 +179,6 @@ def load_traces(log: LogSource, scenario: FlightScenario, every: int = 1) -> Tra
     inputs = {i: collector.finish() for i, collector in sorted(found.items())}
     return Traces(
         inputs={i: history for i, history in inputs.items() if history is not None},
-        inputs_are="true" if c.given else "commanded",
         latency={i: rows.table() for i, rows in sorted(c.latency.items())},
         image_outcomes={i: c.image_outcomes(i) for i in sorted(c.images)},
     )

@@ -336,8 +336,8 @@ class BodyReference(Message, frozen=True, kw_only=True):
     source: Text
     position_m: Vector3
     q_wxyz: Quaternion
-    sigma_m: Annotated[float, Meta(ge=0.0)]
-    sigma_rad: Annotated[float, Meta(ge=0.0)]
+    sigma_m: float
+    sigma_rad: float
     velocity_m_s: Vector3 | None = None
     omega_rad_s: Vector3 | None = None
 

@@ -61,6 +61,7 @@ from chaserdock.verdict import Verdict
 
 TICK_NS = 1_000_000_000 // 15
 SIZE: dict[str, Any] = {"width_px": 96, "height_px": 64}
+ONE = scenario(chasers=[{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}])
 
 
 def put(writer: LogWriter, topic: topics.Topic, place: Any, message: Any) -> None:
@@ -184,7 +185,7 @@ def test_report_has_every_figure_and_no_external_reference(short_flight: Path, p
 
 def test_replay_data_equal_the_recorded_motion(short_flight: Path, page: Page) -> None:
     data = json.loads(page.data)
-    truth = load_flight(short_flight / "mission.mcap").truth
+    truth = load_flight(short_flight / "mission.mcap").motion
     assert np.all(np.diff(data["times"]) > 0)
     assert data["times"][-1] == pytest.approx(truth["target"].time_s[-1], abs=1e-3)
     assert [c["id"] for c in data["chasers"]] == [0, 1]
@@ -242,7 +243,7 @@ def test_flight_aborted_at_once_gives_a_report(tmp_path: Path, ticks: int) -> No
 
 def test_report_of_a_log_without_truth_names_what_is_missing(tmp_path: Path) -> None:
     page = checked(report_of(made_log(tmp_path / "dark.mcap", 5, truth=False)))
-    assert "no ground truth of the target" in page.words
+    assert "neither ground truth nor a reference of the target" in page.words
     assert "figure-cameras" in page.ids
 
 

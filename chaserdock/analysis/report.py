@@ -110,6 +110,10 @@ def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int =
     return f"{text} {unit}".rstrip()
 
 
+def _number(value: int | None) -> str:
+    return _DASH if value is None else str(value)
+
+
 def _count(number: int, thing: str) -> str:
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
@@ -136,7 +140,8 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
         f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '
         f"{result['wall_time_s']:.1f} s, {escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed "
         f"{s.seed}; "
-        f"digest {escape(result['digest'][:16])}</span></p>\n<nav>{links}</nav>"
+        f"digest {escape(result['digest'][:16])}</span></p>\n"
+        f"<p>Judged against {escape(result['judged_against'])}.</p>\n<nav>{links}</nav>"
     )
 
 
@@ -151,6 +156,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     at_distance = any("capture" not in c for c in result["chasers"].values())
     relative = any("relative_estimate" in c for c in result["chasers"].values())
     fuel = any(c["propellant_kg"] > 0.0 for c in result["chasers"].values())
+    estimated = any("estimated_tracking" in c for c in result["chasers"].values())
     rows = [
         (
             f"chaser {i}",
@@ -158,6 +164,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
             _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
             _quantity(c["position_mse_m2"], "m²"),
             _quantity(c["orientation_mse_rad2"], "rad²"),
+            *([_estimated(c)] if estimated else []),
             *([_relative(c)] if relative else []),
             *([_docked(c)] if at_distance else []),
             _quantity(c["min_distance_target_m"], "m"),
@@ -173,6 +180,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         "steady orientation RMS",
         "position MSE, whole run",
         "orientation MSE, whole run",
+        *(["steady RMS as estimated in flight; sightings rejected"] if estimated else []),
         *(["estimated pose relative to the target, RMS"] if relative else []),
         *(["docked since"] if at_distance else []),
         "minimum distance to target",
@@ -199,9 +207,19 @@ def _relative(c: dict[str, Any]) -> str:
     return f"{_quantity(position, 'mm', 1e3)}, {_quantity(angle, '°', math.degrees(1.0))}"
 
 
+def _estimated(c: dict[str, Any]) -> str:
+    """Return the tracking errors by the flight's own estimates, and its rejected sightings."""
+    e, use = c["estimated_tracking"], c["sightings"]
+    position = _quantity(e["position_rms_m"], "mm", 1e3)
+    angle = _quantity(e["orientation_rms_rad"], "°", math.degrees(1.0))
+    return f"{position}, {angle}; {use['rejected']} of {use['used'] + use['rejected']}"
+
+
 def _docked(c: dict[str, Any]) -> str:
     if "capture" in c:
         return _DASH  # a chaser with a port does not dock at a distance
+    if c["docked"] is None:
+        return _DASH
     return f"{c['dock_time_s']:.2f} s" if c["docked"] else "no"
 
 
@@ -288,21 +306,21 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     latency, solver = result["latency_s"], result["solver"]
     safety = [
         ("minimum distance between chasers", _quantity(result["min_distance_chasers_m"], "m")),
-        ("collisions", str(result["collisions"])),
+        ("collisions", _number(result["collisions"])),
         ("mean NEES of the estimate (6 expected)", _quantity(e["nees_mean"], "")),
         (f"solve time ({solver['name']}), median", _quantity(solver["solve_s"]["p50"], "ms", 1e3)),
         ("solve time, 95th percentile", _quantity(solver["solve_s"]["p95"], "ms", 1e3)),
         ("failed solves", str(solver["failures"])),
         ("exposure to command, median", _quantity(latency["p50"], "ms", 1e3)),
         ("exposure to command, 99th percentile", _quantity(latency["p99"], "ms", 1e3)),
-        ("late commands", str(result["late_commands"])),
+        ("late commands", _number(result["late_commands"])),
         ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
     ]
     return (
         '<div class="pair"><section><h2>Target '
         f"estimate</h2>{table(('', 'RMS', 'largest error'), estimate)}"
-        f'<p class="faint">Fused estimate relative to ground truth at the time of exposure, from '
-        f"{flight.scenario.settling_s:g} s on.</p></section>"
+        f'<p class="faint">Fused estimate against {escape(flight.motion.describe())}, at the time '
+        f"of exposure, from {flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
     )
 

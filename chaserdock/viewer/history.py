@@ -134,6 +134,7 @@ class History:
         self._odometry: dict[int, OrderedDict[int, Odometry]] = defaultdict(OrderedDict)
         self._exposed: dict[int, OrderedDict[int, int]] = defaultdict(OrderedDict)
         self._truth: OrderedDict[int, BodyTruth | BodyReference] = OrderedDict()
+        self._uncompared: deque[TargetEstimate] = deque(maxlen=_MOST_LINES)
         self._target: TargetEstimate | None = None
 
     def add_exposure(self, chaser: int, tick: int, sent_ns: int) -> None:
@@ -160,9 +161,11 @@ class History:
                 self._add_tracking_error(message)
             case TargetEstimate() if message.status != "none":
                 self._target = message
-                self._add_estimation_error(message)
+                self._uncompared.append(message)
+                self._compare_estimates()
             case BodyTruth() | BodyReference() if message.body == TARGET:
                 keep_newest(self._truth, message.sim_time_ns, message)
+                self._compare_estimates()
             case PortLoad():
                 self.series["port_load_N", message.chaser].add(
                     message.sim_time_ns / 1e9, message.peak_force_N
@@ -245,9 +248,16 @@ class History:
             time_s, float(np.degrees(turned))
         )
 
-    def _add_estimation_error(self, estimate: TargetEstimate) -> None:
-        # The states just before and after the estimate: a reference has times of its own.
-        times = sorted(self._truth)
+    def _compare_estimates(self) -> None:
+        """Compare the estimates up to the newest known state of the target with its states: those
+        of a reference have times of their own.
+        """
+        newest_ns = max(self._truth, default=-1)
+        while self._uncompared and self._uncompared[0].sim_time_ns <= newest_ns:
+            self._add_estimation_error(self._uncompared.popleft(), sorted(self._truth))
+
+    def _add_estimation_error(self, estimate: TargetEstimate, times: list[int]) -> None:
+        """Add the error of an estimate. ``times``: of the known states, ns."""
         after = bisect_right(times, estimate.sim_time_ns)
         around, time_s = MotionCollector(), estimate.sim_time_ns / 1e9
         for time_ns in times[max(0, after - 2) : after + 1]:

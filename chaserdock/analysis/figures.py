@@ -176,16 +176,17 @@ def _mark_phases(axes: Axes, flight: RecordedFlight, labelled: bool) -> None:
 
 @_figure(
     "Tracking errors",
-    "Distance and angle of each chaser from its reference pose on the true target. Shaded: "
-    "steady-state "
-    "interval.",
+    "Distance and angle of each chaser from its reference pose on the true target; without ground "
+    "truth and reference, of its odometry from its reference pose on the estimated target. Shaded: "
+    "steady-state interval.",
 )
 def tracking(flight: RecordedFlight, _: Traces) -> Figure:
-    numbers = flown(flight)
+    errors = {i: table.T for i, table in flight.estimated_errors.items()}
+    if flight.shown or not errors:
+        errors = {i: tracking_errors(flight, i) for i in flown(flight)}
     figure, (top, bottom) = new_figure(2, sharex=True)
     s = flight.scenario
-    for i in numbers:
-        time_s, position, angle = tracking_errors(flight, i)
+    for i, (time_s, position, angle) in errors.items():
         d = decimated(len(time_s))
         top.semilogy(time_s[d], np.maximum(position[d], 1e-7), color=colour(i), label=f"chaser {i}")
         bottom.semilogy(time_s[d], np.maximum(np.degrees(angle[d]), 1e-5), color=colour(i))
@@ -203,7 +204,8 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
         sigma_m, sigma_rad = flight.motion.sigmas()
         limit_line(top, max(sigma_m, 1e-7), "reference, 1 sigma")
         limit_line(bottom, max(np.degrees(sigma_rad), 1e-5), "reference, 1 sigma")
-    top.set(ylabel="position error / m", xlim=_span_s(flight.motion[TARGET].time_s))
+    last_s = max(float(time_s[-1]) for time_s, *_ in errors.values() if len(time_s))
+    top.set(ylabel="position error / m", xlim=_span_s(np.array([last_s])))
     bottom.set(ylabel="orientation error / °", xlabel="time / s")
     legend_above(top)
     return figure

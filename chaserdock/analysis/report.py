@@ -24,6 +24,7 @@ from .criteria import capture_state
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
 from .mass_properties import PRIOR_ONLY, property_rows, true_values
+from .motion import TARGET
 from .plots import decimation, to_inline_svg
 from .replay_scene import replay_data, small_images
 from .summary import summary_of_run
@@ -304,6 +305,7 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         ("rate", _quantity(e["omega_rms_rad_s"], "°/s", degree), ""),
     ]
     latency, solver = result["latency_s"], result["solver"]
+    against = flight.motion.describe() if TARGET in flight.motion else "nothing: no figures"
     safety = [
         ("minimum distance between chasers", _quantity(result["min_distance_chasers_m"], "m")),
         ("collisions", _number(result["collisions"])),
@@ -319,7 +321,7 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     return (
         '<div class="pair"><section><h2>Target '
         f"estimate</h2>{table(('', 'RMS', 'largest error'), estimate)}"
-        f'<p class="faint">Fused estimate against {escape(flight.motion.describe())}, at the time '
+        f'<p class="faint">Fused estimate against {escape(against)}, at the time '
         f"of exposure, from {flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
     )

@@ -13,10 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chaserdock_agents.recorder.foxglove_layer import SHOWN, ViewerLayer
+from chaserdock_agents.ros2.conversion import Converter
 from chaserdock_models import rotations
-from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import ActuatorCommand, BodyReference, ThrusterPulse
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
+from message_samples import SAMPLES
 from motion_cases import (
     SIGMA_M,
     SIGMA_RAD,
@@ -28,6 +32,7 @@ from motion_cases import (
 )
 from typer.testing import CliRunner
 
+from chaserdock.analysis import video
 from chaserdock.analysis.actuation import commanded_output
 from chaserdock.analysis.figures import component_errors
 from chaserdock.analysis.flight import load_flight
@@ -456,7 +461,7 @@ def test_report_against_a_reference_names_it_and_replays_the_flight(measured: Pa
 @pytest.mark.slow
 def test_report_without_a_reference_shows_what_needs_none(bare: Path) -> None:
     page = report_of(bare)
-    for name in ("inputs", "cameras", "solver", "latency"):
+    for name in ("tracking", "inputs", "cameras", "solver", "latency"):
         assert f'id="figure-{name}"' in page
     assert 'id="replay-data"' not in page
     assert "as estimated in flight; sightings rejected" in page
@@ -503,3 +508,32 @@ def test_viewer_of_a_log_draws_the_measured_bodies_and_the_error_of_the_estimate
         _, truth = whole.history.series[quantity, None].until(9.9)  # type: ignore[index]
         assert len(ours) >= len(truth) - 1
         assert np.abs(ours[-len(truth) + 1 :] - truth[1:]).max() < 5.0 * sigma
+
+
+def test_film_draws_the_measured_bodies(measured: Path) -> None:
+    (_, ours), (_, true) = (
+        next(iter(video.frames(log, load_flight(log), 1.0, 320, 180, (1.0, 1.1))))
+        for log in (measured, GOLDEN)
+    )
+    # The same bodies at the same places, to pixels at their edges.
+    outside = np.s_[:, :180]
+    assert np.mean(np.abs(ours[outside].astype(int) - true[outside]) > 60) < 0.02
+    assert np.mean(true[outside] > 60) > 0.005
+
+
+def test_viewer_layer_and_ros_bag_have_the_measured_poses() -> None:
+    scenario = load_flight(GOLDEN).scenario
+    sample = next(m for m in SAMPLES if isinstance(m, BodyReference))
+    (ros,) = Converter(scenario).convert(sample)
+    assert ros.topic == "/reference/target"
+    covariance = ros.message.pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(
+        np.diag(covariance), [sample.sigma_m**2] * 3 + [sample.sigma_rad**2] * 3
+    )
+    written: list[str] = []
+    layer = ViewerLayer(scenario, lambda topic, *_: written.append(topic))
+    layer.write(sample)  # and what is written once
+    before = len(written)
+    layer.write(sample)
+    assert written[before:] == ["/viewer/tf"]
+    assert topics.BODY_REFERENCE in SHOWN

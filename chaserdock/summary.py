@@ -216,7 +216,7 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     doubts: list[str] = []
     ended: str = ""
     log_lacks: list[str] = []
-    judged_against: str = "ground truth"
+    judged_against: str = ""
     impulses_are: Literal["true", "commanded"] = "true"
     run_failure: str | None = None
     events: list[TimedEvent]

@@ -20,6 +20,7 @@ from chaserdock_protocol.recording.log import (
     read_scenario,
 )
 from chaserdock_protocol.scenario import flight_scenario_json, parse_scenario
+from msgspec import structs
 
 from chaserdock.analysis.columns import Columns
 from chaserdock.analysis.motion import BodyMotion, Track, motion_columns
@@ -85,6 +86,9 @@ def without_truth(
     numbers = dict.fromkeys(bodies, 0)
     for record in read_log(log):
         message, sent_ns = record.message, record.sent_ns
+        if isinstance(message, m.Farewell):
+            sent = {k: n for k, n in message.published.items() if not k.startswith("truth/")}
+            message = structs.replace(message, published=sent)
         if not record.key.startswith("truth/"):
             payload = codec.encode(message)
             writer.write(record.key, m.encoding_of(type(message)), payload, sent_ns)

@@ -288,7 +288,6 @@ def test_typed_summary_has_every_field(log: Path) -> None:
             ("drawn", []),
             ("doubts", []),
             ("log_lacks", []),
-            ("judged_against", "ground truth"),
             ("impulses_are", "true"),
         )
     }

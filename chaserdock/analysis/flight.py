@@ -139,19 +139,21 @@ class WorldHistory:
 @dataclass
 class SensedDocking:
     """What a chaser's docking sensor has measured. ``contacts``: number of touches of the probe.
-    ``latched``: at the end; ``latch_time_s``: since when, or when last.
+    ``latched``: at the end; ``latch_time_s``: when the latch closed last, None if it was closed
+    already when the log begins.
     """
 
     contacts: int = 0
     latched: bool = False
     latch_time_s: float | None = None
     _touching: bool = False
+    _heard: bool = False
 
     def add(self, message: DockingStatus) -> None:
         self.contacts += message.contact and not self._touching
-        if message.latched and not self.latched:
+        if message.latched and not self.latched and self._heard:
             self.latch_time_s = message.sim_time_ns / 1e9
-        self._touching, self.latched = message.contact, message.latched
+        self._touching, self.latched, self._heard = message.contact, message.latched, True
 
 
 @dataclass

@@ -34,6 +34,7 @@ from typer.testing import CliRunner
 
 from chaserdock.analysis import video
 from chaserdock.analysis.actuation import commanded_output
+from chaserdock.analysis.columns import Columns
 from chaserdock.analysis.figures import component_errors
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.motion import Track
@@ -120,10 +121,13 @@ def test_pose_is_not_known_where_the_measurement_is_interrupted() -> None:
 
 
 def test_late_and_doubled_measurements_count_once_and_in_order() -> None:
-    times = np.array([0.0, 0.02, 0.01, 0.03, 0.03])
-    motion = measured_motion({"target": turning(times)}, np.array([0.005, 0.015]))
-    found, true = motion["target"], turning(np.array([0.005, 0.015]))
-    np.testing.assert_allclose(found.position_m, true.position_m, atol=1e-12)
+    """The body accelerates: only neighbours in time give its place."""
+    times, ticks = np.array([0.0, 0.03, 0.01, 0.02, 0.02, 0.04]), np.arange(0.005, 0.04, 0.01)
+    measured = track(times, position_m=np.outer(times**2, [3.0, -2.0, 1.0]))
+    found = measured_motion({"target": measured}, ticks)["target"]
+    np.testing.assert_array_equal(found.time_s, ticks)
+    between = (np.square(ticks - 0.005) + np.square(ticks + 0.005)) / 2.0
+    np.testing.assert_allclose(found.position_m, np.outer(between, [3.0, -2.0, 1.0]), atol=1e-12)
 
 
 def test_bodies_that_are_measured_at_different_times_are_compared_at_the_same_ticks() -> None:
@@ -228,6 +232,17 @@ def test_error_of_the_measurement_is_in_the_bounds_of_the_estimate(measured: Pat
     assert np.all(np.abs(more[:, 3:6]) < 1e-15)
 
 
+def test_estimate_much_better_than_the_measurement_is_judged_by_the_latter(measured: Path) -> None:
+    """Of a filter that states a millionth of its sigmas, the NEES is bounded by the measurement's:
+    errors of 1 mm and 2 mrad are 5 and 2 of its sigmas."""
+    flight = load_flight(measured)
+    tiny = Columns(27)
+    for row in flight.covariances.table() * 1e-12:
+        tiny.add(row.tolist())
+    nees = summary_of(replace(flight, covariances=tiny))["target_estimate"]["nees_mean"]
+    assert 10.0 < nees < 150.0
+
+
 def test_what_needs_velocities_is_not_judged_where_they_are_not_measured(tmp_path: Path) -> None:
     log = without_truth(GOLDEN, tmp_path / "mission.mcap", BODIES, rates=False)
     flight = load_flight(log)
@@ -317,6 +332,7 @@ def test_docking_is_judged_by_its_sensor() -> None:
     assert "verified, latched at 22.2 s" in text_of(result)
     # Without the latch the criterion is violated.
     flight = load_flight(CAPTURE)
+    assert flight.latched == (0,)
     flight.sensed_docking[0].latched = False
     assert "chaser 0 is not latched" in summary_of(flight)["failures"]
 
@@ -441,6 +457,8 @@ def test_latch_that_closed_before_the_log_begins_is_latched(tmp_path: Path) -> N
     log = cropped(CAPTURE, tmp_path / "mission.mcap", 25.0, 99.0)
     result = summarize(log)
     assert result["chasers"]["0"]["capture"]["latched"]
+    assert result["chasers"]["0"]["capture"]["latch_time_s"] is None
+    assert "latched at" not in text_of(result)
     assert "never latched" not in text_of(result)
     assert "verified" in text_of(result)
 

@@ -113,8 +113,8 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
 
     scene = scene_of(flight.scenario)
     return {
-        "motion": flight.motion.describe().capitalize(),
         "times": _numbers(target.time_s[rows], 3),
+        "motion": flight.motion.describe().capitalize(),
         "reach_m": reach_m,
         "sun": list(to_sun(flight.scenario)),
         "target": _thinned(target, rows),

@@ -221,7 +221,7 @@ def test_truncated_log_gives_a_report(short_flight: Path, tmp_path: Path) -> Non
     cut.write_bytes(whole[: int(0.6 * len(whole))])
     page = checked(report_of(cut))
     assert "FAILED" in page.words
-    assert "ended at" in page.words
+    assert "the log ends at" in page.words
 
 
 @pytest.mark.slow
@@ -237,7 +237,7 @@ def test_report_of_a_flight_without_sightings_names_what_is_missing(tmp_path: Pa
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_flight_aborted_at_once_gives_a_report(tmp_path: Path, ticks: int) -> None:
     page = checked(report_of(made_log(tmp_path / "aborted.mcap", ticks)))
-    assert "ended at 0.00 s of 2 s" in page.words
+    assert "the log ends at 0.00 s of 2 s" in page.words
     assert ("replay" in page.ids) == (ticks > 0)
 
 

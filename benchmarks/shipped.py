@@ -137,6 +137,7 @@ def fly_graded(name: str, grade: str, options: Options, seed: int) -> ShippedOut
             [s.orientation_mse_rad2 for s in steady],
         )
     )
+    assert summary.collisions is not None  # simulated flights have ground truth
     return ShippedOutcome(
         tuple(summary.failures), position, angle, summary.collisions, false_alarms(flight)
     )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 from chaserdock_protocol.messages import DrawnBody
@@ -88,16 +88,36 @@ class PoseEstimateErrors(Struct, frozen=True, kw_only=True):
     nees_mean: float | None
 
 
+class EstimatedTracking(Struct, frozen=True, kw_only=True):
+    """RMS distance and angle of a chaser's odometry from its reference pose on the estimated target
+    after the settling time; None if the flight has no such part.
+    """
+
+    position_rms_m: float | None
+    orientation_rms_rad: float | None
+
+
+class SightingCount(Struct, frozen=True, kw_only=True):
+    """Sightings that the estimator used, and that it rejected because their innovation does not fit
+    its covariance.
+    """
+
+    used: int
+    rejected: int
+
+
 class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Results of one chaser, measured on ground truth."""
+    """Results of one chaser, measured on ground truth or on a reference; what is measured on poses
+    is None without either.
+    """
 
     position_mse_m2: float | None
     orientation_mse_rad2: float | None
     steady: SteadyErrors
-    docked: bool
+    docked: bool | None
     dock_time_s: float | None
     reached_time_s: float | None
-    min_distance_target_m: float
+    min_distance_target_m: float | None
     impulse_N_s: float
     thruster_impulse_N_s: float
     propellant_kg: float
@@ -105,6 +125,8 @@ class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     capture: Capture | None = None
     passive_safety: PassiveSafetySummary | None = None
     rendezvous: RendezvousFigures | None = None
+    estimated_tracking: EstimatedTracking | None = None
+    sightings: SightingCount | None = None
 
 
 class TargetEstimateErrors(PoseEstimateErrors, frozen=True, kw_only=True):
@@ -193,14 +215,17 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     not_judged: list[str]
     doubts: list[str] = []
     ended: str = ""
+    log_lacks: list[str] = []
+    judged_against: str = ""
+    impulses_are: Literal["true", "commanded"] = "true"
     run_failure: str | None = None
     events: list[TimedEvent]
     chasers: dict[int, ChaserSummary]
     min_distance_chasers_m: float | None
-    collisions: int
+    collisions: int | None
     target_estimate: TargetEstimateErrors
     latency_s: Latency
-    late_commands: int
+    late_commands: int | None
     unanswered: int
     solver: Solver
     messages: dict[str, MessageCount]

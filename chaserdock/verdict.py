@@ -22,6 +22,7 @@ class Verdict:
 
     ``ended``: why the flight ended; empty if that is not known. ``not_met``, ``not_judged``:
     criteria of the scenario. ``doubts``: estimates whose errors do not fit their covariance.
+    ``lacking``: what the log lacks of its mission.
     """
 
     success: bool
@@ -29,13 +30,14 @@ class Verdict:
     not_met: tuple[str, ...] = ()
     not_judged: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    lacking: tuple[str, ...] = ()
 
     @property
     def level(self) -> Literal["good", "partial", "bad"]:
         """Return ``good`` only for a success to which nothing is to be added."""
         if not self.success:
             return "bad"
-        return "partial" if self.not_judged or self.doubts else "good"
+        return "partial" if self.not_judged or self.doubts or self.lacking else "good"
 
     @property
     def headline(self) -> str:
@@ -45,6 +47,7 @@ class Verdict:
         n = len(self.not_judged)
         limits = [f"{n} {'criterion' if n == 1 else 'criteria'} not judged"] if n else []
         limits += ["NEES out of range"] if self.doubts else []
+        limits += ["log incomplete"] if self.lacking else []
         return f"success, but {' and '.join(limits)}" if limits else "success"
 
     def remarks(self) -> Iterator[tuple[str, str]]:
@@ -52,6 +55,7 @@ class Verdict:
         yield from (("not met", text) for text in self.not_met)
         yield from (("not judged", text) for text in self.not_judged)
         yield from (("doubtful", text) for text in self.doubts)
+        yield from (("the log", text) for text in self.lacking)
 
     def lines(self) -> list[str]:
         """Return the reason of the end, if known, and the remarks as lines of text."""
@@ -81,6 +85,7 @@ def verdict_of(summary: Mapping[str, Any]) -> Verdict:
         not_met=not_met,
         not_judged=tuple(summary.get("not_judged", ())),
         doubts=tuple(summary.get("doubts", ())),
+        lacking=tuple(summary.get("log_lacks", ())),
     )
 
 

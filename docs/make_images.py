@@ -487,7 +487,7 @@ def save(figure: Figure, name: str, quality: int = 80) -> None:
 def controller() -> None:
     """Paths in the target's frame, keep-out and corridors of ``four-chaser-docking``."""
     f = flight("four-chaser-docking")
-    target, s = f.truth["target"], f.scenario
+    target, s = f.motion["target"], f.scenario
     with styled():
         figure = Figure(figsize=(6.4, 5.0))
         axes = figure.add_subplot()
@@ -509,8 +509,8 @@ def controller() -> None:
                     label="corridors of 0 and 3" if i == 0 else None,
                 )
             )
-        for i in f.flown:
-            own = f.truth[f"chaser/{i}"]
+        for i in f.shown:
+            own = f.motion[f"chaser/{i}"]
             path = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
             axes.plot(*path[:, :2].T, color=colour(i), label=f"chaser {i}")
             axes.plot(*path[0, :2], "o", color=colour(i), markersize=4)
@@ -523,7 +523,7 @@ def controller() -> None:
 def estimation() -> None:
     """Error of a chaser's estimated relative position, with three standard deviations."""
     f = flight("four-chaser-docking")
-    relative, target, own = f.relative[1], f.truth["target"], f.truth["chaser/1"]
+    relative, target, own = f.relative[1], f.motion["target"], f.motion["chaser/1"]
     rows = np.searchsorted(target.time_s, relative.time_s + 1e-6) - 1
     true_position = rotations.rotate_inverse(
         target.q_wxyz[rows], own.position_m[rows] - target.position_m[rows]
@@ -548,7 +548,7 @@ def estimation() -> None:
 def detumble() -> None:
     """Rate of the target of ``detumble``, and when the chasers latch."""
     f = flight("detumble")
-    target = f.truth["target"]
+    target = f.motion["target"]
     with styled():
         figure = Figure(figsize=(8.0, 2.9))
         axes = figure.add_subplot()
@@ -571,7 +571,7 @@ def detumble() -> None:
 def docking() -> None:
     """Distance of the probe's tip from the port of ``docking-contact``, by phase."""
     f = flight("docking-contact")
-    s, target, own = f.scenario, f.truth["target"], f.truth["chaser/0"]
+    s, target, own = f.scenario, f.motion["target"], f.motion["chaser/0"]
     port = s.docking.ports[0]
     reach = np.array([s.chaser.probe_reach_m, 0.0, 0.0])
     tip = own.position_m + rotations.rotate(own.q_wxyz, np.tile(reach, (len(own.time_s), 1)))
@@ -612,7 +612,7 @@ def faults() -> None:
                 f"{fault.kind}\n{fault.process}", (fault.at_s, 700), fontsize=8, va="top",
                 xytext=(3, 0), textcoords="offset points", color=colour(chaser),
             )  # fmt: skip
-        for i in f.flown:
+        for i in f.shown:
             time_s, position, _ = tracking_errors(f, i)
             axes.semilogy(time_s, 1e3 * position, color=colour(i), label=f"chaser {i}")
         axes.set(xlabel="time / s", ylabel="position error / mm", ylim=(0.1, 900))

@@ -30,6 +30,7 @@ _RATES = {
         f"then each {STEADY_PERIOD_S:g} s"
     ),
     "event": "when it happens",
+    "sensor": "at the rate of its sensor",
 }
 
 _QUERIES = (
@@ -83,8 +84,10 @@ and `msgpack`: [foreign_controller.py](../examples/foreign_controller/foreign_co
 - Names of processes: `world`, `controller`, `standby` (a second controller), `chaser/0` to
   `chaser/N-1`, `recorder`, `operator`, `viewer`, `bridge`. A process' branch of keys is its name;
   both controllers write `controller/…`.
-- A process writes only keys of its own branch. No flight process may read `truth/**`. With a router
-  and keys (`chaserdock keys`, [deployment.md](deployment.md)) both are enforced.
+- A process writes only keys of its own branch. No flight process may read `truth/**` or
+  `reference/**`, on which a world without ground truth publishes what it measures of the bodies by
+  another system. With a router and keys (`chaserdock keys`, [deployment.md](deployment.md)) both
+  are enforced.
 
 ## Queries
 A query whose payload is malformed, invalid, or of another type or version gets a Zenoh error reply

@@ -47,6 +47,16 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Odometry(**HEAD, chaser=255, position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
     m.DockingStatus(**HEAD, chaser=1, contact=True, armed=True, latched=False),
     m.BodyTruth(**HEAD, body="chaser/0", position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
+    m.BodyReference(
+        **HEAD,
+        body="target",
+        source="optitrack",
+        position_m=V,
+        q_wxyz=Q,
+        sigma_m=2e-4,
+        sigma_rad=1e-3,
+        omega_rad_s=V,
+    ),
     m.DrawnTruth(
         **HEAD,
         bodies=(

@@ -17,7 +17,8 @@ from chaserdock_protocol.shipped_scenarios import shipped_scenario
 from common import Figures, Group, Options, described, seeds_of
 from flights.engine_comparison import CASES, ENGINES, difference, fly_case
 
-from chaserdock.analysis.flight import Track, load_flight
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.motion import Track
 from chaserdock.analysis.summary import summary_of
 from chaserdock.simulation.mission import simulate
 
@@ -91,7 +92,7 @@ def fly_mission(
         if flight.crashes or flight.stalled:
             raise SystemExit("\n".join([*flight.crashes.values(), *flight.stalled]))
         recorded = load_flight(Path(folder) / "mission.mcap")
-        return recorded.truth, summary_of(recorded)["failures"]
+        return recorded.motion, summary_of(recorded)["failures"]
 
 
 def tracks_apart(a: Mapping[str, Track], b: Mapping[str, Track]) -> tuple[float, float]:

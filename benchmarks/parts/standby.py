@@ -270,7 +270,7 @@ def is_identical(at_s: float) -> bool:
             overrides = ("controller.standby=true", f"fault={fault}")
             fly_mission(SCENARIO, Path(name), overrides=overrides)
             flight = load_flight(Path(name) / "mission.mcap")
-            truths.append({body: track.position_m for body, track in flight.truth.items()})
+            truths.append({body: track.position_m for body, track in flight.motion.items()})
     return all(np.array_equal(truths[0][body], truths[1][body]) for body in truths[0])
 
 

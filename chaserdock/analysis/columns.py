@@ -80,3 +80,15 @@ def rows_since(time_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[
     -1.
     """
     return np.searchsorted(time_ns, at_ns, side="right") - 1
+
+
+def rows_at_equal_times(time_s: Array, other_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows (K,) in the first and in the second array of ascending times (s) that hold
+    equal times.
+    """
+    at_ns, other_ns = nanoseconds(time_s), nanoseconds(other_s)
+    if not len(other_ns):
+        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    row = rows_since(other_ns, at_ns)
+    both = np.flatnonzero((row >= 0) & (other_ns[row] == at_ns))
+    return both, row[both]

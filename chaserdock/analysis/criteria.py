@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Success criteria of a recorded flight, evaluated on ground truth: which can be judged; docking
-and goals.
+"""Success criteria of a recorded flight, evaluated on the motion of its bodies: which can be
+judged; docking and goals.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Vector3
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.mission import Success
 
-from .flight import LoadHistory, RecordedFlight
+from .flight import LoadHistory, RecordedFlight, SensedDocking
+from .motion import TARGET
 
 _CONTACT_SLACK_M = 0.02
 """Distance (m) by which a chaser in contact may be closer than a latched one, because it tilts and
@@ -30,13 +34,16 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
     """
     if flight.scenario.docking.port_of(chaser) is None:
         return None
+    reference, loads = flight.references.get(chaser), flight.loads.get(chaser)
+    verified = reference is not None and reference.phases[-1][1] in _VERIFIED
+    if not flight.world.ticks:
+        return _sensed_capture(flight.sensed_docking.get(chaser, SensedDocking()), verified)
     touches = [t for t in flight.world.touches if t.chaser == chaser]
     latching = [t for t in touches if t.latched]
     last = latching[-1] if latching else None
-    reference, loads = flight.references.get(chaser), flight.loads.get(chaser)
     return {
         "latched": chaser in flight.world.latched,
-        "verified": reference is not None and reference.phases[-1][1] in _VERIFIED,
+        "verified": verified,
         "latch_time_s": None if last is None else last.sim_time_ns / 1e9,
         "contact_lateral_m": None if last is None else last.lateral_m,
         "contact_angle_rad": None if last is None else last.angle_rad,
@@ -45,6 +52,22 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
         "probe_touches": len(touches),
         "refused": [t.refused for t in touches if not t.latched],
         "port_load": None if loads is None else port_load_of(loads, flight.scenario, chaser),
+    }
+
+
+def _sensed_capture(sensed: SensedDocking, verified: bool) -> dict[str, Any]:
+    """Return the capture as the docking sensor alone shows it, which measures no offset."""
+    return {
+        "latched": sensed.latched,
+        "verified": verified,
+        "latch_time_s": sensed.latch_time_s,
+        "contact_lateral_m": None,
+        "contact_angle_rad": None,
+        "contact_closing_m_s": None,
+        "contact_lateral_speed_m_s": None,
+        "probe_touches": sensed.contacts,
+        "refused": [],
+        "port_load": None,
     }
 
 
@@ -77,7 +100,7 @@ def _load_limits(s: Scenario, chaser: int) -> list[tuple[str, float, str]]:
 def overloads(result: dict[str, Any], s: Scenario) -> list[str]:
     """Return a message for each load limit that was exceeded, or cannot be judged."""
     out = []
-    for i, c in result["chasers"].items():
+    for i, c in result["chasers"].items() if result["collisions"] is not None else ():
         for quantity, limit, unit in _load_limits(s, int(i)):
             load, what = c["capture"]["port_load"], quantity.split("_")[1]
             if load is None:
@@ -123,7 +146,7 @@ def capture_failures(result: dict[str, Any], s: Scenario) -> list[str]:
 
 def capture_state(capture: dict[str, Any]) -> str:
     """Return the state of a capture at the end of the flight in one or two words."""
-    if capture["latch_time_s"] is None:
+    if capture["latch_time_s"] is None and not capture["latched"]:
         return "never latched"
     return "verified" if capture["verified"] else "latched" if capture["latched"] else "released"
 
@@ -132,6 +155,8 @@ def capture_text(capture: dict[str, Any]) -> str:
     """Describe a capture as part of a line."""
     if capture["latch_time_s"] is None:
         return f"; {capture_state(capture)}"
+    if capture["contact_lateral_m"] is None:
+        return f"; {capture_state(capture)}, latched at {capture['latch_time_s']:.1f} s"
     return (
         f"; {capture_state(capture)}, latched at {capture['latch_time_s']:.1f} s: "
         f"{capture['contact_lateral_m'] * 1e3:.2f} mm and "
@@ -147,23 +172,20 @@ def stack_rest(flight: RecordedFlight) -> dict[str, float | None] | None:
     ``since_s``: simulated time since which both were within ``success.detumbled``; None if they are
     not at the end.
     """
+    names = ["target", *(f"chaser/{i}" for i in flight.latched)]
     limits = flight.scenario.success.detumbled
-    if limits is None or "target" not in flight.truth:
+    if limits is None or any(name not in flight.motion for name in names):
         return None
-    names = ["target", *(f"chaser/{i}" for i in flight.world.latched)]
-    tracks, drawn = (
-        {name: flight.truth[name] for name in names},
-        {body.body: body for body in flight.drawn},
-    )
+    if not flight.motion.has_rates():
+        return None
+    tracks = {name: flight.motion[name] for name in names}
     n = min(len(track.time_s) for track in tracks.values())
     momentum, mass = np.zeros((n, 3)), 0.0
     for name, track in tracks.items():
-        own = drawn[name]
-        turning = np.cross(track.omega_rad_s[:n], own.centre_of_mass_m)
-        momentum += own.mass_kg * (
-            track.velocity_m_s[:n] + rotations.rotate(track.q_wxyz[:n], turning)
-        )
-        mass += own.mass_kg
+        mass_kg, centre_m = _mass_and_centre(flight, name)
+        turning = np.cross(track.omega_rad_s[:n], centre_m)
+        momentum += mass_kg * (track.velocity_m_s[:n] + rotations.rotate(track.q_wxyz[:n], turning))
+        mass += mass_kg
     speed = np.linalg.norm(momentum, axis=1) / mass
     rate = np.linalg.norm(tracks["target"].omega_rad_s[:n], axis=1)
     outside = np.flatnonzero((speed > limits.speed_m_s) | (rate > np.radians(limits.rate_deg_s)))
@@ -175,13 +197,23 @@ def stack_rest(flight: RecordedFlight) -> dict[str, float | None] | None:
     }
 
 
+def _mass_and_centre(flight: RecordedFlight, name: str) -> tuple[float, Vector3]:
+    """Return mass, kg, and centre of mass, m, of a body: the true ones, or else those stated."""
+    for drawn in flight.drawn:
+        if drawn.body == name:
+            return drawn.mass_kg, drawn.centre_of_mass_m
+    if name == TARGET:
+        return flight.scenario.target.mass_kg, flight.scenario.target.centre_of_mass_m
+    return flight.scenario.chaser.mass_kg, (0.0, 0.0, 0.0)
+
+
 def rest_failures(result: dict[str, Any], s: Scenario) -> list[str]:
     """Return the violations of ``success.detumbled``."""
     limits, stack = s.success.detumbled, result.get("stack")
     if limits is None or (stack is not None and stack["since_s"] is not None):
         return []
     if stack is None:
-        return ["the log has no truth to judge success.detumbled"]
+        return ["success.detumbled: the motion of the stack is not in the log"]
     return [
         f"the stack moves at {stack['speed_m_s'] * 1e3:.2f} mm/s and "
         f"{np.degrees(stack['rate_rad_s']):.3f} degrees/s; at most "
@@ -193,20 +225,19 @@ def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
     """Return the simulated time (s) since which a chaser stays at the goal of its last ``goto``;
     None if it does not.
 
-    The goal is the scenario's, placed on the true target. A chaser without a ``goto`` in the
-    timeline has none.
+    The goal is the scenario's, placed on the true (measured) target. A chaser without a ``goto`` in
+    the timeline has none.
     """
     goal, success = flight.scenario.goal_of(chaser), flight.scenario.success
     if goal is None:
         return None
     start_s, offset_m = goal
-    target, own = flight.truth["target"], flight.truth[f"chaser/{chaser}"]
-    n = min(len(target.time_s), len(own.time_s))
-    goal_m = target.position_m[:n] + rotations.rotate(target.q_wxyz[:n], np.array(offset_m))
-    away = np.linalg.norm(own.position_m[:n] - goal_m, axis=1) > success.reached_position_m
-    outside = np.flatnonzero(away | (target.time_s[:n] < start_s))
+    own, target = flight.motion.pair(chaser)
+    goal_m = target.position_m + rotations.rotate(target.q_wxyz, np.array(offset_m))
+    away = np.linalg.norm(own.position_m - goal_m, axis=1) > success.reached_position_m
+    outside = np.flatnonzero(away | (target.time_s < start_s))
     first = int(outside[-1]) + 1 if len(outside) else 0
-    return float(target.time_s[first]) if first < n else None
+    return float(target.time_s[first]) if first < len(away) else None
 
 
 def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[str]:
@@ -225,6 +256,61 @@ def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[s
             f"{success.reached_within_s:g} s allowed"
         ]
     return []
+
+
+_OF_POSES = (
+    "docked",
+    "reached",
+    "detumbled",
+    "speed_limit",
+    "approach_cone",
+    "arrival",
+    "abort_clear_m",
+    "keep_distances",
+    "steady_position_rms_m",
+    "steady_orientation_rms_deg",
+    "max_estimate_position_m",
+    "max_estimate_orientation_deg",
+)
+_OF_RATES = ("detumbled", "speed_limit", "arrival")
+"""Criteria on poses of the bodies, and those that need their velocities, too."""
+
+
+def criteria_of(flight: RecordedFlight) -> tuple[Scenario, list[str]]:
+    """Return the scenario with the success criteria that the log allows to judge, and a line for
+    each other one. Such criteria are neither met nor violated.
+    """
+    if not flight.states_criteria:
+        none = flight.scenario.model_copy(update={"success": Success(keep_distances=False)})
+        return none, ["success: the log holds the flight scenario, which states no criteria"]
+    scenario, skipped = judged_criteria(flight.scenario)
+    motion, success, absent = flight.motion, scenario.success, {}
+    if TARGET not in motion or not any(motion.has_pair(i) for i in flight.chasers):
+        body = "a chaser" if TARGET in motion else "the target"
+        why = f"the log has neither ground truth nor a reference of {body}"
+        absent = dict.fromkeys(_OF_POSES, why)
+    elif not motion.has_rates():
+        absent = dict.fromkeys(_OF_RATES, "the reference does not measure velocities and rates")
+    absent = {name: why for name, why in absent.items() if getattr(success, name)}
+    skipped += [f"success.{name}: {why}" for name, why in absent.items()]
+    unknown = Success(keep_distances=False)
+    success = success.model_copy(update={name: getattr(unknown, name) for name in absent})
+    skipped += _without_truth(flight)
+    return scenario.model_copy(update={"success": success}), skipped
+
+
+def _without_truth(flight: RecordedFlight) -> Iterator[str]:
+    """Yield a line for each criterion of every mission that needs the world's ground truth, and for
+    each chaser without a motion beside others.
+    """
+    if not flight.world.ticks:
+        yield "collisions: the log has no ground truth of contacts"
+        if any(_load_limits(flight.scenario, i) for i in flight.chasers):
+            yield "loads on the ports: the log has no ground truth of them"
+    shown = flight.shown
+    for i in flight.chasers if shown else ():
+        if i not in shown:
+            yield f"chaser {i}, criteria on its pose: the log has no reference of it"
 
 
 def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:

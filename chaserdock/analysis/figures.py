@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of a recorded flight, one function each: the paper's figures and diagnostics.
 
-A function raises ``MissingData`` when the log lacks what it needs. Errors refer to ground truth, as
-in ``summary``. A chaser has the same colour in all figures.
+A function raises ``MissingData`` when the log lacks what it needs. Errors refer to the motion that
+the flight is judged against, as in ``summary``. A chaser has the same colour in all figures.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from .flight import RecordedFlight, Track, load_flight
+from .flight import RecordedFlight, load_flight
 from .mass_properties import NAMES, SCALE, stated_values, true_values
+from .motion import TARGET, Track
 from .plots import (
     AXES_XYZ,
     FAINT,
@@ -75,11 +76,11 @@ def flown(flight: RecordedFlight) -> list[int]:
     """Return the chasers whose motion is in the log. Raise MissingData if there are none or the
     target is missing.
     """
-    if "target" not in flight.truth:
-        raise MissingData("the log holds no ground truth of the target")
-    numbers = flight.flown
+    if TARGET not in flight.motion:
+        raise MissingData("the log holds neither ground truth nor a reference of the target")
+    numbers = flight.shown
     if not numbers:
-        raise MissingData("the log holds no ground truth of any chaser")
+        raise MissingData("the log holds neither ground truth nor a reference of any chaser")
     return numbers
 
 
@@ -90,9 +91,9 @@ def _span_s(times_s: Array) -> tuple[float, float]:
 
 def _path(own: Track, target: Track) -> tuple[Array, Array]:
     """Return the drawn positions of a chaser, up to the last one: in WRF, and relative to the
-    target in TRF.
+    target in TRF. Both motions at the same times.
     """
-    n = min(len(own.time_s), len(target.time_s))
+    n = len(own.time_s)
     rows = np.unique(np.append(np.arange(n)[decimated(n)], n - 1))
     position = own.position_m[rows]
     return position, rotations.rotate_inverse(
@@ -103,8 +104,8 @@ def _path(own: Track, target: Track) -> tuple[Array, Array]:
 @_figure("Trajectories", "Paths of the centres of mass; dot: start, triangle: end.")
 def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
-    target = flight.truth["target"]
-    paths = {i: _path(flight.truth[f"chaser/{i}"], target) for i in numbers}
+    target = flight.motion[TARGET]
+    paths = {i: _path(*flight.motion.pair(i)) for i in numbers}
     figure = Figure(figsize=(9.6, 4.8))
     for place, title in enumerate(
         ("World frame (WRF)", "Relative to the target, target frame (TRF)")
@@ -175,16 +176,17 @@ def _mark_phases(axes: Axes, flight: RecordedFlight, labelled: bool) -> None:
 
 @_figure(
     "Tracking errors",
-    "Distance and angle of each chaser from its reference pose on the true target. Shaded: "
-    "steady-state "
-    "interval.",
+    "Distance and angle of each chaser from its reference pose on the true target; without ground "
+    "truth and reference, of its odometry from its reference pose on the estimated target. Shaded: "
+    "steady-state interval.",
 )
 def tracking(flight: RecordedFlight, _: Traces) -> Figure:
-    numbers = flown(flight)
+    errors = {i: table.T for i, table in flight.estimated_errors.items()}
+    if flight.shown or not errors:
+        errors = {i: tracking_errors(flight, i) for i in flown(flight)}
     figure, (top, bottom) = new_figure(2, sharex=True)
     s = flight.scenario
-    for i in numbers:
-        time_s, position, angle = tracking_errors(flight, i)
+    for i, (time_s, position, angle) in errors.items():
         d = decimated(len(time_s))
         top.semilogy(time_s[d], np.maximum(position[d], 1e-7), color=colour(i), label=f"chaser {i}")
         bottom.semilogy(time_s[d], np.maximum(np.degrees(angle[d]), 1e-5), color=colour(i))
@@ -198,7 +200,12 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
         _mark_phases(axes, flight, axes is top)
         if limit is not None:
             limit_line(axes, limit, f"RMS limit in the shaded interval: {limit:g} {unit}")
-    top.set(ylabel="position error / m", xlim=_span_s(flight.truth["target"].time_s))
+    if flight.motion.source == "reference":
+        sigma_m, sigma_rad = flight.motion.sigmas()
+        limit_line(top, max(sigma_m, 1e-7), "reference, 1 sigma")
+        limit_line(bottom, max(np.degrees(sigma_rad), 1e-5), "reference, 1 sigma")
+    last_s = max(float(time_s[-1]) for time_s, *_ in errors.values() if len(time_s))
+    top.set(ylabel="position error / m", xlim=_span_s(np.array([last_s])))
     bottom.set(ylabel="orientation error / °", xlabel="time / s")
     legend_above(top)
     return figure
@@ -213,7 +220,7 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
 def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, axes = new_figure(2, 3, height=1.7, sharex=True, sharey="row")
-    step = decimation(len(flight.truth["target"].time_s))
+    step = decimation(len(flight.motion[TARGET].time_s))
     reach = np.zeros(2)
     for i in numbers:
         time_s, position, turn = tracking_components(flight, i, step)
@@ -235,7 +242,7 @@ def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
     for k, name in enumerate("xyz"):
         axes[k].annotate(name, (0.03, 0.95), xycoords="axes fraction", va="top", weight="bold")
         axes[3 + k].set_xlabel("time / s")
-    axes[0].set_xlim(_span_s(flight.truth["target"].time_s))
+    axes[0].set_xlim(_span_s(flight.motion[TARGET].time_s))
     figure.legend(
         *axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, handlelength=1.4
     )
@@ -260,9 +267,7 @@ def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float
             "final": docking.final.closing_m_s,
             "contact": docking.tolerances.closing_m_s,
         }
-    ends = [begin_s for begin_s, _ in history.phases[1:]] + [
-        float(flight.truth["target"].time_s[-1])
-    ]
+    ends = [begin_s for begin_s, _ in history.phases[1:]] + [flight.flown_s]
     return [
         (begin_s, end_s, limits[phase])
         for (begin_s, phase), end_s in zip(history.phases, ends, strict=True)
@@ -274,7 +279,7 @@ def keep_out(flight: RecordedFlight, chaser: int) -> tuple[Array, Array]:
     """Return times (K,) s, and the distance (K,) m from the target that a chaser keeps from each
     on; NaN for none.
     """
-    end_s = float(flight.truth["target"].time_s[-1])
+    end_s = flight.flown_s
     history = flight.references.get(chaser)
     if history is None:
         return np.array([0.0, end_s]), np.full(2, flight.scenario.limits.min_distance_target_m)
@@ -293,16 +298,15 @@ def keep_out(flight: RecordedFlight, chaser: int) -> tuple[Array, Array]:
 def docking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, (top, bottom) = new_figure(2, sharex=True)
-    s, target = flight.scenario, flight.truth["target"]
+    s, target = flight.scenario, flight.motion[TARGET]
     nearest, fastest = np.inf, 0.0
     for i in numbers:
-        own = flight.truth[f"chaser/{i}"]
-        distance = own.distance_to(target)
+        time_s, distance = flight.motion[f"chaser/{i}"].distance_to(target)
         n = len(distance)
         limit_s, limit_m = keep_out(flight, i)
         top.step(limit_s, limit_m, where="post", color=colour(i), linestyle=":", linewidth=1.3)
         nearest = min([nearest, float(distance.min()), *limit_m[np.isfinite(limit_m)]])
-        d, time_s = decimated(n), own.time_s[:n]
+        d = decimated(n)
         top.plot(time_s[d], distance[d], color=colour(i), linestyle=dashes(i), label=f"chaser {i}")
         if n > 2:
             speed = -np.gradient(distance, time_s)
@@ -449,25 +453,21 @@ def separation(flight: RecordedFlight, _: Traces) -> Figure:
         raise MissingData("the mission has only one chaser")
     figure, (axes,) = new_figure(1, height=2.8)
     for k, (i, j) in enumerate(combinations(numbers, 2)):
-        a, b = flight.truth[f"chaser/{i}"], flight.truth[f"chaser/{j}"]
-        distance = a.distance_to(b)
-        n = len(distance)
-        d = decimated(n)
-        axes.plot(
-            a.time_s[:n][d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i}, {j}"
-        )
+        time_s, distance = flight.motion[f"chaser/{i}"].distance_to(flight.motion[f"chaser/{j}"])
+        d = decimated(len(distance))
+        axes.plot(time_s[d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i}, {j}")
     least = flight.scenario.limits.min_distance_chasers_m
     limit_line(axes, least, f"limit {least:g} m")
     axes.set(ylabel="distance / m", xlabel="time / s", ylim=(0, None))
-    axes.set_xlim(_span_s(flight.truth["target"].time_s))
+    axes.set_xlim(_span_s(flight.motion[TARGET].time_s))
     legend_above(axes)
     return figure
 
 
 @_figure(
     "Actuator forces and torques",
-    "Applied force and torque, body axes, mean over each tick; dashed: limits of the planned force "
-    "and torque. Pulses of thrusters "
+    "Applied force and torque (without ground truth: as commanded), body axes, mean over each "
+    "tick; dashed: limits of the planned force and torque. Pulses of thrusters "
     "may exceed them within a tick; dotted: all thrusters of an axis open.",
 )
 def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
@@ -558,35 +558,39 @@ _OUTCOME_COLOURS: dict[ImageOutcome, str] = {
 
 
 def component_errors(flight: RecordedFlight) -> tuple[Array, Array, Array]:
-    """Return times (K,) s, errors (K, 12) of the estimate (truth minus estimate) and their sigmas
-    (K, 12), decimated for drawing.
+    """Return times (K,) s, errors (K, 12) of the estimate (true or measured minus estimated) and
+    their sigmas (K, 12), with those of a measured pose, decimated for drawing.
 
     Order and axes as in the covariance: position and velocity in WRF, attitude and rate in TRF.
     """
-    a, b = (rows[decimated(len(rows))] for rows in known_estimates(flight))
+    a, target = known_estimates(flight)
     if not len(a):
         raise MissingData(
-            "the target was never estimated in this log, or its ground truth is missing"
+            "the target was never estimated in this log, or neither its ground truth nor a "
+            "reference is in it"
         )
-    truth, e = flight.truth["target"], flight.estimate
-    turn = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), truth.q_wxyz[b]))
+    part = decimated(len(a))
+    a, target, e = a[part], target.rows(part), flight.estimate
+    turn = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), target.q_wxyz))
     errors = np.concatenate(
         [
-            truth.position_m[b] - e.position_m[a],
-            truth.velocity_m_s[b] - e.velocity_m_s[a],
+            target.position_m - e.position_m[a],
+            target.velocity_m_s - e.velocity_m_s[a],
             turn,
-            truth.omega_rad_s[b] - e.omega_rad_s[a],
+            target.omega_rad_s - e.omega_rad_s[a],
         ],
         axis=1,
     )
-    return e.time_s[a], errors, np.sqrt(np.maximum(flight.variances(a), 0.0))
+    variances = np.maximum(flight.variances(a), 0.0)
+    variances[:, 0:3] += np.square(target.sigma_m)[:, None]
+    variances[:, 6:9] += np.square(target.sigma_rad)[:, None]
+    return e.time_s[a], errors, np.sqrt(variances)
 
 
 @_figure(
     "Errors of the target estimate",
-    "Truth minus estimate by axis, with the filter's three-sigma bounds (position and velocity "
-    "WRF, "
-    "attitude and rate TRF).",
+    "True (or measured) minus estimated by axis, with three-sigma bounds of the filter and of the "
+    "measurement (position and velocity WRF, attitude and rate TRF).",
 )
 def estimate(flight: RecordedFlight, _: Traces) -> Figure:
     time_s, errors, sigmas = component_errors(flight)
@@ -598,6 +602,8 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
         ("rate / ° s⁻¹", np.degrees(1.0)),
     )
     settled = time_s >= min(flight.scenario.settling_s, time_s[-1] / 2.0)
+    if np.isnan(errors).any():  # a reference may measure no velocities: the bounds alone
+        errors = np.nan_to_num(errors, nan=0.0)
     for row, (label, factor) in enumerate(kinds):
         part = slice(3 * row, 3 * row + 3)
         e, s = errors[:, part] * factor, 3.0 * sigmas[:, part] * factor
@@ -820,7 +826,7 @@ def write_figures(log: Path, out: Path, ending: str) -> tuple[list[Path], dict[s
     Raise LogError for an unreadable log and ChaserdockError for a folder that is not writable.
     """
     flight = load_flight(log)
-    traces = load_traces(log, range(len(flight.scenario.chasers)), decimation(flight.world.ticks))
+    traces = load_traces(log, flight.scenario, decimation(flight.ticks))
     files, missing = [], {}
     with errors_of_writing(out):
         out.mkdir(parents=True, exist_ok=True)

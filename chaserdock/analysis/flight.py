@@ -6,23 +6,27 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
 from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    BodyReference,
     BodyTruth,
     CommandReply,
+    DockingStatus,
     DrawnBody,
     DrawnTruth,
     Event,
     Health,
     MissionEnd,
+    Odometry,
     PassiveSafety,
     PlumeLoad,
     PortLoad,
@@ -35,13 +39,23 @@ from chaserdock_protocol.messages import (
     Tick,
     WorldTruth,
 )
+from chaserdock_protocol.recording.extent import late_begin_line, late_begin_s
 from chaserdock_protocol.recording.gaps import SequenceGaps
-from chaserdock_protocol.recording.log import LogSource, Record, logged_scenario, read_log
+from chaserdock_protocol.recording.log import (
+    FLIGHT_SCENARIO,
+    SCENARIO_KIND,
+    LogSource,
+    Record,
+    logged_scenario,
+    read_log,
+)
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
+from .actuation import ImpulseTotals, OutputSource, commanded_output, true_output
 from .columns import Columns
 from .mass_properties import values_of
+from .motion import BodyMotion, MotionCollector, Track, motion_columns
 from .pose_errors import POSE
 
 # Messages whose number or content depends on the wall clock: left out of the digest.
@@ -58,44 +72,6 @@ _UPPER = np.triu_indices(6)
 _KEPT = np.array([12 * POSE[i] + POSE[j] for i, j in zip(*_UPPER, strict=True)])
 _UPPER_FLAT = np.ravel_multi_index(_UPPER, (6, 6))
 _RATES = np.array([13 * k for k in (3, 4, 5, 9, 10, 11)])
-
-
-@dataclass
-class Track:
-    """Motion of one body: times (K,) s, positions and velocities (K, 3) WRF, attitudes (K, 4),
-    rates (K, 3).
-    """
-
-    time_s: Array
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
-
-    def distance_to(self, other: Track) -> Array:
-        """Return the distance (K,), m, to another body while both are in the log."""
-        n = min(len(self.time_s), len(other.time_s))
-        return np.linalg.norm(self.position_m[:n] - other.position_m[:n], axis=1)
-
-
-class Tracks(Mapping[str, Track]):
-    """Tracks by name. A long track is read from its file and occupies memory only while
-    referenced.
-    """
-
-    def __init__(self, motions: dict[str, Columns]) -> None:
-        self._motions = motions
-
-    def __getitem__(self, name: str) -> Track:
-        t = self._motions[name].table()
-        # A copy of the times: a reference to them must not keep the whole table in memory.
-        return Track(t[:, 0].copy(), t[:, 1:4], t[:, 4:7], t[:, 7:11], t[:, 11:14])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._motions)
-
-    def __len__(self) -> int:
-        return len(self._motions)
 
 
 @dataclass
@@ -158,6 +134,36 @@ class WorldHistory:
         self._touching = touching
         self.touches += message.touches
         self.latched = message.latched
+
+
+@dataclass
+class SensedDocking:
+    """What a chaser's docking sensor has measured. ``contacts``: number of touches of the probe.
+    ``latched``: at the end; ``latch_time_s``: when the latch closed last, None if it was closed
+    already when the log begins.
+    """
+
+    contacts: int = 0
+    latched: bool = False
+    latch_time_s: float | None = None
+    _touching: bool = False
+    _heard: bool = False
+
+    def add(self, message: DockingStatus) -> None:
+        self.contacts += message.contact and not self._touching
+        if message.latched and not self.latched and self._heard:
+            self.latch_time_s = message.sim_time_ns / 1e9
+        self._touching, self.latched, self._heard = message.contact, message.latched, True
+
+
+@dataclass
+class SightingUse:
+    """Number of a chaser's sightings that the estimator used, and that it rejected because their
+    innovation does not fit its covariance.
+    """
+
+    used: int = 0
+    rejected: int = 0
 
 
 @dataclass
@@ -240,21 +246,30 @@ class PlumeTotals:
 class RecordedFlight:
     """Content of a log without the images. Mappings are by body name or chaser.
 
-    ``estimates``: the fused estimate is ``target``. ``estimate_known`` (K,): the target was tracked
-    or predicted. ``relative``: of the chasers whose pose the estimator publishes, while the target
-    is known. ``identified``: None without identification. ``end``: None in a log that ends before
-    the mission does. ``expected_commands``: number of actuator commands that all ticks expected.
-    ``blas``: linear algebra library of each process; empty if an older log does not state it.
+    ``motion``: of the bodies, to judge against. ``impulses``: by chaser; ``impulses_are``: true, or
+    as commanded. ``ticks``, ``flown_s``: number of ticks, and simulated time of the last one or of
+    the end. ``estimated``: motion of the target as estimated. ``estimated_errors`` (K, 3): time
+    (s), distance (m) and angle (rad) of a chaser's odometry from its reference pose on the
+    estimated target. ``estimate_known`` (K,): the target was tracked or predicted. ``relative``: of
+    the chasers whose pose the estimator publishes, while the target is known. ``identified``: None
+    without identification. ``end``: None in a log that ends before the mission does. ``begins_s``:
+    time at which a log begins that lacks earlier messages, or None. ``expected_commands``: number
+    of actuator commands that all ticks expected. ``blas``: linear algebra library of each process;
+    empty if an older log does not state it.
     """
 
     scenario: Scenario
     run: dict[str, str]
     blas: dict[str, str]
-    truth: Tracks
-    absolute_impulse_N_s: dict[str, float]
-    thruster_impulse_N_s: dict[str, float]
-    propellant_kg: dict[str, float]
-    estimates: Tracks
+    motion: BodyMotion
+    ticks: int
+    flown_s: float
+    impulses: dict[int, ImpulseTotals]
+    impulses_are: OutputSource
+    estimated: Columns
+    estimated_errors: dict[int, Array]
+    sighting_use: dict[int, SightingUse]
+    sensed_docking: dict[int, SensedDocking]
     estimate_known: NDArray[np.bool_]
     covariances: Columns
     relative: dict[int, RelativeHistory]
@@ -269,6 +284,7 @@ class RecordedFlight:
     drawn: tuple[DrawnBody, ...]
     events: list[Event]
     end: MissionEnd | None
+    begins_s: float | None
     replies: list[CommandReply]
     counts: dict[str, int]
     lost: dict[str, int]
@@ -279,14 +295,40 @@ class RecordedFlight:
     digest: str
 
     @property
-    def flown(self) -> list[int]:
-        """Chasers whose motion is in the log."""
-        return [i for i in range(len(self.scenario.chasers)) if f"chaser/{i}" in self.truth]
+    def chasers(self) -> list[int]:
+        """Chasers that are in the log, by their motion or by what they have commanded."""
+        numbers = {*self.motion.chasers, *self.impulses}
+        return sorted(i for i in numbers if i < len(self.scenario.chasers))
+
+    @property
+    def shown(self) -> list[int]:
+        """Chasers whose motion, and that of the target, is in the log."""
+        return [i for i in self.chasers if self.motion.has_pair(i)]
+
+    @property
+    def latched(self) -> tuple[int, ...]:
+        """Chasers that are latched at the end: by the ground truth, or by their docking sensors."""
+        if self.world.ticks:
+            return self.world.latched
+        return tuple(i for i, sensed in sorted(self.sensed_docking.items()) if sensed.latched)
+
+    @property
+    def states_criteria(self) -> bool:
+        """Whether the log has the full scenario, and not only what flight software receives."""
+        return self.run.get(SCENARIO_KIND) != FLIGHT_SCENARIO
+
+    @property
+    def missing(self) -> list[str]:
+        """What the log lacks of its mission, a line each."""
+        lines = [] if self.begins_s is None else [late_begin_line(self.begins_s)]
+        if not self.states_criteria:
+            lines.append("holds the flight scenario, without success criteria and ground truth")
+        return lines
 
     @property
     def estimate(self) -> Track:
         """Estimated motion of the target."""
-        return self.estimates["target"]
+        return Track.of(self.estimated)
 
     def pose_covariance(self, rows: NDArray[np.intp]) -> Array:
         """Return covariances (K, 6, 6) of position (WRF) and attitude (TRF) at these rows (K,) of
@@ -335,17 +377,22 @@ class _ReferenceCollector:
         return ReferenceHistory(table[:, 0], table[:, 1:], self.phases, self.keep_out.table())
 
 
-def _motion_table() -> Columns:
-    return Columns(14)
+def _impulses() -> dict[int, ImpulseTotals]:
+    return defaultdict(ImpulseTotals)
 
 
 @dataclass
 class _Collector:
-    bodies: dict[str, Columns] = field(default_factory=lambda: defaultdict(_motion_table))
-    impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    thruster_impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    propellant: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    target: Columns = field(default_factory=_motion_table)
+    scenario: Scenario
+    motion: MotionCollector = field(default_factory=MotionCollector)
+    ticks_s: Columns = field(default_factory=lambda: Columns(1))
+    given: dict[int, ImpulseTotals] = field(default_factory=_impulses)
+    commanded: dict[int, ImpulseTotals] = field(default_factory=_impulses)
+    docking: dict[int, SensedDocking] = field(default_factory=lambda: defaultdict(SensedDocking))
+    use: dict[int, SightingUse] = field(default_factory=lambda: defaultdict(SightingUse))
+    odometry: dict[int, Odometry] = field(default_factory=dict)
+    errors: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
+    target: Columns = field(default_factory=motion_columns)
     known: bytearray = field(default_factory=bytearray)
     covariance: Columns = field(default_factory=lambda: Columns(27))
     relative: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(29)))
@@ -381,26 +428,23 @@ class _Collector:
         """Add a message of the log."""
         message = record.message
         self._count(record)
-        if record.topic is topics.TICK:
-            self._add_tick(message, record.sent_ns)
-        elif record.topic is topics.IMAGE:
-            self.sent[message.chaser, message.tick] = record.sent_ns
-        elif record.topic is topics.ACTUATORS:
-            sent_ns = self.sent.pop((message.chaser, message.tick), None)
-            if sent_ns is not None:
-                self.latency.add(((record.sent_ns - sent_ns) / 1e9,))
+        self._add_timed(record)
         match message:
             case BodyTruth():
                 self._add_body(message)
+            case BodyReference():
+                self.motion.add(message)
             case TargetEstimate():
                 self._add_estimate(message)
             case Reference():
-                self.references[message.chaser].add(message)
+                self._add_reference(message)
+            case Odometry():
+                self.odometry[message.chaser] = message
             case SolverStatus():
                 self._add_solve(message)
             case WorldTruth():
                 self.world.add(message)
-            case Sighting() | PortLoad() | PassiveSafety():
+            case Sighting() | PortLoad() | PassiveSafety() | DockingStatus() | ActuatorCommand():
                 self._add_of_chaser(message)
             case (
                 Event()
@@ -413,7 +457,21 @@ class _Collector:
             ):
                 self._add_report(message)
 
-    def _add_of_chaser(self, message: Sighting | PortLoad | PassiveSafety) -> None:
+    def _add_timed(self, record: Record) -> None:
+        """Add the time at which a message was sent."""
+        message = record.message
+        if record.topic is topics.TICK:
+            self._add_tick(message, record.sent_ns)
+        elif record.topic is topics.IMAGE:
+            self.sent[message.chaser, message.tick] = record.sent_ns
+        elif record.topic is topics.ACTUATORS:
+            sent_ns = self.sent.pop((message.chaser, message.tick), None)
+            if sent_ns is not None:
+                self.latency.add(((record.sent_ns - sent_ns) / 1e9,))
+
+    def _add_of_chaser(
+        self, message: Sighting | PortLoad | PassiveSafety | DockingStatus | ActuatorCommand
+    ) -> None:
         time_s = message.sim_time_ns / 1e9
         match message:
             case Sighting():
@@ -426,6 +484,13 @@ class _Collector:
                 self.safety[message.chaser].add(
                     (time_s, message.margin_sigmas, message.distance_m, message.safe)
                 )
+            case DockingStatus():
+                self.docking[message.chaser].add(message)
+            case ActuatorCommand():
+                if not self.given:
+                    s = self.scenario
+                    output = commanded_output(message, s.chaser, 1.0 / s.time.rate_hz)
+                    self.commanded[message.chaser].add(output)
 
     def _add_report(
         self,
@@ -469,18 +534,39 @@ class _Collector:
     def _add_tick(self, message: Tick, sent_ns: int) -> None:
         # A later revision of a tick replaces its number of expected commands.
         replaced = self.tick_expected if message.tick == self.tick else 0
+        if message.tick != self.tick:
+            self.ticks_s.add((message.sim_time_ns / 1e9,))
         self.expected += len(message.chasers) - replaced
         self.tick, self.tick_expected = message.tick, len(message.chasers)
         self.wall = [*self.wall[:1], sent_ns]
 
     def _add_body(self, message: BodyTruth) -> None:
-        _add_motion(self.bodies[message.body], message)
-        self.impulse[message.body] += message.absolute_impulse_N_s
-        self.thruster_impulse[message.body] += sum(message.thruster_impulse_N_s)
-        self.propellant[message.body] += message.propellant_kg
+        self.motion.add(message)
+        if message.body.startswith("chaser/"):
+            self.given[int(message.body.partition("/")[2])].add(true_output(message))
+
+    def _add_reference(self, message: Reference) -> None:
+        self.references[message.chaser].add(message)
+        odometry = self.odometry.get(message.chaser)
+        if odometry is not None and odometry.tick == message.tick:
+            away_m = math.dist(odometry.position_m, message.position_m)
+            angle = rotations.angle_between(message.q_wxyz, odometry.q_wxyz)
+            self.errors[message.chaser].add((message.sim_time_ns / 1e9, away_m, float(angle)))
 
     def _add_estimate(self, message: TargetEstimate) -> None:
-        _add_motion(self.target, message)
+        m = message
+        self.target.add(
+            (m.sim_time_ns / 1e9,),
+            m.position_m,
+            m.velocity_m_s,
+            m.q_wxyz,
+            m.omega_rad_s,
+            (0.0, 0.0),
+        )
+        for chaser in m.accepted:
+            self.use[chaser].used += 1
+        for chaser in m.rejected:
+            self.use[chaser].rejected += 1
         known = message.status in ("tracking", "predicting")
         self.known.append(known)
         covariance = np.asarray(message.covariance)
@@ -495,11 +581,6 @@ class _Collector:
         if message.chasers:
             imperfect = any(s != "solved" for s in message.status)
             self.solves.add((message.sim_time_ns / 1e9, message.wall_solve_s, imperfect))
-
-
-def _add_motion(table: Columns, message: BodyTruth | TargetEstimate) -> None:
-    m = message
-    table.add((m.sim_time_ns / 1e9,), m.position_m, m.velocity_m_s, m.q_wxyz, m.omega_rad_s)
 
 
 def _sighting_history(columns: Columns) -> SightingHistory:
@@ -534,7 +615,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
     chaserdock.
     """
     scenario, run = logged_scenario(log)
-    c = _Collector()
+    c = _Collector(scenario)
     for record in read_log(log):
         c.add(record)
 
@@ -546,16 +627,22 @@ def load_flight(log: LogSource) -> RecordedFlight:
     for health in c.health.values():
         rejected.update(health.rejected)
 
-    solves = c.solves.table()
+    solves, ticks_s = c.solves.table(), c.ticks_s.table()[:, 0]
+    motion = c.motion.finish(ticks_s)
+    known_s = [0.0, *ticks_s[-1:].tolist(), *(motion[n].time_s[-1] for n in motion)]
     return RecordedFlight(
         scenario=scenario,
         run=run,
         blas={name: h.blas for name, h in c.health.items()} | {"recorder": run.get("blas", "")},
-        truth=Tracks(dict(c.bodies)),
-        absolute_impulse_N_s=dict(c.impulse),
-        thruster_impulse_N_s=dict(c.thruster_impulse),
-        propellant_kg=dict(c.propellant),
-        estimates=Tracks({"target": c.target}),
+        motion=motion,
+        ticks=len(ticks_s),
+        flown_s=float(max(known_s if c.end is None else [*known_s, c.end.sim_time_ns / 1e9])),
+        impulses=dict(c.given or c.commanded),
+        impulses_are="true" if c.given else "commanded",
+        estimated=c.target,
+        estimated_errors={i: columns.table() for i, columns in sorted(c.errors.items())},
+        sighting_use=dict(sorted(c.use.items())),
+        sensed_docking=dict(c.docking),
         estimate_known=np.frombuffer(c.known, dtype=np.bool_),
         covariances=c.covariance,
         relative={i: _relative_history(columns) for i, columns in c.relative.items()},
@@ -572,6 +659,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         drawn=c.drawn,
         events=c.events,
         end=c.end,
+        begins_s=late_begin_s(log),
         replies=c.replies,
         counts=dict(sorted(c.counts.items())),
         lost=dict(c.gaps.lost),

@@ -10,6 +10,8 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from numpy.typing import ArrayLike
 
+from .motion import Track
+
 POSE = (0, 1, 2, 6, 7, 8)
 """Position and attitude in the state (12) of ``TargetEstimate``."""
 
@@ -44,3 +46,29 @@ def normalized_square(error: Array, covariance: Array) -> Array:
     average if consistent.
     """
     return np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+def measured_covariance(track: Track) -> Array:
+    """Return the covariances (K, 6, 6) of measured poses: position, and attitude in the axes of the
+    body.
+    """
+    variances = np.repeat(np.square([track.sigma_m, track.sigma_rad]), 3, axis=0).T
+    return variances[:, :, None] * np.eye(6)
+
+
+def relative_measured_covariance(own: Track, other: Track) -> Array:
+    """Return the covariances (K, 6, 6) of the pose of one body relative to another, both measured:
+    position in the axes of the other one, attitude in the own ones.
+
+    To first order, with errors dx of positions in WRF and dtheta of attitudes in body axes: r = R^T
+    (x_own - x) gives dr = R^T (dx_own - dx) + r x dtheta, and the attitude dtheta_own - Q^T dtheta,
+    where R and Q are the rotations from the axes of the other body to WRF and from the own axes to
+    its.
+    """
+    r, q = relative_pose(own.position_m, own.q_wxyz, other.position_m, other.q_wxyz)
+    both = np.zeros((len(r), 6, 3))
+    both[:, :3] = rotations.skew(r)
+    both[:, 3:] = -np.swapaxes(rotations.to_matrix(q), 1, 2)
+    turned = np.square(other.sigma_rad)[:, None, None] * both @ np.swapaxes(both, 1, 2)
+    moved = np.repeat(np.stack([own.sigma_m**2 + other.sigma_m**2, own.sigma_rad**2]), 3, axis=0).T
+    return turned + moved[:, :, None] * np.eye(6)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Criteria of published rendezvous and docking tasks, evaluated on ground truth at every tick.
+"""Criteria of published rendezvous and docking tasks, evaluated on the motion of the bodies at
+every tick.
 
 They are ``success.speed_limit``, ``approach_cone``, ``arrival`` and ``abort_clear_m``. Motion is in
 WRF, in an orbit the Hill frame; distances are between centres.
@@ -43,15 +44,17 @@ def rendezvous_of(flight: RecordedFlight, chaser: int) -> RendezvousResult | Non
         )
     ):
         return None
-    own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
-    n = min(len(own.time_s), len(target.time_s))
-    offset = rotations.rotate_inverse(target.q_wxyz[:n], own.position_m[:n] - target.position_m[:n])
-    speed = np.linalg.norm(own.velocity_m_s[:n] - target.velocity_m_s[:n], axis=1)
-    time_s, abort_s = target.time_s[:n], _first_abort_s(flight, chaser)
+    own, target = flight.motion.pair(chaser)
+    offset = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
+    speed = np.linalg.norm(own.velocity_m_s - target.velocity_m_s, axis=1)
+    with_speed = bool(np.isfinite(speed).all())  # a reference may measure no velocities
+    time_s, abort_s, n = target.time_s, _first_abort_s(flight, chaser), len(target.time_s)
     before = n if abort_s is None else int(np.searchsorted(time_s, abort_s))
-    arrived = _arrival(success.arrival, time_s[:before], offset[:before], speed[:before])
+    arrival = success.arrival if with_speed else None
+    limit = success.speed_limit if with_speed else None
+    arrived = _arrival(arrival, time_s[:before], offset[:before], speed[:before])
     return {
-        "speed_margin_m_s": _speed_margin(success.speed_limit, offset[:before], speed[:before]),
+        "speed_margin_m_s": _speed_margin(limit, offset[:before], speed[:before]),
         "cone_angle_rad": _largest_angle(success.approach_cone, offset[:before]),
         **arrived,
         "abort_s": abort_s,

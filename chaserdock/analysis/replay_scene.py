@@ -22,8 +22,10 @@ from chaserdock_protocol.recording.log import LogError
 from chaserdock_world.orbit import to_sun
 from numpy.typing import NDArray
 
-from .flight import RecordedFlight, Track
+from .columns import nanoseconds, rows_since
+from .flight import RecordedFlight
 from .images import Pair, shots
+from .motion import TARGET, Track
 from .scene import Face, scene_of
 from .snapshot import annotated_image
 from .summary import tracking_errors
@@ -59,6 +61,14 @@ def _faces(faces: tuple[Face, ...]) -> list[dict[str, Any]]:
     ]
 
 
+def _rows_until_end(time_s: Array, at_s: Array) -> NDArray[np.intp]:
+    """Return for each of the times ``at_s`` up to the end of ``time_s`` the row of the latter that
+    is newest then, or the first.
+    """
+    until = at_s[at_s <= time_s[-1]] if len(time_s) else at_s[:0]
+    return np.maximum(rows_since(nanoseconds(time_s), nanoseconds(until)), 0)
+
+
 def _thinned(track: Track, rows: NDArray[Any]) -> dict[str, Any]:
     return {"p": _numbers(track.position_m[rows], 4), "q": _numbers(track.q_wxyz[rows], 4)}
 
@@ -70,17 +80,18 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
     The rows of the bodies belong to ``times``: evenly spaced, at most ``_MOST_SAMPLES``; fewer for
     a lost body.
     """
-    target = flight.truth["target"]
+    target = flight.motion[TARGET]
     rows = np.arange(0, len(target.time_s), max(1, -(-len(target.time_s) // _MOST_SAMPLES)))
     if rows[-1] != len(target.time_s) - 1:
         rows = np.append(rows, len(target.time_s) - 1)
 
     chasers, reach_m = [], 0.3
-    for i in flight.flown:
-        own = flight.truth[f"chaser/{i}"]
-        mine = rows[rows < len(own.time_s)]
-        _, position, _ = tracking_errors(flight, i)
-        distance = np.linalg.norm(own.position_m[mine] - target.position_m[mine], axis=1)
+    for i in flight.shown:
+        own = flight.motion[f"chaser/{i}"]
+        both_s, position, _ = tracking_errors(flight, i)
+        mine = _rows_until_end(own.time_s, target.time_s[rows])
+        errors = _rows_until_end(both_s, target.time_s[rows])
+        _, distance = own.distance_to(target)
         # Distant chasers must not shrink all others.
         reach_m = max(reach_m, min(float(distance.max()), 3.0))
 
@@ -96,13 +107,14 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
                 "outcome": [[round(t, 3), o] for t, _, o in outcomes.intervals()]
                 if outcomes
                 else [],
-                "error_mm": [float(f"{1e3 * e:.3g}") for e in position[mine]],
+                "error_mm": [float(f"{1e3 * e:.3g}") for e in position[errors]],
             }
         )
 
     scene = scene_of(flight.scenario)
     return {
         "times": _numbers(target.time_s[rows], 3),
+        "motion": flight.motion.describe().capitalize(),
         "reach_m": reach_m,
         "sun": list(to_sun(flight.scenario)),
         "target": _thinned(target, rows),

@@ -24,6 +24,7 @@ from .criteria import capture_state
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
 from .mass_properties import PRIOR_ONLY, property_rows, true_values
+from .motion import TARGET
 from .plots import decimation, to_inline_svg
 from .replay_scene import replay_data, small_images
 from .summary import summary_of_run
@@ -48,8 +49,8 @@ def report_of(log: Path) -> str:
     """Return the report as HTML. Raise LogError for an unreadable log."""
     flight = load_flight(log)
     result = summary_of_run(flight, log)
-    every = decimation(flight.world.ticks)
-    traces = load_traces(log, range(len(flight.scenario.chasers)), every)
+    every = decimation(flight.ticks)
+    traces = load_traces(log, flight.scenario, every)
 
     missing: list[str] = []
     figures = []
@@ -65,7 +66,7 @@ def report_of(log: Path) -> str:
         )
 
     replay, script = "", ""
-    if "target" in flight.truth:
+    if flight.shown:
         data = replay_data(flight, traces, small_images(log, flight))
         replay = _replay(data)
         # "</" would end the script element.
@@ -74,7 +75,10 @@ def report_of(log: Path) -> str:
         stored = f'<script type="application/json" id="replay-data">{text}</script>'
         script = f"{stored}\n<script>\n{code}</script>"
     else:
-        missing.insert(0, "3-D replay: the log holds no ground truth of the target.")
+        missing.insert(
+            0,
+            "3-D replay: the log holds neither ground truth nor a reference of target and chaser.",
+        )
 
     body = [
         _head(flight, result),
@@ -107,6 +111,10 @@ def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int =
     return f"{text} {unit}".rstrip()
 
 
+def _number(value: int | None) -> str:
+    return _DASH if value is None else str(value)
+
+
 def _count(number: int, thing: str) -> str:
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
@@ -124,7 +132,7 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
         ("scenario", "Scenario"),
         ("versions", "Versions"),
     ]
-    if "target" in flight.truth:
+    if flight.shown:
         where.insert(0, ("replay-section", "Replay"))
     links = "".join(f'<a href="#{anchor}">{name}</a>' for anchor, name in where)
     mode = {"lockstep": "lock-step", "realtime": "real time"}.get(result["mode"]) or "unknown mode"
@@ -133,7 +141,8 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
         f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '
         f"{result['wall_time_s']:.1f} s, {escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed "
         f"{s.seed}; "
-        f"digest {escape(result['digest'][:16])}</span></p>\n<nav>{links}</nav>"
+        f"digest {escape(result['digest'][:16])}</span></p>\n"
+        f"<p>Judged against {escape(result['judged_against'])}.</p>\n<nav>{links}</nav>"
     )
 
 
@@ -143,11 +152,12 @@ def _outcome(result: dict[str, Any]) -> str:
 
 def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     if not result["chasers"]:
-        return "<h2>Chasers</h2><p>The log holds no motion of a chaser.</p>"
+        return "<h2>Chasers</h2><p>The log holds no chaser.</p>"
     degree = math.degrees(1.0)
     at_distance = any("capture" not in c for c in result["chasers"].values())
     relative = any("relative_estimate" in c for c in result["chasers"].values())
     fuel = any(c["propellant_kg"] > 0.0 for c in result["chasers"].values())
+    estimated = any("estimated_tracking" in c for c in result["chasers"].values())
     rows = [
         (
             f"chaser {i}",
@@ -155,6 +165,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
             _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
             _quantity(c["position_mse_m2"], "m²"),
             _quantity(c["orientation_mse_rad2"], "rad²"),
+            *([_estimated(c)] if estimated else []),
             *([_relative(c)] if relative else []),
             *([_docked(c)] if at_distance else []),
             _quantity(c["min_distance_target_m"], "m"),
@@ -170,6 +181,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         "steady orientation RMS",
         "position MSE, whole run",
         "orientation MSE, whole run",
+        *(["steady RMS as estimated in flight; sightings rejected"] if estimated else []),
         *(["estimated pose relative to the target, RMS"] if relative else []),
         *(["docked since"] if at_distance else []),
         "minimum distance to target",
@@ -196,9 +208,19 @@ def _relative(c: dict[str, Any]) -> str:
     return f"{_quantity(position, 'mm', 1e3)}, {_quantity(angle, '°', math.degrees(1.0))}"
 
 
+def _estimated(c: dict[str, Any]) -> str:
+    """Return the tracking errors by the flight's own estimates, and its rejected sightings."""
+    e, use = c["estimated_tracking"], c["sightings"]
+    position = _quantity(e["position_rms_m"], "mm", 1e3)
+    angle = _quantity(e["orientation_rms_rad"], "°", math.degrees(1.0))
+    return f"{position}, {angle}; {use['rejected']} of {use['used'] + use['rejected']}"
+
+
 def _docked(c: dict[str, Any]) -> str:
     if "capture" in c:
         return _DASH  # a chaser with a port does not dock at a distance
+    if c["docked"] is None:
+        return _DASH
     return f"{c['dock_time_s']:.2f} s" if c["docked"] else "no"
 
 
@@ -283,23 +305,24 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         ("rate", _quantity(e["omega_rms_rad_s"], "°/s", degree), ""),
     ]
     latency, solver = result["latency_s"], result["solver"]
+    against = flight.motion.describe() if TARGET in flight.motion else "nothing: no figures"
     safety = [
         ("minimum distance between chasers", _quantity(result["min_distance_chasers_m"], "m")),
-        ("collisions", str(result["collisions"])),
+        ("collisions", _number(result["collisions"])),
         ("mean NEES of the estimate (6 expected)", _quantity(e["nees_mean"], "")),
         (f"solve time ({solver['name']}), median", _quantity(solver["solve_s"]["p50"], "ms", 1e3)),
         ("solve time, 95th percentile", _quantity(solver["solve_s"]["p95"], "ms", 1e3)),
         ("failed solves", str(solver["failures"])),
         ("exposure to command, median", _quantity(latency["p50"], "ms", 1e3)),
         ("exposure to command, 99th percentile", _quantity(latency["p99"], "ms", 1e3)),
-        ("late commands", str(result["late_commands"])),
+        ("late commands", _number(result["late_commands"])),
         ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
     ]
     return (
         '<div class="pair"><section><h2>Target '
         f"estimate</h2>{table(('', 'RMS', 'largest error'), estimate)}"
-        f'<p class="faint">Fused estimate relative to ground truth at the time of exposure, from '
-        f"{flight.scenario.settling_s:g} s on.</p></section>"
+        f'<p class="faint">Fused estimate against {escape(against)}, at the time '
+        f"of exposure, from {flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
     )
 
@@ -403,7 +426,7 @@ aria-label="target and chasers in three dimensions"></canvas>{views}</div>
 <th>position error</th><th>image</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
 <p class="faint">Drag to rotate, wheel to zoom; or arrow keys, + and −; space starts and stops. \
-Ground truth.
+{data["motion"]}.
 A camera frustum is bright while its image is used. Chasers have the colours of the figures.</p>
 </div>"""  # noqa: RUF001
 

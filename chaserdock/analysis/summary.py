@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluation of a flight on ground truth: ``summary.json``. SI units and radians; keys as in
-docs/summary.md.
+"""Evaluation of a flight on the motion of its bodies: ``summary.json``. SI units and radians; keys
+as in docs/summary.md.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from numpy.typing import NDArray
 
 from chaserdock.verdict import estimate_doubts, verdict_of
 
+from .actuation import ImpulseTotals
 from .columns import nanoseconds, rows_since
 from .criteria import (
     capture_failures,
     capture_of,
     capture_text,
-    judged_criteria,
+    criteria_of,
     nearest_allowed_m,
     not_reached,
     overloads,
@@ -38,8 +39,15 @@ from .criteria import (
     rest_failures,
     stack_rest,
 )
-from .flight import RecordedFlight, SafetyHistory, Track, load_flight
-from .pose_errors import normalized_square, pose_error, relative_pose
+from .flight import RecordedFlight, SafetyHistory, SightingUse, load_flight
+from .motion import TARGET, Track
+from .pose_errors import (
+    measured_covariance,
+    normalized_square,
+    pose_error,
+    relative_measured_covariance,
+    relative_pose,
+)
 from .rendezvous import rendezvous_failures, rendezvous_of, rendezvous_text
 
 SUMMARY_NAME = "summary.json"
@@ -85,10 +93,10 @@ def true_reference(
     flight: RecordedFlight, chaser: int, rows: slice, target: Track
 ) -> tuple[Array, Array]:
     """Return the reference positions (K, 3), WRF, and attitudes (K, 4) of a chaser at these rows of
-    the target's truth.
+    the target's motion.
 
-    The commanded offset is placed on the *true* target, so that estimation errors count as tracking
-    errors. Before the first command it is the scenario's offset.
+    The commanded offset is placed on the *true* (or measured) target, so that estimation errors
+    count as tracking errors. Before the first command it is the scenario's offset.
     """
     c = flight.scenario.chasers[chaser]
     offsets = commanded_offsets(flight, chaser, np.array(c.position_m), target.time_s[rows])
@@ -119,14 +127,14 @@ def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, 
     """Return times (K,) s, position errors (K,) m and orientation errors (K,) rad of a chaser
     relative to its true reference.
     """
-    own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
-    n = min(len(target.time_s), len(own.time_s))
+    own, target = flight.motion.pair(chaser)
+    n = len(target.time_s)
     position, angle = np.empty(n), np.empty(n)
     for rows in blocks(n):
         positions, attitudes = true_reference(flight, chaser, rows, target)
         position[rows] = np.linalg.norm(own.position_m[rows] - positions, axis=1)
         angle[rows] = rotations.angle_between(attitudes, own.q_wxyz[rows])
-    return target.time_s[:n], position, angle
+    return target.time_s, position, angle
 
 
 def tracking_components(
@@ -137,55 +145,41 @@ def tracking_components(
 
     Own pose relative to the true reference. The orientation error is a rotation vector.
     """
-    own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
-    rows = slice(0, min(len(target.time_s), len(own.time_s)), step)
+    own, target = flight.motion.pair(chaser)
+    rows = slice(0, len(target.time_s), step)
     positions, attitudes = true_reference(flight, chaser, rows, target)
     offset = rotations.rotate_inverse(target.q_wxyz[rows], own.position_m[rows] - positions)
     turn = rotations.log(rotations.multiply(rotations.conjugate(attitudes), own.q_wxyz[rows]))
     return target.time_s[rows], offset, turn
 
 
-def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows (K,) of the estimate in which the target is known, and the rows of its truth
-    at the same times.
+def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], Track]:
+    """Return the rows (K,) of the estimate in which the target is known and its motion, too; and
+    that motion at the same times.
     """
-    none = np.zeros(0, dtype=np.intp)
-    truth, known = flight.truth.get("target"), np.flatnonzero(flight.estimate_known)
-    if truth is None or not len(known):
-        return none, none
-    rows, true_rows = rows_at_equal_times(flight.estimate.time_s[known], truth.time_s)
-    return known[rows], true_rows
-
-
-def rows_at_equal_times(time_s: Array, other_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows (K,) in the first and in the second array of ascending times (not empty) that
-    hold equal times.
-    """
-    at_ns, other_ns = nanoseconds(time_s), nanoseconds(other_s)
-    row = rows_since(other_ns, at_ns)
-    both = np.flatnonzero((row >= 0) & (other_ns[row] == at_ns))
-    return both, row[both]
+    known = np.flatnonzero(flight.estimate_known)
+    e = flight.estimate
+    if TARGET not in flight.motion:
+        return known[:0], e.rows(known[:0])
+    rows, target = flight.motion.at(TARGET, e.time_s[known])
+    return known[rows], target
 
 
 def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
     """Return errors of the fused estimate, each (K,): ``time_s``, ``position_m``,
     ``orientation_rad``, ``velocity_m_s``, ``omega_rad_s`` and ``nees`` (over position and
-    attitude).
+    attitude). The covariance of a measured motion is added to that of the estimate.
     """
-    a, b = known_estimates(flight)
-    truth = flight.truth.get("target", flight.estimate)  # without truth there are no rows
+    a, target = known_estimates(flight)
     e = flight.estimate
     errors = {name: np.empty(len(a)) for name in (*_POSE_ERRORS, "velocity_m_s", "omega_rad_s")}
     for rows in blocks(len(a)):
-        i, j = a[rows], b[rows]
-        pose = pose_error(truth.position_m[j], truth.q_wxyz[j], e.position_m[i], e.q_wxyz[i])
-        _store_pose_errors(errors, rows, pose, flight.pose_covariance(i))
-        errors["velocity_m_s"][rows] = np.linalg.norm(
-            truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1
-        )
-        errors["omega_rad_s"][rows] = np.linalg.norm(
-            truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1
-        )
+        i, true = a[rows], target.rows(rows)
+        pose = pose_error(true.position_m, true.q_wxyz, e.position_m[i], e.q_wxyz[i])
+        covariance = flight.pose_covariance(i) + measured_covariance(true)
+        _store_pose_errors(errors, rows, pose, covariance)
+        errors["velocity_m_s"][rows] = np.linalg.norm(true.velocity_m_s - e.velocity_m_s[i], axis=1)
+        errors["omega_rad_s"][rows] = np.linalg.norm(true.omega_rad_s - e.omega_rad_s[i], axis=1)
     return {"time_s": e.time_s[a], **errors}
 
 
@@ -193,22 +187,22 @@ def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
     """Return errors of a chaser's estimated pose relative to the target, each (K,): ``time_s``,
     ``position_m``, ``orientation_rad``, ``nees``.
 
-    There are no rows without truth, or if the estimator does not publish that pose.
+    There are no rows where the motion of one of them is not known, or if the estimator does not
+    publish that pose.
     """
-    own, target = flight.truth.get(f"chaser/{chaser}"), flight.truth.get("target")
     history = flight.relative.get(chaser)
-    if own is None or target is None or history is None:
+    if history is None or not flight.motion.has_pair(chaser):
         return {name: np.zeros(0) for name in ("time_s", *_POSE_ERRORS)}
-    n = min(len(own.time_s), len(target.time_s))
-    a, b = rows_at_equal_times(history.time_s, target.time_s[:n])
+    a, target = flight.motion.at(TARGET, history.time_s)
+    both, own = flight.motion.at(f"chaser/{chaser}", target.time_s)
+    a, target = a[both], target.rows(both)
     errors = {name: np.empty(len(a)) for name in _POSE_ERRORS}
     for rows in blocks(len(a)):
-        i, j = a[rows], b[rows]
-        true = relative_pose(
-            own.position_m[j], own.q_wxyz[j], target.position_m[j], target.q_wxyz[j]
-        )
+        i, mine, its = a[rows], own.rows(rows), target.rows(rows)
+        true = relative_pose(mine.position_m, mine.q_wxyz, its.position_m, its.q_wxyz)
         pose = pose_error(*true, history.position_m[i], history.q_wxyz[i])
-        _store_pose_errors(errors, rows, pose, history.covariance(i))
+        covariance = history.covariance(i) + relative_measured_covariance(mine, its)
+        _store_pose_errors(errors, rows, pose, covariance)
     return {"time_s": history.time_s[a], **errors}
 
 
@@ -239,11 +233,16 @@ def _pose_figures(errors: dict[str, Array], from_s: float) -> dict[str, float | 
 
 
 def _rms(x: Array) -> float | None:
-    return float(np.sqrt(np.mean(x * x))) if len(x) else None
+    """Return the RMS; None without values, or where a reference measures none."""
+    return float(np.sqrt(np.mean(x * x))) if len(x) and np.isfinite(x).all() else None
 
 
 def _mean_square(x: Array) -> float | None:
     return float(np.mean(x * x)) if len(x) else None
+
+
+def _least(x: Array) -> float | None:
+    return float(np.min(x)) if len(x) else None
 
 
 def _greatest(x: Array) -> float | None:
@@ -294,66 +293,58 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
     """Evaluate a flight; return plain values for JSON."""
     s = flight.scenario
     chasers: dict[str, dict[str, Any]] = {}
-    until = s.steady_until_s or s.duration_s
 
-    for i in flight.flown if "target" in flight.truth else ():
-        name = f"chaser/{i}"
-        time_s, position, angle = tracking_errors(flight, i)
-        steady = (time_s >= s.settling_s) & (time_s < until)
-        docked_s = dock_time(flight, i)
+    for i in flight.chasers:
+        impulses = flight.impulses.get(i, ImpulseTotals())
         chasers[str(i)] = {
-            "position_mse_m2": _mean_square(position),
-            "orientation_mse_rad2": _mean_square(angle),
-            "steady": {
-                "position_mse_m2": _mean_square(position[steady]),
-                "orientation_mse_rad2": _mean_square(angle[steady]),
-            },
-            "docked": docked_s is not None,
-            "dock_time_s": docked_s,
-            "reached_time_s": reached_time(flight, i),
-            "min_distance_target_m": float(
-                flight.truth[name].distance_to(flight.truth["target"]).min()
-            ),
-            "impulse_N_s": flight.absolute_impulse_N_s[name],
-            "thruster_impulse_N_s": flight.thruster_impulse_N_s[name],
-            "propellant_kg": flight.propellant_kg[name],
+            **_of_poses(flight, i),
+            "impulse_N_s": impulses.absolute_N_s,
+            "thruster_impulse_N_s": impulses.thrusters_N_s,
+            "propellant_kg": impulses.propellant_kg,
         }
+        if flight.motion.source != "truth":
+            chasers[str(i)] |= _of_estimates(flight, i)
 
         relative = _pose_figures(relative_errors(flight, i), s.settling_s)
         if relative["nees_mean"] is not None:
             chasers[str(i)]["relative_estimate"] = relative
         if (capture := capture_of(flight, i)) is not None:
             chasers[str(i)]["capture"] = capture
-        if (found := rendezvous_of(flight, i)) is not None:
+        if i in flight.shown and (found := rendezvous_of(flight, i)) is not None:
             chasers[str(i)]["rendezvous"] = found
         if i in flight.safety:
             chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
 
-    between = [
-        float(flight.truth[f"chaser/{i}"].distance_to(flight.truth[f"chaser/{j}"]).min())
-        for i, j in combinations(flight.flown, 2)
-    ]
+    motion = flight.motion
+    apart = (
+        motion[f"chaser/{i}"].distance_to(motion[f"chaser/{j}"])[1]
+        for i, j in combinations(motion.chasers, 2)
+    )
+    between = [float(distance_m.min()) for distance_m in apart if len(distance_m)]
 
     errors = estimate_errors(flight)
     late = errors["time_s"] >= s.settling_s
-    end_s = float(flight.truth["target"].time_s[-1]) if "target" in flight.truth else 0.0
+    in_truth = flight.world.ticks > 0
 
     result: dict[str, Any] = {
         "scenario": s.name,
         "seed": s.seed,
         "mode": flight.run.get("mode", ""),
-        "ticks": flight.counts.get("truth/world", 1) - 1,
-        "sim_time_s": end_s,
+        "ticks": flight.ticks,
+        "sim_time_s": flight.flown_s,
         "wall_time_s": flight.wall_time_s,
         "success": False,
         "failures": [],
         "not_judged": [],
         "doubts": [],
         "ended": _ended(flight),
+        "log_lacks": flight.missing,
+        "judged_against": flight.motion.describe(),
+        "impulses_are": flight.impulses_are,
         "events": _events(flight),
         "chasers": chasers,
         "min_distance_chasers_m": min(between) if between else None,
-        "collisions": flight.world.contacts,
+        "collisions": flight.world.contacts if in_truth else None,
         "target_estimate": {
             **_pose_figures(errors, s.settling_s),
             "velocity_rms_m_s": _rms(errors["velocity_m_s"][late]),
@@ -363,7 +354,7 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             ),
         },
         "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
-        "late_commands": flight.world.late_commands,
+        "late_commands": flight.world.late_commands if in_truth else None,
         "unanswered": _unanswered(flight),
         "solver": {
             "name": flight.solves.name or s.controller.solver,
@@ -382,17 +373,64 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
     if (stack := stack_rest(flight)) is not None:
         result["stack"] = stack
 
-    judged, result["not_judged"] = judged_criteria(s)
+    judged, result["not_judged"] = criteria_of(flight)
     result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
     result["doubts"] = estimate_doubts(result)
     return result
 
 
+def _of_poses(flight: RecordedFlight, chaser: int) -> dict[str, Any]:
+    """Return what is measured on the motion of a chaser and of the target; None for each figure
+    where one is not known.
+    """
+    s = flight.scenario
+    steady_until = s.steady_until_s or s.duration_s
+    if not flight.motion.has_pair(chaser):
+        nothing = dict.fromkeys(("position_mse_m2", "orientation_mse_rad2"))
+        others = ("docked", "dock_time_s", "reached_time_s", "min_distance_target_m")
+        return {**nothing, "steady": nothing, **dict.fromkeys(others)}
+    time_s, position, angle = tracking_errors(flight, chaser)
+    steady = (time_s >= s.settling_s) & (time_s < steady_until)
+    docked_s = dock_time(flight, chaser)
+    own, target = flight.motion.pair(chaser)
+    return {
+        "position_mse_m2": _mean_square(position),
+        "orientation_mse_rad2": _mean_square(angle),
+        "steady": {
+            "position_mse_m2": _mean_square(position[steady]),
+            "orientation_mse_rad2": _mean_square(angle[steady]),
+        },
+        "docked": docked_s is not None,
+        "dock_time_s": docked_s,
+        "reached_time_s": reached_time(flight, chaser),
+        "min_distance_target_m": _least(own.distance_to(target)[1]),
+    }
+
+
+def _of_estimates(flight: RecordedFlight, chaser: int) -> dict[str, Any]:
+    """Return what a log without ground truth shows by the flight's own estimates: tracking errors
+    of the odometry from the reference pose on the estimated target, since ``settling_s``, and how
+    many sightings the estimator used and rejected.
+    """
+    s, use = flight.scenario, flight.sighting_use.get(chaser, SightingUse())
+    errors = flight.estimated_errors.get(chaser, np.zeros((0, 3)))
+    steady = errors[
+        (errors[:, 0] >= s.settling_s) & (errors[:, 0] < (s.steady_until_s or s.duration_s))
+    ]
+    return {
+        "estimated_tracking": {
+            "position_rms_m": _rms(steady[:, 1]),
+            "orientation_rms_rad": _rms(steady[:, 2]),
+        },
+        "sightings": {"used": use.used, "rejected": use.rejected},
+    }
+
+
 def _ended(flight: RecordedFlight) -> str:
     """Return why the flight ended, and when."""
     if flight.end is None:
-        return "not known: the log ends before the mission does"
+        return f"not known: the log ends before the mission does, at {flight.flown_s:.2f} s"
     early = "" if flight.end.complete else "early, "
     return f"{early}{flight.end.reason} at {flight.end.sim_time_ns / 1e9:.2f} s"
 
@@ -428,7 +466,8 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
     """Return a message for each criterion of the scenario that a summary violates."""
     out = []
     if result["sim_time_s"] < s.duration_s - 1.0 / s.time.rate_hz:
-        out.append(f"ended at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
+        what = "the log ends" if result["ended"].startswith("not known") else "ended"
+        out.append(f"{what} at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
     if result["collisions"]:
         out.append(f"{result['collisions']} collisions, none allowed")
 
@@ -444,7 +483,8 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         )
 
     for i, c in result["chasers"].items():
-        distance = c["min_distance_target_m"]
+        if (distance := c["min_distance_target_m"]) is None:
+            continue  # without a known motion nothing of it is judged
         limit = nearest_allowed_m(s, int(i))
         if s.success.keep_distances and distance < limit:
             out.append(
@@ -524,29 +564,10 @@ def text_of(result: dict[str, Any]) -> str:
         f"{result['sim_time_s']:.1f} s flown in "
         f"{result['wall_time_s']:.1f} s ({factor:.2f} x real time), digest {result['digest'][:16]}"
     ]
+    if result["judged_against"] != "ground truth":
+        lines.append(f"  judged against {result['judged_against']}")
     for i, c in result["chasers"].items():
-        steady = c["steady"]
-        line = f"  chaser {i}: "
-        if steady["position_mse_m2"] is not None:
-            line += (
-                f"steady RMS {math.sqrt(steady['position_mse_m2']) * 1e3:.2f} mm, "
-                f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f} deg; "
-            )
-        line += f"closest to the target {c['min_distance_target_m']:.3f} m"
-        if c["propellant_kg"] > 0.0:
-            line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
-        if c["docked"]:
-            line += f"; docked since {c['dock_time_s']:.1f} s"
-        if (relative := c.get("relative_estimate")) is not None:
-            line += (
-                f"; estimated relative to it within {relative['position_rms_m'] * 1e3:.2f} mm, "
-                f"{math.degrees(relative['orientation_rms_rad']):.3f} deg RMS"
-            )
-        if "capture" in c:
-            line += capture_text(c["capture"])
-        if "rendezvous" in c:
-            line += rendezvous_text(c["rendezvous"])
-        lines.append(line)
+        lines.append(_chaser_text(i, c))
     estimate = result["target_estimate"]
     if estimate["position_rms_m"] is not None:
         lines.append(
@@ -558,10 +579,51 @@ def text_of(result: dict[str, Any]) -> str:
         )
     if result["mode"] == "realtime" and result["latency_s"]["p50"] is not None:
         latency = result["latency_s"]
+        late = "?" if result["late_commands"] is None else result["late_commands"]
         lines.append(
             f"  exposure to command: median {latency['p50'] * 1e3:.1f} ms, p99 "
             f"{latency['p99'] * 1e3:.1f} ms; "
-            f"{result['late_commands']} commands late, {result['unanswered']} missing"
+            f"{late} commands late, {result['unanswered']} missing"
         )
     lines += [f"  {line}" for line in verdict.lines()]
     return "\n".join(lines)
+
+
+def _chaser_text(i: str, c: dict[str, Any]) -> str:
+    """Format what a summary says of a chaser as a line."""
+    steady, line = c["steady"], f"  chaser {i}: "
+    if steady["position_mse_m2"] is not None:
+        line += (
+            f"steady RMS {math.sqrt(steady['position_mse_m2']) * 1e3:.2f} mm, "
+            f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f} deg; "
+        )
+    if (nearest := c["min_distance_target_m"]) is not None:
+        line += f"closest to the target {nearest:.3f} m"
+    if "estimated_tracking" in c:
+        line += _estimates_text(c)
+    if c["propellant_kg"] > 0.0:
+        line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
+    if c["docked"]:
+        line += f"; docked since {c['dock_time_s']:.1f} s"
+    if (relative := c.get("relative_estimate")) is not None:
+        line += (
+            f"; estimated relative to it within {relative['position_rms_m'] * 1e3:.2f} mm, "
+            f"{math.degrees(relative['orientation_rms_rad']):.3f} deg RMS"
+        )
+    if "capture" in c:
+        line += capture_text(c["capture"])
+    if "rendezvous" in c:
+        line += rendezvous_text(c["rendezvous"])
+    return line
+
+
+def _estimates_text(c: dict[str, Any]) -> str:
+    """Describe what a log without ground truth shows of a chaser, as part of a line."""
+    e, use = c["estimated_tracking"], c["sightings"]
+    text = "" if c["min_distance_target_m"] is None else "; "
+    if e["position_rms_m"] is not None:
+        text += (
+            f"estimated steady RMS {e['position_rms_m'] * 1e3:.2f} mm, "
+            f"{math.degrees(e['orientation_rms_rad']):.3f} deg; "
+        )
+    return f"{text}{use['rejected']} of {use['used'] + use['rejected']} sightings rejected"

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal, get_args
@@ -13,10 +13,13 @@ from typing import Literal, get_args
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import BodyTruth
+from chaserdock_protocol.messages import ActuatorCommand, BodyTruth
 from chaserdock_protocol.recording.log import LogSource, Record, read_log
+from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.bodies import Body
 from numpy.typing import NDArray
 
+from .actuation import TickOutput, commanded_output, true_output
 from .columns import Columns
 
 ImageOutcome = Literal["used", "rejected", "not seen", "bad image", "not processed"]
@@ -47,7 +50,7 @@ class ImageOutcomes:
 
 @dataclass
 class ActuatorHistory:
-    """Applied force and torque of a chaser in body axes.
+    """Applied (or commanded) force and torque of a chaser in body axes.
 
     ``force_N`` and ``torque_N_m`` (K, 3) are means over the intervals between ``edges_s`` (K + 1,).
     ``thruster_duty`` (K, J) is the share of an interval during which each thruster was open, with J
@@ -82,17 +85,17 @@ class _ActuatorCollector:
     sums: Array = field(default_factory=lambda: np.zeros(0))
     ticks: int = 0
 
-    def add(self, m: BodyTruth) -> None:
+    def add(self, m: TickOutput) -> None:
         impulses = np.array([*m.impulse_N_s, *m.angular_impulse_N_m_s, *m.thruster_open_s])
         if self.rows is None:
             self.rows = Columns(1 + len(impulses))
-            self.rows.add((m.sim_time_ns / 1e9,), np.zeros(len(impulses)))
+            self.rows.add((m.time_s,), np.zeros(len(impulses)))
             self.sums = np.zeros(len(impulses))
             return
         self.sums += impulses
         self.ticks += 1
         if self.ticks % self.every == 0:
-            self.rows.add((m.sim_time_ns / 1e9,), self.sums)
+            self.rows.add((m.time_s,), self.sums)
             self.sums = np.zeros(len(impulses))
 
     def finish(self) -> ActuatorHistory | None:
@@ -107,7 +110,10 @@ class _ActuatorCollector:
 @dataclass
 class _Collector:
     every: int
-    actuators: dict[int, _ActuatorCollector] = field(default_factory=dict)
+    body: Body
+    tick_s: float
+    given: dict[int, _ActuatorCollector] = field(default_factory=dict)
+    commanded: dict[int, _ActuatorCollector] = field(default_factory=dict)
     sent: dict[tuple[int, int], int] = field(default_factory=dict)
     latency: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(2)))
     images: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
@@ -122,11 +128,12 @@ class _Collector:
         if isinstance(message, BodyTruth):
             if message.body.startswith("chaser/"):
                 i = int(message.body.partition("/")[2])
-                self.actuators.setdefault(i, _ActuatorCollector(self.every)).add(message)
+                self.given.setdefault(i, _ActuatorCollector(self.every)).add(true_output(message))
         elif record.topic is topics.IMAGE:
             self.sent[message.chaser, message.tick] = record.sent_ns
             self.images[message.chaser].append(message.sim_time_ns)
         elif record.topic is topics.ACTUATORS:
+            self._add_command(message)
             sent_ns = self.sent.pop((message.chaser, message.tick), None)
             if sent_ns is not None:
                 latency_s = (record.sent_ns - sent_ns) / 1e9
@@ -138,6 +145,11 @@ class _Collector:
         elif record.topic is topics.TARGET:
             for chaser in message.rejected:
                 self.rejected[chaser].append(message.sim_time_ns)
+
+    def _add_command(self, message: ActuatorCommand) -> None:
+        if not self.given:
+            collector = self.commanded.setdefault(message.chaser, _ActuatorCollector(self.every))
+            collector.add(commanded_output(message, self.body, self.tick_s))
 
     def image_outcomes(self, chaser: int) -> ImageOutcomes:
         time_ns = np.unique(np.array(self.images[chaser], dtype=np.int64))
@@ -151,19 +163,20 @@ class _Collector:
         return ImageOutcomes(time_ns / 1e9, code)
 
 
-def load_traces(log: LogSource, chasers: Iterable[int], every: int = 1) -> Traces:
+def load_traces(log: LogSource, scenario: FlightScenario, every: int = 1) -> Traces:
     """Read the time series of a log, actuator values as means over ``every`` ticks. Raise LogError
     for an unreadable log.
     """
-    numbers = list(chasers)
+    numbers = range(len(scenario.chasers))
     keys = [topics.TARGET.key_of()]
     for i in numbers:
         keys += [t.key_of(i) for t in (topics.IMAGE, topics.SIGHTING, topics.ACTUATORS)]
         keys.append(topics.TRUTH_BODY.key_of(f"chaser/{i}"))
-    c = _Collector(every)
+    c = _Collector(every, scenario.chaser, 1.0 / scenario.time.rate_hz)
     for record in read_log(log, keys):
         c.add(record)
-    inputs = {i: collector.finish() for i, collector in sorted(c.actuators.items())}
+    found = c.given or c.commanded
+    inputs = {i: collector.finish() for i, collector in sorted(found.items())}
     return Traces(
         inputs={i: history for i, history in inputs.items() if history is not None},
         latency={i: rows.table() for i, rows in sorted(c.latency.items())},

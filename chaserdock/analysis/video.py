@@ -24,9 +24,9 @@ from chaserdock.verdict import Verdict, verdict_of
 
 from .body_renderer import BodyRenderer
 from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint, draw, tint
-from .columns import nanoseconds
-from .flight import RecordedFlight, Track, load_flight
+from .flight import RecordedFlight, load_flight
 from .images import Pair, columns_for, shots
+from .motion import TARGET, Track
 from .scene import scene_of
 from .snapshot import annotated_image
 from .summary import summary_of_run, tracking_errors
@@ -84,7 +84,7 @@ def write_video(
         raise ChaserdockError(f"a video from {part_s[0]:g} s to {part_s[1]:g} s has no length")
 
     flight = load_flight(log)
-    if "target" not in flight.truth:
+    if TARGET not in flight.motion:
         raise LogError(f"{log}: holds no motion of the target; nothing to film")
 
     number = 0
@@ -189,20 +189,19 @@ class _ExternalView:
         sun = np.array(to_sun(flight.scenario))
         self.sun = sun / np.linalg.norm(sun)
 
-        self.numbers = flight.flown
-        self.target = target = flight.truth["target"]
+        self.numbers = flight.shown
+        self.target = target = flight.motion[TARGET]
 
         self._begin_s, self._end_s = part_s[0], min(float(target.time_s[-1]), part_s[1])
         self._span_s = max(self._end_s - self._begin_s, 1e-3)
         self._sky: BgrImage | None = None
         self._mesh = flight.scenario.target.nominal_mesh()
         self._renderers: dict[tuple[int, int], BodyRenderer] = {}
-        self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
+        self.chasers = {i: flight.motion[f"chaser/{i}"] for i in self.numbers}
 
         reach, distances, speeds = 0.3, {}, {}
         for i, own in self.chasers.items():
-            away_m = own.distance_to(target)
-            time_s = own.time_s[: len(away_m)]
+            time_s, away_m = own.distance_to(target)
             closing_m_s = -np.gradient(away_m, time_s) if len(time_s) > 2 else 0.0 * away_m
             inside = (time_s >= part_s[0]) & (time_s <= part_s[1])
             distances[i] = time_s[inside], away_m[inside]
@@ -217,9 +216,7 @@ class _ExternalView:
             i: flight.references[i].phases if i in flight.references else [] for i in self.numbers
         }
         self.seen = {
-            i: set(nanoseconds(s.time_s[s.seen]).tolist())
-            for i in self.numbers
-            if (s := flight.sightings.get(i)) is not None
+            i: s.time_s[s.seen] for i in self.numbers if (s := flight.sightings.get(i)) is not None
         }
 
     def draw(self, time_s: float) -> BgrImage:
@@ -229,8 +226,8 @@ class _ExternalView:
         paths |= {i: _trail(own, time_s) for i, own in self.chasers.items()}
         at = _pose(self.target, time_s)
         look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
-        time_ns = round(_time_of(self.target, time_s) * 1e9)
-        seeing = frozenset(i for i in self.numbers if time_ns in self.seen.get(i, ()))
+        at_s = _time_of(self.target, time_s)
+        seeing = frozenset(i for i, seen_s in self.seen.items() if self._is_near(seen_s, at_s))
         plumes = {i: self._plumes_at(i, time_s) for i in chasers if i in self._plumes}
         rendered = self._rendered(look, at, chasers)
         background = self._background(look) if rendered is None else None
@@ -241,6 +238,12 @@ class _ExternalView:
         self._draw_graph(image, time_s)
         self._write(image, time_s)
         return image
+
+    def _is_near(self, seen_s: Array, time_s: float) -> bool:
+        """Return whether one of the ascending times (K,) s is within half a tick of a time."""
+        row = int(np.searchsorted(seen_s, time_s))
+        half_s = 0.5 / self.flight.scenario.time.rate_hz
+        return any(abs(t - time_s) < half_s for t in seen_s[max(0, row - 1) : row + 1])
 
     def _background(self, look: Viewpoint) -> BgrImage:
         """Return stars and Earth as the simulated cameras see them, in the direction of view."""
@@ -413,7 +416,7 @@ def load_plumes(log: Path, flight: RecordedFlight) -> dict[int, ActuatorHistory]
     """Return the actuator histories of the chasers that have thrusters."""
     if flight.scenario.chaser.actuation != "thrusters":
         return {}
-    histories = load_traces(log, range(len(flight.scenario.chasers))).inputs
+    histories = load_traces(log, flight.scenario).inputs
     return {i: h for i, h in histories.items() if h.thruster_duty.shape[1]}
 
 

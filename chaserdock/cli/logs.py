@@ -49,8 +49,8 @@ def log(
         ExportFormat,
         typer.Option(
             help="--export: a table per topic as parquet (with types and units) or csv; tum: "
-            "trajectories of truth, estimate, odometry and references; rosbag2: a bag of ROS 2 "
-            "(MCAP), which needs chaserdock[ros2]"
+            "trajectories of truth, measured poses, estimate, odometry and references; rosbag2: a "
+            "bag of ROS 2 (MCAP), which needs chaserdock[ros2]"
         ),
     ] = ExportFormat.parquet,
     images: Annotated[

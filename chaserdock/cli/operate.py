@@ -187,7 +187,9 @@ def view(
         typer.Option(min=1, max=65535, help="port; the first free one from 8080 by default"),
     ] = None,
     dark: Annotated[bool, typer.Option("--dark", help="start with dark colours")] = False,
-    truth: Annotated[bool, typer.Option(help="show ground truth where it is readable")] = True,
+    truth: Annotated[
+        bool, typer.Option(help="show ground truth or references where they are readable")
+    ] = True,
     at: Annotated[
         float | None, typer.Option(min=0, help="log: pause at this simulated time, seconds")
     ] = None,

@@ -93,7 +93,7 @@ def row_of(index: int, flight: PlannedFlight, outcome: FlightOutcome) -> ResultR
         row[name] = float(combine(values)) if values else math.nan
     row["docked"] = sum(bool(c.get("docked")) for c in chasers)
 
-    row["collisions"] = int(s.get("collisions", 0))
+    row["collisions"] = int(s.get("collisions") or 0)  # None: a log without ground truth
     row["min_distance_chasers_m"] = _number(s.get("min_distance_chasers_m"))
 
     for key, value in s.get("target_estimate", {}).items():

@@ -9,13 +9,18 @@ from pathlib import Path
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import MissionEnd
+from chaserdock_protocol.messages import JoinReply, MissionEnd
 from chaserdock_protocol.process import StopSignal
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.run_name import run_name
-from chaserdock_protocol.scenario import scenario_from_json
+from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.transport import Link, Node
-from chaserdock_protocol.transport.session import ignore_foreign_publishers, join, request_scenario
+from chaserdock_protocol.transport.session import (
+    NoFullScenario,
+    ignore_foreign_publishers,
+    join,
+    request_scenario,
+)
 
 from chaserdock.exit_codes import STOPPED
 
@@ -52,10 +57,9 @@ def judge_mission(
             return STOPPED
 
         folder = out / run_name(mission)
-        full = request_scenario(node, mission, stop)
-        if full is None:
+        scenario = _scenario_of(node, mission, stop)
+        if scenario is None:
             return STOPPED
-        scenario = scenario_from_json(full, "the world's scenario")
 
         reporter = ProgressReporter(scenario, show)
         # Keys differ between the parties of a mission on several hosts: each has its own folder.
@@ -87,6 +91,18 @@ def judge_mission(
         return outcome.status
     finally:
         node.close()  # last, because the router may exit once this node has left
+
+
+def _scenario_of(node: Node, mission: JoinReply, stop: StopSignal) -> Scenario | None:
+    """Return the mission's full scenario, or that of the flight software of a world that gives no
+    other; None if stopped.
+    """
+    try:
+        text = request_scenario(node, mission, stop)
+    except NoFullScenario as reason:
+        print(f"chaserdock: {reason} Judging without its criteria.", file=sys.stderr)
+        text = mission.scenario_json
+    return None if text is None else scenario_from_json(text, "the world's scenario")
 
 
 def _watch(

@@ -17,7 +17,12 @@ from chaserdock_protocol.messages import (
     ScenarioReply,
     ScenarioRequest,
 )
-from chaserdock_protocol.recording.log import LogSource, read_scenario
+from chaserdock_protocol.recording.log import (
+    FLIGHT_SCENARIO,
+    SCENARIO_KIND,
+    LogSource,
+    read_scenario,
+)
 from chaserdock_protocol.recording.scan import VIEWER_PREFIX, log_files, stored_messages
 from chaserdock_protocol.scenario import flight_scenario_json, scenario_from_json
 from chaserdock_protocol.transport import Link, Node, RawSample
@@ -78,7 +83,10 @@ def play(
                 )
             reply(answer)
 
-        node.declare_queryable(topics.SCENARIO_KEY, ScenarioRequest, lambda _, reply: reply(full))
+        if run.get(SCENARIO_KIND) != FLIGHT_SCENARIO:  # or else the recorder has it by its join
+            node.declare_queryable(
+                topics.SCENARIO_KEY, ScenarioRequest, lambda _, reply: reply(full)
+            )
         node.declare_queryable(topics.JOIN_KEY, JoinRequest, admit)
         _wait_for_recorder(node, timeout_s, stopped)
         number, start_s, first_ns = 0, time.monotonic(), None

@@ -2,8 +2,8 @@
 """Writes a log as a ROS 2 bag (rosbag2 with MCAP storage): ROS 2 schemas and CDR,
 ``metadata.yaml``.
 
-Topics are those of the bridge, plus the true states of the bodies under ``/truth/``. Requires the
-extra ``chaserdock[ros2]``.
+Topics are those of the bridge, plus the true states of the bodies under ``/truth/`` and the
+measured ones under ``/reference/``. Requires the extra ``chaserdock[ros2]``.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ def _track_of(record: Record) -> str | None:
     match record.topic:
         case topics.TRUTH_BODY:
             return f"{message.body.replace('/', '_')}_truth"
+        case topics.BODY_REFERENCE:
+            return f"{message.body.replace('/', '_')}_measured"
         case topics.TARGET if message.status in ("tracking", "predicting"):
             return "target_estimate"
         case topics.ODOMETRY:
@@ -37,13 +39,20 @@ def _track_of(record: Record) -> str | None:
 def write_tracks(
     log: LogSource, folder: Path, from_s: float = 0.0, to_s: float = math.inf
 ) -> dict[str, int]:
-    """Write true states, target estimate, odometry and references from ``from_s`` to ``to_s``.
+    """Write true and measured states, target estimate, odometry and references of the controller
+    from ``from_s`` to ``to_s``.
 
     Returns the number of points by file name. Raises LogError if the log or the files cannot be
     used.
     """
     opened = open_log(log)
-    wanted = (topics.TRUTH_BODY, topics.TARGET, topics.ODOMETRY, topics.REFERENCE)
+    wanted = (
+        topics.TRUTH_BODY,
+        topics.BODY_REFERENCE,
+        topics.TARGET,
+        topics.ODOMETRY,
+        topics.REFERENCE,
+    )
     files: dict[str, TextIO] = {}
     points: dict[str, int] = {}
     with errors_of_writing(folder, LogError), ExitStack() as open_files:

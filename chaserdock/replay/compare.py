@@ -103,17 +103,17 @@ def _messages(first: LogSource, second: LogSource, tolerance: float) -> list[Top
 
 def _deviations(a: RecordedFlight, b: RecordedFlight) -> dict[str, Deviation]:
     out = {}
-    for name in [*(n for n in a.truth if n in b.truth), "target estimate"]:
+    for name in [*(n for n in a.motion if n in b.motion), "target estimate"]:
         estimate = name == "target estimate"
-        one, other = (f.estimate if estimate else f.truth[name] for f in (a, b))
-        _, k, m = np.intersect1d(one.time_s, other.time_s, return_indices=True)
-        if not len(k):
+        one, other = (f.estimate if estimate else f.motion[name] for f in (a, b))
+        one, other = one.with_other(other)
+        if not len(one.time_s):
             continue
-        position = np.linalg.norm(one.position_m[k] - other.position_m[m], axis=1)
-        angle = rotations.angle_between(one.q_wxyz[k], other.q_wxyz[m])
+        position = np.linalg.norm(one.position_m - other.position_m, axis=1)
+        angle = rotations.angle_between(one.q_wxyz, other.q_wxyz)
         p, q = int(np.argmax(position)), int(np.argmax(angle))
         out[name] = Deviation(
-            float(position[p]), float(one.time_s[k][p]), float(angle[q]), float(one.time_s[k][q])
+            float(position[p]), float(one.time_s[p]), float(angle[q]), float(one.time_s[q])
         )
     return out
 

@@ -15,6 +15,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    BodyReference,
     BodyTruth,
     CommandReply,
     Event,
@@ -31,6 +32,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.topics import Topic
 
 from chaserdock.analysis.mass_properties import values_of
+from chaserdock.analysis.motion import MotionCollector
 
 from .snapshot import TARGET, keep_newest
 
@@ -131,7 +133,8 @@ class History:
         self.rejected: dict[str, int] = {}
         self._odometry: dict[int, OrderedDict[int, Odometry]] = defaultdict(OrderedDict)
         self._exposed: dict[int, OrderedDict[int, int]] = defaultdict(OrderedDict)
-        self._truth: OrderedDict[int, BodyTruth] = OrderedDict()
+        self._truth: OrderedDict[int, BodyTruth | BodyReference] = OrderedDict()
+        self._uncompared: deque[TargetEstimate] = deque(maxlen=_MOST_LINES)
         self._target: TargetEstimate | None = None
 
     def add_exposure(self, chaser: int, tick: int, sent_ns: int) -> None:
@@ -158,9 +161,11 @@ class History:
                 self._add_tracking_error(message)
             case TargetEstimate() if message.status != "none":
                 self._target = message
-                self._add_estimation_error(message)
-            case BodyTruth() if message.body == TARGET:
+                self._uncompared.append(message)
+                self._compare_estimates()
+            case BodyTruth() | BodyReference() if message.body == TARGET:
                 keep_newest(self._truth, message.sim_time_ns, message)
+                self._compare_estimates()
             case PortLoad():
                 self.series["port_load_N", message.chaser].add(
                     message.sim_time_ns / 1e9, message.peak_force_N
@@ -243,13 +248,26 @@ class History:
             time_s, float(np.degrees(turned))
         )
 
-    def _add_estimation_error(self, estimate: TargetEstimate) -> None:
-        true = self._truth.get(estimate.sim_time_ns)
-        if true is None:
+    def _compare_estimates(self) -> None:
+        """Compare the estimates up to the newest known state of the target with its states: those
+        of a reference have times of their own.
+        """
+        newest_ns = max(self._truth, default=-1)
+        while self._uncompared and self._uncompared[0].sim_time_ns <= newest_ns:
+            self._add_estimation_error(self._uncompared.popleft(), sorted(self._truth))
+
+    def _add_estimation_error(self, estimate: TargetEstimate, times: list[int]) -> None:
+        """Add the error of an estimate. ``times``: of the known states, ns."""
+        after = bisect_right(times, estimate.sim_time_ns)
+        around, time_s = MotionCollector(), estimate.sim_time_ns / 1e9
+        for time_ns in times[max(0, after - 2) : after + 1]:
+            around.add(self._truth[time_ns])
+        motion = around.finish(np.array([time_s]))
+        rows, true = motion.at(TARGET, np.array([time_s])) if TARGET in motion else ((), None)
+        if true is None or not len(rows):
             return
-        time_s = estimate.sim_time_ns / 1e9
-        away_m = float(np.linalg.norm(np.subtract(true.position_m, estimate.position_m)))
-        turned = float(rotations.angle_between(true.q_wxyz, estimate.q_wxyz))
+        away_m = float(np.linalg.norm(true.position_m[0] - estimate.position_m))
+        turned = float(rotations.angle_between(true.q_wxyz[0], estimate.q_wxyz))
         self.series["estimate_error_mm", None].add(time_s, away_m * 1e3)
         self.series["estimate_error_deg", None].add(time_s, float(np.degrees(turned)))
 

@@ -66,8 +66,8 @@ _WAITING = "no mission is running"
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Address and content of the page. ``truth``: subscribe to ground truth if access rights allow
-    it.
+    """Address and content of the page. ``truth``: subscribe to ground truth and references if
+    access rights allow it.
     """
 
     host: str = DEFAULT_HOST
@@ -180,7 +180,9 @@ class _Feed:
         if truth:
             bodies = ["target", *(f"chaser/{i}" for i in range(chasers))]
             feed.subscriptions += [
-                node.subscribe_newest(topics.TRUTH_BODY, _STATES, body) for body in bodies
+                node.subscribe_newest(topic, _STATES, body)
+                for topic in (topics.TRUTH_BODY, topics.BODY_REFERENCE)
+                for body in bodies
             ]
             feed.subscriptions += [
                 node.subscribe_newest(topics.TRUTH_LOAD, _STATES, i) for i in range(chasers)

@@ -33,13 +33,15 @@ from .history import History
 from .snapshot import OF_ALL, OF_CHASERS, MissionState
 
 _EVENT_TOPICS = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
+_BODIES = (topics.TRUTH_BODY, topics.BODY_REFERENCE)
+"""Topics of where the bodies are."""
 _DECODED = (
     topics.ODOMETRY,
     topics.REFERENCE,
     topics.TARGET,
     topics.STACK,
     topics.SOLVER,
-    topics.TRUTH_BODY,
+    *_BODIES,
     topics.TRUTH_LOAD,
     topics.ACTUATORS,
     topics.TICK,
@@ -83,7 +85,7 @@ class LoggedMission:
         self._shown = {topic.key_of(): topic for topic in (*OF_ALL, topics.TRUTH_DRAWN)}
         self._shown |= {topic.key_of(i): topic for topic in OF_CHASERS for i in range(self.chasers)}
         bodies = ("target", *(f"chaser/{i}" for i in range(self.chasers)))
-        self._shown |= {topics.TRUTH_BODY.key_of(body): topics.TRUTH_BODY for body in bodies}
+        self._shown |= {topic.key_of(body): topic for topic in _BODIES for body in bodies}
         self._chunk = lru_cache(maxsize=_CHUNKS_KEPT)(self._read_chunk)
         for path in log_files(source):
             self._index_file(path)
@@ -126,7 +128,7 @@ class LoggedMission:
             self.history.add_exposure(seen.chaser, seen.tick, stored.publish_time)
         elif topic in _DECODED and (message := self._decode(topic, channel, stored)) is not None:
             self.history.update(topic, message, stored.publish_time)
-            self.truth |= topic is topics.TRUTH_BODY
+            self.truth |= topic in _BODIES
             if topic is topics.TICK:
                 self.end_s = max(self.end_s, message.sim_time_ns / 1e9)
 

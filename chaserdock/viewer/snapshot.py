@@ -13,6 +13,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    BodyReference,
     BodyTruth,
     DockingStatus,
     DrawnBody,
@@ -86,7 +87,9 @@ class Pose:
     q_wxyz: Array
 
 
-def pose_of(message: Odometry | BodyTruth | TargetEstimate | Reference) -> Pose:
+def pose_of(
+    message: Odometry | BodyTruth | BodyReference | TargetEstimate | Reference,
+) -> Pose:
     """Return the pose in a message."""
     return Pose(np.array(message.position_m), np.array(message.q_wxyz))
 
@@ -145,7 +148,8 @@ def keep_newest(store: OrderedDict[int, Any], key: int, message: Any, kept: int 
 class MissionState:
     """Latest messages of the mission.
 
-    ``truth``: true states by body (``target``, ``chaser/0``), empty without access to ground truth.
+    ``truth``: true states by body (``target``, ``chaser/0``), or measured ones where there are only
+    references; empty without access to either.
     ``true_body``: true mass properties of the target, likewise.
     """
 
@@ -155,7 +159,7 @@ class MissionState:
     stack: StackEstimate | None = None
     solver: SolverStatus | None = None
     ended: MissionEnd | None = None
-    truth: dict[str, BodyTruth] = field(default_factory=dict)
+    truth: dict[str, BodyTruth | BodyReference] = field(default_factory=dict)
     true_body: DrawnBody | None = None
 
     @classmethod
@@ -177,6 +181,8 @@ class MissionState:
             case MissionEnd():
                 self.ended = message
             case BodyTruth():
+                self.truth[message.body] = message
+            case BodyReference() if not isinstance(self.truth.get(message.body), BodyTruth):
                 self.truth[message.body] = message
             case DrawnTruth():
                 self.true_body = next((b for b in message.bodies if b.body == TARGET), None)
@@ -217,11 +223,11 @@ class MissionState:
         )
 
     def true_target(self) -> Pose | None:
-        """Return the true pose of the target; None without access to ground truth."""
+        """Return the true (or measured) pose of the target; None without access to it."""
         return pose_of(self.truth[TARGET]) if TARGET in self.truth else None
 
     def chaser(self, i: int) -> Pose | None:
-        """Return the pose of a chaser: ground truth if available, or else odometry."""
+        """Return the pose of a chaser: true or measured if available, or else odometry."""
         body, odometry = self.truth.get(f"chaser/{i}"), self.chasers[i].odometry
         known = body if body is not None else odometry
         return pose_of(known) if known is not None else None

@@ -322,6 +322,26 @@ class BodyTruth(Message, frozen=True, kw_only=True):
     propellant_kg: float = 0.0
 
 
+class BodyReference(Message, frozen=True, kw_only=True):
+    """Pose of one body (``target`` or ``chaser/0``) as an independent system measured it, for
+    recorder, analysis and viewer alone: what a flight without ground truth is judged against.
+
+    ``sim_time_ns`` is the time of the measurement, which need not be that of a tick. ``source``:
+    name of the system, such as that of a motion capture. Velocity (WRF) and rate (body axes): None
+    if the system does not measure them. ``sigma_m``, ``sigma_rad``: standard deviation of the
+    position and of the attitude about each axis.
+    """
+
+    body: Text
+    source: Text
+    position_m: Vector3
+    q_wxyz: Quaternion
+    sigma_m: float
+    sigma_rad: float
+    velocity_m_s: Vector3 | None = None
+    omega_rad_s: Vector3 | None = None
+
+
 class WorldTruth(Message, frozen=True, kw_only=True):
     """Contacts between bodies in the physics steps since the last tick, and saturated commands.
 
@@ -838,6 +858,7 @@ VERSION: dict[type[Struct], int] = {
     Odometry: 2,
     DockingStatus: 1,
     BodyTruth: 2,
+    BodyReference: 1,
     WorldTruth: 1,
     PortLoad: 1,
     PlumeLoad: 1,

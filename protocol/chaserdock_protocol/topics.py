@@ -2,8 +2,8 @@
 """Table of topics: key, type, writer, readers, rate and quality of service.
 
 Keys are relative to the run's namespace and begin with their publisher's name, so that an access
-rule can restrict a process to its own branch. Only the world writes ``truth/**``, and no flight
-process may read it.
+rule can restrict a process to its own branch. Only the world writes ``truth/**`` and
+``reference/**``, and no flight process may read them.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ class Topic:
     Compared by identity.
 
     ``rate``: every tick (``tick``), every tick with images (``image``), every second of simulated
-    time (``second``) or of wall time (``presence``), or on an event (``event``).
+    time (``second``) or of wall time (``presence``), on an event (``event``), or at a sensor's own
+    rate (``sensor``).
     """
 
     key: str
     kind: type[Struct]
     writer: Role | Literal["any"]
     readers: frozenset[Role]
-    rate: Literal["tick", "image", "second", "presence", "event"]
+    rate: Literal["tick", "image", "second", "presence", "event", "sensor"]
     qos: Qos
 
     def key_of(self, place: int | str | None = None) -> str:
@@ -87,6 +88,9 @@ TRUTH_LOAD = Topic(
     "truth/chaser/{chaser}/load", m.PortLoad, "world", _TRUTH_READERS, "tick", "state"
 )
 TRUTH_PLUME = Topic("truth/plume/{process}", m.PlumeLoad, "world", _TRUTH_READERS, "tick", "state")
+BODY_REFERENCE = Topic(
+    "reference/body/{process}", m.BodyReference, "world", _TRUTH_READERS, "sensor", "state"
+)
 TRUTH_DRAWN = Topic("truth/drawn", m.DrawnTruth, "world", _TRUTH_READERS, "event", "state")
 SIGHTING = _topic(
     "chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state"
@@ -143,6 +147,7 @@ TOPICS: tuple[Topic, ...] = (
     TRUTH_LOAD,
     TRUTH_PLUME,
     TRUTH_DRAWN,
+    BODY_REFERENCE,
     SIGHTING,
     ACTUATORS,
     THRUSTERS,
@@ -167,7 +172,7 @@ TOPICS: tuple[Topic, ...] = (
 
 EXPRESS = (WRENCH, ACTUATORS, LEASE, ACK, STATE, KILL)
 """Sent at once (not batched), together with messages of their priority published before."""
-WORLD_BRANCHES = ("world/", "truth/")
+WORLD_BRANCHES = ("world/", "truth/", "reference/")
 """Beginnings of the keys that only the world writes."""
 NEVER_DROPPED = (END, FAREWELL)
 """Published once, at the end, and never dropped, not even in real time."""

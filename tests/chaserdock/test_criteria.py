@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
+from motion_cases import track, true_motion
 
 from chaserdock.analysis.criteria import (
     judged_criteria,
@@ -32,12 +33,12 @@ def scenario(*overrides: str) -> Scenario:
 
 def flight(s: Scenario, chaser_m: np.ndarray, target_q: np.ndarray) -> Any:
     """Return a stub of a recorded flight with one row per second."""
-    n = len(chaser_m)
-    target = SimpleNamespace(
-        time_s=np.arange(n, dtype=float), position_m=np.zeros((n, 3)), q_wxyz=target_q
-    )
-    return SimpleNamespace(scenario=s, truth={"target": target, "chaser/0": SimpleNamespace(
-        time_s=target.time_s, position_m=chaser_m)})  # fmt: skip
+    time_s = np.arange(len(chaser_m), dtype=float)
+    tracks = {
+        "target": track(time_s, q_wxyz=target_q),
+        "chaser/0": track(time_s, position_m=chaser_m),
+    }
+    return SimpleNamespace(scenario=s, motion=true_motion(tracks))
 
 
 def test_goal_counts_as_reached_from_when_the_chaser_stays() -> None:
@@ -103,37 +104,33 @@ def stack_flight(
     moves along +x with the speeds of its centre (K,), and turns about +z with the rates (K,).
     Chaser 1 flies elsewhere, fast."""
     n = len(speed_m_s)
-    times, still, zero = (
-        np.arange(n) * STEP_S,
-        np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-        np.zeros((n, 3)),
-    )
+    times = np.arange(n) * STEP_S
     target_kg, chaser_kg, apart_m = 150.0, 50.0, np.array([-1.0, 0.0, 0.0])
     turning = np.outer(omega_rad_s, [0.0, 0.0, 1.0])
     # The common centre is a quarter of the way to the chaser.
     origin = np.outer(speed_m_s, [1.0, 0.0, 0.0]) - np.cross(turning, apart_m / 4.0)
 
-    def track(velocity: np.ndarray) -> Any:
-        return SimpleNamespace(
-            time_s=times, velocity_m_s=velocity, q_wxyz=still, omega_rad_s=turning
-        )
+    def moving(velocity: np.ndarray) -> Any:
+        return track(times, velocity_m_s=velocity, omega_rad_s=turning)
 
     def drawn(name: str, mass_kg: float) -> Any:
         return SimpleNamespace(body=name, mass_kg=mass_kg, centre_of_mass_m=(0.0, 0.0, 0.0))
 
     return SimpleNamespace(
         scenario=load_scenario(DETUMBLE),
-        truth={
-            "target": track(origin),
-            "chaser/0": track(origin + np.cross(turning, apart_m)),
-            "chaser/1": track(zero + 1.0),
-        },
+        motion=true_motion(
+            {
+                "target": moving(origin),
+                "chaser/0": moving(origin + np.cross(turning, apart_m)),
+                "chaser/1": moving(np.ones((n, 3))),
+            }
+        ),
         drawn=(
             drawn("target", target_kg),
             drawn("chaser/0", chaser_kg),
             drawn("chaser/1", chaser_kg),
         ),
-        world=SimpleNamespace(latched=latched),
+        latched=latched,
     )
 
 
@@ -196,9 +193,9 @@ def test_a_released_chaser_is_no_part_of_the_stack() -> None:
 def test_rest_without_truth_or_criterion_is_not_judged() -> None:
     stub = stack_flight(np.zeros(5), np.zeros(5))
     s = stub.scenario
-    stub.truth = {}
+    stub.motion = true_motion({})
     assert stack_rest(stub) is None
-    assert rest_failures({}, s) == ["the log has no truth to judge success.detumbled"]
+    assert rest_failures({}, s) == ["success.detumbled: the motion of the stack is not in the log"]
     none = s.model_copy(update={"success": s.success.model_copy(update={"detumbled": None})})
     assert rest_failures({}, none) == []
     judged, skipped = judged_criteria(load_scenario(DETUMBLE, ("duration_s=40.0",)))
@@ -218,21 +215,17 @@ def approach_flight(
     n = len(offsets_m)
     turned = np.tile(rotations.exp([0.0, 0.0, np.pi / 2.0]), (n, 1))
     drift = np.tile([0.0, 0.0, 0.3], (n, 1))
-    target = SimpleNamespace(
-        time_s=np.arange(n, dtype=float),
-        position_m=np.ones((n, 3)),
-        q_wxyz=turned,
-        velocity_m_s=drift,
-    )
-    own = SimpleNamespace(
-        time_s=target.time_s,
+    time_s = np.arange(n, dtype=float)
+    target = track(time_s, position_m=np.ones((n, 3)), q_wxyz=turned, velocity_m_s=drift)
+    own = track(
+        time_s,
         position_m=target.position_m + rotations.rotate(turned, offsets_m),
         velocity_m_s=drift + np.outer(speeds_m_s, [1.0, 0.0, 0.0]),
     )
     phases = [(0.0, "hold")] + ([] if abort_s is None else [(abort_s, "abort")])
     return SimpleNamespace(
         scenario=s,
-        truth={"target": target, "chaser/0": own},
+        motion=true_motion({"target": target, "chaser/0": own}),
         references={0: SimpleNamespace(phases=phases)},
     )
 

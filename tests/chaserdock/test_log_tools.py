@@ -65,7 +65,7 @@ def recorded(
     mission = m.JoinReply(
         accepted=True, reason="", run_id=run["run_id"], scenario_json=flight_scenario_json(scenario)
     )
-    recording = Recording(folder, mission, text, rotation, scenario if viewer else None)
+    recording = Recording(folder, mission, text, "full", rotation, scenario if viewer else None)
     for raw, message in raws(GOLDEN) * repeat:
         recording.write(raw, message)
     recording.close()

@@ -61,6 +61,7 @@ from chaserdock.verdict import Verdict
 
 TICK_NS = 1_000_000_000 // 15
 SIZE: dict[str, Any] = {"width_px": 96, "height_px": 64}
+ONE = scenario(chasers=[{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}])
 
 
 def put(writer: LogWriter, topic: topics.Topic, place: Any, message: Any) -> None:
@@ -184,7 +185,7 @@ def test_report_has_every_figure_and_no_external_reference(short_flight: Path, p
 
 def test_replay_data_equal_the_recorded_motion(short_flight: Path, page: Page) -> None:
     data = json.loads(page.data)
-    truth = load_flight(short_flight / "mission.mcap").truth
+    truth = load_flight(short_flight / "mission.mcap").motion
     assert np.all(np.diff(data["times"]) > 0)
     assert data["times"][-1] == pytest.approx(truth["target"].time_s[-1], abs=1e-3)
     assert [c["id"] for c in data["chasers"]] == [0, 1]
@@ -220,7 +221,7 @@ def test_truncated_log_gives_a_report(short_flight: Path, tmp_path: Path) -> Non
     cut.write_bytes(whole[: int(0.6 * len(whole))])
     page = checked(report_of(cut))
     assert "FAILED" in page.words
-    assert "ended at" in page.words
+    assert "the log ends at" in page.words
 
 
 @pytest.mark.slow
@@ -236,13 +237,13 @@ def test_report_of_a_flight_without_sightings_names_what_is_missing(tmp_path: Pa
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_flight_aborted_at_once_gives_a_report(tmp_path: Path, ticks: int) -> None:
     page = checked(report_of(made_log(tmp_path / "aborted.mcap", ticks)))
-    assert "ended at 0.00 s of 2 s" in page.words
+    assert "the log ends at 0.00 s of 2 s" in page.words
     assert ("replay" in page.ids) == (ticks > 0)
 
 
 def test_report_of_a_log_without_truth_names_what_is_missing(tmp_path: Path) -> None:
     page = checked(report_of(made_log(tmp_path / "dark.mcap", 5, truth=False)))
-    assert "no ground truth of the target" in page.words
+    assert "neither ground truth nor a reference of the target" in page.words
     assert "figure-cameras" in page.ids
 
 
@@ -286,16 +287,16 @@ def test_figures_are_written_in_the_requested_format(tmp_path: Path) -> None:
 
 
 def test_forces_are_impulses_divided_by_tick_durations(tmp_path: Path) -> None:
-    given = load_traces(made_log(tmp_path / "a.mcap", 5), [0]).inputs[0]
+    given = load_traces(made_log(tmp_path / "a.mcap", 5), ONE).inputs[0]
     assert given.edges_s.shape == (5,)
     np.testing.assert_allclose(given.force_N, np.tile([1.5, 0.0, 0.0], (4, 1)), rtol=1e-6)
     assert given.thruster_duty.shape == (4, 0)
 
 
 def test_every_image_has_an_outcome(tmp_path: Path) -> None:
-    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).image_outcomes[0]
+    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), ONE).image_outcomes[0]
     assert {OUTCOMES[code] for code in nothing.code} == {"not seen"}
-    seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).image_outcomes[0]
+    seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), ONE).image_outcomes[0]
     assert list(seen.intervals()) == [(0.0, 3 * TICK_NS / 1e9, "used")]
     np.testing.assert_array_equal(seen.time_s, [k * TICK_NS / 1e9 for k in range(4)])
 
@@ -313,7 +314,7 @@ def test_intervals_end_at_changes_and_gaps() -> None:
 
 def test_forces_over_several_ticks_are_means(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8)
-    one, three = (load_traces(log, [0], every).inputs[0] for every in (1, 3))
+    one, three = (load_traces(log, ONE, every).inputs[0] for every in (1, 3))
     np.testing.assert_array_equal(three.edges_s, one.edges_s[::3])
     np.testing.assert_allclose(
         three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12
@@ -322,7 +323,7 @@ def test_forces_over_several_ticks_are_means(tmp_path: Path) -> None:
 
 def test_thruster_figure_shows_duty_cycles(tmp_path: Path) -> None:
     flight = load_flight(made_log(tmp_path / "a.mcap", 5))
-    traces = load_traces(tmp_path / "a.mcap", [0])
+    traces = load_traces(tmp_path / "a.mcap", ONE)
     with pytest.raises(MissingData, match="no thrusters"):
         thrusters(flight, traces)
     duty = np.linspace(0.0, 1.0, 24).reshape(2, 12)
@@ -352,7 +353,7 @@ def test_docking_figure_draws_the_limits_of_each_moment(tmp_path: Path) -> None:
     limits = flight.scenario.docking
     expected = [(5.0, 10.0, limits.corridor.closing_m_s), (10.0, 15.0, limits.final.closing_m_s)]
     assert speed_limits(flight, 0) == expected
-    figure = docking(flight, load_traces(tmp_path / "a.mcap", [0]))
+    figure = docking(flight, load_traces(tmp_path / "a.mcap", ONE))
     # The distance at which chasers without a port hold does not apply to this one.
     assert not [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
 
@@ -363,7 +364,7 @@ def test_docking_figure_draws_the_docking_distance_of_chasers_without_a_port(
     flight = with_references(
         tmp_path / "a.mcap", "four-chaser-docking", [(0.0, "hold"), (5.0, "approach")]
     )
-    figure = docking(flight, load_traces(tmp_path / "a.mcap", [0]))
+    figure = docking(flight, load_traces(tmp_path / "a.mcap", ONE))
     assert [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
     ((begin_s, _, limit),) = speed_limits(flight, 0)
     assert (begin_s, limit) == (5.0, flight.scenario.approach.max_speed_m_s)

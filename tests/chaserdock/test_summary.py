@@ -16,6 +16,7 @@ import pytest
 from chaserdock_protocol.errors import WriteError
 from chaserdock_protocol.recording.log import logged_scenario
 from harness import ROOT
+from motion_cases import table_of
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summarize, summary_of
@@ -27,7 +28,13 @@ GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 RUN_ONLY = {"peak_memory_bytes", "cpu_s", "run_failure"}
 DETUMBLING_ONLY = {"stack"}
 PLUMES_ONLY = {"plumes"}
-IN_SOME_FLIGHTS = {"capture", "passive_safety", "rendezvous"}
+IN_SOME_FLIGHTS = {
+    "capture",
+    "passive_safety",
+    "rendezvous",
+    "estimated_tracking",
+    "sightings",
+}
 """Fields of a chaser."""
 
 
@@ -76,8 +83,8 @@ def test_estimate_is_judged_relative_to_each_chaser() -> None:
         "chaser 0: largest position error of its estimated pose relative to the target"
     )
 
-    drifted = {"target": replace(flight.estimate, position_m=flight.estimate.position_m + 0.02)}
-    common = summary_of(replace(flight, scenario=scenario, estimates=drifted))  # type: ignore[arg-type]
+    drifted = replace(flight.estimate, position_m=flight.estimate.position_m + 0.02)
+    common = summary_of(replace(flight, scenario=scenario, estimated=table_of(drifted)))
     assert common["target_estimate"]["position_rms_m"] > 0.03
     assert not [f for f in common["failures"] if "error" in f]
 

@@ -30,7 +30,7 @@ def fly(
 
 
 def truth_of(flight: RecordedFlight) -> list[bytes]:
-    return [flight.truth[name].position_m.tobytes() for name in sorted(flight.truth)]
+    return [flight.motion[name].position_m.tobytes() for name in sorted(flight.motion)]
 
 
 MANY = (

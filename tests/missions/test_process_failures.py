@@ -212,7 +212,7 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
     finally:
         by_hand.end()
     flight = load_flight(log)
-    assert len(flight.truth["target"].time_s) == 30 * 15 + 1
+    assert len(flight.motion["target"].time_s) == 30 * 15 + 1
     assert {r.command: r.accepted for r in flight.replies} == {"approach": True, "retreat": False}
     reasons = {name.rpartition(":")[2] for name in flight.rejected}
     assert {
@@ -278,7 +278,7 @@ def test_flight_continues_after_process_is_killed(
     if victim == ("controller",):
         assert not ticks[-1].controllers
         # A holding chaser moves with the target's velocity.
-        apart = flight.truth["chaser/0"].velocity_m_s - flight.truth["target"].velocity_m_s
+        apart = flight.motion["chaser/0"].velocity_m_s - flight.motion["target"].velocity_m_s
         speed = [float((v @ v) ** 0.5) for v in apart]
         assert speed[-1] < 0.2 * max(speed)
         states = [

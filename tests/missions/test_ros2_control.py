@@ -86,7 +86,7 @@ def test_node_of_ros_flies_a_chaser_to_a_point(tmp_path: Path) -> None:
     finally:
         ZenohSession.get_instance("127.0.0.1", ros_port).close()
         hand.end()
-    truth = load_flight(flown / "mission.mcap").truth["chaser/0"]
+    truth = load_flight(flown / "mission.mcap").motion["chaser/0"]
     assert len(start) > 100
     moved = truth.position_m[-1] - truth.position_m[0]
     assert np.linalg.norm(moved - [0.2, 0.0, 0.0]) < 0.02

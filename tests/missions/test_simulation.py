@@ -134,8 +134,8 @@ def test_chasers_fly_both_controllers_in_the_tick_in_which_the_commander_dies(
     assert {m.term for m in commands if m.tick > dies_at} == {2}
     assert {m.term for m in commands if m.tick < dies_at} == {1}
     apart_m = max(
-        np.linalg.norm(track.position_m - flown["disturbed"].truth[body].position_m, axis=1).max()
-        for body, track in flown["undisturbed"].truth.items()
+        np.linalg.norm(track.position_m - flown["disturbed"].motion[body].position_m, axis=1).max()
+        for body, track in flown["undisturbed"].motion.items()
     )
     assert apart_m == 0.0
 
@@ -180,7 +180,7 @@ def test_four_chasers_dock_along_the_same_paths_on_another_simd_level(tmp_path: 
     for name, env in (("native", {}), ("other", OTHER_SIMD)):
         simulate_elsewhere(tmp_path / name, env=env)
     native, other = (
-        load_flight(tmp_path / name / "mission.mcap").truth for name in ("native", "other")
+        load_flight(tmp_path / name / "mission.mcap").motion for name in ("native", "other")
     )
     separations_m = [
         np.linalg.norm(native[body].position_m - track.position_m, axis=1).max()

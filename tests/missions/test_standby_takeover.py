@@ -37,7 +37,7 @@ def fly(out: Path, fault: str = "", *overrides: str) -> tuple[int, RecordedFligh
 
 
 def truth_of(flight: RecordedFlight) -> dict[str, Any]:
-    return {name: flight.truth[name].position_m for name in sorted(flight.truth)}
+    return {name: flight.motion[name].position_m for name in sorted(flight.motion)}
 
 
 def check_leases(log: Path) -> None:

@@ -18,7 +18,9 @@ from chaserdock_protocol.recording.log import LogError, read_scenario
 from chaserdock_protocol.recording.scan import log_files, stored_messages
 from chaserdock_protocol.transport import Link, RawSample
 from harness import chaserdock, finished
+from motion_cases import without_truth
 
+from chaserdock.analysis.summary import summarize
 from chaserdock.launch.launcher import free_port
 from chaserdock.logs.info import info_of
 from chaserdock.logs.player import play, stored_samples
@@ -71,6 +73,7 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
         recorder.wait()
     assert by_key(tmp_path / "again") == by_key(GOLDEN)
     assert read_scenario(tmp_path / "again")[0] == read_scenario(GOLDEN)[0]
+    assert read_scenario(tmp_path / "again")[1]["scenario"] == "full"
     info = info_of(tmp_path / "again")
     assert info.whole
     assert (info.viewer > 100) == ("--no-viewer" not in options)
@@ -81,6 +84,39 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
     assert names == (rotated if "--rotate-time" in options else ["mission.mcap"])
     for path in log_files(tmp_path / "again"):  # each stands for itself
         assert read_scenario(path)[1]["run_id"] == read_scenario(GOLDEN)[1]["run_id"]
+
+
+@pytest.mark.slow
+def test_world_that_gives_no_full_scenario_is_recorded_with_that_of_the_flight(
+    tmp_path: Path,
+) -> None:
+    """Played from such a log, the world has no scenario to give: the recorder takes that of its
+    join, says so, and lacks no message."""
+    bodies = ("target", "chaser/0")
+    source = without_truth(GOLDEN, tmp_path / "source.mcap", bodies, flight=True)
+    port = free_port()
+    where = ["-e", f"tcp/127.0.0.1:{port}", "--namespace", "lab"]
+    recorder = chaserdock(
+        "record",
+        *("--out", str(tmp_path / "again"), *where),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    try:
+        arguments = ("--namespace", "lab", "-l", f"tcp/127.0.0.1:{port}")
+        status, said = finished("play", str(source), *arguments)
+        assert status == 0, said
+        words = recorder.communicate(timeout=60)[0].decode()
+        assert recorder.returncode == 0, words
+    finally:
+        recorder.kill()
+        recorder.wait()
+    assert "the world gave no scenario on truth/scenario within 10 s" in words
+    assert "The log holds the flight scenario alone." in words
+    assert by_key(tmp_path / "again") == by_key(source)
+    scenario, run = read_scenario(tmp_path / "again")
+    assert (scenario, run["scenario"]) == (read_scenario(source)[0], "flight")
+    assert summarize(tmp_path / "again")["judged_against"].startswith("motion capture 'optitrack'")
 
 
 def test_play_without_a_recorder_is_refused(tmp_path: Path) -> None:

@@ -119,6 +119,7 @@ def test_every_key_reaches_its_readers_only(mission: Mission) -> None:
         expressions = {key for key, _ in keys_with_owners()} | {
             "**",
             "truth/**",
+            "reference/**",
             "*/body/target",
             "world/*",
         }
@@ -139,7 +140,7 @@ def test_every_key_reaches_its_readers_only(mission: Mission) -> None:
     for name, heard in arrived.items():
         assert heard - own[name] == meant[name] - own[name], name
         if name in (*topics.CONTROLLERS, *(f"chaser/{i}" for i in range(CHASERS))):
-            assert not any(key.startswith("truth") for key in heard), name
+            assert not any(key.startswith(("truth", "reference")) for key in heard), name
 
 
 @pytest.mark.parametrize("query", rights.QUERIES, ids=lambda q: q.key)
@@ -266,8 +267,9 @@ def test_a_chaser_commands_nothing_and_reads_no_truth() -> None:
     chaser = Identity("chaser/1", "chaser")
     assert {key.rpartition("/")[0] for key in rights.writes(chaser)} == {"chaser/1"}
     for who in EVERYONE:
-        truth = [key for key in rights.reads(who) if key == "**" or key.startswith("truth")]
-        assert bool(truth) == (who.role in ("recorder", "analysis", "viewer")), who
+        for branch in ("truth", "reference"):
+            read = [key for key in rights.reads(who) if key == "**" or key.startswith(branch)]
+            assert bool(read) == (who.role in ("recorder", "analysis", "viewer")), who
         assert any(key.endswith("/wrench") for key in rights.writes(who)) == (
             who.role == "controller"
         )

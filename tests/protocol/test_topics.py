@@ -112,6 +112,16 @@ def test_a_key_with_a_place_needs_one_and_one_without_takes_none() -> None:
             topic.key_of(None if "{" in topic.key else 0)
 
 
+def test_flight_roles_may_not_read_what_another_system_measures_of_the_bodies() -> None:
+    topic = topics.BODY_REFERENCE
+    assert topic.key_of("chaser/0") == "reference/body/chaser/0"
+    assert topic.writer == "world"
+    assert [r for r in ROLES if topics.may_read(r, topic)] == ["recorder", "analysis", "viewer"]
+    assert [t for t in TOPICS if t.kind is m.BodyReference] == [topic]
+    # A message on its branch counts only if it comes from the session of the mission's world.
+    assert any(topic.key.startswith(branch) for branch in topics.WORLD_BRANCHES)
+
+
 def test_flight_roles_may_not_read_the_truth() -> None:
     truths = [t for t in TOPICS if t.key.startswith("truth")]
     assert {t.key for t in truths} == {
@@ -145,7 +155,8 @@ def test_everyone_writes_on_their_own_branch_only() -> None:
             assert all(topics.may_write(r, topic) for r in ROLES)
         else:
             first = topic.key.partition("/")[0]
-            assert first == topic.writer or (first, topic.writer) == ("truth", "world")
+            owner = "world" if first in ("truth", "reference") else first
+            assert owner == topic.writer
             assert [r for r in ROLES if topics.may_write(r, topic)] == [topic.writer]
 
 

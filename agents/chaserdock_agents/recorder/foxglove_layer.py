@@ -4,8 +4,9 @@ and Lichtblick.
 
 Channels (all under ``/viewer/``); times are simulated:
 
-- ``tf``: true frames ``target`` and ``chaser/N`` in ``world`` (WRF), ``chaser/N/camera`` (IRF) on
-  each chaser, and ``target/estimate``, the fused estimate while available
+- ``tf``: true (or measured) frames ``target`` and ``chaser/N`` in ``world`` (WRF),
+  ``chaser/N/camera`` (IRF) on each chaser, and ``target/estimate``, the fused estimate while
+  available
 - ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: image, camera, used corners
 - ``chaser/N/measurement`` (in the camera's frame), ``chaser/N/reference``, ``target/estimate`` (in
   WRF): poses
@@ -30,6 +31,7 @@ from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box, cuboid_corners
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
+    BodyReference,
     BodyTruth,
     Event,
     Image,
@@ -49,6 +51,7 @@ SHOWN = frozenset(
     {
         topics.IMAGE,
         topics.TRUTH_BODY,
+        topics.BODY_REFERENCE,
         topics.SIGHTING,
         topics.TARGET,
         topics.REFERENCE,
@@ -163,7 +166,7 @@ class ViewerLayer:
                     timestamp=stamp, frame_id=frame, **self._calibration
                 )
                 yield f"chaser/{message.chaser}/calibration", calibration
-            case BodyTruth():
+            case BodyTruth() | BodyReference():
                 yield "tf", _frame(stamp, "world", message.body, message.position_m, message.q_wxyz)
             case TargetEstimate() if message.status in ("tracking", "predicting"):
                 where = (message.position_m, message.q_wxyz)

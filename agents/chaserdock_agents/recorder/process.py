@@ -28,6 +28,7 @@ from chaserdock_protocol.messages import (
     Tick,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
+from chaserdock_protocol.recording.log import FLIGHT_SCENARIO, FULL_SCENARIO
 from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
@@ -35,6 +36,7 @@ from chaserdock_protocol.transport import Node, RawSample
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from chaserdock_protocol.transport.session import (
     Heartbeat,
+    NoFullScenario,
     create_health,
     request_scenario,
     run_member,
@@ -86,28 +88,42 @@ def record(
 ) -> int:
     """Record until the mission has ended and all published messages are in the file; return the
     exit status.
+
+    A world that gives no full scenario, such as one of a laboratory, is recorded with the flight
+    scenario that it gives to every process.
     """
-    full = request_scenario(node, mission, stop)
-    if full is None:
-        return 1
     scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
+    faults = create_fault_layer(
+        process_faults_from_json(mission.faults),
+        node.name,
+        scenario.timing,
+        mission.mode == "lockstep",
+        node.host,
+    )
+    node.message_filter = faults
+    recorder = Recorder(node, faults)
+    recorder.subscribe()  # such a world need not wait until the recorder is ready
+    text, kind = mission.scenario_json, FLIGHT_SCENARIO
+    try:
+        full = request_scenario(node, mission, stop)
+        if full is None:
+            return 1
+        text, kind = full, FULL_SCENARIO
+    except NoFullScenario as reason:
+        print_status("recorder", f"{reason} The log holds the flight scenario alone.")
     out = options.out / run_name(mission) if options.by_run else options.out
     recording = Recording(
         out,
         mission,
-        full,
+        text,
+        kind,
         options.rotation,
         scenario if options.viewer_layer else None,
         node.host.now_s,
         options.compressed_log,
     )
     try:
-        injected = process_faults_from_json(mission.faults)
-        lockstep = mission.mode == "lockstep"
-        faults = create_fault_layer(injected, node.name, scenario.timing, lockstep, node.host)
-        node.message_filter = faults
-        recorder = Recorder(node, recording, faults)
-        recorder.open(instance, options.stall_s)
+        recorder.open(recording, instance, options.stall_s)
         if mission.mode == "realtime":
             # Flight processes have priority; received messages wait in the queue.
             node.host.lower_priority()
@@ -136,8 +152,8 @@ class Recorder:
     """Record messages, and count those that the other processes report to have published."""
 
     node: Node
-    recording: Recording
     faults: FaultLayer | None
+    recording: Recording = field(init=False)
     ended_s: float | None = None
     _received: dict[str, int] = field(default_factory=dict)
     _published: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -149,12 +165,17 @@ class Recorder:
 
     def __post_init__(self) -> None:
         self._queue: BoundedQueue[RawSample] = self.node.host.new_queue()
-        self._decoded = _READ | SHOWN if self.recording.shows else _READ
+        self._decoded = _READ
 
-    def open(self, instance: str, stall_s: float) -> None:
-        """Subscribe to all topics, then start the heartbeat."""
+    def subscribe(self) -> None:
+        """Subscribe to all topics: messages wait until there is a recording."""
         self.node.advertise(topics.ACK)
         self.node.subscribe_raw("**", self._enqueue)
+
+    def open(self, recording: Recording, instance: str, stall_s: float) -> None:
+        """Start the heartbeat, and write to ``recording`` from now on."""
+        self.recording = recording
+        self._decoded = _READ | SHOWN if recording.shows else _READ
         self.heartbeat = Heartbeat(self.node, instance, stall_s)
 
     def _enqueue(self, raw: RawSample) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from chaserdock_protocol.messages import JoinReply
 from chaserdock_protocol.process import Rotation
-from chaserdock_protocol.recording.log import LogError, LogWriter
+from chaserdock_protocol.recording.log import SCENARIO_KIND, LogError, LogWriter
 from chaserdock_protocol.recording.scan import LOG_NAME, part_name
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import RawSample
@@ -21,15 +21,17 @@ from .foxglove_layer import ViewerLayer
 class Recording:
     """Write a mission's log to ``folder``, which is created.
 
-    Every file is self-contained and holds the full scenario. Without ``scenario`` there is no
-    viewer layer. Raises LogError if a file cannot be created or written.
+    Every file is self-contained and holds the scenario ``scenario_json``; ``kind``: full, or that
+    of flight software. Without ``scenario`` there is no viewer layer. Raises LogError if a file
+    cannot be created or written.
     """
 
     def __init__(
         self,
         folder: Path,
         mission: JoinReply,
-        full_scenario_json: str,
+        scenario_json: str,
+        kind: str,
         rotation: Rotation,
         scenario: FlightScenario | None,
         now_s: Callable[[], float] = time.monotonic,
@@ -42,7 +44,7 @@ class Recording:
             rotation,
             scenario,
         )
-        self._full_scenario_json = full_scenario_json
+        self._scenario_json, self._kind = scenario_json, kind
         self._rotates = rotation.wanted
         self._now_s, self._part = now_s, 0
         self._from_ns: int | None = None
@@ -65,12 +67,16 @@ class Recording:
         return self._writer.path
 
     def _open(self) -> None:
-        run = {"run_id": self._mission.run_id, "mode": self._mission.mode}
+        run = {
+            "run_id": self._mission.run_id,
+            "mode": self._mission.mode,
+            SCENARIO_KIND: self._kind,
+        }
         name = LOG_NAME
         if self._rotates:
             name, run["part"] = part_name(self._part), str(self._part)
         self._writer = LogWriter(self._folder / name, self._now_s, self._compressed)
-        self._writer.describe(self._full_scenario_json, run)
+        self._writer.describe(self._scenario_json, run)
         self._viewer = (
             ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
         )

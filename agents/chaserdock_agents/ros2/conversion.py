@@ -228,6 +228,17 @@ def body_odometry(message: m.BodyTruth) -> ros.nav_msgs__msg__Odometry:
     return _odometry(message.sim_time_ns, frame, message, np.zeros(36), np.zeros(36))
 
 
+def measured_pose(message: m.BodyReference) -> ros.geometry_msgs__msg__PoseWithCovarianceStamped:
+    """Return a measured pose with its covariance."""
+    variances = [message.sigma_m**2] * 3 + [message.sigma_rad**2] * 3
+    pose = ros.geometry_msgs__msg__PoseWithCovariance(
+        _pose(message.position_m, message.q_wxyz), np.diag(variances).ravel()
+    )
+    return ros.geometry_msgs__msg__PoseWithCovarianceStamped(
+        _header(message.sim_time_ns, WORLD), pose
+    )
+
+
 def target_odometry(message: m.TargetEstimate) -> ros.nav_msgs__msg__Odometry:
     """Return the estimated pose and twist of the target with their covariances."""
     to_world = rotations.to_matrix(message.q_wxyz)
@@ -427,6 +438,9 @@ class Converter:
             m.WrenchCommand: lambda x: [(f"/{chaser_frame(x.chaser)}/wrench", wrench(x))],
             m.Plan: self._plan,
             m.Reference: lambda x: [(f"/{chaser_frame(x.chaser)}/reference", reference(x))],
+            m.BodyReference: lambda x: [
+                (f"/reference/{x.body.replace('/', '_')}", measured_pose(x))
+            ],
             m.BodyTruth: lambda x: [(f"/truth/{x.body.replace('/', '_')}", body_odometry(x))],
         }
 

@@ -49,6 +49,11 @@ _FLUSH_S = 0.5
 """Longest time (wall or simulated, s) between writes to disk: a killed recorder loses less than a
 second (tests/protocol/test_record_again.py)."""
 SCENARIO_ATTACHMENT = "scenario.json"
+SCENARIO_KIND = "scenario"
+FULL_SCENARIO, FLIGHT_SCENARIO = "full", "flight"
+"""Key and values of a log's run data that say which scenario it holds: the full one (also without
+the key), or only what flight software receives, of a world that gives no other.
+"""
 LOCK_ATTACHMENT = "uv.lock.gz"
 VERSIONS_ATTACHMENT = "versions.json"
 _PACKAGES = (

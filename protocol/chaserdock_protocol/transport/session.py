@@ -54,6 +54,10 @@ class JoinRefused(ChaserdockError):
     """The world rejects this process. The text gives the reason."""
 
 
+class NoFullScenario(JoinRefused):
+    """The world gives no full scenario, or not to this process."""
+
+
 def join(
     node: Node, instance: str, stopped: Callable[[], bool], patience_s: float | None = None
 ) -> JoinReply | None:
@@ -86,7 +90,7 @@ def request_scenario(
     """Return the JSON of the mission's full scenario, which flight processes may not have. Return
     None if ``stopped``.
 
-    Raises JoinRefused when the world gives none within ``patience_s`` of wall time.
+    Raises NoFullScenario when the world gives none within ``patience_s`` of wall time.
     """
     begun = node.host.now_s()
     while not stopped():
@@ -96,7 +100,7 @@ def request_scenario(
         if reply is not None and reply.run_id == mission.run_id:
             return reply.scenario_json
         if node.host.now_s() - begun > patience_s:
-            raise JoinRefused(
+            raise NoFullScenario(
                 f"the world gave no scenario on {topics.SCENARIO_KEY} within {patience_s:.0f} s; "
                 f"may {node.name} read it?"
             )

@@ -52,9 +52,13 @@ class _Device:
     def close(self) -> None: ...
 
 
+@dataclass
 class _MotionCapture(_Device):
+    from_copy: bool = False
+
     def poll(self) -> list[PoseSample]:
-        now_ns, captured = self.host.now_ns(), self.lab.captured
+        now_ns = self.host.now_ns()
+        captured = self.lab.copied if self.from_copy else self.lab.captured
         self.lab.advance(now_ns)
         found = []
         while captured and captured[0][0] <= now_ns:
@@ -115,6 +119,8 @@ def install(monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
         kind = next(k for k, g in devices.GROUPS.items() if g == group)
 
         def opened(rest: str, options: Mapping[str, Any], host: DeviceHost) -> _Device:
+            if rest == "reference":
+                return _MotionCapture(lab, host, from_copy=True)
             return kinds[kind](lab, host, int(rest or 0))
 
         return [_Entry("virtual", opened)] if kind in kinds else []
@@ -179,6 +185,21 @@ address = "virtual:0"
 [[lab.robot]]
 chaser = 1
 address = "virtual:1"
+[[lab.reference]]
+body = "target"
+address = "virtual:reference"
+name = "target"
+latency_s = 0.004
+[[lab.reference]]
+body = "chaser/0"
+address = "virtual:reference"
+name = "robot0"
+latency_s = 0.004
+[[lab.reference]]
+body = "chaser/1"
+address = "virtual:reference"
+name = "robot1"
+latency_s = 0.004
 [[lab.camera]]
 chaser = 0
 address = "virtual:0"

@@ -114,7 +114,9 @@ class Laboratory:
         self.wrench = {i: (np.zeros(3), np.zeros(3)) for i in chasers}
         self.now_ns = 0
         self.begun_ns: int | None = None
-        self.captured: deque[tuple[int, Capture]] = deque()
+        # For two listeners, the second of which may be absent.
+        self.captured: deque[tuple[int, Capture]] = deque(maxlen=1000)
+        self.copied: deque[tuple[int, Capture]] = deque(maxlen=1000)
         self.exposed: dict[int, deque[tuple[int, Exposure]]] = {i: deque() for i in chasers}
         self.history: list[tuple[int, dict[str, tuple[np.ndarray, Rotation]]]] = []
         self.closest_m = math.inf
@@ -215,7 +217,8 @@ class Laboratory:
                 place = place + np.array([0.4, -0.3, 0.2])
             rotation = body.rotation * Rotation.from_rotvec(noise[1])
             capture = Capture(name, stamp_ns, place, wxyz(rotation))
-            self.captured.append((self.now_ns + delay_ns, capture))
+            for listener in (self.captured, self.copied):
+                listener.append((self.now_ns + delay_ns, capture))
 
     def _expose(self, i: int) -> None:
         lost = self.has("frames lost", i) and self.rng.uniform() < 0.7

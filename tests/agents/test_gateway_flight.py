@@ -11,6 +11,8 @@ import pytest
 from chaserdock_protocol.process import ProcessOptions
 from virtual_lab import SCENARIO, SENT, Fault, fly, tracking_errors_m, two_free_flyers
 
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summary_of
 from chaserdock.simulation.mission import SimulatedFlight
 
 
@@ -40,6 +42,10 @@ def test_free_flyers_track_the_target(
         assert np.sqrt(np.mean(errors**2)) < 1e-3
     assert "disarmed" not in flight.output
     assert "no odometry" not in flight.output
+    judged = summary_of(load_flight(flight.folder / "mission.mcap"))
+    assert judged["success"] is True
+    for chaser in judged["chasers"].values():
+        assert chaser["steady"]["position_mse_m2"] < 2e-3**2
 
 
 def test_nothing_moves_unless_it_is_armed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,14 +9,18 @@ own times. Commands reach the robots when they take effect, if the gateway is ar
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import cv2
+import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import (
     ArmingCommand,
     ArmingReply,
+    BodyReference,
     DockingStatus,
     Kill,
     Latch,
@@ -32,7 +36,9 @@ from chaserdock_protocol.transport import Node
 
 from .actuation import RobotActuation
 from .arming import ArmingRequests, listen_to_keys
+from .axes import BodyPose
 from .devices import DeviceError, DeviceHost, ImageArray
+from .feeds import PoseFeed
 from .images import image_message
 from .lab import Laboratory
 from .odometry import BodyState
@@ -40,6 +46,8 @@ from .safety import SafetyGate
 
 _POLL_S = 0.002
 """Interval, s, at which devices are read and commands sent: the latency that the gateway adds."""
+_LONGEST_SOURCE = 200
+"""Characters of a device's address that a message repeats."""
 _POSE_PATIENCE_S = 10.0
 """Wait, s, for the first odometry of all robots: devices were opened long before."""
 _SETTLING_NS = 200_000_000
@@ -97,6 +105,8 @@ class Gateway:
             node.advertise(topics.IMAGE, i)
             if i in laboratory.latches:
                 node.advertise(topics.DOCKING, i)
+        for reference in scenario.lab.reference:
+            node.advertise(topics.BODY_REFERENCE, reference.body)
         node.subscribe(topics.KILL)
         node.declare_queryable(topics.ARMING_KEY, ArmingCommand, self._requests.submit)
         commands = CommandIntake(
@@ -184,10 +194,29 @@ class Gateway:
             self._lab.read_odometry()
             for chaser, image, time_ns in self._lab.read_images():
                 self._publish_image(chaser, image, time_ns)
-            for _ in self._lab.read_references():
-                pass
+            for feed, pose in self._lab.read_references():
+                self._publish_reference(feed, pose)
         except DeviceError as error:
             self._trip(str(error))
+
+    def _publish_reference(self, feed: PoseFeed, pose: BodyPose) -> None:
+        measured_ns = pose.time_ns - self._start_ns
+        if measured_ns < 0:
+            return
+        body = feed.device.body
+        message = BodyReference(
+            tick=measured_ns * self._timing.rate_hz // 1_000_000_000,
+            sim_time_ns=measured_ns,
+            body=body,
+            source=feed.device.address[:_LONGEST_SOURCE],
+            position_m=vector(pose.position_m),
+            q_wxyz=vector(pose.q_wxyz),
+            sigma_m=_sigma(pose.position_covariance_m2),
+            sigma_rad=_sigma(pose.attitude_covariance_rad2),
+            velocity_m_s=None if pose.velocity_m_s is None else vector(pose.velocity_m_s),
+            omega_rad_s=None if pose.omega_rad_s is None else vector(pose.omega_rad_s),
+        )
+        self._node.publish(topics.BODY_REFERENCE, message, body)
 
     def _publish_image(self, chaser: int, image: ImageArray, time_ns: int) -> None:
         exposed_ns = time_ns - self._start_ns
@@ -293,6 +322,11 @@ class Gateway:
                 self._requests.add("kill", by or "the topic operator/kill")
             case Presence():
                 self._trip("another world or gateway runs in this namespace")
+
+
+def _sigma(covariance: Array) -> float:
+    """Return the standard deviation along an axis, averaged over the axes."""
+    return math.sqrt(float(np.trace(covariance)) / 3.0)
 
 
 def odometry_of(state: BodyState, chaser: int, tick: int, time_ns: int) -> Odometry:

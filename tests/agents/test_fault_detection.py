@@ -118,6 +118,11 @@ class Case:
             mismatch,
         )
 
+    def pulses(self, in_minima: dict[int, float]) -> Array:
+        """Impulses of thrusters from those in minimum pulses."""
+        shares = [in_minima.get(j, 0.0) for j in range(len(self.least))]
+        return self.least * shares
+
     def random(self, share: float = 0.25) -> Array:
         """Impulses of thrusters, some of which fire."""
         fires = self.rng.uniform(size=len(self.full)) < share
@@ -170,6 +175,21 @@ def test_a_lost_thruster_is_found_after_some_pulses(
     assert verdict is not None
     assert (verdict.thruster, verdict.kind) == (thruster, kind)
     assert verdict.factor == pytest.approx(left, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_thruster_that_worked_until_now_is_stuck_off_and_not_weak(seed: int) -> None:
+    """Together with pulses of before, a lost one looks like a part of the thrust."""
+    case = Case("tetra12", seed)
+    # In minimum pulses, as they fire while a chaser tracks the target.
+    firing = [{0: 1.0, 4: 1.5, 8: 1.2, 9: 1.0}, {8: 1.0}, {1: 1.1, 5: 1.2, 7: 1.0, 8: 1.0, 9: 1.0}]
+    for pulses in firing:
+        asked = case.pulses(pulses)
+        assert case.step(asked, asked) is None
+    verdict = case.step(case.pulses({8: 1.0, 9: 1.0}), case.pulses({9: 1.0}))
+    assert verdict is None
+    verdict = case.step(case.pulses({2: 1.0, 8: 1.0}), case.pulses({2: 1.0}))
+    assert verdict == ThrusterFault(8, "stuck_off", 0.0)
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,9 @@ class DetectionParameters:
     # thrust goes on being used. Stuck off needs the gain only: equal test burns of `slider`
     # never tell a loss to less than 0.12: mass, inertia and the other thrusts are uncertain.
     loss_sigma: float = 0.07
+    # Sigmas within which the latest tick agrees with the loss of a weak thruster. A window that
+    # begins before a complete loss shows a part of it on average.
+    latest_sigmas: float = 3.0
 
 
 _TEST = DetectionParameters()
@@ -205,9 +208,8 @@ class ThrusterFaultDetector:
                 )
                 gain = np.where(possible, loss * along - loss**2 * squared / 2.0, -math.inf)
                 stuck_off = loss[thruster] > _TEST.stuck_off_loss
-                known = stuck_off or squared[thruster] * _TEST.loss_sigma**2 >= 1.0
                 if (
-                    not known
+                    not (stuck_off or self._is_weak(thruster, loss[thruster], squared[thruster]))
                     or loss[thruster] < _TEST.weak_loss
                     or int(np.argmax(gain)) != thruster
                 ):
@@ -221,6 +223,13 @@ class ThrusterFaultDetector:
                         0.0 if stuck_off else float(1.0 - loss[thruster]),
                     )
         return None
+
+    def _is_weak(self, thruster: int, loss: float, squared: float) -> bool:
+        """Return whether a loss is known well enough, and the latest tick agrees with it."""
+        _, along, latest = self._off_evidence.marginal(self._off[thruster][-1])
+        off = along[thruster] - loss * latest[thruster]
+        agrees = off**2 < _TEST.latest_sigmas**2 * latest[thruster]
+        return bool(squared * _TEST.loss_sigma**2 >= 1.0 and agrees)
 
 
 def _energetic(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:

@@ -184,42 +184,45 @@ def _isolated_s(record: FlightRecord, thruster: int) -> float:
     return times[0] if times else math.inf
 
 
-def failures(options: Options) -> Figures:
-    """Let every thruster fail at 30 s, not reported: time to isolation, wrongly isolated thrusters,
-    errors afterwards.
+def stuck_on(options: Options) -> Figures:
+    """Let every thruster stick open at 30 s, not reported: time to isolation, wrongly isolated
+    thrusters, errors afterwards.
     """
-    out: Figures = {}
-    thrusters = (0, 5) if options.quick else range(12)
-    for kind in ("stuck_on", "stuck_off"):
-        delays, wrong, peaks, final = [], 0, [], []
-        for thruster in thrusters:
-            failure = {"chaser": 0, "thruster": thruster, "at_s": FAILED_AT_S, "kind": kind}
-            record = fly(
-                scenario(80.0 if kind == "stuck_off" else 60.0, thruster_failure=[failure])
-            )
-            delays.append(_isolated_s(record, thruster))
-            wrong += len({j for c in record.commands_of(0) for j in c.isolated} - {thruster})
-            late = record.time_s >= FAILED_AT_S
-            errors = record.position_error_m[late, 0], record.orientation_error_rad[late, 0]
-            peaks.append((float(errors[0].max()), float(errors[1].max())))
-            final.append(record.rms(record.time_s[-1] - 10.0)[0])
-            print(
-                f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, "
-                f"peak {peaks[-1][0] * 1e3:.1f} mm, "
-                f"{math.degrees(peaks[-1][1]):.2f} deg; {record.thruster_events}",
-                file=sys.stderr,
-            )
-        out |= {
-            f"failures_{kind}_flights": float(len(delays)),
-            f"failures_{kind}_isolated": float(np.isfinite(delays).sum()),
-            f"failures_{kind}_wrong_thrusters": float(wrong),
-            f"failures_{kind}_time_to_isolation_median_s": float(np.median(delays)),
-            f"failures_{kind}_time_to_isolation_max_s": float(max(delays)),
-            f"failures_{kind}_peak_position_error_max_m": float(max(p for p, _ in peaks)),
-            f"failures_{kind}_peak_orientation_error_max_rad": max(a for _, a in peaks),
-            f"failures_{kind}_final_position_rms_max_m": float(max(final)),
-        }
-    return out
+    return _failures(options, "stuck_on", 60.0)
+
+
+def stuck_off(options: Options) -> Figures:
+    """Let every thruster be lost at 30 s, not reported: the same."""
+    return _failures(options, "stuck_off", 80.0)
+
+
+def _failures(options: Options, kind: str, duration_s: float) -> Figures:
+    delays, wrong, peaks, final = [], 0, [], []
+    for thruster in (0, 5) if options.quick else range(12):
+        failure = {"chaser": 0, "thruster": thruster, "at_s": FAILED_AT_S, "kind": kind}
+        record = fly(scenario(duration_s, thruster_failure=[failure]))
+        delays.append(_isolated_s(record, thruster))
+        wrong += len({j for c in record.commands_of(0) for j in c.isolated} - {thruster})
+        late = record.time_s >= FAILED_AT_S
+        errors = record.position_error_m[late, 0], record.orientation_error_rad[late, 0]
+        peaks.append((float(errors[0].max()), float(errors[1].max())))
+        final.append(record.rms(record.time_s[-1] - 10.0)[0])
+        print(
+            f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, "
+            f"peak {peaks[-1][0] * 1e3:.1f} mm, "
+            f"{math.degrees(peaks[-1][1]):.2f} deg; {record.thruster_events}",
+            file=sys.stderr,
+        )
+    return {
+        f"failures_{kind}_flights": float(len(delays)),
+        f"failures_{kind}_isolated": float(np.isfinite(delays).sum()),
+        f"failures_{kind}_wrong_thrusters": float(wrong),
+        f"failures_{kind}_time_to_isolation_median_s": float(np.median(delays)),
+        f"failures_{kind}_time_to_isolation_max_s": float(max(delays)),
+        f"failures_{kind}_peak_position_error_max_m": float(max(p for p, _ in peaks)),
+        f"failures_{kind}_peak_orientation_error_max_rad": max(a for _, a in peaks),
+        f"failures_{kind}_final_position_rms_max_m": float(max(final)),
+    }
 
 
 def healthy(options: Options) -> Figures:
@@ -261,7 +264,8 @@ GROUP = Group(
         "thrusters-allocation": allocation,
         "thrusters-pulses": pulses,
         "thrusters-tracking": tracking,
-        "thrusters-failures": failures,
+        "thrusters-stuck-on": stuck_on,
+        "thrusters-stuck-off": stuck_off,
         "thrusters-healthy": healthy,
     }
 )

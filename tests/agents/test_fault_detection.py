@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from chaserdock_agents.chaser.thrusters.allocation import allocator_of
 from chaserdock_agents.chaser.thrusters.fault_detection import (
     Flags,
     ThrusterFault,
@@ -19,6 +20,7 @@ from chaserdock_agents.chaser.thrusters.impulse_residual import (
     noise_of,
     observed_impulse,
 )
+from chaserdock_agents.chaser.thrusters.self_test import ThrusterSelfTest
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
 from chaserdock_models.wrench_set import wrench_matrix
@@ -65,8 +67,8 @@ class Case:
             wrench_matrix(self.body.thrusters),
             thrusts_max(self.body.thrusters),
         )
-        least = self.full * [t.min_on_s for t in self.body.thrusters]
-        self.watch = ThrusterFaultDetector(self.matrix, self.full, least, 13 + len(self.full))
+        self.least = self.full * [t.min_on_s for t in self.body.thrusters]
+        self.watch = ThrusterFaultDetector(self.matrix, self.full, self.least, 13 + len(self.full))
         self.rng = np.random.default_rng(seed)
         self.state = start(seed)
         self.state[3:6] *= 0.05
@@ -115,6 +117,11 @@ class Case:
             everyone if suspects is None else suspects,
             mismatch,
         )
+
+    def pulses(self, in_minima: dict[int, float]) -> Array:
+        """Impulses of thrusters from those in minimum pulses."""
+        shares = [in_minima.get(j, 0.0) for j in range(len(self.least))]
+        return self.least * shares
 
     def random(self, share: float = 0.25) -> Array:
         """Impulses of thrusters, some of which fire."""
@@ -168,6 +175,43 @@ def test_a_lost_thruster_is_found_after_some_pulses(
     assert verdict is not None
     assert (verdict.thruster, verdict.kind) == (thruster, kind)
     assert verdict.factor == pytest.approx(left, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_thruster_that_worked_until_now_is_stuck_off_and_not_weak(seed: int) -> None:
+    """Together with pulses of before, a lost one looks like a part of the thrust."""
+    case = Case("tetra12", seed)
+    # In minimum pulses, as they fire while a chaser tracks the target.
+    firing = [{0: 1.0, 4: 1.5, 8: 1.2, 9: 1.0}, {8: 1.0}, {1: 1.1, 5: 1.2, 7: 1.0, 8: 1.0, 9: 1.0}]
+    for pulses in firing:
+        asked = case.pulses(pulses)
+        assert case.step(asked, asked) is None
+    verdict = case.step(case.pulses({8: 1.0, 9: 1.0}), case.pulses({9: 1.0}))
+    assert verdict is None
+    verdict = case.step(case.pulses({2: 1.0, 8: 1.0}), case.pulses({2: 1.0}))
+    assert verdict == ThrusterFault(8, "stuck_off", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("body", "thruster"), [("tetra12", 11), ("tetra12", 4), ("slider", 3), ("slider", 13)]
+)
+def test_two_equal_burns_tell_that_an_idle_thruster_is_stuck_off(body: str, thruster: int) -> None:
+    """A thruster that fires in test burns only fires with the same others, each of whose thrusts
+    may differ.
+    """
+    case = Case(body, thruster)
+    allocator, least = allocator_of(case.body), case.least
+    only = np.arange(len(least)) == thruster
+    burn = ThrusterSelfTest(allocator, least, 1.0, case.watch.ticks_to_tell).schedule(
+        0, only, case.full, 0.0 * case.full, 0.1
+    )
+    assert burn is not None
+    asked = np.where(burn > 0.5 * least, burn, 0.0)
+    assert case.step(asked, np.where(only, 0.0, asked)) is None  # it may be a disturbance
+    assert case.watch.ticks_to_tell(thruster) is None
+    verdict = case.step(asked, np.where(only, 0.0, asked))
+    assert verdict == ThrusterFault(thruster, "stuck_off", 0.0)
+    assert case.watch.ticks_to_tell(thruster) == 2
 
 
 @pytest.mark.slow

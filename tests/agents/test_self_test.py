@@ -11,7 +11,7 @@ import pytest
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.allocation import allocator_of
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_agents.chaser.thrusters.self_test import ThrusterSelfTest
+from chaserdock_agents.chaser.thrusters.self_test import MAX_TEST_PULSES, ThrusterSelfTest
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from flights.measured_poses import measurement_model
@@ -23,8 +23,8 @@ PERIOD_S, S = 0.1, 1_000_000_000
 
 
 class Bench:
-    """The self-test of a body's thrusters without a chaser; the caller adds the information of each
-    burn.
+    """The self-test of a body's thrusters without a chaser. The caller adds the pulses of each burn
+    and may state in ``needed`` of how many ticks the motion tells whether a thruster works.
     """
 
     def __init__(self, body: str = "tetra12", every_s: float = 10.0) -> None:
@@ -32,7 +32,10 @@ class Bench:
         self.full = thrusts_max(chaser.thrusters)
         self.allocator = allocator_of(chaser)
         self.least = self.full * [t.min_on_s for t in chaser.thrusters]
-        self.self_test = ThrusterSelfTest(self.allocator, self.least, every_s, sufficient=200.0)
+        self.needed: int | None = 2
+        self.self_test = ThrusterSelfTest(
+            self.allocator, self.least, every_s, lambda thruster: self.needed
+        )
         self.able = np.ones(len(self.full), dtype=np.bool_)
 
     def burn(
@@ -56,7 +59,7 @@ def test_burns_cancel_reach_every_thruster_and_then_stop(body: str, lost: int | 
         assert lost is None or impulses[lost] == 0.0
         fired = impulses >= 0.5 * bench.least
         assert fired.sum() >= 2  # what cancels it is not too little to fire
-        bench.self_test.add_information(np.where(fired, 150.0, 0.0), now_ns)
+        bench.self_test.add_pulses(fired, now_ns)
         tested = np.union1d(tested, np.flatnonzero(fired))
         now_ns, burns = now_ns + S // 2, burns + 1
         assert burns <= 2 * len(can)
@@ -66,25 +69,32 @@ def test_burns_cancel_reach_every_thruster_and_then_stop(body: str, lost: int | 
     assert bench.burn(now_ns + 11 * S, can) is not None
 
 
-def test_one_test_is_not_sufficient_and_neither_are_noisy_ones() -> None:
+def test_a_thruster_is_tested_until_the_motion_tells_and_again_after_a_while() -> None:
     bench = Bench()
-    assert bench.self_test.untested(0).all()
-    bench.self_test.add_information(np.full(12, 1e6), 0)
-    assert bench.self_test.untested(0).all()
-    bench.self_test.add_information(np.full(12, 1.0), 1)
-    assert not bench.self_test.untested(1).any()
-    noisy = Bench()
-    for k in range(5):
-        noisy.self_test.add_information(np.full(12, 30.0), k)
-    assert noisy.self_test.untested(5).all()
+    bench.needed = None
+    fires = np.arange(12) == 4
+    bench.self_test.add_pulses(fires, S)
+    assert bench.self_test.untested(S).all()
+    bench.needed = 3
+    bench.self_test.add_pulses(fires, 2 * S)
+    assert bench.self_test.untested(2 * S).all()
+    bench.self_test.add_pulses(fires, 4 * S)
+    assert (bench.self_test.untested(4 * S) == ~fires).all()
+    # Known for ten seconds from the first of the three ticks; a reset does not change that.
+    bench.self_test.reset()
+    assert (bench.self_test.untested(11 * S) == ~fires).all()
+    assert bench.self_test.untested(11 * S + 1).all()
 
 
-@pytest.mark.parametrize("every_s", [0.0, 10.0])
-def test_old_results_expire_between_tests(every_s: float) -> None:
-    bench = Bench(every_s=every_s)
-    for k in range(1000):
-        bench.self_test.add_information(np.full(12, 1.0), k * S)
-    assert max(map(len, bench.self_test._observations)) <= every_s + 1
+@pytest.mark.parametrize(("apart_s", "tested"), [(1, True), (2, False)])
+def test_pulses_that_never_tell_are_not_repeated_for_ever(apart_s: int, tested: bool) -> None:
+    bench = Bench()
+    bench.needed = None
+    for k in range(MAX_TEST_PULSES):
+        assert bench.self_test.untested(k * apart_s * S).all()
+        bench.self_test.add_pulses(bench.able, k * apart_s * S)
+    untested = bench.self_test.untested((MAX_TEST_PULSES - 1) * apart_s * S)
+    assert (untested == (not tested)).all()
 
 
 def test_burns_are_apart_and_only_where_there_is_room() -> None:
@@ -133,7 +143,7 @@ def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -
     """
     failure = {"chaser": 0, "thruster": 11, "at_s": 8.0, "kind": "stuck_off"}
     scenario = mission(
-        duration_s=60.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]
+        duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]
     )
     record = record_flight(scenario, measurement_model(scenario, 0))
     reports = [what for _, _, what in record.thruster_events if "limits" not in what]

@@ -51,19 +51,26 @@ class DetectionParameters:
     weak_loss: float = 0.3
     # Relative uncertainty of the failed thruster's thrust.
     own_scatter: float = 0.1
-    # Maximum standard deviation of the loss for a decision.
+    # Maximum standard deviation of the loss with which a thruster counts as weak: a share of the
+    # thrust goes on being used. Stuck off needs the gain only: equal test burns of `slider`
+    # never tell a loss to less than 0.12: mass, inertia and the other thrusts are uncertain.
     loss_sigma: float = 0.07
+    # Sigmas within which the latest tick agrees with the loss of a weak thruster. A window that
+    # begins before a complete loss shows a part of it on average.
+    latest_sigmas: float = 3.0
 
 
 _TEST = DetectionParameters()
+MAX_TICKS = max(_TEST.off_windows)
+"""Latest ticks with pulses of a thruster that are kept."""
 
 _MIN_ENERGY = 1.9 * _TEST.min_gain
 """Energy r'r of whitened residuals below which no hypothesis is accepted. None gains more than half
 of it (Cauchy-Schwarz), and the mismatch only reduces it; 5 % are left for rounding.
 """
 SUFFICIENT_INFORMATION = 2.0 / _TEST.loss_sigma**2
-"""Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known
-to ``loss_sigma``. The factor 2: half of it is lost to the uncertainty of the nominal thrust (5 %).
+"""Inverse variance of a thruster's loss, for a plant as modelled, at which it is known to
+``loss_sigma``. The factor 2: half of it is lost to the uncertainty of the nominal thrust (5 %).
 """
 
 
@@ -118,8 +125,7 @@ class ThrusterFaultDetector:
     """Test the residuals of the last ticks for a fault.
 
     ``matrix`` (6, n): see ``wrench_matrix``. ``differences``: number of constant differences
-    between plant and model. ``information`` (n,): inverse variance of every thruster's loss from
-    the last update, for a plant as modelled.
+    between plant and model. ``fired`` (n,): suspects with a pulse in the last update.
     """
 
     def __init__(
@@ -131,13 +137,13 @@ class ThrusterFaultDetector:
         self._off_evidence = _Evidence(len(full_N) + 1, differences)
         self._on: deque[Array] = deque(maxlen=max(_TEST.on_windows))
         self._off: list[deque[Array]] = []
-        self.information = np.zeros(len(full_N))
+        self.fired: Flags = np.zeros(len(full_N), dtype=np.bool_)
         self.reset()
 
     def reset(self) -> None:
         """Discard the residuals, as a change explains them."""
         self._on.clear()
-        self._off = [deque(maxlen=max(_TEST.off_windows)) for _ in self._full_N]
+        self._off = [deque(maxlen=MAX_TICKS) for _ in self._full_N]
 
     def update(
         self,
@@ -160,7 +166,7 @@ class ThrusterFaultDetector:
         extra = self._full_N * time_s - commanded_N_s
         self._on.append(self._on_evidence.of_tick(white, columns * extra, constant))
         fired = suspects & (commanded_N_s > 0.5 * self._min_pulse_N_s)
-        self.information = np.where(fired, commanded_N_s**2 * (columns**2).sum(axis=0), 0.0)
+        self.fired = fired
         signatures = -columns * commanded_N_s
         signatures = np.column_stack([signatures, signatures.sum(axis=1)])
         lost = self._off_evidence.of_tick(white, signatures, constant)
@@ -170,8 +176,17 @@ class ThrusterFaultDetector:
             np.flatnonzero(fired).tolist(), suspects
         )
 
+    def ticks_to_tell(self, thruster: int) -> int | None:
+        """Return how many of the latest ticks with pulses of a thruster tell whether it is stuck
+        off, as that would gain enough; None if all of them do not.
+        """
+        for length, total in _totals(self._off[thruster], _TEST.off_windows):
+            if self._off_evidence.marginal(total)[2][thruster] / 2.0 > _TEST.min_gain:
+                return length
+        return None
+
     def _detect_stuck_on(self, suspects: Flags) -> ThrusterFault | None:
-        for length, total in _totals(self._on, _TEST.on_windows):
+        for length, total in _energetic(self._on, _TEST.on_windows):
             energy, along, squared = self._on_evidence.marginal(total)
             gain = np.where(suspects, along - squared / 2.0, -math.inf)
             best = int(np.argmax(gain))
@@ -184,7 +199,7 @@ class ThrusterFaultDetector:
     def _detect_loss(self, fired: list[int], suspects: Flags) -> ThrusterFault | None:
         possible = np.append(suspects, True)
         for thruster in fired:
-            for length, total in _totals(self._off[thruster], _TEST.off_windows):
+            for length, total in _energetic(self._off[thruster], _TEST.off_windows):
                 energy, along, squared = self._off_evidence.marginal(total)
                 loss = np.where(
                     squared > 0.0,
@@ -192,9 +207,9 @@ class ThrusterFaultDetector:
                     0.0,
                 )
                 gain = np.where(possible, loss * along - loss**2 * squared / 2.0, -math.inf)
-                known = squared[thruster] * _TEST.loss_sigma**2 >= 1.0
+                stuck_off = loss[thruster] > _TEST.stuck_off_loss
                 if (
-                    not known
+                    not (stuck_off or self._is_weak(thruster, loss[thruster], squared[thruster]))
                     or loss[thruster] < _TEST.weak_loss
                     or int(np.argmax(gain)) != thruster
                 ):
@@ -202,7 +217,6 @@ class ThrusterFaultDetector:
                 if _is_distinct(gain, thruster) and is_consistent(
                     energy, float(2.0 * gain[thruster]), float(squared[thruster]), length
                 ):
-                    stuck_off = loss[thruster] > _TEST.stuck_off_loss
                     return ThrusterFault(
                         thruster,
                         "stuck_off" if stuck_off else "weak",
@@ -210,22 +224,32 @@ class ThrusterFaultDetector:
                     )
         return None
 
+    def _is_weak(self, thruster: int, loss: float, squared: float) -> bool:
+        """Return whether a loss is known well enough, and the latest tick agrees with it."""
+        _, along, latest = self._off_evidence.marginal(self._off[thruster][-1])
+        off = along[thruster] - loss * latest[thruster]
+        agrees = off**2 < _TEST.latest_sigmas**2 * latest[thruster]
+        return bool(squared * _TEST.loss_sigma**2 >= 1.0 and agrees)
 
-def _totals(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
-    """Yield the sums over the last ticks of each window that can hold a fault.
 
-    It must be full and have enough energy.
-    """
+def _energetic(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
+    """Yield the sums over the last ticks of each full window with enough energy for a fault."""
     if sum([float(tick[0]) for tick in ticks]) < _MIN_ENERGY:
         return
-    total, first = np.zeros_like(ticks[-1]), len(ticks)
+    for length, total in _totals(ticks, windows):
+        if total[0] >= _MIN_ENERGY:
+            yield length, total
+
+
+def _totals(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
+    """Yield the sums over the last ticks of each full window."""
+    total, first = 0.0, len(ticks)
     for length in windows:
         if len(ticks) < length:
             return
         total = total + np.sum([ticks[k] for k in range(len(ticks) - length, first)], axis=0)
         first = len(ticks) - length
-        if total[0] >= _MIN_ENERGY:
-            yield length, total
+        yield length, total
 
 
 def _is_distinct(gain: Array, best: int) -> bool:

@@ -20,10 +20,7 @@ from .impulse_residual import (
     observed_impulse,
     quiescent_variance,
 )
-from .self_test import ThrusterSelfTest
-
-_MAX_TEST_PULSES = 10
-"""Most minimum pulses that must prove that a thruster works; it is not tested if it takes more."""
+from .self_test import MAX_TEST_PULSES, ThrusterSelfTest
 
 
 class FaultMonitor:
@@ -45,12 +42,12 @@ class FaultMonitor:
         variance = quiescent_variance(self._noise, body)
         information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
         # A single thruster cannot be tested by pulses below the noise.
-        testable = _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
+        testable = MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
         self._self_test = ThrusterSelfTest(
             allocator,
             min_pulse_N_s,
             body.thruster_test_s if testable else 0.0,
-            SUFFICIENT_INFORMATION,
+            self._detector.ticks_to_tell,
         )
         self._test_allowed = False
         self._free_since_ns: int | None = 0
@@ -67,6 +64,7 @@ class FaultMonitor:
     def reset(self) -> None:
         """Discard the motion so far, as more than the known thrusters caused it."""
         self._detector.reset()
+        self._self_test.reset()
 
     def detect(
         self, before: Odometry, after: Odometry, given_N_s: Array, suspects: Flags
@@ -76,7 +74,7 @@ class FaultMonitor:
         ``given_N_s`` (n,): impulses of healthy thrusters; ``suspects`` (n,): those that may fail.
         """
         if self._free_since_ns is None or before.sim_time_ns < self._free_since_ns:
-            self._detector.reset()
+            self.reset()
             return None
         residual = observed_impulse(before, after, self._body) - self._matrix @ given_N_s
         noise = covariance(self._noise, self._body, self._matrix, given_N_s, before, after)
@@ -86,7 +84,7 @@ class FaultMonitor:
         )
         fault = self._detector.update(residual, noise, given_N_s, time_s, suspects, mismatch)
         if fault is None:
-            self._self_test.add_information(self._detector.information, after.sim_time_ns)
+            self._self_test.add_pulses(self._detector.fired, after.sim_time_ns)
         return fault
 
     def test_pulses(

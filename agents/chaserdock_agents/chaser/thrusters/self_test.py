@@ -9,15 +9,18 @@ thrusters do not change the motion, a failed one does. No I/O; times are simulat
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 from chaserdock_models.arrays import Array
 
 from .allocation import Allocator
-from .fault_detection import Flags
+from .fault_detection import MAX_TICKS, Flags
 
-_MIN_OBSERVATIONS = 2
-"""Observations after which a thruster counts as known: a single one may be a disturbance."""
+MAX_TEST_PULSES = 10
+"""Pulses within the period of a test after which a thruster is not tested again: if they do not
+tell, more of the same do not either.
+"""
 _INTERVAL_NS = 500_000_000
 """Time between two burns, ns, in which the first is executed and evaluated."""
 _MAX_DUTY = 0.9
@@ -25,42 +28,49 @@ _MAX_DUTY = 0.9
 
 
 class ThrusterSelfTest:
-    """Schedule test burns for thrusters with too little information within the last ``every_s``.
+    """Schedule test burns for thrusters of which the last ``every_s`` do not tell whether they
+    work.
 
-    0: no tests. ``sufficient``: information (see ``ThrusterFaultDetector.information``) from which
-    a thruster's loss is known.
+    0: no tests. ``ticks_to_tell``: of how many latest ticks with pulses of a thruster the motion
+    tells whether it works (``ThrusterFaultDetector.ticks_to_tell``).
     """
 
     def __init__(
-        self, allocator: Allocator, min_pulse_N_s: Array, every_s: float, sufficient: float
+        self,
+        allocator: Allocator,
+        min_pulse_N_s: Array,
+        every_s: float,
+        ticks_to_tell: Callable[[int], int | None],
     ) -> None:
         self._allocator, self._min_pulse_N_s = allocator, min_pulse_N_s
         self._every_ns = round(every_s * 1e9)
-        self._sufficient = sufficient
-        self._observations: list[deque[tuple[int, float]]] = [deque() for _ in min_pulse_N_s]
+        self._ticks_to_tell = ticks_to_tell
+        self._fired_ns: list[deque[int]] = []
+        self._known_until_ns = np.full(len(min_pulse_N_s), -1)
+        self._changed = np.zeros(len(min_pulse_N_s), dtype=np.bool_)
         self._last_burn_ns = -_INTERVAL_NS
         self._first = 0
+        self.reset()
 
-    def add_information(self, information: Array, now_ns: int) -> None:
-        """Add the information (n,) about every thruster from the motion up to ``now_ns``."""
-        for thruster in np.flatnonzero(information > 0.0):
-            self._observations[thruster].append((now_ns, float(information[thruster])))
-        self._forget_before(now_ns - self._every_ns)
+    def reset(self) -> None:
+        """Discard the motion so far; what it told about thrusters stays."""
+        self._fired_ns = [deque(maxlen=MAX_TICKS) for _ in self._min_pulse_N_s]
 
-    def _forget_before(self, time_ns: int) -> None:
-        for observations in self._observations:
-            while observations and observations[0][0] < time_ns:
-                observations.popleft()
+    def add_pulses(self, fired: Flags, now_ns: int) -> None:
+        """Add the motion up to ``now_ns``, with pulses of the thrusters ``fired`` (n,)."""
+        self._changed |= fired
+        for thruster in np.flatnonzero(fired):
+            self._fired_ns[thruster].append(now_ns)
 
     def untested(self, now_ns: int) -> Flags:
-        """Return the thrusters (n,) with too little information within the last ``every_s``."""
-        self._forget_before(now_ns - self._every_ns)
-        return np.array(
-            [
-                len(x) < _MIN_OBSERVATIONS or sum(i for _, i in x) < self._sufficient
-                for x in self._observations
-            ]
-        )
+        """Return the thrusters (n,) of which the last ``every_s`` do not tell whether they work."""
+        for thruster in np.flatnonzero(self._changed & (self._known_until_ns < now_ns)):
+            self._changed[thruster] = False
+            times = self._fired_ns[thruster]
+            ticks = min(self._ticks_to_tell(int(thruster)) or MAX_TEST_PULSES, MAX_TEST_PULSES)
+            if ticks <= len(times):
+                self._known_until_ns[thruster] = times[-ticks] + self._every_ns
+        return self._known_until_ns < now_ns
 
     def schedule(
         self, now_ns: int, suspects: Flags, available_N: Array, commanded_N: Array, period_s: float

@@ -13,14 +13,20 @@ from typing import Any, Literal
 
 from .errors import ChaserdockError
 
-Kind = Literal["perception", "estimator", "solver"]
+Kind = Literal["perception", "estimator", "solver", "camera"]
 _GROUPS: dict[Kind, str] = {
     "perception": "chaserdock.perceptions",
     "estimator": "chaserdock.estimators",
     "solver": "chaserdock.solvers",
+    "camera": "chaserdock.cameras",
 }
 
-_METHODS: dict[Kind, str] = {"perception": "estimate", "estimator": "update", "solver": "solve"}
+_METHODS: dict[Kind, str] = {
+    "perception": "estimate",
+    "estimator": "update",
+    "solver": "solve",
+    "camera": "frames",
+}
 """Method that is called first in a flight."""
 
 

@@ -8,29 +8,29 @@ that falls off, and noise. Shares no code with the renderers of the world.
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_models.targets import TargetModel
+from chaserdock_models.camera import Camera
+from chaserdock_models.targets import Marker, TargetModel
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 
 from chaserdock.targets.marker_sheets import SHEETS_MM, Sheet, figure_of, lay_out
 
-DPI, _MM_PER_INCH, _FINER = 300, 25.4, 4
-"""Resolution of a printed sheet; the rasterizer works so many times finer, as it rounds to dots."""
+DPI, _MM_PER_INCH = 300, 25.4
 _PX_PER_MM = DPI / _MM_PER_INCH
-SUPERSAMPLED = 6
-"""Samples of a pixel along each side."""
 Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera in OpenCV's terms: ``distortion`` k1, k2, p1, p2."""
+    """A camera in OpenCV's terms: ``distortion`` k1, k2, p1, p2. ``samples`` of a pixel along each
+    side.
+    """
 
     width: int = 1280
     height: int = 720
@@ -39,6 +39,11 @@ class Lens:
     cx: float = 642.7
     cy: float = 355.2
     distortion: tuple[float, ...] = (-0.12, 0.03, 4e-4, -3e-4)
+    samples: int = 6
+
+    def camera(self) -> Camera:
+        """Return the same camera for the tracker."""
+        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -47,7 +52,7 @@ class Lens:
     @cached_property
     def fine_map(self) -> tuple[Any, Any]:
         """Place in the supersampled ideal image of each pixel of the supersampled image."""
-        s = SUPERSAMPLED
+        s = self.samples
         u, v = (np.arange(n * s, dtype=float) for n in (self.width, self.height))
         px = (np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 1, 2) + 0.5) / s - 0.5
         ideal = cv2.undistortPoints(
@@ -82,12 +87,36 @@ class PrintedSheet:
 def printed(model: TargetModel, page: int = 0) -> PrintedSheet:
     """Return a sheet of a target's markers as printed on A4."""
     sheet = lay_out(model, SHEETS_MM["a4"])[page]
-    file = io.BytesIO()
-    figure_of(sheet).savefig(file, format="png", dpi=DPI * _FINER, facecolor="white")
-    fine: Any = cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    cut = fine[fine.shape[0] % _FINER :, : fine.shape[1] // _FINER * _FINER]
-    size = (cut.shape[1] // _FINER, cut.shape[0] // _FINER)
-    return PrintedSheet(sheet, np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA)))
+    # Lines and texts as matplotlib rasterizes them; it would round squares to whole dots.
+    canvas = FigureCanvasAgg(figure_of(replace(sheet, rectangles=[(0.0, 0.0, 1e-6, 1e-6)])))
+    canvas.figure.set_dpi(DPI)
+    canvas.figure.set_facecolor("white")
+    canvas.draw()
+    paper = np.asarray(canvas.buffer_rgba())[..., 1].astype(float)
+    rows, columns = paper.shape
+    up = rows - sheet.size_mm[1] * _PX_PER_MM
+    for x, y, w, h in sheet.rectangles:
+        across = _covered(columns, x * _PX_PER_MM, (x + w) * _PX_PER_MM)
+        down = _covered(rows, up + y * _PX_PER_MM, up + (y + h) * _PX_PER_MM)
+        paper[np.ix_(down > 0, across > 0)] -= 255.0 * np.outer(down[down > 0], across[across > 0])
+    return PrintedSheet(sheet, np.clip(np.rint(paper), 0, 255).astype(np.uint8))
+
+
+def _covered(pixels: int, begin: float, end: float) -> NDArray[np.float64]:
+    """Return the share of each pixel (n,) of a line that lies between two edges."""
+    edges = np.arange(pixels + 1, dtype=float)
+    return np.diff(np.clip(edges, begin, end))
+
+
+def sheet_target(model: TargetModel, sheet: PrintedSheet) -> TargetModel:
+    """Return a printed sheet as a target, in the sheet's axes."""
+    width, height = (1e-3 * mm for mm in sheet.sheet.size_mm)
+    markers = tuple(
+        Marker(m.id, m.side_m, (1e-3 * x - width / 2, height / 2 - 1e-3 * y, 0.0), (1.0, 0, 0, 0))
+        for m, x, y in sheet.sheet.markers
+    )
+    size = (width, height, 1e-3)
+    return TargetModel("sheet", (), markers, model.dictionary, size, model.white_margin_m)
 
 
 @dataclass(frozen=True)
@@ -112,7 +141,7 @@ class Photograph:
         """Return the image (h, w) of a sheet: ``position_m`` (3,) of its middle and ``rotation``
         (3, 3) of its axes, in the camera's.
         """
-        k, s = self.lens, SUPERSAMPLED
+        k, s = self.lens, self.lens.samples
         plane = np.column_stack([rotation[:, 0], rotation[:, 1], position_m])
         finer = np.array([[s, 0.0, (s - 1) / 2], [0.0, s, (s - 1) / 2], [0.0, 0.0, 1.0]])
         homography = finer @ k.matrix @ plane @ np.linalg.inv(sheet.to_pixels())
@@ -143,7 +172,7 @@ class Photograph:
 
 def rotation_of(vector: Any) -> NDArray[np.float64]:
     """Return the matrix (3, 3) of a rotation vector."""
-    return np.asarray(cv2.Rodrigues(np.asarray(vector, dtype=float))[0])
+    return np.asarray(cv2.Rodrigues(np.asarray(vector, dtype=float))[0], dtype=float)
 
 
 def random_view(

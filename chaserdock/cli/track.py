@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -193,7 +193,7 @@ def _files(
 
 
 @contextmanager
-def _page(port: int | None) -> Iterator[Sink]:
+def _page(port: int | None) -> Generator[Sink]:
     from chaserdock.tracking.live_page import LivePage
 
     page = LivePage(port)
@@ -205,7 +205,7 @@ def _page(port: int | None) -> Iterator[Sink]:
 
 
 @contextmanager
-def _window() -> Iterator[Sink]:
+def _window() -> Generator[Sink]:
     import cv2
 
     if not cv2.currentUIFramework():
@@ -225,7 +225,7 @@ def _window() -> Iterator[Sink]:
 
 
 @contextmanager
-def _terminal(quiet: bool) -> Iterator[Sink]:
+def _terminal(quiet: bool) -> Generator[Sink]:
     """Print poses: all, a line each; on a terminal the newest, in one line that is overwritten."""
     from chaserdock.tracking.run import HEADER, pose_lines
 

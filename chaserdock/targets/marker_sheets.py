@@ -31,9 +31,9 @@ text; length of cutting marks; width of lines.
 """
 _NOTE_MM = 2.2
 """Height of the text that states the white border, mm: it fits below the smallest marker."""
-LEAST_MARGIN_CELLS = 0.5
-"""White border that perception needs around a marker, in cells of the marker (docs/track.md): at 20
-px a side no marker was lost with it, one of 16 with 0.4 (docs/evidence/cameras.md).
+LEAST_MARGIN_CELLS, NEAR_MARGIN_CELLS, NEAR_CELL_PX = 0.5, 0.3, 4
+"""White border, in cells of a marker, that perception needs anywhere, and where a cell has so many
+pixels or more in the image: none of 16 views was lost with it (docs/evidence/cameras.md).
 """
 # Footer of a sheet, mm: a ruler to check the scale, and the sheet's name.
 _FOOT_MM = 14.0
@@ -45,7 +45,8 @@ _STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fontty
 @dataclass
 class Sheet:
     """Content of one sheet, mm: ``markers`` with their centres (marker, x, y), black ``rectangles``
-    (x, y, width, height), ``lines`` (x0, y0, x1, y1), ``texts`` and smaller ``notes`` (x, y of the baseline, text).
+    (x, y, width, height), ``lines`` (x0, y0, x1, y1), ``texts`` and smaller ``notes`` (x, y of the
+    baseline, text).
     """
 
     size_mm: tuple[float, float]
@@ -117,8 +118,9 @@ def lay_out(model: TargetModel, size_mm: tuple[float, float]) -> list[Sheet]:
         about = f"100 mm.  {model.name}, {model.dictionary}, sheet {number} of {len(sheets)}"
         sheet.texts.append((_EDGE_MM + 104.0, foot, about))
         rule = (
-            f"Cut at the marks: perception needs white of {LEAST_MARGIN_CELLS:g} cells around each "
-            "marker (a cell is a square of its pattern)."
+            f"Cut at the marks. Perception needs a white border of {LEAST_MARGIN_CELLS:g} cells, "
+            f"or {NEAR_MARGIN_CELLS:g} where a cell has {NEAR_CELL_PX} pixels; a cell is a square "
+            "of the pattern."
         )
         sheet.notes.append((_EDGE_MM, foot + _NOTE_MM + 1.0, rule))
     return sheets

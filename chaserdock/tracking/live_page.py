@@ -108,7 +108,7 @@ class LivePage:
                 except OSError:
                     pass  # the browser has closed the page
 
-            def log_message(self, *_: Any) -> None:
+            def log_message(self, format: str, *args: Any) -> None:
                 """Print nothing: the terminal shows poses."""
 
         return Handler

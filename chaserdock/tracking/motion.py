@@ -81,8 +81,9 @@ class ConstantVelocity:
             ),
             key=lambda h: h.misfit_px2,
         )
-        continues = len(earlier) > 0 and _nearest(ranked[0].pose, earlier) is earlier[0]
-        self._before = (self._time_ns, earlier[0].pose) if continues else None
+        self._before = None
+        if earlier and _nearest(ranked[0].pose, earlier) is earlier[0]:
+            self._before = (self._time_ns, earlier[0].pose)
         self._time_ns, self._hypotheses = time_ns, tuple(ranked)
         return tuple(h.pose for h in ranked)
 

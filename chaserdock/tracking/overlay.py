@@ -23,10 +23,10 @@ _AXIS_SHARE = 0.4
 """Length of the drawn axes over the target's largest extent; that of a marker's, over its side."""
 _EDGES = tuple((a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit)
 """Pairs of corners of a cuboid, in the order of `cuboid_corners`, that an edge joins."""
+_SHADED = 0.3
+"""Share of the light that stays behind text, so that it is legible on any image."""
 _ALERT_BGR = (80, 160, 255)
 """Colour (0 to 255) of what is ambiguous or lost: orange."""
-_SHADE_BGR = (0, 0, 0)
-"""Colour of the rim of text, so that it is legible on any image."""
 _SINCE_1970_NS = 10**18
 """Times from here on, the year 2001, are counted from 1970; cameras and flights count from 0."""
 _TEXT_SHARE = 1.0 / 900.0

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -64,7 +64,7 @@ class OverlayVideo:
 
 
 @contextmanager
-def overlay_video(path: Path) -> Iterator[OverlayVideo]:
+def overlay_video(path: Path) -> Generator[OverlayVideo]:
     """Open a new video, which takes its place when the block ends. Raises TrackError."""
     if path.suffix.lower() != ".mp4":
         raise TrackError(f"--video {path}: must end in .mp4")

@@ -7,7 +7,7 @@ there is none. TUM: the best pose, as lines ``time_s x y z qx qy qz qw``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TextIO
@@ -50,7 +50,7 @@ class PoseFile(Protocol):
 
 
 @contextmanager
-def pose_file(path: Path, targets: int) -> Iterator[PoseFile]:
+def pose_file(path: Path, targets: int) -> Generator[PoseFile]:
     """Open a new file of poses by its ending; it takes its place when the block ends. Raises
     TrackError.
     """

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import cast, get_args
 
 from chaserdock_agents.chaser.perception import (
     Method,
@@ -75,7 +75,7 @@ def subjects_of(
 def _method(name: str) -> Method:
     if name not in get_args(Method):
         raise TrackError(f"perception {name}: must be one of {', '.join(get_args(Method))}")
-    return name
+    return cast("Method", name)
 
 
 def marker_target(

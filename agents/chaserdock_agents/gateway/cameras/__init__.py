@@ -45,8 +45,8 @@ def open_camera(
 
     A device (``0``, ``/dev/video0``), an address (``rtsp://…``), a GStreamer pipeline (``… ! …``),
     a video file, a folder of images, a recording (``.mcap``, folder of a ROS 2 bag), or
-    ``NAME:REST`` of an installed source. ``options``: those of `OpeningOptions`, also as a table. Raises
-    ImageSourceError, and PluginError for an installed source that does not start.
+    ``NAME:REST`` of an installed source. ``options``: those of `OpeningOptions`, also as a
+    table. Raises ImageSourceError, and PluginError for an installed source that does not start.
     """
     given = options if isinstance(options, OpeningOptions) else _options(options or {})
     name, _, rest = address.partition(":")

@@ -66,7 +66,7 @@ def open_pipeline(
     if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
         raise ImageSourceError(
             f"{address}: this OpenCV {cv2.__version__} is built without GStreamer, as those of "
-            "PyPI are; give the camera's device or RTSP address, or install an OpenCV with GStreamer"
+            "PyPI are; give the camera's device or RTSP address, or install another OpenCV"
         )
     capture = _opened(address, cv2.CAP_GSTREAMER)
     if capture is None:

@@ -10,9 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import TargetPose
+from chaserdock_agents.chaser.perception.refine import PoseInCamera
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import target_model
+from chaserdock_world.rendering.background import Light
+from markerless_cases import satellite_image
 from numpy.typing import NDArray
 from sheet_views import Lens, Photograph, printed, random_view, rotation_of, sheet_target
 
@@ -22,7 +25,6 @@ from chaserdock.tracking.motion import ConstantVelocity
 
 SMALL = Lens(640, 480, 600.0, 598.0, 322.3, 237.1, samples=3)
 PAPER = target_model("paper")
-EXAMPLES = Path(__file__).parent.parent / "golden"
 
 
 def errors_of(lens: Lens, number: int, photo: Photograph) -> tuple[NDArray, NDArray, int]:
@@ -222,3 +224,30 @@ def test_a_single_better_fit_does_not_turn_an_ambiguous_target() -> None:
     assert motion.take(800_000_001, (wrong, right)) == (right, wrong)
     later = ConstantVelocity()
     assert later.take(800_000_001, (right, wrong)) == (wrong, right)
+
+
+# -- Shapes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow(1)
+def test_a_target_without_markers_is_tracked_by_its_shape(tmp_path: Path) -> None:
+    """At the first image of a recording, and over several images of a camera."""
+    camera = Camera.from_hfov(960, 540, math.radians(60.0))
+    shape, light = rotations.exp([0.5, 0.8, -0.3]), Light((-0.4, -0.5, -0.8))
+    true = PoseInCamera(np.array([0.05, -0.04, 1.6]), rotations.to_matrix(shape))
+    tracker = cd.Tracker(camera, "geo_servicer")
+    image = satellite_image(true, light, 0)
+    pose = tracker.track(image, 0).pose
+    assert pose is not None
+    assert np.linalg.norm(pose.position_m - true.position) < 0.01
+    assert float(rotations.angle_between(pose.q_wxyz, shape)) < math.radians(1.0)
+
+    live = cd.Tracker(camera, "geo_servicer", live=True)
+    states = []
+    for k in range(200):
+        seen = live.track(image, 33_000_000 * k)
+        states.append(seen.targets[0].status)
+        if seen.pose is not None:
+            break
+    assert states[0] == "searching"
+    assert states[-1] == "tracked"

@@ -8,6 +8,7 @@ that falls off, and noise. Shares no code with the renderers of the world.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -19,7 +20,7 @@ from chaserdock_models.targets import Marker, TargetModel
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 
-from chaserdock.targets.marker_sheets import SHEETS_MM, Sheet, figure_of, lay_out
+from chaserdock.targets.marker_sheets import SHEETS_MM, Sheet, figure_of, lay_out, marker_bits
 
 DPI, _MM_PER_INCH = 300, 25.4
 _PX_PER_MM = DPI / _MM_PER_INCH
@@ -100,6 +101,22 @@ def printed(model: TargetModel, page: int = 0) -> PrintedSheet:
         down = _covered(rows, up + y * _PX_PER_MM, up + (y + h) * _PX_PER_MM)
         paper[np.ix_(down > 0, across > 0)] -= 255.0 * np.outer(down[down > 0], across[across > 0])
     return PrintedSheet(sheet, np.clip(np.rint(paper), 0, 255).astype(np.uint8))
+
+
+def cut_marker(dictionary: str, number: int, side_m: float, margin_m: float) -> PrintedSheet:
+    """Return a marker that is cut out with a white border; its axes are those of its paper."""
+    bits, side, margin = marker_bits(dictionary, number), 1e3 * side_m, 1e3 * margin_m
+    wide, cell = side + 2.0 * margin, side / len(bits)
+    pixels = math.ceil(wide * _PX_PER_MM)
+    paper = np.full((pixels, pixels), 255.0)
+    up = pixels - wide * _PX_PER_MM
+    for row, column in np.argwhere(bits == 0).tolist():
+        x, y = margin + column * cell, margin + row * cell
+        across = _covered(pixels, x * _PX_PER_MM, (x + cell) * _PX_PER_MM)
+        down = _covered(pixels, up + y * _PX_PER_MM, up + (y + cell) * _PX_PER_MM)
+        paper -= 255.0 * np.outer(down, across)
+    image = np.clip(np.rint(paper), 0, 255).astype(np.uint8)
+    return PrintedSheet(Sheet((wide, wide)), image)
 
 
 def _covered(pixels: int, begin: float, end: float) -> NDArray[np.float64]:

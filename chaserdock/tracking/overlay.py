@@ -69,8 +69,8 @@ def lines_of(tracked: TrackedImage, per_second: float) -> list[str]:
         x, y, z = (1e3 * pose.position_m).tolist()
         lines.append(
             f"{target.name}: {target.status}, {by}, ({x:.1f}, {y:.1f}, {z:.1f}) mm "
-            f"+- {1e3 * pose.sigma_m:.2f} mm, {math.degrees(pose.sigma_rad):.3f} deg, "
-            f"residual {pose.residual_px:.2f} px"
+            f"+- {1e3 * pose.sigma_m:.2f} mm, {math.degrees(pose.sigma_rad):.3f} deg; "
+            f"{pose.residual_px:.2f} px"
         )
     return lines
 

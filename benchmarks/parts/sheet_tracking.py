@@ -115,7 +115,7 @@ def measure_margin(options: Options) -> Figures:
     """Count views of a marker, by its size in the image and the width of its white border in cells,
     that give no pose: dark ground, border as stated.
     """
-    count, side_m, figures = views_of(options, 32, 2), 0.09, Figures()
+    count, side_m, figures = views_of(options, 16, 2), 0.09, Figures()
     lens = replace(SMALL, samples=4)
     for dictionary in ("DICT_4X4_50", "DICT_5X5_50", "DICT_APRILTAG_36h11"):
         cell_m = side_m / len(marker_bits(dictionary, 3))

@@ -17,7 +17,6 @@ TYPE_CHECKING = False  # as type checkers know it; `typing` alone takes most of 
 if TYPE_CHECKING:
     from typing import Any
 
-    from chaserdock_models.camera import Camera
     from chaserdock_protocol.errors import ChaserdockError, MissingPackageError, ScenarioError
     from chaserdock_protocol.recording.scan import LogError
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from .tracking.tracker import TrackedImage, TrackedPose, TrackedTarget, Tracker
 
 __all__ = [
-    "Camera",
     "ChaserSummary",
     "ChaserdockError",
     "Log",
@@ -61,8 +59,6 @@ def __getattr__(name: str) -> Any:
         from .launch import launcher as home
     elif name == "Log":
         from .logs import reader as home
-    elif name == "Camera":
-        from chaserdock_models import camera as home
     elif name.startswith("Track"):
         from .tracking import tracker as home
     elif name in ("ChaserSummary", "Summary"):

@@ -13,7 +13,12 @@ from typing import Any
 import cv2
 import matplotlib
 import numpy as np
-from chaserdock_agents.chaser.perception.detect import dictionary_of
+from chaserdock_agents.chaser.perception.detect import (
+    LEAST_MARGIN_CELLS,
+    NEAR_CELL_PX,
+    NEAR_MARGIN_CELLS,
+    dictionary_of,
+)
 from chaserdock_models.targets import Marker, TargetModel, clear_margin_m
 from chaserdock_protocol.output_files import replaced
 from matplotlib.backends.backend_pdf import PdfPages
@@ -31,10 +36,6 @@ text; length of cutting marks; width of lines.
 """
 _NOTE_MM = 2.2
 """Height of the text that states the white border, mm: it fits below the smallest marker."""
-LEAST_MARGIN_CELLS, NEAR_MARGIN_CELLS, NEAR_CELL_PX = 0.5, 0.3, 4
-"""White border, in cells of a marker, that perception needs anywhere, and where a cell has so many
-pixels or more in the image: none of 16 views was lost with it (docs/evidence/cameras.md).
-"""
 # Footer of a sheet, mm: a ruler to check the scale, and the sheet's name.
 _FOOT_MM = 14.0
 _MM_PER_INCH = 25.4  # exact

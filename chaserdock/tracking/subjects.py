@@ -14,13 +14,12 @@ from chaserdock_agents.chaser.perception import (
     PerceptionMethod,
     named_perception,
 )
+from chaserdock_agents.chaser.perception.detect import LEAST_MARGIN_CELLS, dictionary_of
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import Box, Marker, TargetModel
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario.files import find_flight_target
 from chaserdock_protocol.scenario.target import dictionary_size
-
-from chaserdock.targets.marker_sheets import LEAST_MARGIN_CELLS, marker_bits
 
 _PLATE_M = 1e-3
 """Thickness of the plate that a single marker lies on, m: only its edges matter."""
@@ -102,7 +101,8 @@ def marker_target(
             raise TrackError(f"the white border must be positive, m (got {margin_m:g})")
         wide = side_m + 2.0 * margin_m
         return TargetModel(name, (), (marker,), dictionary, (wide, wide, _PLATE_M), margin_m)
-    least_m = LEAST_MARGIN_CELLS * side_m / len(marker_bits(dictionary, number))
+    cells = dictionary_of(dictionary).markerSize + 2
+    least_m = LEAST_MARGIN_CELLS * side_m / cells
     wide = side_m + 2.0 * least_m
     plate = Box((wide, wide, _PLATE_M), (0.0, 0.0, -_PLATE_M / 2.0), shade=1.0)
     # White paint that ends beyond the plate: the border is as wide as the plate, or wider.

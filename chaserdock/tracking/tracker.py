@@ -91,7 +91,8 @@ class Tracker:
     """Estimates the pose of a target in images from anywhere, by the perception that chasers fly.
 
     Args:
-        camera: a calibration file of OpenCV, ROS or Kalibr, or a ``Camera``.
+        camera: a calibration file of OpenCV, ROS or Kalibr, or a ``Camera``
+            (``chaserdock_models.camera``).
         target: a target file (``….toml``), a mesh (``….stl`` and others), the name of a known
             target, or single markers: ``{id: side in m}``.
         perception: ``default`` (by markers), ``model`` (by the shape), or one that is installed; by
@@ -103,8 +104,8 @@ class Tracker:
         live: images come at the pace of a camera. A shape is then searched over several images, as
             that takes seconds; otherwise every image gets its answer at once.
 
-    ``camera``, ``names`` and ``models``: as read. Raises ScenarioError for an invalid file,
-    PluginError for an unknown perception, and ChaserdockError for what does not fit together.
+    ``camera``, ``names`` and ``models``: as read. Raises ScenarioError for an invalid file, and
+    ChaserdockError for an unknown perception and for what does not fit together.
     """
 
     def __init__(

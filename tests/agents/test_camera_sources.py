@@ -316,7 +316,7 @@ KINDS: dict[str, tuple[str, str, Callable[[int], bytes]]] = {
     "/ros/compressed": ("sensor_msgs/msg/CompressedImage", "cdr", ros_jpeg),
     "/fox/compressed": ("foxglove.CompressedImage", "protobuf", foxglove_png),
     "/fox/raw": ("foxglove.RawImage", "protobuf", foxglove_raw),
-    "chaser/0/image": ("Image", "msgpack", mission_image),
+    "world/chaser/0/image": ("Image", "msgpack", mission_image),
     "/numbers": ("std_msgs/msg/String", "cdr", lambda time_ns: b""),
 }
 

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 from chaserdock_agents.gateway.cameras import (
-    CameraSource,
+    ImageSource,
     CapturedImage,
     ImageSourceError,
     UnreadableImage,
@@ -81,7 +81,7 @@ Sink = Callable[[TrackStep], object]
 
 
 def track_source(
-    source: CameraSource,
+    source: ImageSource,
     tracker: Tracker,
     sinks: Sequence[Sink],
     most: int | None = None,

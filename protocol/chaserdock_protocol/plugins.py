@@ -13,20 +13,14 @@ from typing import Any, Literal
 
 from .errors import ChaserdockError
 
-Kind = Literal["perception", "estimator", "solver", "camera"]
+Kind = Literal["perception", "estimator", "solver"]
 _GROUPS: dict[Kind, str] = {
     "perception": "chaserdock.perceptions",
     "estimator": "chaserdock.estimators",
     "solver": "chaserdock.solvers",
-    "camera": "chaserdock.cameras",
 }
 
-_METHODS: dict[Kind, str] = {
-    "perception": "estimate",
-    "estimator": "update",
-    "solver": "solve",
-    "camera": "frames",
-}
+_METHODS: dict[Kind, str] = {"perception": "estimate", "estimator": "update", "solver": "solve"}
 """Method that is called first in a flight."""
 
 

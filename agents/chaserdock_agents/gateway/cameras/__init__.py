@@ -18,7 +18,7 @@ from .capture import open_address, open_device, open_pipeline
 from .files import open_path
 from .recording import open_recording
 from .source import (
-    CameraSource,
+    ImageSource,
     Captured,
     CapturedImage,
     ImageSourceError,
@@ -27,7 +27,7 @@ from .source import (
     UnreadableImage,
 )
 
-Opener = Callable[[str, OpeningOptions], CameraSource]
+Opener = Callable[[str, OpeningOptions], ImageSource]
 _BUILT_IN: tuple[tuple[str, Opener], ...] = (
     # The first pattern that the address matches decides.
     (r"\d+|/dev/.+", open_device),
@@ -40,7 +40,7 @@ _BUILT_IN: tuple[tuple[str, Opener], ...] = (
 
 def open_camera(
     address: str, options: OpeningOptions | Mapping[str, Any] | None = None
-) -> CameraSource:
+) -> ImageSource:
     """Open the source of images at ``address``.
 
     A device (``0``, ``/dev/video0``), an address (``rtsp://…``), a GStreamer pipeline (``… ! …``),
@@ -68,7 +68,7 @@ def _options(values: Mapping[str, Any]) -> OpeningOptions:
 
 
 __all__ = [
-    "CameraSource",
+    "ImageSource",
     "Captured",
     "CapturedImage",
     "ImageSourceError",

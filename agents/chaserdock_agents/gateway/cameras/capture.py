@@ -23,10 +23,10 @@ _LEAST_STAMP_MS = 1.0
 """Stamps below are none: drivers without them, and first images, state 0."""
 _ENDS_WITHIN_S = 1.0
 """Time for which closing waits for a capture that hangs in its driver."""
-Clock = Callable[[], int]
+NowNs = Callable[[], int]
 
 
-def open_device(address: str, options: OpeningOptions, clock: Clock = time.time_ns) -> LiveCapture:
+def open_device(address: str, options: OpeningOptions, clock: NowNs = time.time_ns) -> LiveCapture:
     """Open a camera of Video4Linux, ``0`` or ``/dev/video0``."""
     path = Path(f"/dev/video{address}" if address.isdigit() else address)
     _check_device(path)
@@ -45,7 +45,7 @@ def open_device(address: str, options: OpeningOptions, clock: Clock = time.time_
     return LiveCapture(capture, str(path), options.silent_s, clock, stamped=True)
 
 
-def open_address(address: str, options: OpeningOptions, clock: Clock = time.time_ns) -> LiveCapture:
+def open_address(address: str, options: OpeningOptions, clock: NowNs = time.time_ns) -> LiveCapture:
     """Open a stream by its address, ``rtsp://HOST/PATH``."""
     patience_ms = round(1e3 * options.silent_s)
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience_ms]
@@ -60,7 +60,7 @@ def open_address(address: str, options: OpeningOptions, clock: Clock = time.time
 
 
 def open_pipeline(
-    address: str, options: OpeningOptions, clock: Clock = time.time_ns
+    address: str, options: OpeningOptions, clock: NowNs = time.time_ns
 ) -> LiveCapture:
     """Open a GStreamer pipeline, which ends in ``appsink``."""
     if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
@@ -125,7 +125,7 @@ class LiveCapture:
     live = True
 
     def __init__(
-        self, capture: Any, name: str, silent_s: float, clock: Clock, stamped: bool
+        self, capture: Any, name: str, silent_s: float, clock: NowNs, stamped: bool
     ) -> None:
         self.name = name
         self._capture, self._silent_s = capture, silent_s

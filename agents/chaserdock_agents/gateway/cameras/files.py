@@ -13,7 +13,7 @@ import numpy as np
 from .capture import VideoFile
 from .recording import open_recording
 from .source import (
-    CameraSource,
+    ImageSource,
     Captured,
     CapturedImage,
     ImageSourceError,
@@ -27,7 +27,7 @@ _UNITS_NS = ((19, 1), (16, 1_000), (13, 1_000_000))
 """Digits of a time since 1970, and its unit, ns: nanoseconds, microseconds, milliseconds."""
 
 
-def open_path(address: str, options: OpeningOptions) -> CameraSource:
+def open_path(address: str, options: OpeningOptions) -> ImageSource:
     """Open the folder or file at a path."""
     path = Path(address)
     if not path.exists():

@@ -28,7 +28,7 @@ class _Stored(NamedTuple):
     about: dict[str, str]
 
 
-def open_recording(address: str, options: OpeningOptions) -> Recording:
+def open_recording(address: str, options: OpeningOptions) -> RecordedTopic:
     """Open an image topic of an MCAP file, or of a folder with MCAP files or a bag of ROS 2."""
     path = Path(address)
     if not path.exists():
@@ -40,7 +40,7 @@ def open_recording(address: str, options: OpeningOptions) -> Recording:
     )  # fmt: skip
 
 
-class Recording:
+class RecordedTopic:
     """Delivers the images of a topic in the order of the recording, with the times of their
     exposure.
     """
@@ -72,7 +72,7 @@ class Recording:
         raise NotImplementedError
 
 
-class McapTopic(Recording):
+class McapTopic(RecordedTopic):
     """A topic of MCAP files. Files are read to their last whole message, as those of our logs."""
 
     def __init__(self, path: Path, options: OpeningOptions) -> None:
@@ -124,7 +124,7 @@ def _topics_of(file: Path) -> dict[str, str]:
     return topics
 
 
-class BagTopic(Recording):
+class BagTopic(RecordedTopic):
     """A topic of a bag of ROS 2, with either storage. Needs the extra ``chaserdock[ros2]``."""
 
     def __init__(self, path: Path, options: OpeningOptions) -> None:

@@ -67,7 +67,7 @@ class OpeningOptions:
     silent_s: float = 5.0
 
 
-class CameraSource(Protocol):
+class ImageSource(Protocol):
     """A source of images.
 
     ``name``: for messages. ``live``: images come at their own pace, and those that are not waited

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import Figures, Group, Options, main
+from parts import laboratory
 
 from chaserdock.simulation.flight import memory_folder
 from chaserdock.simulation.mission import simulate
@@ -123,6 +124,7 @@ GROUPS = (
         {"nominal": nominal, "swarm": swarm, "instructions": instructions},
         on_request=("instructions",),
     ),
+    laboratory.GROUP,
 )
 
 if __name__ == "__main__":

@@ -378,6 +378,48 @@ def ros2() -> None:
     )
 
 
+def devices() -> None:
+    diagram(
+        "devices",
+        {
+            "camera": Box(0, 1.2, "camera", "real", 0.7),
+            "pose": Box(0, 0.6, "odometry,\nmotion capture", "real", 0.7, 0.5),
+            "robot": Box(0, 0.0, "robot", "real", 0.7),
+            "gateway": Box(2.4, 0.6, "chaserdock\ngateway", "real", 0.8, 0.75),
+        },
+        [
+            ("camera", "gateway", "ros2:", 0.0),
+            ("pose", "gateway", "ros2:  mavlink:", 0.0),
+            ("gateway", "robot", "ros2:  px4:  mavlink:", 0.0),
+        ],
+    )
+
+
+def laboratory() -> None:
+    diagram(
+        "laboratory",
+        {
+            "cameras": Box(0, 2, "cameras", "person", 0.8),
+            "capture": Box(0, 1, "motion\ncapture", "person", 0.8),
+            "robots": Box(0, 0, "robots,\nlatches", "person", 0.8),
+            "gateway": Box(2, 1, "gateway\nclocks, axes, arming,\nlimits", "real", 1.0, 0.75),
+            "mission": Box(4, 1, "chasers,\ncontroller"),
+            "recorder": Box(2, 0, "recorder, viewer", "file", 0.9),
+            "operator": Box(2, 2, "operator:\narm, kill", "person", 0.8),
+        },
+        [
+            ("cameras", "gateway", "images"),
+            ("capture", "gateway", "poses"),
+            ("gateway", "robots", "forces or pulses"),
+            ("gateway", "mission", "odometry, images", -0.2),
+            ("mission", "gateway", "commands", -0.2),
+            ("gateway", "recorder", "references"),
+            ("mission", "recorder", ""),
+            ("operator", "gateway", ""),
+        ],
+    )
+
+
 def frames() -> None:
     """World, chaser, target and image frame."""
     with styled("frames"):
@@ -790,7 +832,8 @@ def log_info() -> None:
 PICTURES: dict[str, Callable[[], None]] = {
     "processes": processes, "simulation": simulation, "redundancy": redundancy,
     "perception": perception, "errors": errors, "hosts": hosts, "limits": limits,
-    "extend": extend, "knowledge": knowledge, "ros2": ros2, "frames": frames,
+    "extend": extend, "knowledge": knowledge, "ros2": ros2, "devices": devices, "frames": frames,
+    "laboratory": laboratory,
     "controller": controller, "estimation": estimation, "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,
     "results": results, "thrusters": thrusters,

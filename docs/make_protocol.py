@@ -37,6 +37,7 @@ _QUERIES = (
     (topics.SCENARIO_KEY, messages.ScenarioRequest, messages.ScenarioReply),
     (topics.OPERATE_KEY, messages.OperatorCommand, messages.CommandReply),
     (topics.THRUSTER_FAULT_KEY, messages.ThrusterFaultCommand, messages.CommandReply),
+    (topics.ARMING_KEY, messages.ArmingCommand, messages.ArmingReply),
 )
 """Key, request and reply of each query."""
 _WITHOUT_HEAD = sorted(

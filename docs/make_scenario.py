@@ -155,7 +155,7 @@ def sections(path: str, node: SchemaNode, root: SchemaNode) -> list[str]:
         item = resolved(item_of(inner) or {}, root) if inner.get("type") == "array" else inner
         cells = [f"`{key}`", *words, range_of(inner, root), description_of(entry, root)]
         out.append(f"| {' | '.join(cell(text) for text in cells)} |")
-        if item.get("type") == "object":
+        if item.get("type") == "object" and "properties" in item:
             below += sections(f"{path}.{key}".removeprefix("."), item, root)
     return [*out, "", *below]
 

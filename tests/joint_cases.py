@@ -6,9 +6,11 @@ navigation grade.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
 from chaserdock_controller.estimation.joint.parameters import SightingNoise, TargetParameters
@@ -109,17 +111,20 @@ class SyntheticFlight:
         )
         return EstimatorInputs(self.time_ns, PERIOD_S, chasers, sightings)
 
-    def step(self) -> None:
+    def step(self, exposures_s: Mapping[int, float] | None = None) -> list[Sighting]:
         """Move everything to the next tick under a feedback that holds the chasers at their
-        places.
+        places. Returns the sightings of chasers with an exposure so long after the present tick.
         """
         e, r = self.errors, self.rng
+        earlier = self.target.copy(), [c.state for c in self.chasers]
+        wrenches = []
         for i, c in enumerate(self.chasers):
             wrench = np.concatenate([self._pull(i), self._turn(i)]) + r.normal(0, 1, 6) * np.repeat(
                 [0.01, 0.001], 3
             )
             c.state = propagate(c.state, wrench + c.disturbance, self.body, PERIOD_S)
             self.impulses[i] = wrench * PERIOD_S
+            wrenches.append(wrench + c.disturbance)
             for name, sigma, time_s in (
                 ("position_drift_m", e.position_drift_m, e.position_drift_time_s),
                 ("attitude_drift_rad", e.attitude_drift_rad, e.attitude_drift_time_s),
@@ -127,10 +132,25 @@ class SyntheticFlight:
                 fade = math.exp(-PERIOD_S / time_s)
                 noise = r.normal(0, sigma * math.sqrt(1 - fade**2), 3)
                 setattr(c, name, fade * getattr(c, name) + noise)
-        t = self.target
-        t[0:3] += t[3:6] * PERIOD_S
-        t[6:10] = rotations.integrate(t[6:10], t[10:13], PERIOD_S)
+        self.target = self._target_after(PERIOD_S)
         self.tick += 1
+        now = self.target, [c.state for c in self.chasers]
+        seen = []
+        for i, after_s in sorted((exposures_s or {}).items(), key=lambda x: x[1]):
+            self.target = earlier[0]
+            self.target = self._target_after(after_s)
+            self.chasers[i].state = propagate(earlier[1][i], wrenches[i], self.body, after_s)
+            time_ns = round(((self.tick - 1) * PERIOD_S + after_s) * 1e9)
+            seen.append(msgspec.structs.replace(self._sighting(i), sim_time_ns=time_ns))
+            self.target, self.chasers[i].state = now[0], now[1][i]
+        return seen
+
+    def _target_after(self, time_s: float) -> Array:
+        """Return the target's state (13,) after ``time_s``."""
+        t = self.target.copy()
+        t[0:3] += t[3:6] * time_s
+        t[6:10] = rotations.integrate(t[6:10], t[10:13], time_s)
+        return t
 
     def _place(self, i: int) -> tuple[Array, Array]:
         """Return the place (3,) in TRF and the attitude (4,) that the chaser holds."""

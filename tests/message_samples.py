@@ -201,6 +201,9 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Health(**HEAD, process="chaser/0", rejected={"world/tick:format": 2}, lost=1, stale=0),
     m.RecorderAck(**HEAD),
     m.ThrusterFaultCommand(chaser=1, thruster=3, kind="weak", factor=0.5, operator="me"),
+    m.ArmingCommand(action="arm", operator="me"),
+    m.ArmingReply(accepted=True, reason="armed by me"),
+    m.Kill(by="a button"),
     m.OperatorCommand(**HEAD, command="goto", chaser=1, offset_m=V),
     m.CommandReply(**HEAD, command="goto", chaser=1, accepted=False, reason="no"),
     m.ControllerState(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Aborts at random moments of a rendezvous, without the flight: the guidance of the controller on a
 profile that is tracked up to the errors of navigation, then two orbits of nonlinear relative motion
-with J2 after the abort's burn."""
+with J2 after the abort's burn, under the disturbances that the scenario states."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
+from chaserdock_controller.estimation.joint.parameters import parameters_of
 from chaserdock_controller.guidance.chaser_state import ChaserTick, TrackingErrors
 from chaserdock_controller.guidance.escape import EscapePlanner, RelativeState
 from chaserdock_controller.guidance.phases import Phase, Trigger
@@ -20,6 +21,7 @@ from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.orbit import HillFrame, hill_frame, propagate, state_of
+from chaserdock_models.passive_safety import CoastNoise, disturbed
 from chaserdock_models.relative_motion import relative_acceleration
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 
@@ -40,6 +42,16 @@ def navigation_covariance(distance_m: float) -> Array:
     position_m = math.hypot(_POSITION_M, _POSITION_SHARE * distance_m)
     velocity_m_s = math.hypot(_VELOCITY_M_S, _VELOCITY_SHARE * distance_m)
     return np.diag([position_m**2] * 3 + [velocity_m_s**2] * 3)
+
+
+def known_at(state: Array, scenario: Scenario) -> RelativeState:
+    """Return what guidance knows in a relative state (6,): it cannot tell the force that lasts in a
+    coast from errors of thrust, and knows its size only.
+    """
+    parameters = parameters_of(flight_scenario(scenario))
+    covariance = navigation_covariance(float(np.linalg.norm(state[:3])))
+    sigma_m_s2 = parameters.lasting_force_N / parameters.body.mass_kg
+    return RelativeState(state, disturbed(covariance, sigma_m_s2), still_target(scenario))
 
 
 def still_target(scenario: Scenario) -> TargetState:
@@ -65,9 +77,8 @@ def profile(scenario: Scenario) -> tuple[EscapePlanner, Array, Array]:
     for now_s in np.arange(0.0, scenario.duration_s, 1.0).tolist():
         offsets, velocities, _ = chaser.state.move.at(np.array([now_s]))
         state = rotations.rotate(still.q_wxyz, np.stack([offsets[0], velocities[0]])).ravel()
-        covariance = navigation_covariance(float(np.linalg.norm(offsets[0])))
         chaser.position_m = offsets[0]
-        chaser.relative = RelativeState(state, covariance, still)
+        chaser.relative = known_at(state, scenario)
         commands = fleet.due_commands(now_s)
         for command, result in zip(commands, fleet.apply(commands, now_s), strict=True):
             if not result.accepted:
@@ -99,10 +110,12 @@ class AbortOutcome:
 
 def study(scenario: Scenario, aborts: int, seed: int) -> AbortOutcome:
     """Abort at random moments of a scenario's rendezvous, with random errors of navigation and
-    burn.
+    burn, and random disturbances.
 
     The true state differs from the one that guidance aborts from by an error of the covariance that
-    guidance receives, and the burn by 3 % in size.
+    guidance receives, and the burn by 3 % in size. Two forces act on the coast, each with the
+    standard deviation of ``limits.passive_safety_force_N`` along every axis of the Hill frame: a
+    constant one and a Gauss-Markov process that begins at zero.
     """
     if scenario.orbit is None:
         raise ValueError("the study needs an orbit")
@@ -110,17 +123,18 @@ def study(scenario: Scenario, aborts: int, seed: int) -> AbortOutcome:
     frames = _frames(scenario, planner.duration_s)
     rng = np.random.default_rng([seed, 0xAB07])
     keep_out_m = scenario.limits.min_distance_target_m
+    noise = parameters_of(flight_scenario(scenario)).coast_noise
     certified, entered, nearest, impulses = 0, 0, math.inf, []
     for row in rng.integers(0, len(times), aborts):
         state = states[row]
-        covariance = navigation_covariance(float(np.linalg.norm(state[:3])))
-        known = RelativeState(state, covariance, still_target(scenario))
+        known = known_at(state, scenario)
         escape, margin = planner.escape(known, float(times[row]))
         certified += margin >= planner.sigmas
         impulses.append(escape.impulse_m_s)
-        error = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
+        error = np.linalg.cholesky(known.disturbed.covariance[:6, :6]) @ rng.standard_normal(6)
         burn = escape.acceleration_m_s2 * (1.0 + _BURN_ERROR * rng.standard_normal())
-        nearest_m = _fly(state + error, burn, escape.burn_s, frames)
+        pushes = _disturbances(noise, (len(frames) - 1) // 2 + 1, rng)
+        nearest_m = _fly(state + error, burn, escape.burn_s, pushes, frames)
         entered += nearest_m < keep_out_m
         nearest = min(nearest, nearest_m)
     return AbortOutcome(
@@ -146,21 +160,30 @@ def _frames(scenario: Scenario, duration_s: float) -> list[HillFrame]:
     return frames
 
 
-def _fly(state: Array, burn_m_s2: Array, burn_s: float, frames: Sequence[HillFrame]) -> float:
+def _disturbances(noise: CoastNoise, steps: int, rng: np.random.Generator) -> Array:
+    """Return the accelerations (steps, 3) by disturbances, constant within a step."""
+    kept = math.exp(-STEP_S / noise.varying_s)
+    constant, varying, found = noise.varying_m_s2 * rng.standard_normal(3), np.zeros(3), []
+    for _ in range(steps):
+        found.append(constant + varying)
+        fresh = noise.varying_m_s2 * math.sqrt(1.0 - kept * kept) * rng.standard_normal(3)
+        varying = kept * varying + fresh
+    return np.array(found)
+
+
+def _fly(
+    state: Array, burn_m_s2: Array, burn_s: float, pushes: Array, frames: Sequence[HillFrame]
+) -> float:
     """Return the smallest distance from the target after a burn, in steps of RK4 of which the first
-    ends with the burn.
+    ends with the burn. ``pushes`` (K, 3): accelerations by disturbances in the K steps.
     """
     y, nearest = state, math.inf
     # The burn takes seconds: one step in the first frame, and the coast begins there.
-    for h, first, push in (
-        (burn_s, 0, burn_m_s2),
-        *((STEP_S, 2 * k, np.zeros(3)) for k in range((len(frames) - 1) // 2)),
-    ):
-        inside = (
-            (frames[first], frames[first], frames[first])
-            if push.any()
-            else frames[first : first + 3]
-        )
+    for k, push in enumerate(pushes):
+        first = max(0, 2 * (k - 1))
+        h, inside = STEP_S, frames[first : first + 3]
+        if k == 0:
+            h, inside, push = burn_s, [frames[0]] * 3, push + burn_m_s2
         a = _derivative(inside[0], y, push)
         b = _derivative(inside[1], y + 0.5 * h * a, push)
         c = _derivative(inside[1], y + 0.5 * h * b, push)

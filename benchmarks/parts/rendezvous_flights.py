@@ -85,10 +85,11 @@ def aborts(options: Options) -> Figures:
     keep-out within two orbits.
 
     The guidance of the controller chooses each abort; its burn and two orbits of coast are those of
-    the nonlinear relative motion with J2.
+    the nonlinear relative motion with J2, under random disturbances of the stated size.
     """
     count = options.flights or (50 if options.quick else 1000)
-    found = study(load_shipped(options.abort_scenario), count, seed=options.first)
+    scenario = load_shipped(options.abort_scenario, *options.set)
+    found = study(scenario, count, seed=options.first)
     return {
         "aborts": found.aborts,
         "certified": found.certified,

@@ -99,7 +99,7 @@ def reproduce(
 
 def check(
     process: Annotated[
-        str, typer.Argument(help="process that it replaces: controller, or chaser/N")
+        str, typer.Argument(help="process that it replaces: controller, chaser/N, or world")
     ],
     log: LogArg,
     command: Annotated[
@@ -117,12 +117,18 @@ def check(
 ) -> None:
     """Run a process against a lock-step log and check its messages. Status 0 if it conforms to the
     protocol, else 1.
+
+    A world needs no log: `chaserdock check world -- COMMAND ...`.
     """
     import msgspec
 
     from chaserdock.conformance.harness import check as run
+    from chaserdock.conformance.world import check_world
 
-    result = run(log, process, command, ticks, join_timeout, timeout)
+    if process == "world":  # what stands in the log's place is the command's first word
+        result = check_world([str(log), *command], ticks, join_timeout, timeout)
+    else:
+        result = run(log, process, command, ticks, join_timeout, timeout)
     verdict = f"{len(result.findings)} findings" if result.findings else "conforms to the protocol"
     counts = f"{result.ticks} ticks played, {result.messages} messages received"
     lines = [*(finding.line() for finding in result.findings), f"{process}: {verdict}; {counts}"]

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .options import (
-    ChaserArg,
     JsonOpt,
     LinkOptions,
     OperatorOpt,
@@ -27,7 +26,9 @@ if TYPE_CHECKING:
 
 
 class CommandName(StrEnum):
-    """Operator commands to a chaser, and one to its simulated hardware."""
+    """Operator commands to a chaser, one to its simulated hardware, and three to all robots of a
+    gateway.
+    """
 
     approach = "approach"
     hold = "hold"
@@ -41,6 +42,9 @@ class CommandName(StrEnum):
     isolate = "isolate"
     restore = "restore"
     thruster_fault = "thruster-fault"
+    arm = "arm"
+    disarm = "disarm"
+    kill = "kill"
 
 
 class ThrusterFaultKind(StrEnum):
@@ -56,7 +60,10 @@ class ThrusterFaultKind(StrEnum):
 def command(
     context: typer.Context,
     what: Annotated[CommandName, typer.Argument(help="command")],
-    number: ChaserArg,
+    number: Annotated[
+        int | None,
+        typer.Argument(min=0, max=255, help="chaser number, from 0; not with arm, disarm, kill"),
+    ] = None,
     offset: Annotated[
         tuple[float, float, float] | None,
         typer.Option(metavar="X Y Z", help="goto: position in the target's frame, metres"),
@@ -91,10 +98,20 @@ def command(
     reply.
 
     thruster-fault injects a failure of which the chaser is not informed; the scenario must allow it
-    with chaser.thruster_faults_by_command.
+    with chaser.thruster_faults_by_command. arm, disarm and kill concern all robots of a gateway.
     """
-    from chaserdock.launch.operator import send_command, send_thruster_fault
+    from chaserdock.launch.operator import send_arming, send_command, send_thruster_fault
 
+    if what.value in ("arm", "disarm", "kill"):
+        others = ("number", "offset", "thruster", "fault", "factor", "before")
+        refuse_options(context, others, f"not with {what.value}")
+        done = send_arming(link.link(timeout_s=timeout), what.value, timeout, operator)
+        value = {"accepted": done.accepted, "reason": done.reason}
+        word = "accepted" if done.accepted else "refused"
+        print_result(as_json, value, [f"{word}: {done.reason}"])
+        raise typer.Exit(0 if done.accepted else 1)
+    if number is None:
+        raise fail(f"{what.value}: needs the number of a chaser")
     if what is CommandName.thruster_fault:
         refuse_options(context, ("offset", "before"), "not with thruster-fault")
         if thruster is None or fault is None:

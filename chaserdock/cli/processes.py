@@ -93,6 +93,89 @@ def world(
 
 
 @with_link_options()
+def gateway(
+    scenario: ScenarioArg,
+    seed: SeedOpt = None,
+    overrides: SetOpt = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="send nothing to robots and latches")
+    ] = False,
+    check: Annotated[
+        float | None,
+        typer.Option(
+            min=0.5,
+            max=600,
+            metavar="SECONDS",
+            help="look at the devices for so long, print what is found, and move nothing",
+        ),
+    ] = None,
+    recorder: Annotated[
+        bool, typer.Option(help="wait for a recorder before the first tick")
+    ] = True,
+    *,
+    link: LinkOptions,
+    timeout: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            help="seconds to wait for a router and, before the first tick, for another process "
+            "to connect; unlimited by default",
+        ),
+    ] = None,
+    rejoin_timeout: Annotated[
+        float, typer.Option(min=0.0, help="seconds to wait after all processes were lost")
+    ] = 0.0,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """Connect cameras, robots and motion capture of a laboratory to a mission, in place of the
+    world. Nothing moves before `chaserdock command arm`; in the terminal, k or space kills.
+    """
+    from chaserdock_protocol.process import ProcessOptions
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    options = ProcessOptions(
+        link=link.link("world", timeout),
+        scenario=find_scenario(scenario),
+        overrides=tuple(overrides or ()),
+        seed=seed,
+        mode="realtime",
+        recorder_expected=recorder,
+        patience_s=timeout,
+        rejoin_s=rejoin_timeout,
+        watch_parent=watch_parent,
+        dry_run=dry_run,
+    )
+    if check is not None:
+        _check_devices(options, check)
+    start_process("gateway", options)
+
+
+def _check_devices(options: ProcessOptions, duration_s: float) -> None:
+    """Print what is found about each device; exit with status 1 if something is wrong."""
+    import time
+
+    from chaserdock_agents.gateway.check import check_laboratory
+    from chaserdock_agents.gateway.devices import DeviceHost
+    from chaserdock_protocol.mission.host import load_mission_scenario
+    from rich.console import Console
+    from rich.table import Table
+
+    scenario = load_mission_scenario(options)
+    if scenario.lab is None:
+        raise fail(f"{options.scenario}: has no [lab], which names the devices")
+    host = DeviceHost(time.monotonic_ns)
+    findings = check_laboratory(scenario, host, duration_s, time.sleep)
+    table = Table("device", "rate", "jitter", "age", "clock offset", "found")
+    for f in findings:
+        offset = "" if f.offset_s is None else f"{f.offset_s:+.4f} s"
+        found = "; ".join([*f.problems, f.sees] if f.sees else f.problems) or "good"
+        row = (f"{f.rate_hz:.1f} Hz", f"{f.jitter_s * 1e3:.1f} ms", f"{f.age_s * 1e3:.0f} ms")
+        table.add_row(f.device, *row, offset, found, style="red" if f.problems else None)
+    Console().print(table)
+    raise typer.Exit(FAILED if any(f.problems for f in findings) else 0)
+
+
+@with_link_options()
 def chaser(
     number: ChaserArg,
     *,

@@ -89,17 +89,26 @@ def scenario(
             help="print the JSON schema of scenario files, for editors (taplo, Even Better TOML)",
         ),
     ] = False,
+    flight: Annotated[
+        bool,
+        typer.Option(
+            "--flight",
+            help="print the part that flight software receives as JSON, for a world of your own",
+        ),
+    ] = False,
     as_json: JsonOpt = False,
 ) -> None:
     """Check scenarios; or list, show or create them. Status 2 if one is not valid, with one line
     per error.
     """
-    if sum((show or changes, new, schema)) > 1:
-        raise fail("--show, --new and --schema exclude each other")
+    if sum((show or changes, new, schema, flight)) > 1:
+        raise fail("--show, --new, --schema and --flight exclude each other")
     if names:
         refuse_options(context, ("schema", "as_json"), "not with a scenario")
     else:
-        refuse_options(context, ("overrides", "show", "changes", "new"), "needs a scenario")
+        refuse_options(
+            context, ("overrides", "show", "changes", "new", "flight"), "needs a scenario"
+        )
     if schema:
         _print_schema()
     elif not names:
@@ -107,6 +116,12 @@ def scenario(
     elif new:
         refuse_options(context, ("overrides",), "not with --new")
         _write_new(_only(names))
+    elif flight:
+        from chaserdock_protocol.scenario import flight_scenario_json, load_scenario
+        from chaserdock_protocol.shipped_scenarios import find_scenario
+
+        loaded = load_scenario(find_scenario(_only(names)), tuple(overrides or ()))
+        print(flight_scenario_json(loaded))
     elif show or changes:
         from chaserdock_protocol.scenario import load_scenario
         from chaserdock_protocol.scenario.camera import lens_note

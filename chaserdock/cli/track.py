@@ -121,7 +121,7 @@ def track(
         raise fail("--margin-mm, --dictionary: only with --marker; a target file states both")
     if mesh is None and scale != 1.0:
         raise fail("--scale: only with --mesh; a target file states mesh_scale")
-    live = source.isdigit() or source.startswith("/dev/") or "://" in source or " ! " in source
+    live = source.startswith("/dev/") or not Path(source).exists()
     tracker = Tracker(
         camera,
         subject,

@@ -78,17 +78,18 @@ def check(
             word.replace("{endpoint}", endpoint).replace("{namespace}", namespace)
             for word in command
         ]
-        child = _start(filled)
+        child = start_process(filled)
         try:
             played = stand.fly(child, recorded.turns, start_s, patience_s)
         finally:
-            _end(child)
+            end_process(child)
     finally:
         node.close()
     return Checked(list(ledger.findings.values()), played, ledger.messages)
 
 
-def _start(command: list[str]) -> subprocess.Popen[bytes]:
+def start_process(command: list[str]) -> subprocess.Popen[bytes]:
+    """Start a command in a session of its own. Raises CheckError if it cannot be run."""
     try:
         return subprocess.Popen(
             command,
@@ -100,7 +101,7 @@ def _start(command: list[str]) -> subprocess.Popen[bytes]:
         raise CheckError(f"{command[0]}: cannot be run: {error.strerror or error}") from None
 
 
-def _end(child: subprocess.Popen[bytes]) -> None:
+def end_process(child: subprocess.Popen[bytes]) -> None:
     """Terminate the process group, which is a session of its own."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         if child.poll() is None:

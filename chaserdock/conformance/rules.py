@@ -143,7 +143,7 @@ class Ledger:
         try:
             message: Any = codec.decode(topic.kind, raw.payload, raw.encoding)
         except Rejected as rejected:
-            self.report(raw.key, _WORDS.get(rejected.reason, rejected.reason), rejected.detail)
+            self.report(raw.key, WORDS.get(rejected.reason, rejected.reason), rejected.detail)
             return
         self._number(raw.key, message, topic.rate in ("tick", "image"))
         match message:
@@ -269,10 +269,11 @@ class Ledger:
                 self.report(own, "wrong number of published messages", detail)
 
 
-_WORDS = {
+WORDS = {
     "encoding": "wrong encoding",
     "size": "too long",
     "format": "not of the message's type",
     "not_finite": "a number that is not finite",
     "not_unit_quaternion": "a quaternion that is not of unit length",
 }
+"""What is wrong with a message, by the reason for which it is rejected."""

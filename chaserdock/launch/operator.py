@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import time
+from typing import Literal, TypeVar
 
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import (
+    ArmingCommand,
+    ArmingReply,
     CommandReply,
     OperatorCommand,
     ThrusterFaultCommand,
@@ -15,7 +18,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.transport import Link, Node
 from msgspec import Struct
 
-from .reach import TO_COMMAND, TO_INJECT_FAULTS, Rights, check_rights, why_silent
+from .reach import TO_ARM, TO_COMMAND, TO_INJECT_FAULTS, Rights, check_rights, why_silent
 
 
 class OperatorError(ChaserdockError):
@@ -51,7 +54,7 @@ def send_command(
         operator=operator,
         expires_ns=None if before_s is None else round(before_s * 1e9),
     )
-    return _request(link, TO_COMMAND, command, request, timeout_s, "controller")
+    return _request(link, TO_COMMAND, command, request, timeout_s, "controller", CommandReply)
 
 
 def send_thruster_fault(
@@ -71,19 +74,40 @@ def send_thruster_fault(
     request = ThrusterFaultCommand(
         chaser=chaser, thruster=thruster, kind=kind, factor=factor, operator=operator
     )
-    return _request(link, TO_INJECT_FAULTS, "thruster-fault", request, timeout_s, "world")
+    return _request(
+        link, TO_INJECT_FAULTS, "thruster-fault", request, timeout_s, "world", CommandReply
+    )
+
+
+def send_arming(
+    link: Link, action: Literal["arm", "disarm", "kill"], timeout_s: float, operator: str = ""
+) -> ArmingReply:
+    """Arm, disarm or kill the robots of a gateway and return its reply. Raises OperatorError,
+    RightsError, TransportError.
+    """
+    request = ArmingCommand(action=action, operator=operator)
+    return _request(link, TO_ARM, action, request, timeout_s, "gateway", ArmingReply)
+
+
+Reply = TypeVar("Reply", bound=Struct)
 
 
 def _request(
-    link: Link, rights: Rights, what: str, request: Struct, timeout_s: float, receiver: str
-) -> CommandReply:
+    link: Link,
+    rights: Rights,
+    what: str,
+    request: Struct,
+    timeout_s: float,
+    receiver: str,
+    kind: type[Reply],
+) -> Reply:
     check_rights(link, what, rights)
     (key,) = rights.queries
     node = Node("operator", "operator", link)
     try:
         start_s = time.monotonic()
         while time.monotonic() - start_s < timeout_s:
-            reply = node.query(key, request, CommandReply, timeout_s)
+            reply = node.query(key, request, kind, timeout_s)
             if reply is not None:
                 return reply
             time.sleep(0.05)  # not connected yet

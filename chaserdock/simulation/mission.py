@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from .network import SimulatedNetwork
 from .scheduler import Scheduler, Task
 
 Tap = Callable[[str, RawSample], None]
+ProcessMain = Callable[[ProcessOptions], int]
 
 _START_S, _END_S = 30.0, 60.0
 """Longest virtual time (s) from the start of the processes to the first tick, and from the end of
@@ -56,12 +57,14 @@ def simulate(
     overrides: tuple[str, ...] = (),
     tap: Tap | None = None,
     over: Callable[[], bool] | None = None,
+    others: Mapping[str, ProcessMain] | None = None,
 ) -> SimulatedFlight:
     """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes
     to ``folder``.
 
     ``tap``: called with sender and sample of every message when it is published. ``over``: the
-    flight is broken off once it returns True. Raises ScenarioError and MissingPackageError.
+    flight is broken off once it returns True. ``others``: processes by name, which are added or
+    take the place of those of their names. Raises ScenarioError and MissingPackageError.
     """
     scenario = load_scenario(path, overrides)
     require_packages(scenario)
@@ -86,7 +89,7 @@ def simulate(
     gc.disable()
     try:
         with contextlib.redirect_stderr(printed):
-            tasks = _spawn(scheduler, scenario, options)
+            tasks = _spawn(scheduler, scenario, options, others or {})
             limit_s = _START_S + 3.0 * scenario.duration_s + _END_S
             scheduler.run(limit_s, over)
             stalled = tuple(t.name for t in tasks if not t.done)
@@ -106,14 +109,22 @@ def simulate(
     )
 
 
-def _spawn(scheduler: Scheduler, scenario: Scenario, options: ProcessOptions) -> list[Task]:
-    """Start world, controllers, chasers and recorder."""
+def _spawn(
+    scheduler: Scheduler,
+    scenario: Scenario,
+    options: ProcessOptions,
+    others: Mapping[str, ProcessMain],
+) -> list[Task]:
+    """Start world, controllers, chasers, recorder, and ``others``, some in place of these."""
+    left = dict(others)
 
-    def start(name: str, main: Callable[[ProcessOptions], int], **changes: object) -> Task:
-        return scheduler.spawn(name, lambda: main(replace(options, **changes)))
+    def start(name: str, main: ProcessMain, **changes: object) -> Task:
+        own = left.pop(name, main)
+        return scheduler.spawn(name, lambda: own(replace(options, **changes)))
 
     tasks = [start("world", world.main), start("controller", controller.main)]
     if scenario.controller.standby:
         tasks.append(start("standby", controller.main, standby=True))
     tasks += [start(f"chaser/{i}", chaser.main, chaser=i) for i in range(len(scenario.chasers))]
-    return [*tasks, start("recorder", recorder.main)]
+    tasks.append(start("recorder", recorder.main))
+    return [*tasks, *(start(name, left[name]) for name in tuple(left))]

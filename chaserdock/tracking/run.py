@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 from chaserdock_agents.gateway.cameras import (
-    ImageSource,
     CapturedImage,
+    ImageSource,
     ImageSourceError,
     UnreadableImage,
 )

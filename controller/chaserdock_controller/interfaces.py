@@ -16,7 +16,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.geometry_errors import GeometryParameter
 from chaserdock_models.mounting import MountedChaser
-from chaserdock_models.passive_safety import CoastCertificate
+from chaserdock_models.passive_safety import CoastCertificate, DisturbedMotion
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import (
     CameraCalibration,
@@ -239,15 +239,15 @@ class ChaserEstimate:
     """What is estimated of one chaser.
 
     ``own``: its motion, None without valid odometry. ``relative``: its pose relative to the target.
-    ``motion_covariance`` (6, 6): of its position and velocity relative to the target, WRF; None
-    while passive safety is off. Both only with ``own`` and if the estimator provides them.
+    ``disturbed``: what decides where it coasts besides its position and velocity; None while
+    passive safety is off. Both only with ``own`` and if the estimator provides them.
     ``camera``: errors of its camera, once estimated. ``visible``: it sees the target in this tick.
     ``latched``: its latch holds the target. ``doubtful``: its odometry may be wrong.
     """
 
     chaser: int
     own: OwnMotion | None = None
-    motion_covariance: Array | None = None
+    disturbed: DisturbedMotion | None = None
     relative: RelativePose | None = None
     camera: CameraCalibration | None = None
     visible: bool = False

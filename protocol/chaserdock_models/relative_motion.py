@@ -190,6 +190,26 @@ def cw_transition(mean_motion_rad_s: float, time_s: ArrayLike) -> Array:
     return phi
 
 
+def cw_response(mean_motion_rad_s: float, time_s: ArrayLike) -> Array:
+    """Return the states (..., 6, 3) that a constant acceleration of 1 m/s^2 along each axis gives a
+    body at rest in the origin after ``time_s`` (...): the integral of ``cw_transition``.
+
+    A mean motion of 0 gives free motion.
+    """
+    n, t = mean_motion_rad_s, np.asarray(time_s, dtype=float)
+    response = np.zeros((*t.shape, 6, 3))
+    response[..., 3:, :] = cw_transition(n, t)[..., :3, 3:]
+    if n == 0.0:
+        response[..., range(3), range(3)] = 0.5 * np.square(t)[..., None]
+        return response
+    raised = 2.0 * np.square(np.sin(0.5 * n * t) / n)
+    aside = -2.0 * _sine_lag(n * t) / (n * n)
+    response[..., 0, 0], response[..., 0, 1] = raised, aside
+    response[..., 1, 0], response[..., 1, 1] = -aside, 4.0 * raised - 1.5 * np.square(t)
+    response[..., 2, 2] = raised
+    return response
+
+
 def cw_wrench(mean_motion_rad_s: float, state: Array, mass_kg: float, moments: Scalars3) -> Array:
     """Return the wrench (6,) that moves a body in free space as a circular orbit moves it in Hill
     axes.

@@ -748,6 +748,30 @@ class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):
     operator: Text = ""
 
 
+class ArmingCommand(Struct, frozen=True, kw_only=True):
+    """Let the robots of a laboratory move (``arm``), stop them (``disarm``), or stop them for good
+    (``kill``).
+    """
+
+    action: Literal["arm", "disarm", "kill"]
+    operator: Text = ""
+
+
+class ArmingReply(Struct, frozen=True, kw_only=True):
+    """Whether the gateway did what an ``ArmingCommand`` asks for, and why."""
+
+    accepted: bool
+    reason: Text
+
+
+class Kill(Message, frozen=True, kw_only=True):
+    """Stop the robots of a laboratory for good. Anything may publish it that may be an operator,
+    such as an emergency button.
+    """
+
+    by: Text = ""
+
+
 class Presence(Message, frozen=True, kw_only=True):
     """Heartbeat of a process. ``heard``: processes whose presence it has received, name to
     instance.
@@ -836,6 +860,9 @@ VERSION: dict[type[Struct], int] = {
     ThrusterFaultCommand: 2,
     CommandReply: 1,
     ControllerState: 2,
+    ArmingCommand: 1,
+    ArmingReply: 1,
+    Kill: 1,
     Presence: 1,
     Farewell: 1,
     JoinRequest: 1,

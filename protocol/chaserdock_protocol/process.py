@@ -63,7 +63,7 @@ class ProcessOptions:
     world waits after it lost all processes. ``by_run``: the recorder creates one folder per run in
     ``out``. ``until``: the router ends when this process has joined and left. ``standby``: the
     controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM. ``ros``:
-    for the bridge.
+    for the bridge. ``dry_run``: a gateway sends nothing to robots.
     """
 
     link: Link = field(default_factory=Link)
@@ -86,6 +86,7 @@ class ProcessOptions:
     standby: bool = False
     signals: bool = True
     ros: RosLink = RosLink()
+    dry_run: bool = False
 
     def stop_signal(self) -> StopSignal:
         """Return the signal that stops the process."""

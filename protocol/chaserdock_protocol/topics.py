@@ -125,6 +125,9 @@ STATE = _topic(
 )
 OPERATED = _topic("controller/operated", m.OperatorCommand, "controller", set(), "event", "event")
 ACK = _topic("recorder/ack", m.RecorderAck, "recorder", {"world"}, "tick", "command")
+KILL = Topic(
+    "operator/kill", m.Kill, "operator", (_OBSERVERS - {"operator"}) | {"world"}, "event", "command"
+)
 EVENT = _topic("{process}/event", m.Event, "any", set(), "event", "event")
 HEALTH = _topic("{process}/health", m.Health, "any", set(), "second", "event")
 PRESENCE = _topic("{process}/presence", m.Presence, "any", _EVERYONE, "presence", "event")
@@ -156,13 +159,14 @@ TOPICS: tuple[Topic, ...] = (
     OPERATED,
     STATE,
     ACK,
+    KILL,
     EVENT,
     HEALTH,
     PRESENCE,
     FAREWELL,
 )
 
-EXPRESS = (WRENCH, ACTUATORS, LEASE, ACK, STATE)
+EXPRESS = (WRENCH, ACTUATORS, LEASE, ACK, STATE, KILL)
 """Sent at once (not batched), together with messages of their priority published before."""
 WORLD_BRANCHES = ("world/", "truth/")
 """Beginnings of the keys that only the world writes."""
@@ -179,6 +183,8 @@ OPERATE_KEY = "controller/operate"
 """Query: OperatorCommand -> CommandReply."""
 THRUSTER_FAULT_KEY = "world/thruster_fault"
 """Query: ThrusterFaultCommand -> CommandReply."""
+ARMING_KEY = "world/arming"
+"""Query: ArmingCommand -> ArmingReply, of a gateway."""
 LIVE_KEY = "live/{process}"
 """Liveliness token of a process."""
 

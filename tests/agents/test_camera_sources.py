@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from chaserdock_agents.gateway.cameras import (
     UnreadableImage,
     capture,
     open_camera,
+    open_driver,
 )
 from chaserdock_agents.gateway.cameras.files import time_of_name
 from chaserdock_agents.gateway.cameras.image_messages import (
@@ -28,8 +28,10 @@ from chaserdock_agents.gateway.cameras.image_messages import (
     compressed_pixels,
     raw_pixels,
 )
+from chaserdock_agents.gateway.cameras.polled import PolledCamera
+from chaserdock_agents.gateway.devices import CameraFrame, DeviceError, DeviceHost
 from chaserdock_agents.ros2.types import TYPES
-from chaserdock_protocol import codec, plugins
+from chaserdock_protocol import codec
 from chaserdock_protocol.messages import Image, encoding_of, schema_of
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -244,27 +246,53 @@ def test_a_slow_reader_gets_the_newest_image(device: Callable[[FakeCapture | Non
 
 
 class OwnCamera:
-    """A source of an installed package."""
+    """A camera with a driver of the gateway: two images at once, then it is gone."""
 
-    live = False
+    def __init__(self, stamp_ns: int | None) -> None:
+        self.frames = [[], [CameraFrame(GREY, stamp_ns, 5), CameraFrame(GREY, stamp_ns, 9)]]
+        self.closed = False
 
-    def __init__(self, rest: str, options: Any) -> None:
-        self.name, self.fps = rest, options.fps
-
-    def frames(self) -> Iterator[Captured]:
-        yield CapturedImage(GREY, 7, "exposure", None, 0)
+    def poll(self) -> list[CameraFrame]:
+        if not self.frames:
+            raise DeviceError("mine:1: is gone")
+        return self.frames.pop(0)
 
     def close(self) -> None:
-        pass
+        self.closed = True
 
 
-def test_an_installed_package_adds_a_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("mine", f"{__name__}:OwnCamera", "chaserdock.cameras")
-    monkeypatch.setattr(EntryPoint, "load", lambda self: OwnCamera)
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
-    source: Any = open_camera("mine:left/2", {"fps": 3.0})
-    assert (source.name, source.fps) == ("left/2", 3.0)
-    assert [c.time_ns for c in images(source)] == [7]
+@pytest.mark.parametrize(
+    ("stamp_ns", "expected"), [(7, (7, "exposure", 9, 1)), (None, (9, "arrival", 9, 1))]
+)
+def test_a_camera_of_the_gateway_is_a_source(
+    stamp_ns: int | None, expected: tuple[object, ...]
+) -> None:
+    camera = OwnCamera(stamp_ns)
+    source = PolledCamera(camera, "mine:1", 1.0)
+    frames = source.frames()
+    image = next(frames)
+    assert isinstance(image, CapturedImage)
+    assert (image.time_ns, image.stamp, image.arrival_ns, image.sequence) == expected
+    with pytest.raises(DeviceError, match="is gone"):
+        next(frames)
+    source.close()
+    assert camera.closed
+
+
+def test_a_source_is_a_camera_of_the_gateway(
+    device: Callable[[FakeCapture | None], None],
+) -> None:
+    device(FakeCapture(2, stamp_ms=1234.0))
+    camera = open_driver("0", {"fps": 30.0}, DeviceHost(lambda: 42))
+    seen: list[CameraFrame] = []
+    with pytest.raises(DeviceError, match="/dev/video0: has ended"):
+        for _ in range(1000):
+            seen += camera.poll()
+            time.sleep(0.01)
+    camera.close()
+    assert {(f.stamp_ns, f.arrived_ns) for f in seen} <= {(1_234_000_000, 42)}
+    with pytest.raises(DeviceError, match="unknown option speed; known: width_px"):
+        open_driver("0", {"speed": 1}, DeviceHost(lambda: 42))
 
 
 # -- Recordings ------------------------------------------------------------------------------------

@@ -51,7 +51,7 @@ FORBIDDEN_TYPES = {
     TruthValues,
 }  # fmt: skip
 FORBIDDEN_ANYWHERE = {
-    "simulation", "world",
+    "lab", "simulation", "world",
     "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad",
     "start_velocity_m_s",
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",

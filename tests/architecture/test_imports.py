@@ -103,7 +103,7 @@ OPTIONAL = {
     "chaserdock.experiments": {"chaserdock.cli.compare", "chaserdock.cli.run"},
     "chaserdock.targets": {"chaserdock.cli.target"},
     "chaserdock.tracking": {"chaserdock", "chaserdock.cli.track"},
-    "chaserdock_agents.gateway": {
+    "chaserdock_agents.gateway.cameras": {
         "chaserdock.cli.track",
         "chaserdock.tracking.pose_files",
         "chaserdock.tracking.run",
@@ -111,12 +111,16 @@ OPTIONAL = {
     "chaserdock_agents.ros2": {
         "chaserdock.logs.rosbag",
         "chaserdock_agents.gateway.cameras.image_messages",
+        "chaserdock_agents.gateway.drivers.px4_robot",
+        "chaserdock_agents.gateway.drivers.ros2_network",
+        "chaserdock_agents.gateway.drivers.ros2_robot",
     },
+    "chaserdock_agents.gateway.drivers": set(),
     "chaserdock.logs.rosbag": {"chaserdock.cli.logs"},
     "chaserdock_world.physics.mujoco_engine": {"chaserdock_world.physics.engine_factory"},
 }
 """What few users need, and the modules that may import it: its command or its table. The process
-``ros2`` is started by its entry point.
+``ros2`` and drivers are loaded by their entry points.
 """
 
 

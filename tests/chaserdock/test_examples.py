@@ -6,17 +6,29 @@ controller.
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
+import json
 import os
 import re
+import socket
 import subprocess
 import sys
+import threading
+import time
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from chaserdock_agents.gateway.devices import (
+    DeviceError,
+    DeviceHost,
+    RobotCommand,
+    open_device,
+)
 from chaserdock_controller.estimation.estimators import make_estimator
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import load_scenario
@@ -82,6 +94,60 @@ def test_missing_plugin_is_named(tmp_path: Path) -> None:
     assert status != 0
     assert "'pd'" in said
     assert "chaserdock.solvers" in said
+
+
+@pytest.fixture
+def udp_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """Install the driver; return the socket of its robot."""
+    install(EXAMPLES / "own_driver", tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
+        robot.settimeout(30.0)
+        robot.bind(("127.0.0.1", 0))
+        yield robot
+    sys.modules.pop("own_driver", None)
+
+
+def test_own_driver_is_found_and_its_robot_gets_what_is_commanded(
+    udp_driver: socket.socket,
+) -> None:
+    address = f"udp:127.0.0.1:{udp_driver.getsockname()[1]}"
+    device = open_device("robot", address, {"thrusters": 2}, DeviceHost(time.monotonic_ns))
+
+    def answer(armed: bool) -> None:
+        asked, sender = udp_driver.recvfrom(1024)
+        assert json.loads(asked) == {"arm": True}
+        udp_driver.sendto(json.dumps({"armed": armed}).encode(), sender)
+
+    for armed in (False, True):
+        thread = threading.Thread(target=answer, args=(armed,))
+        thread.start()
+        with contextlib.nullcontext() if armed else pytest.raises(DeviceError, match="refuses"):
+            device.arm()
+        thread.join()
+    force, torque, duty = np.array([0.1, -0.2, 0.3]), np.array([0.4, -0.5, 0.6]), np.array([0, 0.7])
+    device.send(RobotCommand(1, force, torque, duty))
+    device.close()
+    read = [json.loads(udp_driver.recv(1024)) for _ in range(3)]
+    assert read == [
+        {"force_N": [0.1, -0.2, 0.3], "torque_N_m": [0.4, -0.5, 0.6], "duty": [0.0, 0.7]},
+        {"force_N": [0.0] * 3, "torque_N_m": [0.0] * 3, "duty": [0.0] * 2},
+        {"arm": False},
+    ]
+
+
+def test_own_driver_says_what_is_wrong_in_one_line(udp_driver: socket.socket) -> None:
+    host = DeviceHost(time.monotonic_ns)
+    with pytest.raises(DeviceError, match=r"robot 'udp:here': must be udp:HOST:PORT"):
+        open_device("robot", "udp:here", {}, host)
+    address = f"udp:127.0.0.1:{udp_driver.getsockname()[1]}"
+    with pytest.raises(DeviceError, match="no other option than thrusters"):
+        open_device("robot", address, {"rate": 3}, host)
+    udp_driver.close()
+    device = open_device("robot", address, {}, host)
+    with pytest.raises(DeviceError, match="no answer to arming"):
+        device.arm()
+    device.close()
 
 
 def test_estimator_of_the_docs_ignores_few_markers(

@@ -23,6 +23,7 @@ from chaserdock_controller.estimation.joint.replay import FilterTick
 from chaserdock_controller.estimation.joint.state import (
     CENTRE,
     CHASER,
+    FORCE,
     POSITION_DRIFT,
     TARGET,
     JointState,
@@ -121,16 +122,70 @@ def test_relative_poses_and_their_covariance(seed: int) -> None:
         np.testing.assert_allclose(pose.covariance, j @ s.covariance @ j.T, rtol=1e-5, atol=1e-10)
 
 
+def acceleration_of(s: JointState, i: int) -> Array:
+    """Acceleration by the disturbance, WRF."""
+    return matrix(s.attitudes_wxyz[i]) @ s.of(i, FORCE) / MASS_KG
+
+
 @SEEDS
-def test_covariance_of_the_motion_relative_to_the_target(seed: int) -> None:
-    s = joint_state(np.random.default_rng(seed))
+def test_what_disturbs_a_coast_is_the_estimated_force_with_the_errors_of_the_motion(
+    seed: int,
+) -> None:
+    """Without a limit of its own the force lasts; derivatives are central differences."""
+    s, e = joint_state(np.random.default_rng(seed)), 1e-5
     for i in range(2):
-        j = np.zeros((6, len(s.covariance)))
-        own = TARGET + CHASER * i
-        j[:, own : own + 6], j[:, 0:6] = np.eye(6), -np.eye(6)
-        found = estimator_of(s).motion_covariance(i)
+        columns = []
+        for d in np.eye(len(s.covariance)):
+            values = []
+            for sign in (1, -1):
+                t = inject(s, sign * e * d)
+                relative = [t.positions_m[i] - t.position_m, t.velocities_m_s[i] - t.velocity_m_s]
+                values.append(np.concatenate([*relative, acceleration_of(t, i)]))
+            columns.append((values[0] - values[1]) / (2 * e))
+        j = np.column_stack(columns)
+        found = estimator_of(s).disturbed_motion(i)
         assert found is not None
-        np.testing.assert_allclose(found, j @ s.covariance @ j.T, atol=1e-15)
+        np.testing.assert_allclose(found.acceleration_m_s2, acceleration_of(s, i), atol=1e-12)
+        np.testing.assert_allclose(found.covariance, j @ s.covariance @ j.T, rtol=1e-6, atol=1e-12)
+
+
+@SEEDS
+def test_force_that_lasts_has_its_own_prior_in_place_of_the_filters(seed: int) -> None:
+    """Bayes' rule in information form: the filter's prior is taken out of its result, and another
+    one is put in.
+    """
+    rng, lasting_N = np.random.default_rng(seed), 0.004
+    s, estimator = joint_state(rng), estimator_of(joint_state(np.random.default_rng(seed)))
+    p = estimator.parameters = changed(estimator.parameters, lasting_force_N=lasting_N)
+    found, free = estimator.disturbed_motion(1), estimator_of(s).disturbed_motion(1)
+    assert found is not None
+    assert free is not None
+    own, r = TARGET + CHASER, matrix(s.attitudes_wxyz[1])
+    force, turn = (slice(own + k, own + k + 3) for k in (12, 6))
+    information = np.linalg.inv(s.covariance[force, force])
+    total = information + np.eye(3) * (1.0 / lasting_N**2 - 1.0 / p.disturbance_force_N**2)
+    mean = np.linalg.solve(total, information @ s.of(1, FORCE))
+    np.testing.assert_allclose(found.acceleration_m_s2, r @ mean / MASS_KG, atol=1e-12)
+    # Errors of the force are those of a regression on the filter's, those of the attitude its own.
+    gain, lever = np.linalg.solve(total, information), -skew(mean)
+    cross = gain @ s.covariance[force, turn] @ lever.T
+    spread = np.linalg.inv(total) + lever @ s.covariance[turn, turn] @ lever.T + cross + cross.T
+    np.testing.assert_allclose(
+        found.covariance[6:, 6:], r @ spread @ r.T / MASS_KG**2, rtol=1e-6, atol=1e-14
+    )
+    np.testing.assert_allclose(found.covariance[:6, :6], free.covariance[:6, :6], atol=1e-15)
+    assert np.linalg.eigvalsh(found.covariance).min() > -1e-12
+
+
+def test_stated_force_bounds_what_is_assumed_of_a_coast_whatever_is_estimated() -> None:
+    s = joint_state(np.random.default_rng(4))
+    estimator = estimator_of(s)
+    estimator.parameters = changed(estimator.parameters, lasting_force_N=1e-6)
+    found = estimator.disturbed_motion(0)
+    assert found is not None
+    sigmas = np.sqrt(np.diag(found.covariance)[6:])
+    np.testing.assert_allclose(sigmas, 1e-6 / MASS_KG, rtol=1e-3)
+    assert np.abs(found.acceleration_m_s2).max() < 1e-8 / MASS_KG
 
 
 @SEEDS
@@ -143,7 +198,7 @@ def test_camera_errors_are_given_in_the_chasers_axes(seed: int) -> None:
         rng.normal(size=3), rng.normal(size=3), float(rng.normal()), covariance(rng, sigmas)
     )
     still = np.zeros(3)
-    motion = ChaserMotion(1, still, still, q, still, np.zeros(6), None, None, error)
+    motion = ChaserMotion(1, still, still, q, still, np.zeros(6), None, error)
     found, r = camera_calibrations([motion], camera)[1], matrix(q)
     np.testing.assert_allclose(found.turn_rad, r @ error.turn_rad, atol=1e-12)
     np.testing.assert_allclose(found.shift_m, r @ error.shift_m, atol=1e-12)
@@ -212,9 +267,7 @@ def test_state_at_effect_is_flown_under_commands_disturbance_and_orbit(seed: int
     state, pushed = np.zeros(13), rng.uniform(-0.02, 0.02, 6)
     state[:3], state[3:6] = rng.uniform(-90.0, 90.0, 3), rng.uniform(-0.3, 0.3, 3)
     state[6:10], state[10:] = attitude(rng), rng.uniform(-0.2, 0.2, 3)
-    motion = ChaserMotion(
-        0, state[:3], state[3:6], state[6:10], state[10:], pushed, None, None, None
-    )
+    motion = ChaserMotion(0, state[:3], state[3:6], state[6:10], state[10:], pushed, None, None)
     commands = rng.uniform(-0.5, 0.5, (2, 6))
     ahead = ((0.07, commands[0]), (0.12, commands[1]))
     found = EstimationStage(mission, Fixed(target, (motion,))).run(
@@ -483,3 +536,15 @@ def test_published_estimate_is_that_of_the_filter() -> None:
     np.testing.assert_array_equal(message.relative[0].torque_N_m, pushed[3:])
     np.testing.assert_array_equal(message.velocity_m_s, target.velocity_m_s)
     np.testing.assert_array_equal(message.covariance, target.covariance.ravel())
+
+
+def test_force_varies_in_a_coast_as_its_random_walk_begins_and_stays_as_large_as_stated() -> None:
+    """The density of the white noise behind it is that of the walk, scaled with the force."""
+    p = changed(parameters(scenario(chaser=CHASER_BODY), navigation("lab")), lasting_force_N=0.002)
+    noise = p.coast_noise
+    assert noise.varying_m_s2 == pytest.approx(0.002 / MASS_KG)
+    density = 2.0 * noise.varying_m_s2**2 / noise.varying_s
+    walk = (p.disturbance_force_N_sqrt_s / MASS_KG) ** 2
+    assert density == pytest.approx(walk * (0.002 / p.disturbance_force_N) ** 2)
+    target = process_noise(2.0, *(x * x for x in p.target_noise[p.target.motion_model]))
+    assert noise.white_m_s2_sqrt_s**2 * 2.0 == pytest.approx(target[3, 3])

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.estimation.joint.parameters import parameters_of
 from chaserdock_controller.estimation.types import (
     ChaserMotion,
     Estimate,
@@ -31,6 +33,8 @@ from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, NmpcSolver
 from chaserdock_controller.nmpc import stage as planning
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.passive_safety import disturbed
+from coast_cases import disturbed_in_general, margins_of
 from flight_cases import odometry, scenario, tick_inputs
 from general_position import (
     INERTIA,
@@ -42,6 +46,7 @@ from general_position import (
 )
 
 MASS_KG, HZ, LATENCY_S, STEP_S = 17.8, 10, 0.19, 0.2
+NOTHING_VARIES = {"passive_safety": "enforce", "passive_safety_force_N": 0.0}
 PLACES = ((-1.0, 0.4, 0.3), (0.5, -1.1, -0.4))
 
 
@@ -85,7 +90,7 @@ class Uniform(Estimator):
         for i in range(2):
             x = self.chaser(i, inputs.time_ns / 1e9)
             parts = x[:3], x[3:6], x[6:10], x[10:]
-            motions.append(ChaserMotion(i, *parts, self.pushed[i], self.relative[i], None, None))
+            motions.append(ChaserMotion(i, *parts, self.pushed[i], self.relative[i], None))
         return Estimate(self.estimate_at(inputs.time_ns), tuple(motions))
 
 
@@ -214,15 +219,15 @@ def test_messages_of_a_tick_are_of_its_own_time(flown: Flown) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_margin_of_a_move_is_that_of_its_coasts_from_a_turning_target(seed: int) -> None:
     """Coasts begin with the velocity of the place, by differences of its path in WRF."""
-    rng, h, sigma_m = np.random.default_rng(seed), 1e-4, 0.03
-    mission = scenario(limits={"passive_safety": "enforce", "passive_safety_s": 200.0})
+    rng, h = np.random.default_rng(seed), 1e-4
+    mission = scenario(limits=NOTHING_VARIES | {"passive_safety_s": 200.0})
     planner, estimator = EscapePlanner(mission, 0.05), Uniform(rng)
     estimator.velocity = np.zeros(3)
     estimator.start = (np.zeros(3), estimator.start[1])
     move = move_to(stay((1.6, 1.3, -0.9), 0.0), (1.1, -1.9, 1.2), 1.0, 0.3)
     state = np.concatenate([rng.uniform(1, 2, 3), rng.uniform(-0.1, 0.1, 3)])
-    spread = np.diag([sigma_m**2] * 3 + [1e-30] * 3)
-    known = RelativeState(state, spread, estimator.estimate_at(1_000_000_000))
+    motion = disturbed_in_general(rng, 0.03, 1e-4, 1e-5)
+    known = RelativeState(state, motion, estimator.estimate_at(1_000_000_000))
     turn_s = 2 * math.pi / float(np.linalg.norm(estimator.omega))
     end_s = move.start_s + move.duration_s
     moments = [*np.linspace(1.0, end_s, 33), *(end_s + np.linspace(0.0, turn_s, 12))]
@@ -230,34 +235,40 @@ def test_margin_of_a_move_is_that_of_its_coasts_from_a_turning_target(seed: int)
     def place(time_s: float) -> Array:
         return estimator.pose(time_s)[1] @ move.at([time_s])[0][0]
 
-    distances = []
+    noise, kept_m = parameters_of(mission).coast_noise, mission.limits.min_distance_target_m
+    least, times_s = [], np.arange(0.0, 200.0, 0.02)
     for time_s in moments:
-        r = place(time_s)
         v = (place(time_s + h) - place(time_s - h)) / (2 * h)
-        t = min(max(-float(r @ v) / float(v @ v), 0.0), 200.0)
-        distances.append(float(np.linalg.norm(r + t * v)))
-    expected = (min(distances) - mission.limits.min_distance_target_m) / sigma_m
-    assert planner.move_margin(known, move, 1.0) == pytest.approx(expected, abs=1e-3)
+        x = np.concatenate([place(time_s), v])
+        least.append(float(margins_of(x, motion, noise, kept_m, times_s)[0].min()))
+    found = planner.move_margin(known, move, 1.0)
+    # Within a step of 10 s the deviation counts as that at one of its ends.
+    assert found == pytest.approx(min(least), rel=0.05, abs=0.05)
+    assert found <= 1.005 * min(least)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_abort_has_the_margin_of_its_coast_with_the_error_of_its_burn(seed: int) -> None:
-    """Between those with the error's effect at the closest approach and at the coast's end."""
-    rng, duration_s, sigma_m = np.random.default_rng(seed), 200.0, 0.03
-    mission = scenario(limits={"passive_safety": "enforce", "passive_safety_s": duration_s})
+    """The disturbance acts from the burn's end; a burn's error is 3 % of it along each axis."""
+    rng, duration_s = np.random.default_rng(seed), 200.0
+    mission = scenario(limits=NOTHING_VARIES | {"passive_safety_s": duration_s})
     state = np.concatenate([rng.uniform(1, 2, 3), rng.uniform(-0.03, 0.03, 3)])
-    spread = np.diag([sigma_m**2] * 3 + [1e-30] * 3)
-    known = RelativeState(state, spread, Uniform(rng).estimate_at(0))
+    motion = disturbed_in_general(rng, 0.03, 1e-4, 1e-5)
+    known = RelativeState(state, motion, Uniform(rng).estimate_at(0))
     move, margin = EscapePlanner(mission, 0.05).escape(known, 1.0)
     burn_s, burn = move.burn_s, move.acceleration_m_s2
     r = state[:3] + burn_s * state[3:] + 0.5 * burn_s**2 * burn
     v = state[3:] + burn_s * burn
-    t = min(max(-float(r @ v) / float(v @ v), 0.0), duration_s)
-    room_m = float(np.linalg.norm(r + t * v)) - mission.limits.min_distance_target_m
-    sigma_m_s = 0.03 * burn_s * float(np.linalg.norm(burn))
-    most, least = (room_m / math.hypot(sigma_m, s * sigma_m_s) for s in (t, duration_s))
-    assert room_m > 0.0
-    assert least - 1e-6 <= margin <= most + 1e-6
+    spread = motion.covariance.copy()
+    spread[3:6, 3:6] += (0.03 * burn_s * float(np.linalg.norm(burn))) ** 2 * np.eye(3)
+    margins, _ = margins_of(
+        np.concatenate([r, v]), replace(motion, covariance=spread),
+        parameters_of(mission).coast_noise, mission.limits.min_distance_target_m,
+        np.arange(0.0, duration_s + 0.02, 0.02),
+    )  # fmt: skip
+    assert margins.min() > 0.0
+    assert margin == pytest.approx(float(margins.min()), rel=0.05)
+    assert margin <= 1.005 * float(margins.min())
 
 
 def test_guidance_knows_position_and_velocity_relative_to_the_target() -> None:
@@ -265,9 +276,11 @@ def test_guidance_knows_position_and_velocity_relative_to_the_target() -> None:
     mission, estimator = scenario(limits={"passive_safety": "enforce"}), Uniform(rng)
     target, own = estimator.estimate_at(10**9), odometry(0, 10, 10**9)
     motion = OwnMotion(own, np.zeros(13), np.zeros(6))
-    estimate = ChaserEstimate(0, motion, motion_covariance=np.eye(6))
+    pushed = disturbed(np.eye(6), 0.02)
+    estimate = ChaserEstimate(0, motion, disturbed=pushed)
     known = GuidanceStage(mission)._relative(estimate, target)
     assert known is not None
     apart = np.array(own.position_m) - target.position_m
     np.testing.assert_allclose(known.state[:3], apart, atol=1e-15)
+    assert known.disturbed is pushed
     np.testing.assert_allclose(known.state[3:], own.velocity_m_s - estimator.velocity, atol=1e-15)

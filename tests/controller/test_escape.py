@@ -6,6 +6,7 @@ chaser does without them.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -20,8 +21,9 @@ from chaserdock_controller.guidance.trajectories import Escape, move_to, stay
 from chaserdock_controller.interfaces import TargetState
 from chaserdock_models import rotations
 from chaserdock_models.orbit import OrbitalElements, propagate, state_of
+from chaserdock_models.passive_safety import DisturbedMotion, disturbed
 from chaserdock_models.relative_motion import propagate_relative
-from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.messages import OperatorCommand, PassiveSafety
 from chaserdock_protocol.scenario import Scenario, flight_scenario, parse_scenario
 from flight_cases import drain, fleet_of, known, order
 from flights.measured_poses import measurement_model
@@ -31,7 +33,7 @@ from hypothesis import strategies as st
 from chaserdock.experiments.in_process import InProcessMission
 
 GOOD = np.diag([2e-3**2] * 3 + [2e-5**2] * 3)
-KEEP_OUT_M = 2.0
+KEEP_OUT_M, FORCE_N = 2.0, 1e-8
 
 
 def scenario(**changes: Any) -> Scenario:
@@ -45,8 +47,10 @@ def scenario(**changes: Any) -> Scenario:
             "omega_rad_s": [0.0, 0.0, 0.0],
         },
         "approach": {"max_speed_m_s": 0.1},
+        "estimator": {"target_acceleration_noise": 1e-8},
         "limits": {
             "passive_safety": "enforce",
+            "passive_safety_force_N": FORCE_N,
             "min_distance_target_m": KEEP_OUT_M,
             "max_reference_distance_m": 300.0,
         },
@@ -67,7 +71,7 @@ def planner(**changes: Any) -> EscapePlanner:
 
 
 def relative(state: np.ndarray, covariance: np.ndarray = GOOD) -> RelativeState:
-    return RelativeState(state, covariance, at_rest())
+    return RelativeState(state, disturbed(covariance, FORCE_N / 17.8), at_rest())
 
 
 @pytest.mark.slow
@@ -103,6 +107,55 @@ def test_small_burn_is_preferred_and_an_uncertain_state_needs_a_larger_one() -> 
     rough = planner().escape(relative(state, np.diag([0.5**2] * 3 + [4e-2**2] * 3)), 0.0)
     assert small[0].burn_s < rough[0].burn_s
     assert small[1] >= 4.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_abort_stays_out_under_a_known_force_that_would_push_it_in(seed: int) -> None:
+    """In free space: the coast of the abort that is best without it would come back."""
+    rng, keep_out_m, duration_s = np.random.default_rng(seed), 0.75, 250.0
+    limits: dict[str, Any] = {
+        "passive_safety_s": duration_s,
+        "min_distance_target_m": keep_out_m,
+    }
+    base: dict[str, Any] = scenario().model_dump(exclude_unset=True)
+    base.pop("orbit")
+    base["limits"] |= limits
+    found = EscapePlanner(flight_scenario(parse_scenario(base, "test")), 0.05)
+    away, aside = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
+    state = np.concatenate([3.0 * away, 1e-3 * aside])
+    best = found.escape(relative(state), 0.0)[0]
+    # Against the burn of the best abort, with a turn-round of its coast at the target.
+    end, speed_m_s = best.burnt_out(), best.impulse_m_s
+    back_s = float(np.linalg.norm(end[:3])) / speed_m_s * 2.0
+    push = -2.0 * (end[:3] + back_s * end[3:]) / back_s**2
+    assert back_s < duration_s
+    motion = DisturbedMotion(push, disturbed(GOOD, 1e-6).covariance)
+    escape, margin = found.escape(replace(relative(state), disturbed=motion), 0.0)
+    assert margin >= found.sigmas
+    times = np.linspace(0.0, duration_s, 5001)
+    nearest = []
+    for chosen in (best, escape):
+        x = chosen.burnt_out()
+        coast = x[:3] + times[:, None] * x[3:] + 0.5 * times[:, None] ** 2 * push
+        nearest.append(float(np.linalg.norm(coast, axis=1).min()))
+    assert nearest[0] < 0.1
+    assert nearest[1] > keep_out_m
+
+
+def test_force_of_unknown_direction_needs_a_larger_burn_and_rules_out_near_goals() -> None:
+    """0.3 uN/kg for two orbits is tens of metres along V-bar."""
+    state = np.array([1.0, -12.0, -2.0, 0.0, 0.0, 0.0])
+    small = EscapePlanner(flight_scenario(scenario()), 0.005)
+    still = relative(state)
+    unsure = replace(still, disturbed=disturbed(GOOD, 3e-7))
+    least, larger = (small.escape(x, 0.0)[0].impulse_m_s for x in (still, unsure))
+    assert larger > 1.5 * least
+
+    def near(v: float) -> Any:
+        return move_to(stay(state[:3], 0.0), (0.0, -11.0, 0.0), 0.0, v)
+
+    assert planner().limited(still, near, 0.2, 0.0) is not None
+    assert planner().limited(unsure, near, 0.2, 0.0) is None
 
 
 def test_escape_is_a_continuous_motion_that_needs_its_acceleration_only_while_it_burns() -> None:
@@ -147,6 +200,7 @@ def test_final_corridor_is_exempt() -> None:
     state = np.array([0.0, -30.0, 0.0, 0.0, 0.0, 0.0])
     limits = {
         "passive_safety": "enforce",
+        "passive_safety_force_N": FORCE_N,
         "min_distance_target_m": KEEP_OUT_M,
         "max_reference_distance_m": 300.0,
         "final_corridor_m": 31.0,
@@ -187,6 +241,7 @@ def test_unsafe_chaser_aborts_onto_a_safe_coast_and_takes_commands_from_there() 
 def test_unsafe_chaser_in_the_final_corridor_continues() -> None:
     limits = {
         "passive_safety": "enforce",
+        "passive_safety_force_N": FORCE_N,
         "min_distance_target_m": KEEP_OUT_M,
         "max_reference_distance_m": 300.0,
         "final_corridor_m": 40.0,
@@ -242,3 +297,35 @@ def test_flight_publishes_certificates_and_its_abort_coasts() -> None:
     assert last.abort_margin_sigmas is not None
     assert max(forces[60:80]) > 0.5
     assert np.mean(forces[-30:]) < 0.1
+
+
+@pytest.mark.slow
+def test_flight_3_m_away_under_3_mN_is_not_certified_although_it_holds_its_place() -> None:
+    """It hardly moves, and without thrust it would be in the keep-out of 0.75 m within 200 s: the
+    filter's estimate of the force tells.
+    """
+    limits = {
+        "passive_safety": "monitor",
+        "passive_safety_s": 200.0,
+        "passive_safety_force_N": 3e-3,
+        "min_distance_target_m": 0.75,
+    }
+    chaser = {"position_m": [-2.7, 1.1, -0.7], "look_at": "target"}
+    found: list[PassiveSafety] = []
+    for newtons in (3e-3, 0.0):
+        towards = [newtons, 0.0, 0.0]  # body axes: the camera looks along X
+        base: dict[str, Any] = scenario(
+            duration_s=40.0, limits=limits, chasers=[chaser],
+            truth={"values": [{"chaser": 0, "force_N": towards}]},
+        ).model_dump(exclude_unset=True)  # fmt: skip
+        base.pop("orbit")
+        s = parse_scenario(base, "test")
+        with InProcessMission(s, measurement_model(s, 1, 1e-3, 1e-3)) as mission:
+            records = [mission.step() for _ in range(s.ticks)]
+        outputs = records[-1].outputs
+        assert outputs is not None
+        found.append(outputs.safety[0])
+    pushed, free = found
+    assert not pushed.safe
+    assert pushed.margin_sigmas < free.margin_sigmas - 0.5
+    assert pushed.distance_m < free.distance_m - 1.0

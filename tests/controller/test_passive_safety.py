@@ -10,18 +10,22 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from chaserdock_controller.interfaces import ChaserEstimate, TargetEstimation
-from chaserdock_controller.nmpc import rti
+from chaserdock_controller.nmpc import kernels, rti
 from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
+from chaserdock_controller.nmpc.problem import check_input, model_of
+from chaserdock_controller.nmpc.rti import RtiSolver
 from chaserdock_controller.nmpc.terms import coast as coast_term
 from chaserdock_controller.nmpc.types import CoastSafety, NmpcPlan
-from chaserdock_models.passive_safety import CoastModel
+from chaserdock_models.passive_safety import CoastModel, CoastNoise, DisturbedMotion, disturbed
 from chaserdock_protocol.scenario import (
     FlightScenario,
     ScenarioError,
     flight_scenario,
     parse_scenario,
 )
+from general_position import attitude
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh, with_settings
+from nmpc_kernels import build_rows
 
 
 def mission(limits: dict[str, Any], **changes: Any) -> FlightScenario:
@@ -29,7 +33,7 @@ def mission(limits: dict[str, Any], **changes: Any) -> FlightScenario:
         "name": "test",
         "duration_s": 10.0,
         "target": {"velocity_m_s": [0.0, 0.0, 0.0]},
-        "limits": limits,
+        "limits": {"passive_safety_force_N": 1e-6} | limits,
         "chasers": [{"position_m": [-5.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],
     }
     return flight_scenario(parse_scenario(values | changes, "x"))
@@ -39,8 +43,8 @@ def estimation(latched: bool = False) -> TargetEstimation:
     target = SimpleNamespace(
         position_m=np.array([1.0, 0.0, 0.0]), velocity_m_s=np.array([0.1, 0.0, 0.0])
     )
-    covariance = np.diag([1e-6] * 3 + [1e-10] * 3)
-    chaser = ChaserEstimate(0, motion_covariance=covariance, latched=latched)
+    motion = disturbed(np.diag([1e-6] * 3 + [1e-10] * 3))
+    chaser = ChaserEstimate(0, disturbed=motion, latched=latched)
     values = SimpleNamespace(at_effect=target, chasers=(chaser,))
     return cast(TargetEstimation, values)
 
@@ -121,7 +125,7 @@ def fly(
     coast: CoastModel,
     start: np.ndarray,
     goal: np.ndarray,
-    covariance: np.ndarray,
+    motion: DisturbedMotion,
     ticks: int,
     enforced: bool,
 ) -> tuple[np.ndarray, list[float]]:
@@ -129,14 +133,14 @@ def fly(
     plan at each tick.
     """
     solver, state, margins = fresh("rti", 1, WITH_COASTS), at_rest(start), []
-    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: covariance})
+    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: motion})
     for tick in range(ticks):
         problem = replace(
             fixed_problem(state[None], goal[None], d_target=0.0),
             coast_safety=safety if enforced else None,
         )
         found = solver.solve(problem, PARAMS.dt_s if tick else 0.0)
-        margins.append(coast.certify(found.states[0, :, :6], covariance, 0.75).margin_sigmas)
+        margins.append(coast.certify(found.states[0, :, :6], motion, 0.75).margin_sigmas)
         state = found.states[0, 1]
     return state[:3], margins
 
@@ -146,10 +150,10 @@ def test_plan_to_a_place_on_v_bar_is_bent_so_that_its_coasts_stay_outside() -> N
     leaves none.
     """
     coast, goal = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S), np.array([0.0, -119.0, 0.0])
-    covariance = np.diag([4e-3] * 3 + [1e-7] * 3)
+    motion = disturbed(np.diag([4e-3] * 3 + [1e-7] * 3))
     start = np.array([0.0, -120.0, 0.0])
-    end, free = fly(coast, start, goal, covariance, 140, enforced=False)
-    bent_end, bent = fly(coast, start, goal, covariance, 140, enforced=True)
+    end, free = fly(coast, start, goal, motion, 140, enforced=False)
+    bent_end, bent = fly(coast, start, goal, motion, 140, enforced=True)
     assert min(free) < 0.0
     assert min(bent) > SIGMAS
     np.testing.assert_allclose(end, goal, atol=0.15)
@@ -158,10 +162,10 @@ def test_plan_to_a_place_on_v_bar_is_bent_so_that_its_coasts_stay_outside() -> N
 
 def test_plan_that_heads_for_the_target_in_free_space_is_bent_aside_or_slowed() -> None:
     coast = CoastModel(0.0, 600.0)
-    covariance = np.diag([1e-6] * 3 + [1e-8] * 3)
+    motion = disturbed(np.diag([1e-6] * 3 + [1e-8] * 3))
     start, goal = np.array([-5.0, 0.02, 0.0]), np.array([-2.0, 0.0, 0.0])
-    _, free = fly(coast, start, goal, covariance, 60, enforced=False)
-    _, bent = fly(coast, start, goal, covariance, 60, enforced=True)
+    _, free = fly(coast, start, goal, motion, 60, enforced=False)
+    _, bent = fly(coast, start, goal, motion, 60, enforced=True)
     assert max(free[1:]) < 0.0
     assert min(bent[10:]) > SIGMAS
 
@@ -172,15 +176,15 @@ def test_only_plans_that_are_not_safe_without_them_have_rows(
     """A safe plan is that of the unrestricted problem to the last bit, and its certificate need not
     be computed again.
     """
-    coast, covariance = CoastModel(0.0, 600.0), np.diag([1e-6] * 3 + [1e-8] * 3)
+    coast, motion = CoastModel(0.0, 600.0), disturbed(np.diag([1e-6] * 3 + [1e-8] * 3))
     rows, restricted = coast_term.coast_rows, []
 
     def counted(safety: CoastSafety, *rest: Any) -> np.ndarray:
-        restricted.append(sorted(safety.covariances))
+        restricted.append(sorted(safety.motions))
         return rows(safety, *rest)
 
     monkeypatch.setattr(rti, "coast_rows", counted)
-    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: covariance, 1: covariance})
+    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: motion, 1: motion})
     starts, aside = (
         np.array([[-5.0, 0.0, 0.0], [0.0, 9.0, 0.0]]),
         np.array([[-5.0, 0.5, 0.0], [0.0, 9.5, 0.0]]),
@@ -194,11 +198,11 @@ def test_only_plans_that_are_not_safe_without_them_have_rows(
     safe, free = solved(aside, safety), solved(aside, None)
     assert restricted == []
     np.testing.assert_array_equal(safe.inputs, free.inputs)
-    assert safe.coasts[1] == coast.certify(safe.states[1, :, :6], covariance, 0.75)
+    assert safe.coasts[1] == coast.certify(safe.states[1, :, :6], motion, 0.75)
     towards = np.array([[-2.0, 0.0, 0.0], [0.0, 9.5, 0.0]])
     bent, free = solved(towards, safety), solved(towards, None)
     assert restricted == [[0]]
-    unbent = coast.certify(free.states[0, :, :6], covariance, 0.75)
+    unbent = coast.certify(free.states[0, :, :6], motion, 0.75)
     assert bent.coasts[0].margin_sigmas > unbent.margin_sigmas + SIGMAS
     np.testing.assert_array_equal(bent.inputs[1], free.inputs[1])
 
@@ -208,13 +212,16 @@ def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:
     certified margin.
     """
     rng = np.random.default_rng(3)
-    coast = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S)
-    covariance = np.diag([1e-2] * 3 + [1e-8] * 3)
+    coast = CoastModel(
+        ORBIT_RAD_S, TWO_ORBITS_S, noise=CoastNoise(1e-6, varying_m_s2=4e-8, varying_s=200.0)
+    )
+    whole = rng.normal(size=(9, 9)) * np.repeat([0.05, 5e-5, 3e-8], 3)[:, None]
+    motion = DisturbedMotion(rng.normal(0.0, 1e-7, 3), whole @ whole.T)
     states = np.concatenate(
         [rng.normal(0.0, 60.0, (40, 3)), rng.normal(0.0, 0.05, (40, 3))], axis=1
     )
     planes, wider = (
-        coast.tangent_planes(states, covariance, 0.75, k, coast_term.COASTS) for k in (0.0, 1.0)
+        coast.tangent_planes(states, motion, 0.75, k, coast_term.COASTS) for k in (0.0, 1.0)
     )
     used = np.abs(planes[..., :6]).max(axis=2) > 0.0
     assert used[:, 0].all()
@@ -223,7 +230,7 @@ def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:
         used, room / np.where(used, wider[..., 6] - planes[..., 6], 1.0), np.inf
     ).min(axis=1)
     np.testing.assert_allclose(
-        margins, coast.closest(states, covariance, 0.75).margin_sigmas, rtol=1e-3
+        margins, coast.closest(states, motion, 0.75).margin_sigmas, rtol=1e-3
     )
 
 
@@ -239,7 +246,7 @@ def test_chasers_are_restricted_where_safety_is_enforced_once_they_count() -> No
     )
     found = monitor.restriction((1, 0), {0}, both)
     assert found is not None
-    assert set(found.covariances) == {1}
+    assert set(found.motions) == {1}
     np.testing.assert_array_equal(found.target_velocity_m_s, [0.1, 0.0, 0.0])
     assert monitor.restriction((0,), set(), estimation()) is None
 
@@ -247,3 +254,84 @@ def test_chasers_are_restricted_where_safety_is_enforced_once_they_count() -> No
 def test_enforcing_needs_the_solver_that_keeps_it() -> None:
     with pytest.raises(ScenarioError, match=r"limits\.passive_safety: .*needs controller\.solver"):
         mission({"passive_safety": "enforce"}, controller={"solver": "ipopt"})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_coast_row_that_a_full_reversal_of_thrust_can_reach_is_dropped(seed: int) -> None:
+    """The rollout flies at full thrust, in a turned attitude; the reversed one breaks the rows of
+    its velocity by a little.
+    """
+    rng, force_N = np.random.default_rng(seed), PARAMS.force_max_N
+    q = attitude(rng)
+    start = at_rest(rng.uniform(4.0, 6.0, 3), q)
+    problem = fixed_problem(start[None], start[None, :3], q, d_target=0.0)
+    problem = check_input(problem, PARAMS, 1)
+    inputs = np.zeros((PARAMS.stages, 6))
+    inputs[:, :3] = force_N * rng.choice([-1.0, 1.0], 3)
+    x, reversed_x = (np.tile(start, (1, PARAMS.stages + 1, 1)) for _ in range(2))
+    for rollout, u in ((x, inputs), (reversed_x, -inputs)):
+        kernels.roll(model_of(PARAMS, PARAMS.dt_s), rollout, u[None])
+    reach_m = force_N * RtiSolver(PARAMS, 1)._reach
+    coasts = np.zeros((1, PARAMS.stages + 1, 1, 7))
+    change = x[0, 1:, 3:6] - reversed_x[0, 1:, 3:6]
+    coasts[0, 1:, 0, 3:6] = change / np.linalg.norm(change, axis=1)[:, None]
+    kept = np.einsum("kj,kj->k", coasts[0, 1:, 0, 3:6], reversed_x[0, 1:, 3:6])
+    coasts[0, 1:, 0, 6] = kept + 0.01 * np.linalg.norm(change, axis=1)
+    problem = replace(problem, coasts=coasts)
+    rows = build_rows(problem, PARAMS, x, reach_m[None])
+    of_velocity = np.abs(rows.a[0, : rows.n_rows[0], 3:]).sum(axis=1) > 0.0
+    stages = rows.stage[0, : rows.n_rows[0]][of_velocity]
+    np.testing.assert_array_equal(stages, np.arange(1, PARAMS.stages + 1))
+
+
+def pushed(force_N: float, sigma_N: float, mass_kg: float = 30.0) -> TargetEstimation:
+    """As ``estimation``, with a force along X: towards the target, 5 m ahead, where positive."""
+    found = estimation()
+    (chaser,) = found.chasers
+    assert chaser.disturbed is not None
+    motion = DisturbedMotion(
+        np.array([force_N / mass_kg, 0.0, 0.0]),
+        disturbed(chaser.disturbed.covariance[:6, :6], sigma_N / mass_kg).covariance,
+    )
+    values = SimpleNamespace(
+        at_effect=found.at_effect, chasers=(replace(chaser, disturbed=motion),)
+    )
+    return cast(TargetEstimation, values)
+
+
+def test_chaser_at_rest_is_unsafe_once_the_filter_sees_a_force_towards_the_target() -> None:
+    monitor = PassiveSafetyMonitor(mission({"passive_safety": "enforce"}))
+    for known, safe in (
+        (pushed(0.0, 0.0), True),
+        (pushed(3e-3, 1e-4), False),
+        (pushed(-3e-3, 1e-4), True),  # away from it
+        (pushed(0.0, 2e-3), False),  # of unknown direction
+    ):
+        monitor.update((0,), plan(0.0), known)
+        certificate = monitor.chasers[0].certificate
+        assert certificate is not None
+        assert certificate.safe is safe
+
+
+def test_force_that_may_begin_in_a_coast_counts_as_the_filter_assumes() -> None:
+    """Without a stated force, 10 mN per axis: no certificate over 600 s near the target."""
+    stated, default = (
+        PassiveSafetyMonitor(mission({"passive_safety": "monitor"} | limits))
+        for limits in ({}, {"passive_safety_force_N": None})
+    )
+    for monitor, safe in ((stated, True), (default, False)):
+        monitor.update((0,), plan(0.0), pushed(0.0, 0.0))
+        certificate = monitor.chasers[0].certificate
+        assert certificate is not None
+        assert certificate.safe is safe
+
+
+def test_plan_of_a_chaser_that_is_pushed_to_the_target_is_bent_aside() -> None:
+    """Its coasts under the known force keep the margin; without the rows they enter."""
+    coast, goal = CoastModel(0.0, 300.0), np.array([-5.0, 0.1, 0.0])
+    covariance = disturbed(np.diag([1e-6] * 3 + [1e-8] * 3), 1e-7).covariance
+    motion = DisturbedMotion(np.array([1.5e-4, 1e-6, 0.0]), covariance)
+    _, free = fly(coast, goal, goal, motion, 60, enforced=False)
+    _, bent = fly(coast, goal, goal, motion, 60, enforced=True)
+    assert max(free[1:]) < 0.0
+    assert min(bent[10:]) > SIGMAS

@@ -336,7 +336,7 @@ def test_frozen_chaser_that_was_replaced_ends_when_it_wakes(tmp_path: Path) -> N
     first, last = instances[0], instances[-1]
     assert first != last
     # What it sends before it reads of its successor, the world rejects
-    # (tests/world/test_tick_barrier.py).
+    # (tests/protocol/test_tick_barrier.py).
     assert instances[instances.index(last) :].count(first) <= 2
 
 

@@ -35,7 +35,7 @@ def test_relative_velocity_at_200_m_is_known_well_enough_for_a_passively_safe_mo
         assert known is not None
     own, target = record.states["chaser/0"], record.states["target"]
     error = known.state[3:] - (own.velocity_m_s - target.velocity_m_s)
-    sigma = np.sqrt(np.diag(known.covariance))[3:]
+    sigma = np.sqrt(np.diag(known.disturbed.covariance))[3:6]
     assert np.all(np.abs(error) < 4.0 * sigma)
     assert sigma[1] < 5e-4
     assert np.linalg.norm(known.target.omega_rad_s) < 3e-5

@@ -17,12 +17,12 @@ import pytest
 import zenoh
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import JoinRequest, MissionEnd, Tick, encoding_of
+from chaserdock_protocol.mission.membership import Membership
 from chaserdock_protocol.recording.log import read_log
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from chaserdock_protocol.transport.zenoh_network import zenoh_config
-from chaserdock_world.lockstep.membership import Membership
 from chaserdock_world.process import World
 from harness import ROOT, SHORT, ByHand, sets
 

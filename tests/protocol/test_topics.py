@@ -83,6 +83,7 @@ def test_the_table_holds_every_topic_of_the_module_once() -> None:
         topics.SCENARIO_KEY,
         topics.OPERATE_KEY,
         topics.THRUSTER_FAULT_KEY,
+        topics.ARMING_KEY,
     ],
 )
 def test_foreign_keys_belong_to_no_topic(key: str) -> None:

@@ -7,37 +7,24 @@ arrival or on the wall clock. Real time: the wall clock ends a tick.
 
 from __future__ import annotations
 
-import math
-
 import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.fault_injection import create_fault_layer
-from chaserdock_protocol.messages import (
-    JoinRequest,
-    MissionEnd,
-    ScenarioReply,
-    ScenarioRequest,
-    ThrusterFaultCommand,
+from chaserdock_protocol.messages import ThrusterFaultCommand
+from chaserdock_protocol.mission.command_intake import CommandIntake
+from chaserdock_protocol.mission.host import (
+    MissionHost,
+    load_mission_scenario,
+    open_mission,
+    open_world_node,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
-from chaserdock_protocol.scenario import (
-    Scenario,
-    ScenarioError,
-    flight_scenario_json,
-    load_scenario,
-)
-from chaserdock_protocol.scenario.faults import faults_of
-from chaserdock_protocol.stall import StallTimer
-from chaserdock_protocol.transport import Node, TransportError
-from chaserdock_protocol.transport.session import Heartbeat, ask_as_world
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.transport import Node
 
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
 from chaserdock_world.actuators.thrusters import make_actuators
-from chaserdock_world.lockstep.command_intake import CommandIntake
-from chaserdock_world.lockstep.membership import Membership
-from chaserdock_world.lockstep.tick_barrier import TickBarrier
 from chaserdock_world.physics.simulation import Physics
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.rendering.pose_cameras import make_cameras
@@ -67,9 +54,9 @@ def main(options: ProcessOptions) -> int:
     cv2.setNumThreads(1)
     node: Node | None = None
     try:
-        scenario = load_world_scenario(options)
-        node = Node("world", "world", options.link)
-        refuse_second_world(node)
+        scenario = load_mission_scenario(options)
+        require_packages(scenario)
+        node = open_world_node(options)
         return World(scenario, options, node).run(options.stop_signal())
     except ChaserdockError as error:
         print_status("world", str(error))
@@ -77,27 +64,6 @@ def main(options: ProcessOptions) -> int:
     finally:
         if node is not None:
             node.close()
-
-
-def load_world_scenario(options: ProcessOptions) -> Scenario:
-    """Return the scenario of the options, with overrides and seed; raises ScenarioError and
-    MissingPackageError.
-    """
-    if options.scenario is None:
-        raise ScenarioError("the world needs a scenario file")
-    overrides = (
-        options.overrides if options.seed is None else (*options.overrides, f"seed={options.seed}")
-    )
-    scenario = load_scenario(options.scenario, overrides)
-    require_packages(scenario)
-    return scenario
-
-
-def refuse_second_world(node: Node) -> None:
-    """Raise TransportError if a world is already running in this namespace."""
-    reply = ask_as_world(node)
-    if reply is not None:
-        raise TransportError(reply.reason)
 
 
 class World:
@@ -117,37 +83,13 @@ class World:
         self._faults = ThrusterFaultHandler(scenario, self._actuators)
         self._contacts: set[tuple[str, str]] = set()
         self._started_s = 0.0
-        own = faults_of(scenario, "world")
-        faults = create_fault_layer(own, "world", scenario.timing, not self._realtime, node.host)
-        node.message_filter = faults
-        self._barrier = self._open_mission()
-        self._barrier.faults = faults
+        self._host = self._open_mission()
+        self._barrier = self._host.barrier
 
-    def _open_mission(self) -> TickBarrier:
-        """Subscribe, advertise and announce the world; return the barrier of its ticks."""
-        node, scenario, options = self._node, self._scenario, self._options
-        membership = Membership(
-            chasers=len(scenario.chasers),
-            run_id=node.host.unique_id(),
-            mode=options.mode,
-            scenario_json=flight_scenario_json(scenario),
-            faults_of=lambda process: faults_of(scenario, process).model_dump_json(),
-            instance=node.host.unique_id(),
-            source=node.source,
-            now_s=node.host.now_s,
-        )
-
-        node.blocking = not self._realtime
-        node.subscribe(topics.ACTUATORS)
-        node.subscribe(topics.ACK)
-        node.watch_liveliness(membership.set_alive)
-        full = ScenarioReply(run_id=membership.run_id, scenario_json=scenario.model_dump_json())
-        node.declare_queryable(topics.SCENARIO_KEY, ScenarioRequest, lambda _, reply: reply(full))
-        node.declare_queryable(
-            topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request))
-        )
-
-        for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD, topics.TRUTH_DRAWN):
+    def _open_mission(self) -> MissionHost:
+        """Advertise what the world publishes, and open the mission."""
+        node, scenario = self._node, self._scenario
+        for topic in (topics.TRUTH_WORLD, topics.TRUTH_DRAWN):
             node.advertise(topic)
         for i in range(len(scenario.chasers)):
             node.advertise(topics.ODOMETRY, i)
@@ -158,12 +100,7 @@ class World:
         if self._physics.plumes is not None:
             for name in self._physics.plumes.bodies:
                 node.advertise(topics.TRUTH_PLUME, name)
-
-        # After all other subscriptions, see ``Heartbeat``.
-        heartbeat = Heartbeat(node, membership.instance)
-        node.declare_liveliness()
         node.declare_queryable(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
-
         commands = CommandIntake(
             self._timing,
             self._actuators,
@@ -171,67 +108,31 @@ class World:
             self._physics.command_latch,
             scenario.controller.command_lifetime_s,
         )
-        return TickBarrier(
-            node,
-            membership,
-            heartbeat,
-            self._timing,
-            commands,
-            options.recorder_expected,
-            scenario.controller.standby,
-        )
+        return open_mission(scenario, self._options, node, commands)
 
     def run(self, stop: StopSignal) -> int:
         """Wait for the processes, simulate all ticks and end the mission; return the exit
         status.
         """
-        if reason := self._wait_for_processes(stop):
-            return self._end_mission(0, reason, complete=False)
-        self._node.host.finish_startup()
+        if reason := self._host.wait_for_processes(stop):
+            return self._host.end(0, reason, complete=False)
         self._node.publish(topics.TRUTH_DRAWN, drawn_truth(self._scenario, self._odometry))
         self._started_s, tick = self._node.host.now_s(), 0
         while True:
             states = self._publish_state(tick)
             if tick == self._scenario.ticks:
-                return self._end_mission(tick, "completed", complete=True)
+                return self._host.end(tick, "completed", complete=True)
             self._open_tick(tick)
             self._expose_images(tick, states)
             if self._realtime:
                 self._step_realtime(tick)
             elif stalled := self._await_replies_and_step(tick, stop):
-                return self._end_mission(tick, stalled, complete=False)
+                return self._host.end(tick, stalled, complete=False)
             if stop() or self._barrier.lost_all_chasers(self._options.rejoin_s, stop):
-                return self._end_mission(
+                return self._host.end(
                     tick, "stopped" if stop() else "no chaser is left", complete=False
                 )
             tick += 1
-
-    def _wait_for_processes(self, stop: StopSignal) -> str:
-        """Wait until all expected processes are connected; return why they are not, empty if they
-        are.
-
-        ``ProcessOptions.patience_s`` limits the time in which no process connects.
-        """
-        barrier, patience_s = self._barrier, self._options.patience_s or math.inf
-        timer, missing = StallTimer(self._node.host.now_s), barrier.missing_processes()
-
-        def over() -> bool:
-            nonlocal missing
-            before, missing = missing, barrier.missing_processes()
-            if missing != before:
-                timer.reset()
-            return not missing or timer.update() >= patience_s
-
-        def missing_names() -> str:
-            return ", ".join(missing)
-
-        print_status(
-            "world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing_names()}"
-        )
-        if not barrier.wait_until(over, stop, missing_names):
-            return "stopped before the first tick"
-        barrier.start_flight()
-        return f"not connected within {patience_s:g} s: {missing_names()}" if missing else ""
 
     def _publish_state(self, tick: int) -> States:
         """Publish odometry, docking sensors and ground truth at the beginning of a tick.
@@ -303,13 +204,3 @@ class World:
         self._contacts |= fly_to(
             step, self._physics, self._actuators, 1.0 / self._timing.physics_hz
         )
-
-    def _end_mission(self, tick: int, reason: str, complete: bool) -> int:
-        """Publish the end of the mission; return the exit status."""
-        time_ns = self._timing.tick_time_ns(tick)
-        self._node.publish(
-            topics.END, MissionEnd(tick=tick, sim_time_ns=time_ns, reason=reason, complete=complete)
-        )
-        self._barrier.publish_farewell(tick, time_ns)
-        print_status("world", f"{reason} at {time_ns / 1e9:.2f} s")
-        return 0 if complete else 1

@@ -17,7 +17,7 @@ from .sighting import (
 )
 
 REMEMBERED_IMAGES = 64
-"""Ticks of processed images that are remembered to recognize repeated ones. More than the delay of
+"""Processed images that are remembered to recognize repeated ones. More than the delay of
 any message, a few ticks; the number only bounds the memory.
 """
 
@@ -35,14 +35,17 @@ class Vision:
         self.sighting: Sighting | None = None
         self.failure = ""
         self._expected: ExpectedPose | None = None
-        self._processed: deque[int] = deque(maxlen=REMEMBERED_IMAGES)
+        self._processed: deque[tuple[int, int]] = deque(maxlen=REMEMBERED_IMAGES)
 
     def look(self, image: Image) -> Sighting | None:
-        """Return the sighting in an image; None if the image of its tick was processed before."""
-        if self.has_processed(image.tick):
+        """Return the sighting in an image; None if the image of its exposure was processed
+        before.
+        """
+        exposure = (image.tick, image.sim_time_ns)
+        if exposure in self._processed:
             return None
         assert self.perception is not None
-        self._processed.append(image.tick)
+        self._processed.append(exposure)
         predicted = prediction_from(self.sighting, self._expected, image.sim_time_ns)
         self.failure = ""
         try:
@@ -53,8 +56,8 @@ class Vision:
         return self.sighting
 
     def has_processed(self, tick: int) -> bool:
-        """Return whether the image of a tick was processed."""
-        return tick in self._processed
+        """Return whether an image of a tick was processed."""
+        return any(processed == tick for processed, _ in self._processed)
 
     def inform(self, command: WrenchCommand) -> str | None:
         """Pass on what a command states about the target: its geometry and its expected pose.

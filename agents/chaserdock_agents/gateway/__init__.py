@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interfaces to devices of a laboratory, one small interface for each kind of device."""
+"""Fly a mission in a laboratory: cameras, robots and motion capture in place of the world."""

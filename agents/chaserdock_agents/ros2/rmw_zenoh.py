@@ -10,6 +10,7 @@ service exists. Every message carries its number, time and publisher as an attac
 from __future__ import annotations
 
 import hashlib
+import re
 import struct
 import threading
 import time
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from chaserdock_protocol.process import RosLink, print_status
+from chaserdock_protocol.transport.network import Undo
 from chaserdock_protocol.transport.zenoh_network import AttachedQuery, PlainSession
 
 from .types import TYPES, type_hash
@@ -29,6 +31,10 @@ EndpointKind = Literal["NN", "MP", "MS", "SS"]
 DEFAULT_QOS = "::,10:,:,:,,"
 """Reliable, volatile, keep the last 10: reliability : durability : history,depth : deadline :
 lifespan : liveliness. An empty field is the default of rmw_zenoh."""
+BEST_EFFORT_QOS = "2" + DEFAULT_QOS
+"""As `DEFAULT_QOS`, but best effort (rmw's number of it). Only stated: what is published arrives at
+every subscription, whatever either states.
+"""
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
 """Bytes of the identity of a publisher (rmw.h, ``RMW_GID_STORAGE_SIZE``)."""
@@ -61,13 +67,35 @@ def node_token(domain: int, session: str, node: str) -> str:
 
 
 def endpoint_token(
-    domain: int, session: str, node: str, number: int, kind: EndpointKind, name: str, type_name: str
+    domain: int,
+    session: str,
+    node: str,
+    number: int,
+    kind: EndpointKind,
+    name: str,
+    type_name: str,
+    qos: str = DEFAULT_QOS,
 ) -> str:
     """Return the liveliness token of the node's endpoint ``number``: publisher, subscription or
     service ``name``.
     """
     head = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/%/%/{node}"
-    return f"{head}/{_mangled(name)}/{dds_name(type_name)}/{type_hash(type_name)}/{DEFAULT_QOS}"
+    return f"{head}/{_mangled(name)}/{dds_name(type_name)}/{type_hash(type_name)}/{qos}"
+
+
+def endpoint_tokens(domain: int, kind: EndpointKind, name: str) -> str:
+    """Return the expression of the tokens of all nodes' endpoints of a kind at ``name``."""
+    return f"@ros2_lv/{domain}/*/*/*/{kind}/*/*/*/{_mangled(name)}/**"
+
+
+def type_of_token(token: str) -> tuple[str, str]:
+    """Return name and hash of the type that an endpoint's token states. Raises ValueError for
+    another text.
+    """
+    parts = token.split("/")
+    if len(parts) < 12:
+        raise ValueError(f"no token of an endpoint: {token!r}")
+    return re.sub(r"_$", "", parts[10].replace("::dds_::", "::")).replace("::", "/"), parts[11]
 
 
 @dataclass(frozen=True)
@@ -103,10 +131,14 @@ def _gid_of(token: str) -> bytes:
 
 
 class RosPublisher:
-    """Publishes messages of one type on one topic; safe to call from several threads."""
+    """Publishes messages of one type on one topic, until ``close``; safe to call from several
+    threads.
+    """
 
-    def __init__(self, type_name: str, gid: bytes, put: Callable[[bytes, bytes], None]) -> None:
-        self._type_name, self._gid, self._put = type_name, gid, put
+    def __init__(
+        self, type_name: str, gid: bytes, put: Callable[[bytes, bytes], None], close: Undo
+    ) -> None:
+        self._type_name, self._gid, self._put, self.close = type_name, gid, put, close
         self._number = 0
         self._lock = threading.Lock()
 
@@ -126,18 +158,23 @@ class RosNode:
 
     def __init__(self, session: PlainSession, domain: int, name: str) -> None:
         self._session, self._domain, self._name = session, domain, name
-        self._endpoints = 0
+        self._endpoints, self._numbering = 0, threading.Lock()
         self._workers = ThreadPoolExecutor(_WORKERS, "service")
         session.declare_token(node_token(domain, session.session_id, name))
 
-    def publisher(self, topic: str, type_name: str, *, blocking: bool) -> RosPublisher:
+    def publisher(
+        self, topic: str, type_name: str, *, blocking: bool, qos: str = DEFAULT_QOS
+    ) -> RosPublisher:
         """Declare a publisher. ``blocking``: it waits for slow readers, else they miss messages."""
-        put = self._session.declare_publisher(
+        put, undo = self._session.declare_publisher(
             topic_key(self._domain, topic, type_name), blocking=blocking
         )
-        return RosPublisher(type_name, self._declare("MP", topic, type_name), put)
+        gid, withdraw = self._declare("MP", topic, type_name, qos)
+        return RosPublisher(type_name, gid, put, _both(withdraw, undo))
 
-    def subscribe(self, topic: str, type_name: str, arrived: Callable[[Any], None]) -> None:
+    def subscribe(
+        self, topic: str, type_name: str, arrived: Callable[[Any], None], qos: str = DEFAULT_QOS
+    ) -> Undo:
         """Call ``arrived(message)`` on Zenoh's thread for every message of a topic; those that are
         no CDR are ignored.
         """
@@ -147,8 +184,9 @@ class RosNode:
             if message is not None:
                 arrived(message)
 
-        self._session.subscribe(topic_key(self._domain, topic, type_name), decode)
-        self._declare("MS", topic, type_name)
+        undo = self._session.subscribe(topic_key(self._domain, topic, type_name), decode)
+        _, withdraw = self._declare("MS", topic, type_name, qos)
+        return _both(withdraw, undo)
 
     def serve(self, name: str, type_name: str, handle: Callable[[Any], Any]) -> None:
         """Serve requests with ``handle(request) -> response``, on threads of this node. Malformed
@@ -174,25 +212,32 @@ class RosNode:
         self._session.declare_queryable(topic_key(self._domain, name, type_name), arrived)
         self._declare("SS", name, type_name)
 
-    def _declare(self, kind: EndpointKind, name: str, type_name: str) -> bytes:
-        """Declare an endpoint's token, after the endpoint, and return its identity."""
-        self._endpoints += 1
+    def _declare(
+        self, kind: EndpointKind, name: str, type_name: str, qos: str = DEFAULT_QOS
+    ) -> tuple[bytes, Undo]:
+        """Declare an endpoint's token, after the endpoint. Return its identity and what withdraws
+        the token.
+        """
+        with self._numbering:
+            self._endpoints += 1
+            number = self._endpoints
         token = endpoint_token(
-            self._domain,
-            self._session.session_id,
-            self._name,
-            self._endpoints,
-            kind,
-            name,
-            type_name,
+            self._domain, self._session.session_id, self._name, number, kind, name, type_name, qos
         )
-        self._session.declare_token(token)
-        return _gid_of(token)
+        return _gid_of(token), self._session.declare_token(token)
 
     def close(self) -> None:
         """Answer the requests that have arrived, then close the session, which ends the node."""
         self._workers.shutdown()
         self._session.close()
+
+
+def _both(first: Undo, second: Undo) -> Undo:
+    def undo() -> None:
+        first()
+        second()
+
+    return undo
 
 
 def open_ros(link: RosLink, name: str) -> RosNode:

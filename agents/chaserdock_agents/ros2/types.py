@@ -3,7 +3,8 @@
 
 The hash (REP 2016, RIHS01) of a type is part of its keys on the network. Messages come with
 rosbags; services are defined here, those with arguments by the files of the ROS package
-``chaserdock_interfaces`` beside this module.
+``chaserdock_interfaces`` beside this module. Messages of PX4 are defined by the files in
+``px4_msgs``: names and types of the fields, which are all that CDR and hash depend on.
 """
 
 from __future__ import annotations
@@ -79,6 +80,8 @@ for _service in (GOTO, SELECT_THRUSTER):
     _register_service(
         _service, (INTERFACES / f"srv/{_service.rpartition('/')[2]}.srv").read_text("utf-8")
     )
+for _message in sorted(Path(__file__).with_name("px4_msgs").glob("*.msg")):
+    TYPES.register(get_types_from_msg(_message.read_text("utf-8"), f"px4_msgs/msg/{_message.stem}"))
 
 
 @cache

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import Event
+from chaserdock_protocol.mission.tick_barrier import RECORDER_WINDOW_TICKS
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, role_of
-from chaserdock_world.lockstep.tick_barrier import RECORDER_WINDOW_TICKS
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 

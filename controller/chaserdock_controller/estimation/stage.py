@@ -127,18 +127,18 @@ class EstimationStage:
         pose is known.
         """
         i, latched = c.chaser, c.chaser in self.composite.latched
-        own = relative = covariance = None
+        own = relative = disturbed = None
         if state is not None:
             disturbance = self._disturbance(state, motion, latched)
             at_effect = predict_state(state, c.ahead, disturbance, self._body)
             own = OwnMotion(state, at_effect, disturbance)
             relative = None if motion is None else motion.relative
             if motion is not None and known and self._passive_safety:
-                covariance = motion.motion_covariance
+                disturbed = self.estimator.disturbed_motion(i)
         return ChaserEstimate(
             chaser=i,
             own=own,
-            motion_covariance=covariance,
+            disturbed=disturbed,
             relative=relative,
             camera=cameras.get(i),
             visible=i in seeing,

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.messages import Level, Odometry, Sighting
 
 from chaserdock_controller.bodies.body_shape import BodyShape
@@ -93,7 +94,6 @@ class ChaserMotion:
     position_m, velocity_m_s (3,): WRF. q_wxyz (4,): CRF to WRF. omega_rad_s (3,): CRF. disturbance
     (6,): force and torque besides the commanded ones, body axes; zero on a latched chaser, whose
     motion is the target's. relative: pose relative to the target, while that is known.
-    motion_covariance (6, 6): of position and velocity relative to the target, WRF, likewise.
     camera: once its errors are estimated.
     """
 
@@ -104,7 +104,6 @@ class ChaserMotion:
     omega_rad_s: Array
     disturbance: Array
     relative: RelativePose | None
-    motion_covariance: Array | None
     camera: CameraError | None
 
 
@@ -146,6 +145,12 @@ class Estimator(Protocol):
     def reinitialisations(self) -> int:
         """Return how often the target's estimate was restarted, for statistics."""
         return 0
+
+    def disturbed_motion(self, chaser: int) -> DisturbedMotion | None:
+        """Return what decides where a chaser coasts besides its position and velocity, after the
+        newest tick; None if it or the target is unknown. Needed for passive safety only.
+        """
+        return None
 
     def without_drift(self, odometry: Odometry) -> Odometry:
         """Return odometry less the drift of its position, as estimated up to now."""

@@ -12,16 +12,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.passive_safety import CoastModel
+from chaserdock_models.passive_safety import STEP_S, DisturbedMotion
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import TargetState
-from chaserdock_controller.nmpc.passive_safety import coast_duration_s
+from chaserdock_controller.nmpc.passive_safety import coast_duration_s, coast_model
 
 from .trajectories import Escape, Motion
 
@@ -54,12 +54,12 @@ is taken.
 
 @dataclass(frozen=True)
 class RelativeState:
-    """Estimated state (6,) of a chaser relative to the target, WRF, with its covariance (6, 6), at
-    one time.
+    """Estimated state (6,) of a chaser relative to the target, WRF, and what else decides where it
+    coasts, at one time.
     """
 
     state: Array
-    covariance: Array
+    disturbed: DisturbedMotion
     target: TargetState
 
 
@@ -70,8 +70,7 @@ class EscapePlanner:
         orbit, limits, body = scenario.orbit, scenario.limits, scenario.chaser
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self.duration_s = coast_duration_s(scenario)
-        step_s = self.duration_s if orbit is None else _COARSE_STEP_S
-        self._coast = CoastModel(self._mean_motion_rad_s, self.duration_s, step_s)
+        self._coast = coast_model(scenario, STEP_S if orbit is None else _COARSE_STEP_S)
         self._keep_out_m, self._final_m = limits.min_distance_target_m, limits.final_corridor_m
         self.sigmas = limits.estimate_margin_sigmas
         self._acceleration_m_s2 = _FORCE_SHARE * float(body.wrench_max[:3].min()) / body.mass_kg
@@ -124,7 +123,7 @@ class EscapePlanner:
         states = np.concatenate(
             [rotations.rotate(turned, offsets), rotations.rotate(turned, moving)], axis=1
         )
-        return self._margin(states, known.covariance)
+        return self._margin(states, known.disturbed)
 
     # -- aborts ------------------------------------------------------------------------------------
 
@@ -161,10 +160,11 @@ class EscapePlanner:
             )
             for direction in _DIRECTIONS
         ]
-        covariance = known.covariance.copy()
+        covariance = known.disturbed.covariance.copy()
         covariance[range(3, 6), range(3, 6)] += (_BURN_ERROR * impulse_m_s) ** 2
         ends = np.array([e.burnt_out() for e in escapes])
-        margins = self._coast.closest(ends, covariance, self._keep_out_m).margin_sigmas
+        motion = replace(known.disturbed, covariance=covariance)
+        margins = self._coast.closest(ends, motion, self._keep_out_m).margin_sigmas
         times_s = now_s + np.linspace(0.0, burn_s, 9)
         nearest_m = np.array([np.linalg.norm(e.at(times_s)[0], axis=1).min() for e in escapes])
         # A burn through the keep-out is worse than any coast that stays outside.
@@ -172,5 +172,5 @@ class EscapePlanner:
         best = int(np.argmax(margins))
         return escapes[best], float(margins[best])
 
-    def _margin(self, states: Array, covariance: Array) -> float:
-        return float(self._coast.closest(states, covariance, self._keep_out_m).margin_sigmas.min())
+    def _margin(self, states: Array, motion: DisturbedMotion) -> float:
+        return float(self._coast.closest(states, motion, self._keep_out_m).margin_sigmas.min())

@@ -42,7 +42,7 @@ class MovePlanner:
         return (
             "no speed makes the move passively safe: the coast after a loss of thrust comes within "
             f"{self._scenario.limits.min_distance_target_m:g} m of the target "
-            "(limits.passive_safety)"
+            "(limits.passive_safety, limits.passive_safety_force_N)"
         )
 
     def _safe(

@@ -154,14 +154,14 @@ class GuidanceStage:
         """Return a chaser's state relative to the target; None unless passive safety is
         enforced.
         """
-        covariance, enforced = estimate.motion_covariance, self._scenario.limits.passive_safety
-        if covariance is None or estimate.own is None or enforced != "enforce":
+        disturbed, enforced = estimate.disturbed, self._scenario.limits.passive_safety
+        if disturbed is None or estimate.own is None or enforced != "enforce":
             return None
         own = estimate.own.state
         state = np.concatenate(
             [own.position_m - target.position_m, own.velocity_m_s - target.velocity_m_s]
         )
-        return RelativeState(state, covariance, target)
+        return RelativeState(state, disturbed, target)
 
     def _reply(
         self, commands: Sequence[OperatorCommand], observation: Observation

@@ -48,7 +48,7 @@ class TickInputCollector:
         self.chasers = tuple(Mailbox(scenario) for _ in scenario.chasers)
         self._sightings: list[Sighting] = []
         self._received_sightings: set[tuple[int, int]] = set()
-        self._usable_sightings: dict[tuple[int, int], bool] = {}
+        self._usable_sightings: dict[tuple[int, int, int], bool] = {}
         self._forgotten_tick = 0
         self._lost: set[tuple[str, int, int]] = set()
         self._has_thrusters = scenario.chaser.actuation == "thrusters"
@@ -90,12 +90,12 @@ class TickInputCollector:
 
     def add_sighting(self, sighting: Sighting) -> bool:
         """Add a sighting; return False for a duplicate, which must not count twice as evidence."""
-        key = (sighting.tick, sighting.chaser)
+        key = (sighting.tick, sighting.sim_time_ns, sighting.chaser)
         if self._mailbox(sighting.chaser) is None:
             return False
         if sighting.solutions and self._usable_sightings.get(key):
             return False
-        self._received_sightings.add(key)
+        self._received_sightings.add((sighting.tick, sighting.chaser))
         self._usable_sightings[key] = bool(sighting.solutions)
         self._sightings.append(sighting)
         return True
@@ -140,7 +140,7 @@ class TickInputCollector:
             tick.sim_time_ns,
             tuple(self._inputs_of(i, own, tick) for i, own in enumerate(self.chasers)),
             # The order of arrival must not affect results.
-            tuple(sorted(self._sightings, key=lambda s: (s.tick, s.chaser))),
+            tuple(sorted(self._sightings, key=lambda s: (s.tick, s.chaser, s.sim_time_ns))),
             commands,
         )
         self._sightings.clear()

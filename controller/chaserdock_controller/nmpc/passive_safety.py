@@ -11,9 +11,10 @@ from types import MappingProxyType
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.passive_safety import CoastCertificate, CoastModel
+from chaserdock_models.passive_safety import STEP_S, CoastCertificate, CoastModel
 from chaserdock_protocol.scenario import FlightScenario
 
+from chaserdock_controller.estimation.joint.parameters import parameters_of
 from chaserdock_controller.interfaces import LogEntry, PlanCertificate, TargetEstimation
 
 from .types import CoastSafety
@@ -32,6 +33,16 @@ CONVERGED_S, ARMED_AFTER_S = 10.0, 60.0
 """A chaser is monitored for aborts once its plans were safe for the first of these times, or known
 for the second: the filter has then converged.
 """
+
+
+def coast_model(scenario: FlightScenario, step_s: float = STEP_S) -> CoastModel:
+    """Return the model of the coasts that have to be safe, with the process noise that the joint
+    filter assumes.
+    """
+    orbit = scenario.orbit
+    mean_motion = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
+    noise = parameters_of(scenario).coast_noise
+    return CoastModel(mean_motion, coast_duration_s(scenario), step_s, noise)
 
 
 def coast_duration_s(scenario: FlightScenario) -> float:
@@ -79,10 +90,10 @@ class PassiveSafetyMonitor:
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
-        limits, orbit = scenario.limits, scenario.orbit
-        mean_motion = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
+        limits = scenario.limits
         self.duration_s = coast_duration_s(scenario)
-        self._coast = CoastModel(mean_motion, self.duration_s)
+        self._coast = coast_model(scenario)
+        self._force_N = parameters_of(scenario).lasting_force_N
         self._keep_out_m, self._step_s = limits.min_distance_target_m, scenario.controller.dt_s
         self._sigmas = limits.estimate_margin_sigmas
         self.chasers = tuple(ChaserSafety() for _ in scenario.chasers)
@@ -108,15 +119,15 @@ class PassiveSafetyMonitor:
         moving = target.position_m + times * target.velocity_m_s
         for row, i in enumerate(chasers):
             estimate, safety = estimation.chasers[i], self.chasers[i]
-            covariance = estimate.motion_covariance
-            if covariance is None or estimate.latched:
+            motion = estimate.disturbed
+            if motion is None or estimate.latched:
                 safety.forget()
                 continue
             own = states[row]
             relative = np.concatenate(
                 [own[:, :3] - moving, own[:, 3:6] - target.velocity_m_s], axis=1
             )
-            found = known.get(row) or self._coast.certify(relative, covariance, self._keep_out_m)
+            found = known.get(row) or self._coast.certify(relative, motion, self._keep_out_m)
             safe = found.margin_sigmas >= self._sigmas
             safety.certificate = PlanCertificate(found, found.loss * self._step_s, safe)
             safety.follow(safe, time_ns)
@@ -135,9 +146,9 @@ class PassiveSafetyMonitor:
         """
         target, kept = estimation.at_effect, {}
         for row, i in enumerate(chasers):
-            covariance = estimation.chasers[i].motion_covariance
-            if i in enforced and self.chasers[i].armed and covariance is not None:
-                kept[row] = covariance
+            motion = estimation.chasers[i].disturbed
+            if i in enforced and self.chasers[i].armed and motion is not None:
+                kept[row] = motion
         if target is None or not kept:
             return None
         return CoastSafety(self._coast, self._keep_out_m, self._sigmas, target.velocity_m_s, kept)
@@ -162,5 +173,6 @@ class PassiveSafetyMonitor:
             "target after "
             f"{found.time_s:.0f} s, {found.margin_sigmas:.1f} sigmas from the keep-out of "
             f"{self._keep_out_m:g} m, in a coast of "
-            f"{self.duration_s:.0f} s"
+            f"{self.duration_s:.0f} s under forces of {self._force_N:g} N "
+            "(limits.passive_safety_force_N)"
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from chaserdock_models.arrays import Array, IntArray
-from chaserdock_models.passive_safety import CoastCertificate, CoastModel
+from chaserdock_models.passive_safety import CoastCertificate, CoastModel, DisturbedMotion
 
 INTEGRATORS = ("rk4", "euler")
 
@@ -24,16 +24,16 @@ VIOLATION_TOLERANCE_M = 1e-4
 class CoastSafety:
     """Passive safety to keep: the coasts from all stages stay outside a sphere about the target.
 
-    ``covariances``: (6, 6) of a chaser's position and velocity relative to the target, by row of
-    the problem; rows without one are not restricted. ``sigmas``: the margin, in standard deviations
-    along the line from the target. ``target_velocity_m_s`` (3,): WRF.
+    ``motions``: what is known of a chaser's motion, by row of the problem; rows without one are not
+    restricted. ``sigmas``: the margin, in standard deviations along the line from the target.
+    ``target_velocity_m_s`` (3,): WRF.
     """
 
     coast: CoastModel
     keep_out_m: float
     sigmas: float
     target_velocity_m_s: Array
-    covariances: Mapping[int, Array]
+    motions: Mapping[int, DisturbedMotion]
 
 
 @dataclass(frozen=True)

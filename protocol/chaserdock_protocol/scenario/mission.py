@@ -16,6 +16,7 @@ from .detumble import RestLimits
 from .faults import Fault
 from .fields import Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
+from .lab import LabSection, check_lab
 from .rendezvous import Arrival, ConeLimit, SpeedLimit
 from .schema import FlightChaser
 from .simulation import SimulationSection
@@ -135,12 +136,14 @@ class Scenario(FlightScenario):
     world: WorldSection = WorldSection()
     truth: TruthSection = TruthSection()
     simulation: SimulationSection = SimulationSection()
+    lab: LabSection | None = None
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Scenario:
         if self.extends is not None:
             raise ValueError("extends: is resolved in scenario files only")
         check_consistent(self)
+        check_lab(self)
         return self
 
     def goal_of(self, chaser: int) -> tuple[float, Vector] | None:

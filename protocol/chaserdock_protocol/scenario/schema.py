@@ -257,6 +257,12 @@ class Limits(Section):
         default=None,
         description="Length of that coast, s. Without it: two orbits, in free space 600 s.",
     )
+    passive_safety_force_N: NotNegative | None = Field(
+        default=None,
+        description="Disturbance force on a chaser without thrust, N: standard deviation along "
+        "each axis. Coasts are predicted with it. Without it: the estimator's 10 mN, far too much "
+        "for a coast of orbits. State what the environment exerts (drag, sunlight, plumes).",
+    )
 
 
 class Approach(Section):

@@ -32,6 +32,7 @@ QUERIES = (
     ),
     QueryAccess(topics.OPERATE_KEY, frozenset({"operator", "viewer", "bridge"}), "controller"),
     QueryAccess(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
+    QueryAccess(topics.ARMING_KEY, frozenset({"operator"}), "world"),
 )
 OBSERVERS: frozenset[Role] = frozenset({"analysis", "viewer", "bridge"})
 """Roles that publish nothing and have no process name on the network."""

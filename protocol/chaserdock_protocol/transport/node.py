@@ -384,9 +384,9 @@ class Node:
                 raise TransportError(f"reply on {key}: {refusal}") from None
         return None
 
-    def declare_liveliness(self) -> None:
-        """Declare this process' liveliness token."""
-        self._connection.declare_liveliness(topics.LIVE_KEY.format(process=self.name))
+    def declare_liveliness(self, process: str = "") -> None:
+        """Declare this process' liveliness token, or in a test stand that of another one."""
+        self._connection.declare_liveliness(topics.LIVE_KEY.format(process=process or self.name))
 
     def watch_liveliness(self, changed: Callable[[str, bool], None]) -> None:
         """Call ``changed(process, alive)`` on the network's thread for every process that appears

@@ -257,14 +257,19 @@ class _ZenohConnection:
 
 class PlainSession:
     """A Zenoh session without a namespace and with attachments, for another protocol than that of a
-    mission.
+    mission. What is declared lives until it is undone, or the session is closed.
 
-    ``mode``: a ``peer``, or a ``router`` that other peers find each other by. Raises TransportError
-    if it cannot be opened.
+    ``mode``: a ``peer``, or a ``router`` that other peers find each other by. ``must_connect``: not
+    to go on without one of the endpoints. Raises TransportError if it cannot be opened.
     """
 
     def __init__(
-        self, connect: tuple[str, ...], listen: tuple[str, ...], mode: Literal["peer", "router"]
+        self,
+        connect: tuple[str, ...],
+        listen: tuple[str, ...],
+        mode: Literal["peer", "router"],
+        *,
+        must_connect: bool = False,
     ) -> None:
         zenoh.init_log_from_env_or(_LOG_FILTER)
         config = zenoh.Config()
@@ -277,6 +282,8 @@ class PlainSession:
             "transport/shared_memory/enabled": False,
             **QUEUE_OPTIONS,
         }
+        if must_connect:
+            values["connect/exit_on_failure"] = True
         try:
             for name, value in values.items():
                 config.insert_json5(name, json.dumps(value))
@@ -285,43 +292,78 @@ class PlainSession:
             raise TransportError(
                 open_error(error, Link(connect=connect, listen=listen, mode=mode))
             ) from None
-        self._declared: list[Any] = []
+        self._declared: set[Any] = set()
         self.session_id = str(self._session.zid())
 
-    def declare_publisher(self, key: str, *, blocking: bool) -> Callable[[bytes, bytes], None]:
-        """Return a function that publishes a payload with an attachment; ``blocking``: it waits for
-        slow readers.
+    def declare_publisher(
+        self, key: str, *, blocking: bool
+    ) -> tuple[Callable[[bytes, bytes], None], Undo]:
+        """Return a function that publishes a payload with an attachment, and its undoing.
+        ``blocking``: it waits for slow readers.
         """
         control = zenoh.CongestionControl
         publisher = self._session.declare_publisher(
             key, congestion_control=control.BLOCK if blocking else control.DROP
         )
-        self._declared.append(publisher)
-        return lambda payload, attachment: publisher.put(payload, attachment=attachment)
 
-    def subscribe(self, key: str, arrived: Callable[[bytes, bytes], None]) -> None:
+        def put(payload: bytes, attachment: bytes) -> None:
+            publisher.put(payload, attachment=attachment)
+
+        return put, self._keep(publisher)
+
+    def subscribe(self, key: str, arrived: Callable[[bytes, bytes], None]) -> Undo:
         """Call ``arrived(payload, attachment)`` on Zenoh's thread for every sample on a key."""
 
         def callback(sample: zenoh.Sample) -> None:
             arrived(sample.payload.to_bytes(), _attachment(sample.attachment))
 
-        self._declared.append(self._session.declare_subscriber(key, callback))
+        return self._keep(self._session.declare_subscriber(key, callback))
 
-    def declare_queryable(self, key: str, arrived: Callable[[AttachedQuery], None]) -> None:
+    def declare_queryable(self, key: str, arrived: Callable[[AttachedQuery], None]) -> Undo:
         """Call ``arrived(query)`` on Zenoh's thread for every query on a key, which this session
         answers completely.
         """
-        queryable = self._session.declare_queryable(
-            key, lambda query: arrived(AttachedQuery(key, query)), complete=True
+        return self._keep(
+            self._session.declare_queryable(
+                key, lambda query: arrived(AttachedQuery(key, query)), complete=True
+            )
         )
-        self._declared.append(queryable)
 
-    def declare_token(self, key: str) -> None:
+    def declare_token(self, key: str) -> Undo:
         """Declare a liveliness token."""
-        self._declared.append(self._session.liveliness().declare_token(key))
+        return self._keep(self._session.liveliness().declare_token(key))
+
+    def watch_tokens(self, expression: str, changed: Callable[[str, bool], None]) -> Undo:
+        """Call ``changed(key, is alive)`` on Zenoh's thread for every liveliness token that exists
+        or changes.
+        """
+
+        def callback(sample: zenoh.Sample) -> None:
+            changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        return self._keep(
+            self._session.liveliness().declare_subscriber(expression, callback, history=True)
+        )
+
+    def tokens(self, expression: str, timeout_s: float) -> list[str]:
+        """Return the liveliness tokens that exist now."""
+        replies = self._session.liveliness().get(expression, timeout=timeout_s)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def _keep(self, entity: Any) -> Undo:
+        """Hold something declared, which ends with its last reference; return what ends it."""
+        self._declared.add(entity)
+
+        def undo() -> None:
+            if entity in self._declared:
+                self._declared.discard(entity)
+                entity.undeclare()
+
+        return undo
 
     def close(self) -> None:
         """Close the session, which ends everything declared."""
+        self._declared.clear()
         self._session.close()
 
 

@@ -1,26 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sources of images: devices, video files and addresses, folders, recordings.
 
-A kind of source is one file with a function that opens it, and one line in ``_BUILT_IN``. Installed
-packages add others by entry points of the group ``chaserdock.cameras``; their address is
-``NAME:REST``.
+A kind of source is one file with a function that opens it, and one line in ``_BUILT_IN``. Cameras
+with a driver of the gateway (``devices``) are sources, too, by their address ``SCHEME:REST``; and
+`open_driver` makes a source a camera of the gateway.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
 from typing import Any
 
-from chaserdock_protocol import plugins
-
+from ..devices import GROUPS
 from .capture import open_address, open_device, open_pipeline
 from .files import open_path
+from .polled import open_driver, open_polled
 from .recording import open_recording
 from .source import (
-    ImageSource,
     Captured,
     CapturedImage,
+    ImageSource,
     ImageSourceError,
     OpeningOptions,
     Stamp,
@@ -45,13 +46,13 @@ def open_camera(
 
     A device (``0``, ``/dev/video0``), an address (``rtsp://…``), a GStreamer pipeline (``… ! …``),
     a video file, a folder of images, a recording (``.mcap``, folder of a ROS 2 bag), or
-    ``NAME:REST`` of an installed source. ``options``: those of `OpeningOptions`, also as a
-    table. Raises ImageSourceError, and PluginError for an installed source that does not start.
+    ``SCHEME:REST`` of a driver of the gateway. ``options``: those of `OpeningOptions`, also as a
+    table. Raises ImageSourceError, and DeviceError of a driver.
     """
     given = options if isinstance(options, OpeningOptions) else _options(options or {})
-    name, _, rest = address.partition(":")
-    if re.fullmatch(r"[A-Za-z][\w-]+", name) and name in plugins.installed("camera"):
-        return plugins.make("camera", name, (), rest, given)
+    scheme, colon, _ = address.partition(":")
+    if colon and scheme in {e.name for e in entry_points(group=GROUPS["camera"])}:
+        return open_polled(address, given)
     opener = next(o for pattern, o in _BUILT_IN if re.fullmatch(pattern, address))
     return opener(address, given)
 
@@ -68,12 +69,13 @@ def _options(values: Mapping[str, Any]) -> OpeningOptions:
 
 
 __all__ = [
-    "ImageSource",
     "Captured",
     "CapturedImage",
+    "ImageSource",
     "ImageSourceError",
     "OpeningOptions",
     "Stamp",
     "UnreadableImage",
     "open_camera",
+    "open_driver",
 ]

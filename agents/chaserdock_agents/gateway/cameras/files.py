@@ -13,9 +13,9 @@ import numpy as np
 from .capture import VideoFile
 from .recording import open_recording
 from .source import (
-    ImageSource,
     Captured,
     CapturedImage,
+    ImageSource,
     ImageSourceError,
     OpeningOptions,
     Stamp,

@@ -3,8 +3,8 @@
 and disturbances.
 
 Mathematics: docs/estimation.md. Every tick is recorded with its inputs. A sighting that arrives
-late is inserted at its exposure, and the later ticks are processed again. The state therefore does
-not depend on the order of arrival.
+late is inserted at its exposure, also between two ticks, and the later ticks are processed again.
+The state therefore does not depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array, IntArray
+from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, Sighting
 
@@ -34,14 +35,17 @@ from chaserdock_controller.estimation.types import (
 )
 from chaserdock_controller.interfaces import RelativePose, TargetState
 
+from .between_ticks import split_tick
 from .hypotheses import FilterState, is_lost, mixture_covariance, target_state
 from .measurements import mounting_of
 from .parameters import JointParameters, TargetParameters, rows_of
 from .prediction import disturbance, predict_target
 from .replay import FilterTick, ReplayBuffer
 from .state import (
+    ATTITUDE,
     CHASER,
     FOCAL,
+    FORCE,
     POSE,
     POSITION_DRIFT,
     TARGET,
@@ -194,7 +198,6 @@ class JointEstimator(Estimator):
                     s, i, inputs.chasers[i].impulse.impulse / inputs.covered_s, self.parameters
                 ),
                 relative.get(i),
-                self.motion_covariance(i),
                 cameras.get(i),
             )
             for i in np.flatnonzero(s.alive).tolist()
@@ -210,17 +213,32 @@ class JointEstimator(Estimator):
         chasers = np.flatnonzero(s.alive).tolist()
         return dict(zip(chasers, relative_poses(s, chasers), strict=True))
 
-    def motion_covariance(self, chaser: int) -> Array | None:
-        """Return the covariance (6, 6) of a chaser's position and velocity relative to the target,
-        WRF; None if either is unknown.
+    def disturbed_motion(self, chaser: int) -> DisturbedMotion | None:
+        """Return what decides where a chaser coasts besides its position and velocity; None if it
+        or the target is unknown.
+
+        The force that lasts without thrust is known by the estimate and by its own size: in Bayes'
+        rule the prior ``lasting_force_N`` takes the place of ``disturbance_force_N``.
         """
-        s = self.state
+        s, p = self.state, self.parameters
         if s is None or not s.target_known or not s.alive[chaser]:
             return None
-        size = VELOCITY.stop
-        own, target = slice(block(chaser).start, block(chaser).start + size), slice(0, size)
-        p, cross = s.covariance, s.covariance[own, target]
-        return p[own, own] + p[target, target] - cross - cross.T
+        own = np.r_[: VELOCITY.stop, ATTITUDE, FORCE] + block(chaser).start
+        known = np.concatenate([np.arange(VELOCITY.stop), own])
+        # Of the target's position and velocity, then the chaser's, its attitude, its force.
+        covariance = s.covariance[np.ix_(known, known)]
+        prior_N2 = p.disturbance_force_N**2
+        lasting_N2 = min(p.lasting_force_N**2, prior_N2)
+        stated = lasting_N2 * prior_N2 * np.eye(3)
+        share = np.linalg.solve(stated + (prior_N2 - lasting_N2) * covariance[15:, 15:], stated)
+        covariance[15:] = share @ covariance[15:]
+        covariance[:15, 15:] = covariance[15:, :15].T
+        force = share @ s.of(chaser, FORCE)
+        per_N = so3.to_matrix(s.attitudes_wxyz[chaser]) / p.body.mass_kg
+        j = np.zeros((9, 18))
+        j[:6, :6], j[:6, 6:12] = -np.eye(6), np.eye(6)
+        j[6:, 12:15], j[6:, 15:] = -per_N @ so3.skew(force), per_N
+        return DisturbedMotion(per_N @ force, j @ covariance @ j.T)
 
     def cameras(self) -> dict[int, CameraError]:
         """Return the estimated calibration errors of the cameras after the newest tick, by
@@ -241,13 +259,16 @@ class JointEstimator(Estimator):
         return p if target is p.target else dataclasses.replace(p, target=target)
 
     def _insert(self, sighting: Sighting) -> int:
-        """Add a sighting to the record of its exposure. Returns the index of that record, or of the
-        newest one if nothing was added.
+        """Add a sighting to the record of its exposure, or of the first tick after it. Returns the
+        index of that record, or of the newest one if nothing was added.
         """
-        newest = len(self._buffer.records) - 1
+        records = self._buffer.records
         i, record = self._buffer.find(sighting.sim_time_ns)
-        if record is None or sighting.chaser in record.sightings:
-            return newest
+        if record is None:
+            is_buffered = 0 < i < len(records)
+            return i if is_buffered and records[i].insert_between(sighting) else len(records) - 1
+        if sighting.chaser in record.sightings:
+            return len(records) - 1
         record.sightings[sighting.chaser] = sighting
         return i
 
@@ -264,6 +285,21 @@ class JointEstimator(Estimator):
         return i
 
     def _process(
+        self, before: FilterState | None, record: FilterTick
+    ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
+        if before is None or not record.between:
+            return self._process_part(before, record)
+        state, events = before, ()
+        seen, rejected = set[int](), set[int]()
+        for part in split_tick(before.time_ns, record):
+            state, own = self._process_part(state, part)
+            events += own
+            seen.update(state.seen)
+            rejected.update(state.rejected)
+        seen_in_tick, rejected_in_tick = tuple(sorted(seen)), tuple(sorted(rejected - seen))
+        return msgspec.structs.replace(state, seen=seen_in_tick, rejected=rejected_in_tick), events
+
+    def _process_part(
         self, before: FilterState | None, record: FilterTick
     ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
         return process_tick(

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from chaserdock_models.arrays import Array, Matrix3, Vector3
 from chaserdock_models.camera import Camera
+from chaserdock_models.passive_safety import CoastNoise
 from chaserdock_models.rigid_body import RigidBody
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.navigation import NavigationErrors
@@ -174,6 +175,8 @@ class JointParameters:
     disturbance_force_N_sqrt_s: float = 1e-3
     """Density of the random walk of this force."""
     disturbance_torque_N_m_sqrt_s: float = 1e-4
+    lasting_force_N: float = disturbance_force_N
+    """Size of this force without thrust, as far as it is known beforehand: sigma."""
     centre_of_mass_m: float = 0.005
     """Sigma of a chaser's centre of mass from the origin of CRF, per axis."""
     latched_acceleration_m_s2: float = 0.05
@@ -261,6 +264,20 @@ class JointParameters:
         return self.single_marker if markers == 1 else self.several_markers
 
     @property
+    def coast_noise(self) -> CoastNoise:
+        """Return the process noise of a coast: that of the target, and that of the force.
+
+        Over a coast the random walk of the force is replaced by a Gauss-Markov process that begins
+        with the same density and does not exceed the force's size.
+        """
+        varying_s = 2.0 * (self.disturbance_force_N / self.disturbance_force_N_sqrt_s) ** 2
+        return CoastNoise(
+            self.target_noise[self.target.motion_model][0],
+            self.lasting_force_N / self.body.mass_kg,
+            varying_s,
+        )
+
+    @property
     def inertia(self) -> Vector3:
         """Return the chasers' principal moments of inertia, kg m²."""
         return self.body.inertia
@@ -271,6 +288,7 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
     target, body = scenario.target, scenario.chaser
     rate_hz, orbit = scenario.time.rate_hz, scenario.orbit
     xx, xy, xz, _, yy, yz, _, _, zz = target.inertia_tensor.reshape(-1).tolist()
+    lasting_N = scenario.limits.passive_safety_force_N
     return JointParameters(
         target=TargetParameters(
             motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
@@ -286,6 +304,7 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
         torque_max_N_m=body.torque_max_N_m,
         unexpected_velocity_m_s=body.force_max_N / body.mass_kg / rate_hz / math.sqrt(3.0),
         unexpected_omega_rad_s=math.sqrt(3.0) * body.torque_max_N_m / min(body.inertia) / rate_hz,
+        lasting_force_N=JointParameters.lasting_force_N if lasting_N is None else lasting_N,
         mean_motion_rad_s=0.0 if orbit is None else orbit.elements.mean_motion_rad_s,
         target_noise=_target_noise(scenario.estimator),
         shape=_far_noise(scenario),

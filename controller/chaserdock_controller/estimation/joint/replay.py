@@ -28,7 +28,8 @@ class FilterTick:
 
     ``parameters``: with the target's model, valid from the tick before to this one. ``shocks``:
     change the rates after it. ``chasers``, ``covered_s``: as in ``EstimatorInputs``, without
-    outdated odometry. ``sightings``: exposed at the tick, by chaser.
+    outdated odometry. ``sightings``: exposed at the tick, by chaser. ``between``: exposed since the
+    tick before, in order of time.
     """
 
     time_ns: int
@@ -36,6 +37,7 @@ class FilterTick:
     covered_s: float
     chasers: tuple[MeasuredChaser, ...]
     sightings: dict[int, Sighting] = field(default_factory=dict)
+    between: list[Sighting] = field(default_factory=list)
     shocks: list[Shock] = field(default_factory=list)
     state: FilterState | None = None
     events: tuple[EstimatorEvent, ...] = ()
@@ -44,6 +46,18 @@ class FilterTick:
     def odometry(self) -> dict[int, Odometry]:
         """Return the odometry of the tick, by chaser."""
         return {c.chaser: c.odometry for c in self.chasers if c.odometry is not None}
+
+    def insert_between(self, sighting: Sighting) -> bool:
+        """Add a sighting exposed before the tick; return False for one that is known."""
+
+        def order(s: Sighting) -> tuple[int, int]:
+            return s.sim_time_ns, s.chaser
+
+        i = bisect_left(self.between, order(sighting), key=order)
+        if i < len(self.between) and order(self.between[i]) == order(sighting):
+            return False
+        self.between.insert(i, sighting)
+        return True
 
 
 @dataclass

@@ -279,8 +279,9 @@ static void coast_rows(const Problem *problem, const Rows *rows, int64_t i, cons
                 problem->coasts + 7 * (problem->n_coasts * (rows->nodes * i + k) + j);
             double a = sqrt_of(dot3(row, row)), b = sqrt_of(dot3(row + 3, row + 3));
             double room = dot3(row, x + 13 * k) + dot3(row + 3, x + 13 * k + 3) - row[6];
+            /* A constant force that moves a chaser by r in t changes its velocity by 2 r / t. */
             double reach =
-                rows->reach[i * rows->nodes + k] * (a + b / (problem->step_s * (double)k));
+                rows->reach[i * rows->nodes + k] * (a + 2.0 * b / (problem->step_s * (double)k));
             if ((a == 0.0 && b == 0.0) || !(room <= reach)) continue;
             int64_t m = i * rows->width + rows->n_rows[i]++;
             copy(row, rows->a + 6 * m, 6);

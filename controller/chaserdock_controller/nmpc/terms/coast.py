@@ -52,8 +52,8 @@ def certify(safety: CoastSafety, states: Array, targets: Array) -> dict[int, Coa
     """
     origin = _origin(safety, targets)
     return {
-        i: safety.coast.certify(states[i, :, :6] - origin, covariance, safety.keep_out_m)
-        for i, covariance in safety.covariances.items()
+        i: safety.coast.certify(states[i, :, :6] - origin, motion, safety.keep_out_m)
+        for i, motion in safety.motions.items()
     }
 
 
@@ -62,8 +62,8 @@ def unsafe_rows(safety: CoastSafety, found: Mapping[int, CoastCertificate]) -> C
     does.
     """
     least = _planned_sigmas(safety)
-    kept = {i: c for i, c in safety.covariances.items() if not found[i].margin_sigmas >= least}
-    return replace(safety, covariances=kept) if kept else None
+    kept = {i: m for i, m in safety.motions.items() if not found[i].margin_sigmas >= least}
+    return replace(safety, motions=kept) if kept else None
 
 
 def _planned_sigmas(safety: CoastSafety) -> float:
@@ -86,11 +86,9 @@ def coast_rows(safety: CoastSafety, states: Array, targets: Array, horizon_s: fl
     n, nodes, _ = states.shape
     rows = np.zeros((n, nodes, COASTS, 7))
     origin, sigmas = _origin(safety, targets[1:]), _planned_sigmas(safety)
-    for i, covariance in safety.covariances.items():
+    for i, motion in safety.motions.items():
         relative = states[i, 1:, :6] - origin
-        planes = safety.coast.tangent_planes(
-            relative, covariance, safety.keep_out_m, sigmas, COASTS
-        )
+        planes = safety.coast.tangent_planes(relative, motion, safety.keep_out_m, sigmas, COASTS)
         planes[..., 6] += np.einsum("kcj,kj->kc", planes[..., :6], origin)
         by_velocity = np.linalg.norm(planes[..., 3:6], axis=2) / horizon_s
         scale = np.maximum(np.linalg.norm(planes[..., :3], axis=2), by_velocity)

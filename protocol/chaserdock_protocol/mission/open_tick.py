@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from chaserdock_models.clock import Timing
+
 from chaserdock_protocol.messages import Tick
 
 

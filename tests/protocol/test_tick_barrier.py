@@ -8,11 +8,11 @@ from unittest.mock import Mock
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import ActuatorCommand, Tick
+from chaserdock_protocol.mission.command_intake import CommandIntake
+from chaserdock_protocol.mission.tick_barrier import _MOST_REPEATS, TickBarrier
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import ReceivedMessage
 from chaserdock_protocol.transport.node import TrafficCounters
-from chaserdock_world.lockstep.command_intake import CommandIntake
-from chaserdock_world.lockstep.tick_barrier import _MOST_REPEATS, TickBarrier
 from harness import ROOT
 
 TIMING = load_scenario(ROOT / "scenarios" / "fault-drill.toml").timing

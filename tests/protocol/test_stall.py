@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+from chaserdock_protocol.mission.stall import WaitReport, explain_stall
 from chaserdock_protocol.stall import StallTimer
-from chaserdock_world.lockstep.stall import WaitReport, explain_stall
 
 TICK = ("world/tick",)
 

@@ -6,9 +6,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from chaserdock_models.clock import Timing
+
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import FaultLayer, LostMessage
-from chaserdock_protocol.messages import ActuatorCommand, Event, Presence, RecorderAck
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    Event,
+    Message,
+    Presence,
+    RecorderAck,
+)
 from chaserdock_protocol.process import print_status
 from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node
@@ -56,6 +63,8 @@ class TickBarrier:
         standby_expected: bool = False,
     ) -> None:
         self.faults: FaultLayer | None = None
+        self.take_other: Callable[[Message], None] = lambda message: None
+        """Takes messages that are no matter of ticks, and presence of another world."""
         self._node = node
         self._membership = membership
         self._heartbeat = heartbeat
@@ -246,9 +255,13 @@ class TickBarrier:
             case Presence() as presence:
                 if self._membership.update_presence(presence):
                     self._heartbeat.take(presence)
+                elif presence.process == "world" and presence.instance != self._membership.instance:
+                    self.take_other(presence)
             case LostMessage(tick=tick) if received is not None and tick == self._open.tick:
                 # The chaser's actuators keep their last command.
                 self._open.replied.add(int(received.place or 0))
+            case Message() as message:
+                self.take_other(message)
         if self._remove_departed():
             self._revise_tick()
 

@@ -8,12 +8,11 @@ No I/O.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from chaserdock_models.clock import Timing
-from chaserdock_protocol.messages import ActuatorCommand, Latch
 
-from chaserdock_world.actuators.ideal import Actuators
+from chaserdock_protocol.messages import ActuatorCommand, Latch
 
 from .observed_commander import ObservedCommander
 from .open_tick import OpenTick
@@ -22,6 +21,18 @@ _MAX_CLOCK_ERROR_NS = 1_000_000_000
 """Largest difference (ns) between a command's effective time and its tick's. More comes from a
 wrong clock.
 """
+
+
+class CommandedActuators(Protocol):
+    """Actuators of one chaser as the owner of a mission commands them."""
+
+    def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
+        """Queue a command that acts from ``effective_step`` on; a late one acts at once."""
+        ...
+
+    def stop(self, step: int) -> None:
+        """Stop the actuators at ``step``: the chaser is lost."""
+        ...
 
 
 class Taken(NamedTuple):
@@ -45,7 +56,7 @@ class CommandIntake:
     def __init__(
         self,
         timing: Timing,
-        actuators: Mapping[str, Actuators],
+        actuators: Mapping[str, CommandedActuators],
         current_step: Callable[[], int],
         command_latch: Callable[[int, Latch, int], None],
         watchdog_s: float = 0.5,

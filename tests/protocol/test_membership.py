@@ -11,11 +11,11 @@ import msgspec
 import pytest
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import JoinRequest, Presence, encoding_of
+from chaserdock_protocol.mission.membership import Membership
 from chaserdock_protocol.scenario.simulation import SimulationSection
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_protocol.transport.network import RawSample
 from chaserdock_protocol.transport.session import Heartbeat
-from chaserdock_world.lockstep.membership import Membership
 
 from chaserdock.simulation.network import SimulatedNetwork
 from chaserdock.simulation.scheduler import Scheduler

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collect what people ask of a gateway: arm, disarm and kill, by command, by topic, by key.
+
+Requests arrive on other threads; the gateway's loop takes them.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+
+from chaserdock_protocol.messages import ArmingCommand, ArmingReply
+
+from .safety import ArmingAction
+
+Answer = Callable[[ArmingReply], None]
+
+KEYS: dict[str, ArmingAction] = {"a": "arm", "d": "disarm", "k": "kill", " ": "kill"}
+"""Keys of the terminal; space kills, as it is the easiest to hit."""
+_MOST_REQUESTS = 64
+"""Requests that wait for the next look, at most; a look comes every few milliseconds."""
+
+
+class ArmingRequests:
+    """Requests that wait for the gateway's loop."""
+
+    def __init__(self) -> None:
+        self._requests: deque[tuple[ArmingAction, str, Answer]] = deque(maxlen=_MOST_REQUESTS)
+
+    def submit(self, command: ArmingCommand, reply: Answer) -> None:
+        """Queue a command of an operator. Runs on Zenoh's thread."""
+        self.add(command.action, command.operator, reply)
+
+    def add(self, action: ArmingAction, by: str, answer: Answer = lambda reply: None) -> None:
+        """Queue a request."""
+        self._requests.append((action, by, answer))
+
+    def take(self) -> list[tuple[ArmingAction, str, Answer]]:
+        """Return the requests since the last call; what stops comes first."""
+        taken = [self._requests.popleft() for _ in range(len(self._requests))]
+        return sorted(taken, key=lambda request: ("kill", "disarm", "arm").index(request[0]))
+
+
+def listen_to_keys(requests: ArmingRequests) -> Callable[[], None]:
+    """Take keys of the terminal as requests, if standard input is one. Returns what ends this and
+    restores the terminal.
+    """
+    if not sys.stdin or not sys.stdin.isatty():
+        return lambda: None
+    import select
+    import termios
+    import tty
+
+    number = sys.stdin.fileno()
+    before = termios.tcgetattr(number)
+    ended = threading.Event()
+    tty.setcbreak(number)
+
+    def read() -> None:
+        while not ended.is_set():
+            ready, _, _ = select.select([number], [], [], 0.1)
+            if ready and (action := KEYS.get(sys.stdin.read(1).lower())) is not None:
+                requests.add(action, "a key of the gateway's terminal")
+
+    thread = threading.Thread(target=read, name="keys", daemon=True)
+    thread.start()
+
+    def end() -> None:
+        ended.set()
+        thread.join(timeout=1.0)
+        with suppress(termios.error):
+            termios.tcsetattr(number, termios.TCSADRAIN, before)
+
+    return end

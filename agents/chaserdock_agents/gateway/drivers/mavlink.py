@@ -1,0 +1,473 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read poses from MAVLink, and command a robot by it. Needs the extra ``chaserdock[mavlink]``.
+
+Poses: ``ODOMETRY`` and ``ATT_POS_MOCAP``. Their stamps are those of the sender's clock, which the
+gateway estimates; ``TIMESYNC`` is not needed. Robots: ``MANUAL_CONTROL`` in the manual mode of
+PX4's spacecraft and of ArduSub, which pass it on as forces and torques, and end it when it ceases.
+Others that look fit are not: ``SET_ACTUATOR_CONTROL_TARGET`` is read neither by PX4 since 1.14 nor
+by ArduPilot; ``SET_ATTITUDE_TARGET`` has no torque; ``DO_SET_ACTUATOR`` and ``DO_SET_SERVO`` hold
+the last value for ever, so that a thruster stays open when the gateway ends.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.errors import require_extra
+from chaserdock_protocol.transport.network import Undo
+
+from ..devices import DeviceError, DeviceHost, PoseSample, RobotCommand
+from .acknowledgements import (
+    COMPONENT_ARM_DISARM,
+    CUSTOM_MODE_ENABLED,
+    DO_SET_MODE,
+    FORCE,
+    Acknowledgements,
+)
+from .command_stream import CommandStream
+from .options import read_options
+from .pose_samples import KEPT, is_finite, stated, turned
+from .shares import Maxima, wrench_shares
+from .sharing import Shared
+
+SOURCE = (255, 190)
+"""System and component of the gateway: those of a ground station, as ArduPilot takes manual control
+from system 255 only (MAV_GCS_SYSID).
+"""
+_HEARTBEAT_S = 1.0
+"""Interval of heartbeats, s (mavlink.io, Heartbeat/Connection Protocol)."""
+_GONE_S = 3.0
+"""Silence, s, after which a system is gone: it missed three heartbeats."""
+_CONNECT_S = 5.0
+"""Longest wait, s, for a TCP connection on a local network."""
+_WAIT_S = 0.1
+"""Longest wait, s, of the receiving thread, which looks then whether it is closed."""
+_DATAGRAM = 65536
+"""Bytes that are read at once: the largest datagram."""
+# MAV_FRAME: frames of poses, and of velocities in the body's axes, by world axes.
+_WORLD_FRAMES = {"ned": (1, 20), "enu": (4, 21)}
+_BODY_FRAMES = {"ned": (8, 12), "enu": (13,)}
+# MAV_AUTOPILOT and MAV_TYPE of a heartbeat.
+_ARDUPILOT, _PX4, _SUBMARINE, _GROUND_STATION, _NO_AUTOPILOT = 3, 12, 12, 6, 8
+_PX4_MANUAL, _ARDUSUB_MANUAL = 1.0, 19.0
+"""Numbers of the manual modes (PX4_CUSTOM_MAIN_MODE_MANUAL; ArduSub, Mode::Number::MANUAL)."""
+_LEAD_S = 0.3
+"""Time, s, for which control must have arrived before PX4 arms in manual mode: three messages."""
+_FULL = 1000.0
+"""Full deflection of MANUAL_CONTROL."""
+_PITCH_AND_ROLL = 3
+"""Bits of MANUAL_CONTROL that state its fields ``s`` and ``t`` as valid."""
+
+
+def _dialect() -> Any:
+    """Return pymavlink's messages. Raises MissingPackageError, which says how to install it."""
+    require_extra("pymavlink", "mavlink")
+    from pymavlink.dialects.v20 import common
+
+    return common
+
+
+# -- link ------------------------------------------------------------------------------------------
+
+
+class _Port:
+    """A socket at ``udp://HOST:PORT`` (or ``udpin``: listens), ``udpout`` or ``tcp``."""
+
+    def __init__(self, address: str) -> None:
+        scheme, found, rest = address.partition("://")
+        host, colon, port = rest.rpartition(":")
+        if scheme not in ("udp", "udpin", "udpout", "tcp") or not (found and colon and host):
+            raise DeviceError(
+                f"{address!r} must be udp://HOST:PORT (listens), udpout://HOST:PORT or "
+                "tcp://HOST:PORT"
+            )
+        self._listens, self._streams = scheme in ("udp", "udpin"), scheme == "tcp"
+        try:
+            if self._streams:
+                self.socket = socket.create_connection((host, int(port)), _CONNECT_S)
+                self.socket.settimeout(_WAIT_S)  # of sending to a side that does not read
+            else:
+                self.socket = opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                (opened.bind if self._listens else opened.connect)((host, int(port)))
+        except (OSError, ValueError, OverflowError) as error:
+            if not self._streams:
+                self.socket.close()
+            what = "listen on" if self._listens else "reach"
+            raise DeviceError(f"cannot {what} {address}: {error}") from None
+        self.fixed = None if self._listens else (host, int(port))
+
+    def receive(self, wait_s: float) -> tuple[bytes, Any] | None:
+        """Return bytes and their sender, None if there are none. Raises EOFError at the end."""
+        if not select.select([self.socket], [], [], wait_s)[0]:
+            return None
+        try:
+            data, sender = self.socket.recvfrom(_DATAGRAM)
+        except ConnectionRefusedError:  # of an earlier datagram: nobody listens yet
+            return None
+        if not data and self._streams:
+            raise EOFError
+        return data, sender if self._listens else self.fixed
+
+    def send(self, data: bytes, receiver: Any) -> None:
+        """Send bytes; a datagram that nobody takes is lost."""
+        if self._listens:
+            self.socket.sendto(data, receiver)
+            return
+        try:
+            self.socket.sendall(data)
+        except ConnectionRefusedError:
+            return
+
+
+class MavlinkLink:
+    """One port, shared by all devices with its address: dispatches what arrives, and sends
+    heartbeats.
+    """
+
+    def __init__(self, address: str, now_ns: Callable[[], int]) -> None:
+        self._dialect = _dialect()
+        self._address, self._now_ns = address, now_ns
+        self._port = _Port(address)
+        self._mav = self._dialect.MAVLink(self, *SOURCE)
+        self._mav.robust_parsing = True
+        self._lock, self._closed = threading.Lock(), threading.Event()
+        self._receiver: Any = None
+        self._addresses: dict[int, Any] = {}
+        self._heard_ns: dict[int, int] = {}
+        self._ended = False
+        self._listeners: list[Callable[[Any, int], None]] = []
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def listen(self, names: tuple[str, ...], arrived: Callable[[Any, int], None]) -> Undo:
+        """Call ``arrived(message, arrived_ns)`` on the link's thread for messages of these names;
+        return what ends it.
+        """
+
+        def take(message: Any, arrived_ns: int) -> None:
+            if message.get_type() in names:
+                arrived(message, arrived_ns)
+
+        self._listeners.append(take)
+        return lambda: self._listeners.remove(take)
+
+    def write(self, data: bytes) -> None:
+        """Send bytes of pymavlink to the receiver at hand."""
+        self._port.send(bytes(data), self._receiver)
+
+    def send(self, system: int, message: Any) -> None:
+        """Send a message to a system. Raises DeviceError if it was not heard."""
+        address = self._addresses.get(system, self._port.fixed)
+        if address is None:
+            raise DeviceError(f"system {system} was not heard on {self._address}")
+        try:
+            with self._lock:
+                self._receiver = address
+                self._mav.send(message)
+        except OSError as error:
+            raise DeviceError(f"{self._address}: {error}") from None
+
+    def check(self, system: int) -> None:
+        """Raise DeviceError if a system (0: all that were heard) has become silent."""
+        if self._ended:
+            raise DeviceError(f"{self._address} is closed by the other side")
+        heard = [t for s, t in self._heard_ns.items() if system in (0, s)]
+        if heard and self._now_ns() - max(heard) > _GONE_S * 1e9:
+            who = f"system {system}" if system else "everybody"
+            raise DeviceError(f"{who} on {self._address} is silent for over {_GONE_S:g} s")
+
+    def close(self) -> None:
+        """Close the port."""
+        self._closed.set()
+        self._thread.join()
+        self._port.socket.close()
+
+    def _run(self) -> None:
+        due_ns = self._now_ns()
+        while not self._closed.is_set():
+            try:
+                received = self._port.receive(_WAIT_S)
+            except (EOFError, OSError):
+                self._ended = True
+                return
+            if received is not None:
+                self._dispatch(*received)
+            if self._now_ns() >= due_ns:
+                due_ns = self._now_ns() + round(_HEARTBEAT_S * 1e9)
+                self._beat()
+
+    def _dispatch(self, data: bytes, sender: Any) -> None:
+        arrived_ns = self._now_ns()
+        for message in self._mav.parse_buffer(data) or ():
+            if message.get_type() == "BAD_DATA":
+                continue
+            system = message.get_srcSystem()
+            self._addresses[system], self._heard_ns[system] = sender, arrived_ns
+            for take in tuple(self._listeners):
+                take(message, arrived_ns)
+
+    def _beat(self) -> None:
+        beat = self._dialect.MAVLink_heartbeat_message(
+            _GROUND_STATION, _NO_AUTOPILOT, 0, 0, self._dialect.MAV_STATE_ACTIVE, 3
+        )
+        for address in set(self._addresses.values()) or {self._port.fixed}:
+            if address is not None:
+                with self._lock:
+                    self._receiver = address
+                    try:
+                        self._mav.send(beat)
+                    except OSError:  # the next `send`, or the end of the stream, tells
+                        return
+
+
+_LINKS: Shared[MavlinkLink] = Shared()
+
+
+# -- poses -----------------------------------------------------------------------------------------
+
+
+class MavlinkPoseOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of a source of poses on MAVLink. ``system``: number of the sender (0: any; its number
+    is the body's name then). ``axes``: world axes that ``ODOMETRY`` states.
+    """
+
+    message: Literal["ODOMETRY", "ATT_POS_MOCAP"] = "ODOMETRY"
+    system: Annotated[int, msgspec.Meta(ge=0, le=255)] = 0
+    axes: Literal["ned", "enu"] = "ned"
+
+
+def full_covariance(triangle: Sequence[float]) -> Array | None:
+    """Return the covariance (6, 6) of the upper triangle (21,) by rows; None if it is unknown."""
+    upper = np.zeros((6, 6))
+    upper[np.triu_indices(6)] = triangle
+    whole = upper + upper.T - np.diag(upper.diagonal())
+    return whole if stated(whole) else None
+
+
+def _vector(*components: float) -> Array:
+    return np.array(components, dtype=float)
+
+
+def of_odometry(message: Any, arrived_ns: int, body: str, axes: str) -> PoseSample:
+    """Read ``ODOMETRY``: pose in the world, twist in its child frame. Raises DeviceError for frames
+    of other axes.
+    """
+    child = message.child_frame_id
+    if message.frame_id not in _WORLD_FRAMES[axes]:
+        raise DeviceError(
+            f"ODOMETRY states MAV_FRAME {message.frame_id}; axes {axes!r} are "
+            f"{' and '.join(map(str, _WORLD_FRAMES[axes]))}: set option axes"
+        )
+    q, velocity = _vector(*message.q), _vector(message.vx, message.vy, message.vz)
+    in_world = None
+    if child == message.frame_id:
+        in_world = velocity if is_finite(velocity) else None
+    elif child in _BODY_FRAMES[axes] and is_finite(q) and np.any(q):
+        in_world = turned(q, velocity)
+    omega = _vector(message.rollspeed, message.pitchspeed, message.yawspeed)
+    return PoseSample(
+        body,
+        1000 * message.time_usec or None,
+        arrived_ns,
+        _vector(message.x, message.y, message.z),
+        q,
+        in_world,
+        omega if is_finite(omega) else None,
+        full_covariance(message.pose_covariance),
+    )
+
+
+def of_mocap(message: Any, arrived_ns: int, body: str, axes: str) -> PoseSample:
+    """Read ``ATT_POS_MOCAP``: NED and FRD, no velocity."""
+    return PoseSample(
+        body,
+        1000 * message.time_usec or None,
+        arrived_ns,
+        _vector(message.x, message.y, message.z),
+        _vector(*message.q),
+        covariance=full_covariance(message.covariance),
+    )
+
+
+class MavlinkPoses:
+    """Poses that one message states."""
+
+    def __init__(self, address: str, options: MavlinkPoseOptions, host: DeviceHost) -> None:
+        ned = options.message == "ATT_POS_MOCAP" or options.axes == "ned"
+        self.world_axes, self.body_axes = ("ned", "frd") if ned else ("enu", "flu")
+        self._options, self._address = options, address
+        self._read = of_mocap if options.message == "ATT_POS_MOCAP" else of_odometry
+        self._arrived: deque[tuple[Any, int]] = deque(maxlen=KEPT)
+        self._link = _LINKS.acquire(address, lambda: MavlinkLink(address, host.now_ns))
+        self._end = self._link.listen((options.message,), self._take)
+
+    def _take(self, message: Any, arrived_ns: int) -> None:
+        if self._options.system in (0, message.get_srcSystem()):
+            self._arrived.append((message, arrived_ns))
+
+    def poll(self) -> Sequence[PoseSample]:
+        """See `PoseSource`."""
+        samples: list[PoseSample] = []
+        while self._arrived:
+            message, arrived_ns = self._arrived.popleft()
+            body = "" if self._options.system else str(message.get_srcSystem())
+            samples.append(self._read(message, arrived_ns, body, self._options.axes))
+        if not samples:
+            self._link.check(self._options.system)
+        return samples
+
+    def close(self) -> None:
+        """See `PoseSource`."""
+        self._end()
+        _LINKS.release(self._address)
+
+
+def open_poses(address: str, options: Mapping[str, Any], host: DeviceHost) -> MavlinkPoses:
+    """Open a source of poses: ``mavlink:udp://0.0.0.0:14550``."""
+    return MavlinkPoses(address, read_options(MavlinkPoseOptions, options), host)
+
+
+# -- robot -----------------------------------------------------------------------------------------
+
+
+class MavlinkRobotOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of a robot on MAVLink: its system, and force and torque (FRD) at full deflection; 0
+    where it has no actuator.
+    """
+
+    force_max_N: Maxima
+    torque_max_N_m: Maxima
+    system: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
+
+
+def deflections(force: Array, torque: Array) -> dict[str, int]:
+    """Return the fields of ``MANUAL_CONTROL`` of force and torque (3,) as shares, FRD.
+
+    x, y: forward and right. z: up, from 0 to 1000, 500 for none, as both autopilots read it. r, s,
+    t: yaw, pitch and roll, positive about the axes of FRD in both, unlike MAVLink's text on r.
+    """
+    x, y, z = force
+    roll, pitch, yaw = torque
+    full = {"x": x, "y": y, "z": 0.5 - 0.5 * z, "r": yaw, "s": pitch, "t": roll}
+    return {name: round(_FULL * float(share)) for name, share in full.items()}
+
+
+class MavlinkRobot:
+    """A robot under PX4 (its spacecraft: force x and y, torque z) or ArduSub (all six)."""
+
+    body_axes, thrusters = "frd", 0
+
+    def __init__(self, address: str, options: MavlinkRobotOptions, host: DeviceHost) -> None:
+        self._address, self._options = address, options
+        self._link = _LINKS.acquire(address, lambda: MavlinkLink(address, host.now_ns))
+        self._dialect = _dialect()
+        self._acknowledgements = Acknowledgements()
+        self._beaten = threading.Event()
+        self._kind = (-1, -1)
+        self._end = self._link.listen(("HEARTBEAT", "COMMAND_ACK"), self._take)
+        self._stream = CommandStream(self._publish, host.now_ns)
+        self._was_armed = False
+
+    def _take(self, message: Any, arrived_ns: int) -> None:
+        if message.get_srcSystem() != self._options.system:
+            return
+        if message.get_type() == "COMMAND_ACK":
+            self._acknowledgements.take(message.command, message.result)
+        elif message.autopilot != _NO_AUTOPILOT:  # of a camera or a companion beside it
+            self._kind = message.autopilot, message.type
+            self._beaten.set()
+
+    def _publish(self, command: RobotCommand | None) -> None:
+        options = self._options
+        shares = wrench_shares(command, options.force_max_N, options.torque_max_N_m)
+        fields = deflections(*shares)
+        message = self._dialect.MAVLink_manual_control_message(
+            options.system, buttons=0, enabled_extensions=_PITCH_AND_ROLL, **fields
+        )
+        self._link.send(options.system, message)
+
+    def send(self, command: RobotCommand) -> None:
+        """See `Robot`. Sends nothing before `arm`, and zero after `stop`."""
+        self._stream.put(command)
+        self._link.check(self._options.system)
+
+    def arm(self) -> None:
+        """Switch the autopilot to its manual mode, and arm it. Raises DeviceError if it refuses, is
+        silent, is another, or cannot do what the maxima state.
+        """
+        if not self._beaten.wait(_GONE_S):
+            raise DeviceError(
+                f"no heartbeat of an autopilot with system {self._options.system} within "
+                f"{_GONE_S:g} s"
+            )
+        mode = manual_mode(*self._kind, self._options)
+        self._was_armed = True
+        self._stream.start()
+        time.sleep(_LEAD_S)
+        self._ask(DO_SET_MODE, "manual mode", CUSTOM_MODE_ENABLED, mode)
+        self._ask(COMPONENT_ARM_DISARM, "arming", 1.0, 0.0)
+        self._stream.arm()
+
+    def stop(self) -> None:
+        """Command zero and disarm, in motion too, if this driver has armed. Does not wait."""
+        self._stream.disarm()
+        if not self._was_armed:
+            return
+        try:
+            self._command(COMPONENT_ARM_DISARM, 0, 0.0, FORCE)
+        except Exception:  # it was never heard, or is gone
+            return
+
+    def close(self) -> None:
+        """See `Robot`."""
+        self.stop()
+        self._stream.close()
+        self._end()
+        _LINKS.release(self._address)
+
+    def _command(self, command: int, attempt: int, param1: float, param2: float) -> None:
+        unused = (0.0,) * 5
+        # Component 1 is the autopilot.
+        message = self._dialect.MAVLink_command_long_message(
+            self._options.system, 1, command, attempt, param1, param2, *unused
+        )
+        self._link.send(self._options.system, message)
+
+    def _ask(self, command: int, what: str, param1: float, param2: float) -> None:
+        self._acknowledgements.ask(
+            command, what, lambda attempt: self._command(command, attempt, param1, param2)
+        )
+
+
+def manual_mode(autopilot: int, kind: int, options: MavlinkRobotOptions) -> float:
+    """Return the number of an autopilot's manual mode, from its heartbeat. Raises DeviceError for
+    another autopilot, and for actuation that PX4's spacecraft does not take from sticks.
+    """
+    force, torque = options.force_max_N, options.torque_max_N_m
+    if autopilot == _PX4:
+        if force[2] or torque[0] or torque[1]:
+            raise DeviceError(
+                "PX4 takes force x, y and torque z only from MANUAL_CONTROL: set the other maxima "
+                "to 0, or use px4: over ROS 2"
+            )
+        return _PX4_MANUAL
+    if autopilot == _ARDUPILOT and kind == _SUBMARINE:
+        return _ARDUSUB_MANUAL
+    raise DeviceError(
+        f"autopilot {autopilot} of vehicle type {kind} is neither PX4 nor ArduSub: none of its "
+        "modes takes forces and torques from MANUAL_CONTROL"
+    )
+
+
+def open_robot(address: str, options: Mapping[str, Any], host: DeviceHost) -> MavlinkRobot:
+    """Open a robot: ``mavlink:udp://0.0.0.0:14550``."""
+    return MavlinkRobot(address, read_options(MavlinkRobotOptions, options), host)

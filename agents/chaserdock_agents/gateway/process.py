@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run a gateway: the devices of a laboratory in the place of the world.
+
+It owns time, members and ticks of a mission in real time, and simulates nothing. Each tick it
+publishes the odometry of the robots; images and references are published as they arrive, with their
+own times. Commands reach the robots when they take effect, if the gateway is armed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.messages import (
+    ArmingCommand,
+    ArmingReply,
+    DockingStatus,
+    Kill,
+    Latch,
+    Message,
+    Odometry,
+    Presence,
+)
+from chaserdock_protocol.mission.command_intake import CommandIntake
+from chaserdock_protocol.mission.host import load_mission_scenario, open_mission, open_world_node
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
+from chaserdock_protocol.scenario import Scenario, ScenarioError
+from chaserdock_protocol.transport import Node
+
+from .actuation import RobotActuation
+from .arming import ArmingRequests, listen_to_keys
+from .devices import DeviceError, DeviceHost, ImageArray
+from .images import image_message
+from .lab import Laboratory
+from .odometry import BodyState
+from .safety import SafetyGate
+
+_POLL_S = 0.002
+"""Interval, s, at which devices are read and commands sent: the latency that the gateway adds."""
+_POSE_PATIENCE_S = 10.0
+"""Wait, s, for the first odometry of all robots: devices were opened long before."""
+_SETTLING_NS = 200_000_000
+"""Time, ns, whose poses must give the first odometry."""
+
+
+def main(options: ProcessOptions) -> int:
+    """Run the gateway of ``options.scenario``; return 0 if the mission was completed, 1 if not, 2
+    for invalid input or a device that does not work.
+    """
+    cv2.setNumThreads(1)
+    node: Node | None = None
+    laboratory: Laboratory | None = None
+    realtime = dataclasses.replace(options, mode="realtime")
+    try:
+        scenario = load_mission_scenario(realtime)
+        if scenario.lab is None:
+            raise ScenarioError(f"{options.scenario}: has no [lab], which names the devices")
+        node = open_world_node(realtime)
+        now_s = node.host.now_s
+        host = DeviceHost(lambda: round(now_s() * 1e9))
+        laboratory = Laboratory(scenario, host, options.dry_run)
+        return Gateway(scenario, realtime, node, laboratory).run(options.stop_signal())
+    except ChaserdockError as error:
+        print_status("gateway", str(error))
+        return 2
+    finally:
+        if laboratory is not None:
+            laboratory.close()
+        if node is not None:
+            node.close()
+
+
+class Gateway:
+    """Fly one mission on the devices of a laboratory."""
+
+    def __init__(
+        self, scenario: Scenario, options: ProcessOptions, node: Node, laboratory: Laboratory
+    ) -> None:
+        assert scenario.lab is not None
+        self._scenario, self._node, self._lab = scenario, node, laboratory
+        self._timing, self._chasers = scenario.timing, len(scenario.chasers)
+        self._gate = SafetyGate(scenario.lab.safety)
+        self._requests = ArmingRequests()
+        self._start_ns = 0
+        self._used_ns: dict[int, int] = {}
+        self._commanded_ns: dict[int, int] = {}
+        self._missing: set[int] = set()
+        self._actuation = {
+            f"chaser/{i}": RobotActuation(scenario.chaser, self._timing)
+            for i in range(self._chasers)
+        }
+        for i in range(self._chasers):
+            node.advertise(topics.ODOMETRY, i)
+            node.advertise(topics.IMAGE, i)
+            if i in laboratory.latches:
+                node.advertise(topics.DOCKING, i)
+        node.subscribe(topics.KILL)
+        node.declare_queryable(topics.ARMING_KEY, ArmingCommand, self._requests.submit)
+        commands = CommandIntake(
+            self._timing,
+            self._actuation,
+            lambda: self._timing.step_of_time(self._mission_ns()),
+            self._command_latch,
+            scenario.controller.command_lifetime_s,
+        )
+        self._host = open_mission(scenario, options, node, commands)
+        self._barrier = self._host.barrier
+        self._barrier.take_other = self._take_other
+
+    def _now_ns(self) -> int:
+        return round(self._node.host.now_s() * 1e9)
+
+    def _mission_ns(self) -> int:
+        return max(0, self._now_ns() - self._start_ns)
+
+    def run(self, stop: StopSignal) -> int:
+        """Wait for the processes, fly all ticks and end the mission; return the exit status."""
+        end_keys = listen_to_keys(self._requests)
+        try:
+            reason = self._host.wait_for_processes(stop) or self._wait_for_poses(stop)
+            if reason:
+                return self._host.end(0, reason, complete=False)
+            self._start_ns = self._now_ns()
+            return self._fly(stop)
+        finally:
+            end_keys()
+            self._lab.stop()
+
+    def _wait_for_poses(self, stop: StopSignal) -> str:
+        """Read the devices until each robot has odometry; return why there is none, else
+        nothing.
+        """
+        begun_s = self._node.host.now_s()
+        while not stop():
+            self._lab.read_odometry()
+            for _ in self._lab.read_images():
+                pass
+            now_ns = self._now_ns()
+            late = [
+                feed.watch.name
+                for feed in self._lab.odometry.values()
+                if feed.track.at(now_ns, now_ns - _SETTLING_NS) is None
+            ]
+            if not late:
+                return ""
+            if self._node.host.now_s() - begun_s > _POSE_PATIENCE_S:
+                return f"no odometry within {_POSE_PATIENCE_S:g} s: {', '.join(late)}"
+            self._barrier.process_until(self._node.host.now_s() + _POLL_S)
+        return "stopped before the first tick"
+
+    def _fly(self, stop: StopSignal) -> int:
+        for tick in range(self._scenario.ticks + 1):
+            self._work_until(self._start_ns + self._timing.tick_time_ns(tick))
+            self._publish_odometry(tick)
+            self._publish_docking(tick)
+            if tick == self._scenario.ticks:
+                return self._host.end(tick, "completed", complete=True)
+            # Cameras run freely: no image belongs to a tick, and no tick waits for one.
+            self._barrier.open_tick(tick, images=False)
+            if stop() or self._barrier.lost_all_chasers(self._host.options.rejoin_s, stop):
+                reason = "stopped" if stop() else "no chaser is left"
+                return self._host.end(tick, reason, complete=False)
+        raise AssertionError("the last tick ends the mission")
+
+    def _work_until(self, due_ns: int) -> None:
+        """Read devices, guard the robots and command them until a time of the host's clock."""
+        while True:
+            self._read()
+            self._guard()
+            self._actuate()
+            left_ns = due_ns - self._now_ns()
+            if left_ns <= 0:
+                return
+            wait_s = min(_POLL_S, left_ns / 1e9)
+            self._barrier.process_until(self._node.host.now_s() + wait_s)
+
+    # -- devices to mission ------------------------------------------------------------------------
+
+    def _read(self) -> None:
+        try:
+            self._lab.read_odometry()
+            for chaser, image, time_ns in self._lab.read_images():
+                self._publish_image(chaser, image, time_ns)
+            for _ in self._lab.read_references():
+                pass
+        except DeviceError as error:
+            self._trip(str(error))
+
+    def _publish_image(self, chaser: int, image: ImageArray, time_ns: int) -> None:
+        exposed_ns = time_ns - self._start_ns
+        if exposed_ns <= 0 or chaser not in self._barrier.chasers:
+            return
+        message = image_message(self._scenario, chaser, image, exposed_ns)
+        self._node.publish(topics.IMAGE, message, chaser)
+
+    def _publish_odometry(self, tick: int) -> None:
+        time_ns = self._timing.tick_time_ns(tick)
+        host_ns = self._start_ns + time_ns
+        for chaser, feed in self._lab.odometry.items():
+            since_ns = self._used_ns.get(chaser, host_ns - 1_000_000_000 // self._timing.rate_hz)
+            state = feed.track.at(host_ns, since_ns)
+            if state is None:
+                if chaser not in self._missing:
+                    self._missing.add(chaser)
+                    self._barrier.publish_warning("no odometry", f"chaser {chaser}")
+                continue
+            self._missing.discard(chaser)
+            self._used_ns[chaser] = min(host_ns, feed.track.newest_ns or host_ns)
+            self._node.publish(topics.ODOMETRY, odometry_of(state, chaser, tick, time_ns), chaser)
+
+    def _publish_docking(self, tick: int) -> None:
+        for chaser, latch in self._lab.latches.items():
+            try:
+                reading = latch.poll()
+            except DeviceError as error:
+                self._trip(str(error))
+                continue
+            if reading is not None:
+                message = DockingStatus(
+                    tick=tick,
+                    sim_time_ns=self._timing.tick_time_ns(tick),
+                    chaser=chaser,
+                    contact=reading.contact,
+                    armed=reading.armed,
+                    latched=reading.latched,
+                )
+                self._node.publish(topics.DOCKING, message, chaser)
+
+    # -- mission to robots -------------------------------------------------------------------------
+
+    def _command_latch(self, chaser: int, latch: Latch, step: int) -> None:
+        self._commanded_ns[chaser] = self._now_ns()
+        device = self._lab.latches.get(chaser)
+        if device is not None and latch != "keep" and self._gate.is_armed:
+            try:
+                device.command(latch)
+            except DeviceError as error:
+                self._trip(str(error))
+
+    def _actuate(self) -> None:
+        mission_ns = self._mission_ns()
+        for chaser in range(self._chasers):
+            actuation = self._actuation[f"chaser/{chaser}"]
+            output = actuation.take(mission_ns)
+            if output is None or not self._gate.is_armed:
+                continue
+            try:
+                self._lab.send(chaser, actuation, output)
+            except DeviceError as error:
+                self._trip(str(error))
+
+    # -- safety ------------------------------------------------------------------------------------
+
+    def _guard(self) -> None:
+        now_ns = self._now_ns()
+        ages = {i: (now_ns - at_ns) / 1e9 for i, at_ns in self._commanded_ns.items()}
+        sights = self._lab.sights(ages)
+        for action, by, answer in self._requests.take():
+            accepted, reason = self._gate.request(action, by, sights)
+            if accepted and action == "arm":
+                accepted, reason = self._arm_robots(reason)
+            elif accepted:
+                self._lab.stop()
+            self._barrier.publish_warning(
+                f"{action} {'accepted' if accepted else 'refused'}", reason
+            )
+            answer(ArmingReply(accepted=accepted, reason=reason))
+        if reason := self._gate.check(sights):
+            self._lab.stop()
+            self._barrier.publish_warning("disarmed", reason)
+
+    def _arm_robots(self, reason: str) -> tuple[bool, str]:
+        try:
+            self._lab.arm()
+        except DeviceError as error:
+            self._lab.stop()
+            return False, self._gate.trip(str(error))
+        self._commanded_ns.clear()  # ages count from now on
+        return True, reason
+
+    def _trip(self, reason: str) -> None:
+        if self._gate.is_armed or reason != self._gate.reason:
+            self._gate.trip(reason)
+            self._lab.stop()
+            self._barrier.publish_warning("disarmed", reason)
+
+    def _take_other(self, message: Message) -> None:
+        match message:
+            case Kill(by=by):
+                self._requests.add("kill", by or "the topic operator/kill")
+            case Presence():
+                self._trip("another world or gateway runs in this namespace")
+
+
+def odometry_of(state: BodyState, chaser: int, tick: int, time_ns: int) -> Odometry:
+    """Return a body's state at a tick as odometry."""
+    return Odometry(
+        tick=tick,
+        sim_time_ns=time_ns,
+        chaser=chaser,
+        position_m=vector(state.position_m),
+        velocity_m_s=vector(state.velocity_m_s),
+        q_wxyz=vector(state.q_wxyz),
+        omega_rad_s=vector(state.omega_rad_s),
+        position_covariance_m2=vector(state.position_covariance_m2),
+        velocity_covariance_m2_s2=vector(state.velocity_covariance_m2_s2),
+        attitude_covariance_rad2=vector(state.attitude_covariance_rad2),
+        omega_covariance_rad2_s2=vector(state.omega_covariance_rad2_s2),
+    )

@@ -111,7 +111,7 @@ def test_markers_lie_within_the_printable_area() -> None:
 def test_sheets_state_the_white_border_and_draw_its_width(name: str) -> None:
     model = target_model(name)
     for sheet in lay_out(model, SHEETS_MM["a4"]):
-        assert "Perception needs a white border of 0.5 cells" in sheet.notes[-1][2]
+        assert "needs a white border of 0.5 cells, or 0.4 where" in sheet.notes[-1][2]
         assert len(sheet.notes) == len(sheet.markers) + 1
         for (marker, x, y), (_, _, note) in zip(sheet.markers, sheet.notes, strict=False):
             margin = 1e3 * clear_margin_m(model, marker)

@@ -28,7 +28,7 @@ _HALVED_PX = 300
 _REGION_LIMIT = 0.7
 # White border, in cells of a marker, that detection needs anywhere, and where a cell has so many
 # pixels or more in the image (docs/evidence/cameras.md#printed-sheets).
-LEAST_MARGIN_CELLS, NEAR_MARGIN_CELLS, NEAR_CELL_PX = 0.5, 0.3, 4
+LEAST_MARGIN_CELLS, NEAR_MARGIN_CELLS, NEAR_CELL_PX = 0.5, 0.4, 4
 
 Region = tuple[int, int, int, int]
 

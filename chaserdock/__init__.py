@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Python API of chaserdock: fly missions, open their logs, load scenarios.
+"""Python API of chaserdock: fly missions, open their logs, load scenarios, track targets in images.
 
 >>> import chaserdock as cd
 >>> camera = {"width_px": 640, "height_px": 360}
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .launch.launcher import RunError
     from .logs.reader import Log
     from .summary import ChaserSummary, Summary
+    from .tracking.tracker import TrackedImage, TrackedPose, TrackedTarget, Tracker
 
 __all__ = [
     "ChaserSummary",
@@ -35,6 +36,10 @@ __all__ = [
     "RunResult",
     "ScenarioError",
     "Summary",
+    "TrackedImage",
+    "TrackedPose",
+    "TrackedTarget",
+    "Tracker",
     "list_scenarios",
     "load_scenario",
     "open_log",
@@ -54,6 +59,8 @@ def __getattr__(name: str) -> Any:
         from .launch import launcher as home
     elif name == "Log":
         from .logs import reader as home
+    elif name.startswith("Track"):
+        from .tracking import tracker as home
     elif name in ("ChaserSummary", "Summary"):
         from . import summary as home
     else:

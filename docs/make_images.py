@@ -726,6 +726,25 @@ def targets() -> None:
     write("targets", np.hstack(tiles))
 
 
+def tracked() -> None:
+    """A printed sheet in a photograph, as `chaserdock track` shows it."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    from chaserdock_models.targets import target_model
+    from sheet_views import Lens, Photograph, printed, rotation_of
+
+    from chaserdock.tracking.overlay import overlay
+    from chaserdock.tracking.tracker import Tracker
+
+    lens = Lens(960, 540, 840.0, 840.0, 478.2, 272.9, samples=4)
+    paper = target_model("paper")
+    tracker = Tracker(lens.camera(), {0: 0.09, 1: 0.09}, dictionary=paper.dictionary)
+    rotation = rotation_of([0.35, -0.5, 1.25]) @ np.diag([1.0, -1.0, -1.0])
+    position, rng = np.array([0.02, 0.015, 0.5]), np.random.default_rng(1)
+    image = Photograph(lens).of(printed(paper), position, rotation, rng)
+    seen = tracker.track(image, 12_340_000_000)
+    write("track", overlay(image, tracker.camera, tracker.models, seen, 30.0))
+
+
 def dataset() -> None:
     """Images of random views, and the masks of the target."""
     with tempfile.TemporaryDirectory() as name:
@@ -818,7 +837,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "controller": controller, "estimation": estimation, "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,
     "results": results, "thrusters": thrusters,
-    "targets": targets, "dataset": dataset, "report": report,
+    "targets": targets, "track": tracked, "dataset": dataset, "report": report,
     "terminal": first_flight, "status": log_info,
 }  # fmt: skip
 

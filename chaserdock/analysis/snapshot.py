@@ -10,20 +10,17 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_agents.chaser.sighting import BadImage, decode_image
-from chaserdock_models import rotations
 from chaserdock_protocol.messages import Image, Sighting
 from chaserdock_protocol.recording.log import LogError, logged_scenario
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import NDArray
 
+from chaserdock.pose_drawing import TEXT_BGR, draw_axes, draw_markers
+
 from .images import Pair, pairs
 
-_MARKER = (90, 220, 90)
-"""Colour (BGR, 0 to 255) of detected markers: green, which grey images do not have."""
-_TEXT = (235, 235, 235)
-"""Colour (BGR, 0 to 255) of text: light on dark images."""
-_AXES = ((80, 80, 255), (90, 220, 90), (255, 160, 60))
-"""Colours (BGR, 0 to 255) of the axes x, y, z: red, green, blue."""
+_AXIS_M = 0.08
+"""Length (m) of the drawn axes: about that of a marker."""
 
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
@@ -72,32 +69,16 @@ def annotated_image(
     )
     if sighting is not None and sighting.sim_time_ns == image.sim_time_ns:
         corners = (np.reshape(sighting.corners_px, (-1, 4, 2)) + 0.5) * scale - 0.5
-        for square in corners:
-            points = np.round(square * 16).astype(np.int32)
-            cv2.polylines(canvas, [points], True, _MARKER, 1, cv2.LINE_AA, 4)
+        draw_markers(canvas, corners)
         if sighting.solutions:
-            _draw_axes(canvas, scenario, sighting, scale)
+            best = sighting.solutions[0]
+            camera = scenario.camera_model()
+            draw_axes(canvas, camera, best.position_m, best.q_wxyz, _AXIS_M, scale)
     text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen_text(sighting)}"
     (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     size = 0.5 * min(1.0, (width_px - 16) / length_px)  # fit the text into a small image
-    cv2.putText(canvas, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, TEXT_BGR, 1, cv2.LINE_AA)
     return np.asarray(canvas, dtype=np.uint8)
-
-
-def _draw_axes(
-    canvas: NDArray[np.uint8], scenario: FlightScenario, sighting: Sighting, scale: float
-) -> None:
-    """Draw the measured target frame: x red, y green, z blue, 8 cm each."""
-    best = sighting.solutions[0]
-    points = np.vstack([np.zeros(3), 0.08 * np.eye(3)])
-    irf = rotations.rotate(best.q_wxyz, points) + best.position_m
-    px = (scenario.camera_model().project(irf) + 0.5) * scale - 0.5
-    if not np.all(np.isfinite(px)):
-        return
-    ends = np.round(px * 16).astype(int)
-    for k, colour in enumerate(_AXES):
-        a, b = ends[0].tolist(), ends[k + 1].tolist()
-        cv2.line(canvas, a, b, colour, 2, cv2.LINE_AA, 4)
 
 
 def seen_text(sighting: Sighting | None) -> str:

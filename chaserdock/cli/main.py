@@ -33,6 +33,7 @@ from .run import campaign, run
 from .scenario import scenario
 from .simulate import simulate
 from .target import target
+from .track import track
 
 _GC_THRESHOLD = 100_000
 """Objects allocated between two garbage collections. Imports create several 100,000 objects that
@@ -45,6 +46,7 @@ GROUPS: dict[str, tuple[Callable[..., None], ...]] = {
     "Operate": (command, status, view),
     "Look at a flight": (judge, report, video, log),
     "Compare": (replay, compare, check),
+    "Laboratory": (track,),
     "Prepare": (scenario, target, calibrate, dataset, deploy),
 }
 """Commands by the section of the help that lists them."""

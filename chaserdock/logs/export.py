@@ -43,7 +43,8 @@ class _CsvFile:
         self._file.close()
 
 
-def _create_file(path: Path, schema: pa.Schema, format: TableFormat) -> Any:
+def create_table_file(path: Path, schema: pa.Schema, format: TableFormat) -> Any:
+    """Return a new file with `write_table` and `close`, as `pyarrow.parquet.ParquetWriter`."""
     return (
         pq.ParquetWriter(path, schema, compression="zstd")
         if format == "parquet"
@@ -78,7 +79,7 @@ def export(
                     raise LogError(f"{path}: already exists; export into an empty folder")
                 new = open_files.enter_context(replaced(path))
                 files[name] = open_files.enter_context(
-                    closing(_create_file(new, chunk.schema, format))
+                    closing(create_table_file(new, chunk.schema, format))
                 )
             files[name].write_table(chunk)
             rows[path.name] += chunk.num_rows

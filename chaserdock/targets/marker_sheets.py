@@ -13,7 +13,12 @@ from typing import Any
 import cv2
 import matplotlib
 import numpy as np
-from chaserdock_agents.chaser.perception.detect import dictionary_of
+from chaserdock_agents.chaser.perception.detect import (
+    LEAST_MARGIN_CELLS,
+    NEAR_CELL_PX,
+    NEAR_MARGIN_CELLS,
+    dictionary_of,
+)
 from chaserdock_models.targets import Marker, TargetModel, clear_margin_m
 from chaserdock_protocol.output_files import replaced
 from matplotlib.backends.backend_pdf import PdfPages
@@ -29,6 +34,8 @@ _EDGE_MM, _GAP_MM, _TEXT_MM, _MARK_MM, _LINE_MM = 12.0, 8.0, 3.0, 3.0, 0.1
 """Lengths, mm: margin, which printers leave blank; gap between markers, for scissors; height of
 text; length of cutting marks; width of lines.
 """
+_NOTE_MM = 2.2
+"""Height of the text that states the white border, mm: it fits below the smallest marker."""
 # Footer of a sheet, mm: a ruler to check the scale, and the sheet's name.
 _FOOT_MM = 14.0
 _MM_PER_INCH = 25.4  # exact
@@ -38,14 +45,17 @@ _STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fontty
 
 @dataclass
 class Sheet:
-    """Content of one sheet, mm: black ``rectangles`` (x, y, width, height), ``lines`` (x0, y0, x1,
-    y1), ``texts`` (x, y of the baseline, text).
+    """Content of one sheet, mm: ``markers`` with their centres (marker, x, y), black ``rectangles``
+    (x, y, width, height), ``lines`` (x0, y0, x1, y1), ``texts`` and smaller ``notes`` (x, y of the
+    baseline, text).
     """
 
     size_mm: tuple[float, float]
+    markers: list[tuple[Marker, float, float]] = field(default_factory=list)
     rectangles: list[tuple[float, float, float, float]] = field(default_factory=list)
     lines: list[tuple[float, float, float, float]] = field(default_factory=list)
     texts: list[tuple[float, float, str]] = field(default_factory=list)
+    notes: list[tuple[float, float, str]] = field(default_factory=list)
 
 
 def write_sheets(
@@ -65,12 +75,12 @@ def write_sheets(
         if out.suffix.lower() == ".pdf":
             with replaced(out) as new, PdfPages(new) as pdf:
                 for sheet in sheets:
-                    pdf.savefig(_figure_of(sheet))
+                    pdf.savefig(figure_of(sheet))
             return len(sheets), [out]
         for number, sheet in enumerate(sheets, 1):
             path = out if len(sheets) == 1 else out.with_stem(f"{out.stem}-{number}")
             with replaced(path) as new:
-                _figure_of(sheet).savefig(new, format="svg", metadata={"Date": None})
+                figure_of(sheet).savefig(new, format="svg", metadata={"Date": None})
             written.append(path)
     return len(sheets), written
 
@@ -87,7 +97,7 @@ def lay_out(model: TargetModel, size_mm: tuple[float, float]) -> list[Sheet]:
     for marker in sorted(model.markers, key=lambda m: (-m.side_m, m.id)):
         margin = 1000.0 * clear_margin_m(model, marker)
         side = 1000.0 * marker.side_m + 2.0 * margin
-        tall = side + _TEXT_MM + 1.0
+        tall = side + _TEXT_MM + _NOTE_MM + 2.0
         if side > width - 2 * _EDGE_MM or tall > height - 2 * _EDGE_MM - _FOOT_MM:
             raise ValueError(
                 f"marker {marker.id} with its border is {side:g} mm wide, too large for the sheet"
@@ -108,19 +118,26 @@ def lay_out(model: TargetModel, size_mm: tuple[float, float]) -> list[Sheet]:
         ]
         about = f"100 mm.  {model.name}, {model.dictionary}, sheet {number} of {len(sheets)}"
         sheet.texts.append((_EDGE_MM + 104.0, foot, about))
+        rule = (
+            f"Cut at the marks. Perception needs a white border of {LEAST_MARGIN_CELLS:g} cells, "
+            f"or {NEAR_MARGIN_CELLS:g} where a cell has {NEAR_CELL_PX} pixels; a cell is a square "
+            "of the pattern."
+        )
+        sheet.notes.append((_EDGE_MM, foot + _NOTE_MM + 1.0, rule))
     return sheets
 
 
 def _place(
     sheet: Sheet, dictionary: str, marker: Marker, at: tuple[float, float], margin: float
 ) -> None:
-    """Add a marker ``at`` (x, y) with a white ``margin``, crop marks at its corners, and its id
-    below.
+    """Add a marker ``at`` (x, y) with a white ``margin``, crop marks at its corners, and below its
+    id and, drawn and as text, the width of the margin.
     """
     cells = marker_bits(dictionary, marker.id)
     cell = 1000.0 * marker.side_m / len(cells)
     x, y = at
     side = 1000.0 * marker.side_m + 2.0 * margin
+    sheet.markers.append((marker, x + side / 2.0, y + side / 2.0))
     for r, line in enumerate(cells):
         # Adjacent black cells form one rectangle, so that no hairlines appear between them.
         edges = np.flatnonzero(np.diff(np.concatenate([[1], line, [1]])))
@@ -133,8 +150,14 @@ def _place(
             sheet.lines.append((cx + sx * 0.5, cy, cx + sx * _MARK_MM, cy))
             sheet.lines.append((cx, cy + sy * 0.5, cx, cy + sy * _MARK_MM))
     sheet.texts.append(
-        (x + 1.0, y + side + _TEXT_MM, f"{marker.id}   {1000.0 * marker.side_m:g} mm")
+        (x + margin + 1.5, y + side + _TEXT_MM, f"{marker.id}   {1000.0 * marker.side_m:g} mm")
     )
+    # Between the crop mark and the marker's black edge, on what is cut off.
+    edge, middle = x + margin, y + side + 0.5 + _MARK_MM / 2.0
+    sheet.lines.append((edge, y + side + 0.5, edge, y + side + _MARK_MM))
+    sheet.lines.append((x, middle, edge, middle))
+    note = f"white border {margin:.3g} mm, {margin / cell:.2g} cells"
+    sheet.notes.append((x + 1.0, y + side + _TEXT_MM + 1.0 + _NOTE_MM, note))
 
 
 def marker_bits(dictionary: str, marker_id: int) -> NDArray[np.int64]:
@@ -148,7 +171,7 @@ def marker_bits(dictionary: str, marker_id: int) -> NDArray[np.int64]:
     return (np.asarray(image) > 0).astype(np.int64)
 
 
-def _figure_of(sheet: Sheet) -> Figure:
+def figure_of(sheet: Sheet) -> Figure:
     """Return the sheet as a matplotlib figure of its size; one unit of the transform is a
     millimetre of paper.
     """
@@ -173,7 +196,8 @@ def _figure_of(sheet: Sheet) -> Figure:
     )
     for artist in (squares, lines):
         figure.add_artist(artist)
-    for x, y, text in sheet.texts:
-        place = x / sheet.size_mm[0], 1.0 - y / sheet.size_mm[1]
-        figure.text(*place, text, fontsize=_TEXT_MM * _POINTS_PER_MM, va="baseline")
+    for texts, high_mm in ((sheet.texts, _TEXT_MM), (sheet.notes, _NOTE_MM)):
+        for x, y, text in texts:
+            place = x / sheet.size_mm[0], 1.0 - y / sheet.size_mm[1]
+            figure.text(*place, text, fontsize=high_mm * _POINTS_PER_MM, va="baseline")
     return figure

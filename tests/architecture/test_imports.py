@@ -102,8 +102,15 @@ OPTIONAL = {
     "chaserdock.datasets": {"chaserdock.cli.datasets"},
     "chaserdock.experiments": {"chaserdock.cli.compare", "chaserdock.cli.run"},
     "chaserdock.targets": {"chaserdock.cli.target"},
+    "chaserdock.tracking": {"chaserdock", "chaserdock.cli.track"},
+    "chaserdock_agents.gateway.cameras": {
+        "chaserdock.cli.track",
+        "chaserdock.tracking.pose_files",
+        "chaserdock.tracking.run",
+    },
     "chaserdock_agents.ros2": {
         "chaserdock.logs.rosbag",
+        "chaserdock_agents.gateway.cameras.image_messages",
         "chaserdock_agents.gateway.drivers.px4_robot",
         "chaserdock_agents.gateway.drivers.ros2_network",
         "chaserdock_agents.gateway.drivers.ros2_robot",

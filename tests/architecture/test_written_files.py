@@ -19,6 +19,7 @@ ALLOWED = {
     "chaserdock/launch/launcher.py": "output of the processes, which grows",
     "chaserdock/launch/keys.py": "exclusive, with the rights of a key",
     "chaserdock/analysis/video.py": "the path is what `replaced` yields",
+    "chaserdock/tracking/overlay_video.py": "the path is what `replaced` yields",
     "chaserdock/logs/export.py": "the path is what `replaced` yields",
     "chaserdock/logs/recover.py": "a log, removed if it is not complete",
 }

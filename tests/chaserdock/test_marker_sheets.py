@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception.detect import detect, dictionary_of
-from chaserdock_models.targets import target_model, target_names
+from chaserdock_models.targets import clear_margin_m, target_model, target_names
 from typer.testing import CliRunner
 
 from chaserdock.cli.main import app
-from chaserdock.targets.marker_sheets import SHEETS_MM, lay_out, write_sheets
+from chaserdock.targets.marker_sheets import SHEETS_MM, lay_out, marker_bits, write_sheets
 
 POINTS_PER_MM = 72.0 / 25.4
 
@@ -105,6 +105,26 @@ def test_markers_lie_within_the_printable_area() -> None:
         for x, y, w, h in sheet.rectangles:
             assert 0 < x < x + w < 210
             assert 0 < y < y + h < 297 - 26
+
+
+@pytest.mark.parametrize("name", ["paper", "servicer"])
+def test_sheets_state_the_white_border_and_draw_its_width(name: str) -> None:
+    model = target_model(name)
+    for sheet in lay_out(model, SHEETS_MM["a4"]):
+        assert "needs a white border of 0.5 cells, or 0.4 where" in sheet.notes[-1][2]
+        assert len(sheet.notes) == len(sheet.markers) + 1
+        for (marker, x, y), (_, _, note) in zip(sheet.markers, sheet.notes, strict=False):
+            margin = 1e3 * clear_margin_m(model, marker)
+            cells = margin / (1e3 * marker.side_m / len(marker_bits(model.dictionary, marker.id)))
+            assert note == f"white border {margin:.3g} mm, {cells:.2g} cells"
+            edge = x - 5e2 * marker.side_m
+            drawn = [
+                line
+                for line in sheet.lines
+                if line[0] == pytest.approx(edge - margin) and line[2] == pytest.approx(edge)
+            ]
+            below = y + 5e2 * marker.side_m + margin  # not on the white
+            assert any(line[1] == line[3] > below for line in drawn)
 
 
 def test_marker_larger_than_the_sheet_is_rejected(tmp_path: Path) -> None:

@@ -13,11 +13,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from chaserdock_models.camera import Camera
 from chaserdock_models.satellites import satellite_names
-from chaserdock_models.targets import TargetModel, target_model, target_names
+from chaserdock_models.targets import TargetModel, target_names
 from pydantic import TypeAdapter, ValidationError
 
+from .bodies import FlightTarget
 from .calibration_files import read_calibration
+from .camera import Intrinsics
 from .errors import ScenarioError, invalid
 from .fields import Positive, Vector
 from .surface import SUFFIXES
@@ -119,15 +122,35 @@ def _surface_values(path: Path, changed_ns: int, scale: float, origin_m: Vector)
     return read_surface(path, scale, origin_m).model_dump(mode="json")
 
 
+def load_camera(path: Path) -> Camera:
+    """Return the camera of a calibration file (`read_calibration`). Raises ScenarioError."""
+    try:
+        return Intrinsics.model_validate(read_calibration(path)).camera()
+    except ValidationError as error:
+        raise invalid(error, Intrinsics, path) from None
+
+
 def find_target(name: str) -> TargetModel:
     """Return the target of a file (``….toml``, a mesh) or of a known name. Raises ScenarioError."""
+    return find_flight_target(name).shape()
+
+
+def find_flight_target(name: str, mesh_scale: float = 1.0) -> FlightTarget:
+    """Return what flight software knows of a target: that of a file (``….toml``, or a mesh, with
+    the factor from its unit of length to m) or of a known name. Raises ScenarioError.
+    """
+    values: dict[str, Any]
     if Path(name).suffix.lower() in SUFFIXES:
-        values: dict[str, Any] = {"mesh": name}
+        values = {"mesh": name, "mesh_scale": mesh_scale}
         _read_mesh(values, Path())
-        return Geometry.model_validate(values).model(_name_of(Path(name)))
+        return FlightTarget(model=_name_of(Path(name)), geometry=Geometry.model_validate(values))
     if name.endswith(".toml"):
-        return Geometry.model_validate(_geometry_values(Path(name))).model(Path(name).stem)
-    try:
-        return target_model(name)
-    except ValueError as error:
-        raise ScenarioError(f"{error}, or a file ….toml or ….glb") from None
+        path = Path(name)
+        geometry = Geometry.model_validate(_geometry_values(path))
+        return FlightTarget(model=_name_of(path), geometry=geometry)
+    if name not in target_names():
+        raise ScenarioError(
+            f"unknown target {name!r}; known: {', '.join(target_names())}, or a file ….toml or "
+            "….glb"
+        )
+    return FlightTarget(model=name)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from chaserdock_models.camera import Camera
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import PERCEPTIONS, FlightScenario
 from chaserdock_protocol.scenario.bodies import FlightTarget
@@ -45,31 +46,36 @@ class FarPerception:
 
 
 def make_perception(scenario: FlightScenario, single_images: bool = False) -> PerceptionMethod:
-    """Return the perception that the scenario names.
+    """Return the perception that the scenario names, as `named_perception`."""
+    camera, name = scenario.camera_model(), scenario.perception.name
+    if name == "statistical":
+        return StatisticalPerception(camera, scenario.target_model(), scenario.ranging)
+    perception = named_perception(name, camera, scenario.target, single_images)
+    if scenario.ranging is None or not isinstance(perception, Perception):
+        return perception
+    focal_share = scenario.navigation.errors().camera_focal_share
+    return FarPerception(perception, BearingFinder(camera, scenario.target_model(), focal_share))
+
+
+def named_perception(
+    name: str, camera: Camera, target: FlightTarget, single_images: bool = False
+) -> PerceptionMethod:
+    """Return a perception of images by its name.
 
     It is built in, or an installed ``chaserdock.perceptions`` entry point, which is a function of
     (camera: Camera, target: TargetModel). ``single_images``: images do not follow each other, so
     that an acquisition ends in the image in which it begins. Raises PluginError for a perception
     that is not installed.
     """
-    camera, target = scenario.camera_model(), scenario.target_model()
-    match scenario.perception.name:
+    match name:
         case "default" | "paper" | "paper_iterative" as method:
-            by_markers = Perception(camera, target, method)
-            if scenario.ranging is None:
-                return by_markers
-            focal_share = scenario.navigation.errors().camera_focal_share
-            return FarPerception(by_markers, BearingFinder(camera, target, focal_share))
-        case "statistical":
-            return StatisticalPerception(camera, target, scenario.ranging)
+            return Perception(camera, target.shape(), method)
         case "model":
-            perception = ModelPerception(
-                camera, tracker_mesh(scenario.target), single_images=single_images
-            )
+            perception = ModelPerception(camera, tracker_mesh(target), single_images=single_images)
             perception.prepare()
             return perception
-        case name:
-            return plugins.make("perception", name, PERCEPTIONS, camera, target)
+        case _:
+            return plugins.make("perception", name, PERCEPTIONS, camera, target.shape())
 
 
 def tracker_mesh(target: FlightTarget) -> TrackerMesh:
@@ -92,5 +98,6 @@ __all__ = [
     "RangedTarget",
     "TargetPose",
     "make_perception",
+    "named_perception",
     "tracker_mesh",
 ]

@@ -24,6 +24,9 @@ _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
 _HALVED_PX = 300
 # Share of the image above which a region is not used: it would hardly save time.
 _REGION_LIMIT = 0.7
+# White border, in cells of a marker, that detection needs anywhere, and where a cell has so many
+# pixels or more in the image (docs/evidence/cameras.md#printed-sheets).
+LEAST_MARGIN_CELLS, NEAR_MARGIN_CELLS, NEAR_CELL_PX = 0.5, 0.4, 4
 
 Region = tuple[int, int, int, int]
 

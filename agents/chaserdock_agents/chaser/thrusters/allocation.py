@@ -44,14 +44,17 @@ class Allocation:
 
 
 class Allocator:
-    """Thruster allocation for one layout; ``scale`` (6,): unit of each axis in the norm."""
+    """Thruster allocation for one layout; ``scale`` (6,): unit of each axis in the norm, 0 for one
+    on which the body cannot move.
+    """
 
     def __init__(self, thrusters: Sequence[Thruster], scale: Array) -> None:
         self.matrix = wrench_matrix(thrusters)
         self._full_N = thrusts_max(thrusters)
         # In units of the axes and of full thrust, all numbers are near one.
-        self._rows = self.matrix * self._full_N / scale[:, None]
-        self._scale = scale
+        self._axes = np.flatnonzero(scale)
+        self._scale = scale[self._axes]
+        self._rows = self.matrix[self._axes] * self._full_N / self._scale[:, None]
         self._cost = self._full_N / self._full_N.max()
 
     def allocate(
@@ -64,7 +67,7 @@ class Allocator:
 
         Raises ValueError for numbers that are not finite, RuntimeError if the solver fails.
         """
-        target = wrench / self._scale
+        target = wrench[self._axes] / self._scale
         limits = thrusts_max_N / self._full_N
         if not (np.isfinite(target).all() and np.isfinite(limits).all() and (limits >= 0.0).all()):
             raise ValueError("wrench and limits must be finite, limits not negative")
@@ -91,9 +94,9 @@ def _cheapest(rows: Array, cost: Array, target: Array, most: Array) -> tuple[Arr
 
     Return daqp's solution and flag.
     """
-    n = len(most)
+    n, axes = len(most), len(target)
     upper, lower = np.concatenate([most, target]), np.concatenate([np.zeros(n), target])
-    sense = np.array([0] * n + [_EQUALITY] * 6, dtype=np.int32)
+    sense = np.array([0] * n + [_EQUALITY] * axes, dtype=np.int32)
     x, _, flag, _ = daqp.solve(_REGULARIZATION * np.eye(n), cost, rows, upper, lower, sense)
     return x, flag
 
@@ -103,18 +106,18 @@ def _closest(rows: Array, target: Array, most: Array) -> tuple[Array, int]:
 
     Return daqp's solution and flag.
     """
-    n = len(most)
-    free = np.full(6, 1e30)
+    n, axes = len(most), len(target)
+    free = np.full(axes, 1e30)
     upper, lower = (
         np.concatenate([most, free, target]),
         np.concatenate([np.zeros(n), -free, target]),
     )
-    sense = np.array([0] * (n + 6) + [_EQUALITY] * 6, dtype=np.int32)
-    hessian = np.diag([_SMALL] * n + [1.0] * 6)
+    sense = np.array([0] * (n + axes) + [_EQUALITY] * axes, dtype=np.int32)
+    hessian = np.diag([_SMALL] * n + [1.0] * axes)
     x, _, flag, _ = daqp.solve(
         hessian,
-        np.zeros(n + 6),
-        np.ascontiguousarray(np.hstack([rows, np.eye(6)])),
+        np.zeros(n + axes),
+        np.ascontiguousarray(np.hstack([rows, np.eye(axes)])),
         upper,
         lower,
         sense,

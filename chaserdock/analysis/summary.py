@@ -39,7 +39,7 @@ from .criteria import (
     stack_rest,
 )
 from .flight import RecordedFlight, SafetyHistory, Track, load_flight
-from .pose_errors import normalized_square, pose_error, relative_pose
+from .pose_errors import Verticals, pose_error, pose_nees, relative_pose, verticals_of
 from .rendezvous import rendezvous_failures, rendezvous_of, rendezvous_text
 
 SUMMARY_NAME = "summary.json"
@@ -174,12 +174,12 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
     """
     a, b = known_estimates(flight)
     truth = flight.truth.get("target", flight.estimate)  # without truth there are no rows
-    e = flight.estimate
+    e, up = flight.estimate, verticals_of(flight.scenario)
     errors = {name: np.empty(len(a)) for name in (*_POSE_ERRORS, "velocity_m_s", "omega_rad_s")}
     for rows in blocks(len(a)):
         i, j = a[rows], b[rows]
         pose = pose_error(truth.position_m[j], truth.q_wxyz[j], e.position_m[i], e.q_wxyz[i])
-        _store_pose_errors(errors, rows, pose, flight.pose_covariance(i))
+        _store_pose_errors(errors, rows, pose, flight.pose_covariance(i), up and up[0])
         errors["velocity_m_s"][rows] = np.linalg.norm(
             truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1
         )
@@ -201,26 +201,30 @@ def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
         return {name: np.zeros(0) for name in ("time_s", *_POSE_ERRORS)}
     n = min(len(own.time_s), len(target.time_s))
     a, b = rows_at_equal_times(history.time_s, target.time_s[:n])
-    errors = {name: np.empty(len(a)) for name in _POSE_ERRORS}
+    errors, up = {name: np.empty(len(a)) for name in _POSE_ERRORS}, verticals_of(flight.scenario)
     for rows in blocks(len(a)):
         i, j = a[rows], b[rows]
         true = relative_pose(
             own.position_m[j], own.q_wxyz[j], target.position_m[j], target.q_wxyz[j]
         )
         pose = pose_error(*true, history.position_m[i], history.q_wxyz[i])
-        _store_pose_errors(errors, rows, pose, history.covariance(i))
+        _store_pose_errors(errors, rows, pose, history.covariance(i), up and up[1])
     return {"time_s": history.time_s[a], **errors}
 
 
 def _store_pose_errors(
-    errors: dict[str, Array], rows: slice, pose: Array, covariance: Array
+    errors: dict[str, Array],
+    rows: slice,
+    pose: Array,
+    covariance: Array,
+    verticals: Verticals | None,
 ) -> None:
     """Store the quantities of ``_POSE_ERRORS`` in these rows, computed from pose errors (K, 6) with
-    covariances (K, 6, 6).
+    covariances (K, 6, 6). ``verticals``: see ``pose_nees``.
     """
     errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
     errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
-    errors["nees"][rows] = normalized_square(pose, covariance)
+    errors["nees"][rows] = pose_nees(pose, covariance, verticals)
 
 
 def _pose_figures(errors: dict[str, Array], from_s: float) -> dict[str, float | None]:

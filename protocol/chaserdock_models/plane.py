@@ -27,6 +27,15 @@ def flattened(vectors: ArrayLike, up: Array, height: float = 0.0) -> Array:
     return v + (height - v @ up)[..., None] * up
 
 
+def across(up: Array) -> Array:
+    """Return two unit vectors (2, 3) perpendicular to the unit vector ``up`` (3,) and to each
+    other.
+    """
+    first = rotations.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first = first / np.linalg.norm(first)
+    return np.array([first, rotations.cross(up, first)])
+
+
 def levelled(q_wxyz: Array, up: Array) -> Array:
     """Return the attitude (4,), body to WRF, nearest to ``q_wxyz`` at which ``up`` (3,), body axes,
     is vertical.

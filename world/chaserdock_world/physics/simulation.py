@@ -196,10 +196,11 @@ class Physics:
             bodies.step_count += 1
             latching.end_step()
             # A bounce may last a single step, so contacts are checked after each.
-            if engine.touching():
+            touching = engine.touching()
+            if touching:
                 touched.update(latching.process_contacts())
             bodies.place_target()
-            if self._floor is not None:
+            if self._floor is not None and (touching or jointed):
                 self._floor.hold()
         return touched
 

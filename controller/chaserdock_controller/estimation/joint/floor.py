@@ -16,6 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array, IntArray
+from chaserdock_models.plane import UP, across
 from msgspec.structs import replace
 
 from .parameters import LevelFloor
@@ -53,7 +54,7 @@ def _rows(state: JointState, floor: LevelFloor) -> Iterator[Row]:
         yield from _of_body(0, state.q_wxyz, velocity, omega, np.array(floor.up_trf), floor)
     for i in np.flatnonzero(state.alive).tolist():
         motion = state.attitudes_wxyz[i], state.velocities_m_s[i], state.omegas_rad_s[i]
-        yield from _of_body(block(i).start, *motion, np.array([0.0, 0.0, 1.0]), floor)
+        yield from _of_body(block(i).start, *motion, UP, floor)
 
 
 def _of_body(
@@ -65,14 +66,7 @@ def _of_body(
     attitude = start + np.arange(ATTITUDE.start, ATTITUDE.stop)
     rate = start + np.arange(RATE.start, RATE.stop)
     leaning = so3.to_matrix(q_wxyz)[2]
-    for across in _across(up):
-        turned = across @ so3.skew(leaning)
-        yield attitude, turned, float(across @ (up - leaning)), floor.lean_rad**2
-        yield rate, across, -float(across @ omega), floor.lean_rate_rad_s**2
-
-
-def _across(up: Array) -> tuple[Array, Array]:
-    """Return two unit vectors (3,) perpendicular to ``up`` and to each other."""
-    first = so3.skew(up) @ np.eye(3)[int(np.argmin(np.abs(up)))]
-    first = first / np.linalg.norm(first)
-    return first, so3.skew(up) @ first
+    for side in across(up):
+        turned = side @ so3.skew(leaning)
+        yield attitude, turned, float(side @ (up - leaning)), floor.lean_rad**2
+        yield rate, side, -float(side @ omega), floor.lean_rate_rad_s**2

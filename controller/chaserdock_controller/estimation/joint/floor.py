@@ -36,7 +36,7 @@ def keep_on_floor(state: JointState, floor: LevelFloor) -> JointState:
     """Return the state updated by the knowledge that its bodies are on a floor."""
     covariance, error = state.covariance.copy(), np.zeros(len(state.covariance))
     likelihood = state.log_likelihood
-    for components, derivatives, residual, variance in _rows(state, floor):
+    for components, derivatives, residual, variance in rows_of_bodies(state, floor):
         column = covariance[:, components] @ derivatives
         spread = float(derivatives @ column[components]) + variance
         off = residual - float(derivatives @ error[components])
@@ -47,7 +47,7 @@ def keep_on_floor(state: JointState, floor: LevelFloor) -> JointState:
     return inject(replace(state, covariance=covariance, log_likelihood=likelihood), error)
 
 
-def _rows(state: JointState, floor: LevelFloor) -> Iterator[Row]:
+def rows_of_bodies(state: JointState, floor: LevelFloor) -> Iterator[Row]:
     """Yield the rows of the target, if it is known, and of the chasers that are."""
     if state.target_known:
         velocity, omega = state.velocity_m_s, state.omega_rad_s

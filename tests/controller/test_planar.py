@@ -241,6 +241,11 @@ def test_a_chaser_that_searches_turns_on_about_its_vertical() -> None:
         yaws.append(rotations.log(rotations.multiply(rotations.conjugate(q), turned))[2])
     assert np.diff(yaws)[:2] == pytest.approx(np.radians([45.0, 90.0]))
 
+    own, camera = moving_odometry(np.random.default_rng(3), 0, 3, 10**9), s.camera_model()
+    now, soon = (search_attitude(q, camera, t, planar=True) for t in (7.0, 7.02))
+    wrench = search_wrench(own, s.chaser, camera, q, 7.0)
+    assert wrench == pytest.approx(turning_wrench(own, s.chaser, now, soon))
+
 
 @SEEDS
 def test_no_law_commands_a_wrench_out_of_the_plane(seed: int) -> None:

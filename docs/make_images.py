@@ -482,7 +482,7 @@ def planar() -> None:
     """``planar-docking`` from above: paths, bodies at the start and when the latches hold."""
     f = flight("planar-docking")
     s, end = f.scenario, len(f.truth["target"].time_s) - 1
-    sizes = {name: s.chaser.size_m for name in f.truth} | {"target": s.target_model().size_m}
+    sizes = dict.fromkeys(f.truth, s.chaser.size_m) | {"target": s.target_model().size_m}
     with styled():
         figure = Figure(figsize=(6.4, 4.6))
         axes = figure.add_subplot()

@@ -25,6 +25,10 @@ TARGET_KG, CHASER_KG = 40.0, 17.8
 PORT_M = 0.25
 """Distance of the ports from the vertical through the target's centre."""
 
+MARKERS = ((0.16, -0.14, 0.14), (0.16, 0.14, 0.14), (0.04, -0.05, 0.03), (0.04, 0.05, 0.03),
+           (0.04, -0.05, -0.05), (0.04, 0.05, -0.05))  # fmt: skip
+"""Edge, and place right of and above the middle of a side, m, of the markers on each side."""
+
 
 def in_trf(x: float, y: float, z: float = 0.0) -> list[float]:
     """Return a vector of level axes in TRF."""
@@ -71,8 +75,9 @@ def values(engine: str = "pybullet", **changes: Any) -> dict[str, Any]:
                     {"size_m": [2 * PORT_M] * 3, "q_wxyz": LEVEL_TO_TRF.tolist()},
                 ],
                 "markers": [
-                    {"id": k, "side_m": 0.2, "cuboid": 0, "face": face}
-                    for k, face in enumerate(("+x", "-x", "+y", "-y"))
+                    {"id": len(MARKERS) * side + k, "side_m": size_m, "face": face, "at_m": [x, y]}
+                    for side, face in enumerate(("+x", "-x", "+y", "-y"))
+                    for k, (size_m, x, y) in enumerate(MARKERS)
                 ],
             },
             "motion": "torque_free",

@@ -252,7 +252,8 @@ def test_no_law_commands_a_wrench_out_of_the_plane(seed: int) -> None:
     rng = np.random.default_rng(seed)
     s, own = scenario(), moving_odometry(rng, 0, 3, 10**9)
     body, q = s.chaser, rotations.exp(rng.normal(size=3))
-    pushed = Setpoint(*rng.normal(size=(2, 3)), q, rng.normal(size=3), rng.normal(size=6))
+    place, speed, rate = rng.normal(size=(3, 3))
+    pushed = Setpoint(place, speed, q, rate, rng.normal(size=6))
     for wrench in (
         brake_wrench(own, body),
         track_setpoint(own, body, pushed),

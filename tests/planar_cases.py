@@ -41,11 +41,10 @@ def yawed(yaw_rad: float) -> list[float]:
     return rotations.multiply(LEVEL_TO_TRF, turn).tolist()
 
 
-def chaser(bearing_rad: float, distance_m: float = 1.0, **changes: Any) -> dict[str, Any]:
-    """Return a chaser that faces the target from a bearing in level axes."""
-    x, y = math.cos(bearing_rad), math.sin(bearing_rad)
-    place = in_trf(distance_m * x, distance_m * y, HEIGHT_M)
-    return {"position_m": place, "q_wxyz": yawed(bearing_rad + math.pi)} | changes
+def chaser(bearing_rad: float, height_m: float = HEIGHT_M) -> dict[str, Any]:
+    """Return a chaser that faces the target from a bearing in level axes, 1 m away."""
+    place = in_trf(math.cos(bearing_rad), math.sin(bearing_rad), height_m)
+    return {"position_m": place, "q_wxyz": yawed(bearing_rad + math.pi)}
 
 
 def port(number: int, bearing_rad: float) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import planar_cases
 import pytest
 from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario
 from chaserdock_protocol.scenario.planar import height_m, up_in_target
@@ -104,6 +105,10 @@ def test_shipped_scenarios_are_planar_with_a_target_that_turns_at_3_degrees_per_
             put("chasers", 1, "start_velocity_m_s", value=[0.0, 0.0, 0.01]),
             "chasers.1.start_velocity_m_s: must be in the plane",
         ),
+        (
+            put("docking", value={"kind": "held"}),
+            "chasers.0.position_m: -0.05 m above the target's centre; docking.kind held approaches",
+        ),
         (put("orbit", value={"altitude_m": 4e5}), "orbit: excludes"),
         (
             put(
@@ -136,5 +141,7 @@ def test_a_static_target_and_an_ideal_planar_actuator_need_no_rates_and_thruster
     own["target"] |= {"motion": "static", "omega_rad_s": [0.1, 0.2, 0.3]}
     own["target"] |= {"inertia_products_kg_m2": [0.0, 0.0, 0.0]}
     own["chaser"] = {"degrees_of_freedom": "planar", "size_m": [0.2, 0.3, 0.3]}
-    del own["docking"], own["truth"]
+    own["docking"] = {"kind": "held"}
+    own["chasers"] = [planar_cases.chaser(x, height_m=0.0) for x in (0.0, math.pi / 2)]
+    del own["truth"]
     assert parse_scenario(own, "test").chaser.wrench_max[2] == 0.0

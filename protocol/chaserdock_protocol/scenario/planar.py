@@ -75,6 +75,12 @@ def check_planar_flight(scenario: FlightScenario) -> None:
         own = rotations.rotate(c.q_wxyz, UP)
         _check_along(f"chasers.{i}.q_wxyz: its Z axis (TRF)", own, up, "that of chasers.0")
         _check_in_view(scenario, i)
+        above_m = height_m(scenario, i, up)
+        if scenario.docking.kind == "held" and abs(above_m) > _LEVEL_M:
+            raise ValueError(
+                f"chasers.{i}.position_m: {above_m:.6g} m above the target's centre; docking.kind "
+                "held approaches that centre, which on a floor must be at the same height"
+            )
     for k, port in enumerate(scenario.docking.ports):
         if abs(float(np.asarray(port.axis) @ up)) > _LEVEL_RAD:
             raise ValueError(f"docking.ports.{k}.axis: points out of the plane of the floor")

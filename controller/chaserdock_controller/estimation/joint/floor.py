@@ -26,8 +26,6 @@ _GATE_SIGMAS = 5.0
 """Residual, in sigmas, that counts at most against a hypothesis: more would come from errors of the
 linearization, as the wrong pose of a single marker leans by tens of degrees.
 """
-
-
 Row = tuple[IntArray, Array, float, float]
 """Components of the error vector, derivatives of the measurement by them, residual, variance."""
 

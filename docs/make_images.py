@@ -520,6 +520,32 @@ def controller() -> None:
         save(figure, "controller")
 
 
+def planar() -> None:
+    """``planar-docking`` from above: paths, bodies at the start and when the latches hold."""
+    f = flight("planar-docking")
+    s, end = f.scenario, len(f.truth["target"].time_s) - 1
+    sizes = dict.fromkeys(f.truth, s.chaser.size_m) | {"target": s.target_model().size_m}
+    with styled():
+        figure = Figure(figsize=(6.4, 4.6))
+        axes = figure.add_subplot()
+        for name, own in sorted(f.truth.items(), reverse=True):
+            shade = INK if name == "target" else colour(int(name.partition("/")[2]))
+            half = np.array(sizes[name]) / 2.0
+            corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) * half
+            tip = np.array([[half[0], 0.0, 0.0], [s.chaser.probe_reach_m, 0.0, 0.0]])
+            axes.plot(*own.position_m[:, :2].T, color=shade, label=name.replace("/", " "))
+            for k, alpha in ((0, 0.15), (end, 0.45)):
+                at, q = own.position_m[k], own.q_wxyz[k]
+                outline = (at + rotations.rotate(np.tile(q, (4, 1)), corners))[:, :2]
+                axes.add_patch(Polygon(outline, facecolor=shade, edgecolor=shade, alpha=alpha))
+                if name != "target":
+                    probe = (at + rotations.rotate(np.tile(q, (2, 1)), tip))[:, :2]
+                    axes.plot(*probe.T, color=shade, alpha=2.0 * alpha, linewidth=2.5)
+        axes.set(xlabel="x of WRF / m", ylabel="y of WRF / m", aspect="equal")
+        axes.legend(loc="upper right", fontsize=7.5)
+        save(figure, "planar")
+
+
 def estimation() -> None:
     """Error of a chaser's estimated relative position, with three standard deviations."""
     f = flight("four-chaser-docking")
@@ -833,7 +859,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "processes": processes, "simulation": simulation, "redundancy": redundancy,
     "perception": perception, "errors": errors, "hosts": hosts, "limits": limits,
     "extend": extend, "knowledge": knowledge, "ros2": ros2, "devices": devices, "frames": frames,
-    "laboratory": laboratory,
+    "laboratory": laboratory, "planar": planar,
     "controller": controller, "estimation": estimation, "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,
     "results": results, "thrusters": thrusters,

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
 from chaserdock_controller.estimation.joint.parameters import SightingNoise, TargetParameters
+from chaserdock_controller.estimation.joint.state import CHASER, TARGET, JointState, empty_state
 from chaserdock_controller.estimation.types import EstimatorInputs, MeasuredChaser
 from chaserdock_controller.interfaces import AppliedImpulse
 from chaserdock_models import rotations
@@ -23,6 +24,8 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.navigation import NavigationErrors, NavigationSection
+from general_position import attitude, covariance, target_state
+from msgspec.structs import replace as structs_replace
 
 PERIOD_S = 1.0 / 15.0
 SIGHTING_SIGMAS = np.array([3e-4] * 3 + [math.radians(0.08)] * 3)
@@ -31,6 +34,26 @@ SIGHTING_SIGMAS = np.array([3e-4] * 3 + [math.radians(0.08)] * 3)
 def navigation(grade: str, **figures: float) -> NavigationErrors:
     """Return the sensor errors of a grade, with some figures replaced."""
     return NavigationSection(grade=grade, **figures).errors()  # type: ignore[arg-type]
+
+
+def joint_state(rng: np.random.Generator, chasers: int = 2, time_ns: int = 10**9) -> JointState:
+    """A state of the joint filter in general position with all correlations."""
+    target, extra = target_state(rng), rng.normal(0.0, 0.02, (chasers, CHASER - 12))
+    return structs_replace(
+        empty_state(time_ns, chasers),
+        target_known=True,
+        alive=np.ones(chasers, dtype=bool),
+        position_m=target.position_m,
+        velocity_m_s=target.velocity_m_s,
+        q_wxyz=target.q_wxyz,
+        omega_rad_s=target.omega_rad_s,
+        positions_m=rng.uniform(-2.0, 2.0, (chasers, 3)),
+        velocities_m_s=rng.uniform(-0.1, 0.1, (chasers, 3)),
+        attitudes_wxyz=np.array([attitude(rng) for _ in range(chasers)]),
+        omegas_rad_s=rng.uniform(-0.2, 0.2, (chasers, 3)),
+        extra=extra,
+        covariance=covariance(rng, np.full(TARGET + CHASER * chasers, 3e-3)),
+    )
 
 
 @dataclass

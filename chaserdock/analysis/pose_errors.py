@@ -8,6 +8,9 @@ from __future__ import annotations
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.plane import UP, across
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.planar import up_in_target
 from numpy.typing import ArrayLike
 
 from .motion import Track
@@ -72,3 +75,30 @@ def relative_measured_covariance(own: Track, other: Track) -> Array:
     turned = np.square(other.sigma_rad)[:, None, None] * both @ np.swapaxes(both, 1, 2)
     moved = np.repeat(np.stack([own.sigma_m**2 + other.sigma_m**2, own.sigma_rad**2]), 3, axis=0).T
     return turned + moved[:, :, None] * np.eye(6)
+
+
+Verticals = tuple[Array, Array]
+"""Vertical (3,) in the axes of a pose error's position, and in those of its rotation."""
+
+
+def verticals_of(scenario: Scenario) -> tuple[Verticals, Verticals] | None:
+    """Return the verticals of errors of the target's pose in WRF, and of a chaser's pose relative
+    to it; None unless the bodies are on a floor.
+    """
+    up = up_in_target(scenario)
+    return None if up is None else ((UP, up), (up, UP))
+
+
+def pose_nees(error: Array, covariance: Array, verticals: Verticals | None = None) -> Array:
+    """Return the NEES (...) of pose errors (..., 6) with covariances (..., 6, 6): 6 on average if
+    consistent.
+
+    With ``verticals``, of a body on a floor: twice that of place and rotation in the plane, as the
+    other three components are known.
+    """
+    if verticals is None:
+        return normalized_square(error, covariance)
+    up, axis = verticals
+    in_plane = np.zeros((3, 6))
+    in_plane[:2, :3], in_plane[2, 3:] = across(up), axis
+    return 2.0 * normalized_square(error @ in_plane.T, in_plane @ covariance @ in_plane.T)

@@ -42,11 +42,13 @@ from .criteria import (
 from .flight import RecordedFlight, SafetyHistory, SightingUse, load_flight
 from .motion import TARGET, Track
 from .pose_errors import (
+    Verticals,
     measured_covariance,
-    normalized_square,
     pose_error,
+    pose_nees,
     relative_measured_covariance,
     relative_pose,
+    verticals_of,
 )
 from .rendezvous import rendezvous_failures, rendezvous_of, rendezvous_text
 
@@ -171,13 +173,13 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
     attitude). The covariance of a measured motion is added to that of the estimate.
     """
     a, target = known_estimates(flight)
-    e = flight.estimate
+    e, up = flight.estimate, verticals_of(flight.scenario)
     errors = {name: np.empty(len(a)) for name in (*_POSE_ERRORS, "velocity_m_s", "omega_rad_s")}
     for rows in blocks(len(a)):
         i, true = a[rows], target.rows(rows)
         pose = pose_error(true.position_m, true.q_wxyz, e.position_m[i], e.q_wxyz[i])
         covariance = flight.pose_covariance(i) + measured_covariance(true)
-        _store_pose_errors(errors, rows, pose, covariance)
+        _store_pose_errors(errors, rows, pose, covariance, up and up[0])
         errors["velocity_m_s"][rows] = np.linalg.norm(true.velocity_m_s - e.velocity_m_s[i], axis=1)
         errors["omega_rad_s"][rows] = np.linalg.norm(true.omega_rad_s - e.omega_rad_s[i], axis=1)
     return {"time_s": e.time_s[a], **errors}
@@ -196,25 +198,29 @@ def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
     a, target = flight.motion.at(TARGET, history.time_s)
     both, own = flight.motion.at(f"chaser/{chaser}", target.time_s)
     a, target = a[both], target.rows(both)
-    errors = {name: np.empty(len(a)) for name in _POSE_ERRORS}
+    errors, up = {name: np.empty(len(a)) for name in _POSE_ERRORS}, verticals_of(flight.scenario)
     for rows in blocks(len(a)):
         i, mine, its = a[rows], own.rows(rows), target.rows(rows)
         true = relative_pose(mine.position_m, mine.q_wxyz, its.position_m, its.q_wxyz)
         pose = pose_error(*true, history.position_m[i], history.q_wxyz[i])
         covariance = history.covariance(i) + relative_measured_covariance(mine, its)
-        _store_pose_errors(errors, rows, pose, covariance)
+        _store_pose_errors(errors, rows, pose, covariance, up and up[1])
     return {"time_s": history.time_s[a], **errors}
 
 
 def _store_pose_errors(
-    errors: dict[str, Array], rows: slice, pose: Array, covariance: Array
+    errors: dict[str, Array],
+    rows: slice,
+    pose: Array,
+    covariance: Array,
+    verticals: Verticals | None,
 ) -> None:
     """Store the quantities of ``_POSE_ERRORS`` in these rows, computed from pose errors (K, 6) with
-    covariances (K, 6, 6).
+    covariances (K, 6, 6). ``verticals``: see ``pose_nees``.
     """
     errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
     errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
-    errors["nees"][rows] = normalized_square(pose, covariance)
+    errors["nees"][rows] = pose_nees(pose, covariance, verticals)
 
 
 def _pose_figures(errors: dict[str, Array], from_s: float) -> dict[str, float | None]:

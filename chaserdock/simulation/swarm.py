@@ -14,8 +14,10 @@ import random
 from collections.abc import Sequence
 from typing import Any, get_args
 
+from chaserdock_models.plane import flattened
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.faults import LATCH_FAULTS, FaultKind
+from chaserdock_protocol.scenario.planar import height_m, up_in_target
 
 from .checks.docking import settling_s
 
@@ -324,6 +326,9 @@ def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, An
             # The farthest allowed reference, less 0.1 % for rounding.
             farthest_m = 0.999 * scenario.limits.max_reference_distance_m
             share = min(1.3, farthest_m / (math.hypot(*position_m) or 1.0))
-            entry["offset_m"] = [round(share * x, 3) for x in position_m]
+            offset_m = [round(share * x, 3) for x in position_m]
+            if (up := up_in_target(scenario)) is not None:
+                offset_m = flattened(offset_m, up, height_m(scenario, chaser, up)).tolist()
+            entry["offset_m"] = offset_m
         timeline.append(entry)
     return sorted(timeline, key=lambda e: e["at_s"])

@@ -7,11 +7,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Array
+from .plane import flattened
 from .rotations import multiply, normalize
 
 
 def facing_attitudes(
-    nominal_m: ArrayLike, q_nominal_wxyz: ArrayLike, offsets_m: ArrayLike
+    nominal_m: ArrayLike,
+    q_nominal_wxyz: ArrayLike,
+    offsets_m: ArrayLike,
+    up: Array | None = None,
 ) -> Array:
     """Return the attitudes (K, 4), chaser body to TRF, at offsets (K, 3) in TRF.
 
@@ -19,16 +23,20 @@ def facing_attitudes(
     rotation from the nominal direction a to the direction b of the offset, q = normalize([1 + a .
     b, a x b]). For an offset opposite to the nominal one the axis is not unique: the axis
     perpendicular to a that is closest to z (to x if a is along z) is used. At the target's centre
-    the attitude is the nominal one.
+    the attitude is the nominal one. With ``up`` (3,), TRF, a chaser turns about this axis only:
+    towards directions in the plane across it.
     """
     offsets = np.atleast_2d(np.asarray(offsets_m, dtype=float))
-    a = np.asarray(nominal_m, dtype=float) / np.linalg.norm(nominal_m)
+    nominal = np.asarray(nominal_m, dtype=float)
+    if up is not None:
+        offsets, nominal = flattened(offsets, up), flattened(nominal, up)
+    a = nominal / np.linalg.norm(nominal)
     length = np.linalg.norm(offsets, axis=1, keepdims=True)
     b = np.where(length > 1e-9, offsets / np.maximum(length, 1e-9), a)
     turn = np.concatenate(
         [1.0 + (b @ a)[:, None], np.cross(np.broadcast_to(a, b.shape), b)], axis=1
     )
-    axis = np.eye(3)[2 if abs(a[2]) < 0.9 else 0]
+    axis = np.eye(3)[2 if abs(a[2]) < 0.9 else 0] if up is None else up
     axis = axis - (axis @ a) * a
     half_turn = np.concatenate([[0.0], axis / np.linalg.norm(axis)])
     opposite = np.linalg.norm(turn, axis=1, keepdims=True) < 1e-6

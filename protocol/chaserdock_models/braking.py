@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import rotations
-from .arrays import Array
+from .arrays import Array, limited
 
 BRAKE_TIME_S = 3.0
 """Time constant (s) with which velocity and angular rate decay while the limits allow it."""
@@ -29,8 +29,8 @@ class MovingBody(Protocol):
 
 
 class ActuatedBody(Protocol):
-    """Describe a body that can be actuated: mass, principal moments of inertia (3,), limits per
-    axis.
+    """Describe a body that can be actuated: mass, principal moments of inertia (3,), largest force
+    and torque (6,) per body axis.
     """
 
     @property
@@ -38,9 +38,7 @@ class ActuatedBody(Protocol):
     @property
     def inertia(self) -> ArrayLike: ...
     @property
-    def force_max_N(self) -> float: ...
-    @property
-    def torque_max_N_m(self) -> float: ...
+    def wrench_max(self) -> Array: ...
 
 
 def brake_wrench(
@@ -52,7 +50,6 @@ def brake_wrench(
     """
     relative = np.asarray(odometry.velocity_m_s) - np.asarray(velocity_m_s)
     velocity = rotations.rotate_inverse(odometry.q_wxyz, relative)
-    force = np.clip(-body.mass_kg / BRAKE_TIME_S * velocity, -body.force_max_N, body.force_max_N)
+    force = -body.mass_kg / BRAKE_TIME_S * velocity
     torque = -np.asarray(body.inertia) / BRAKE_TIME_S * np.asarray(odometry.omega_rad_s)
-    torque = np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m)
-    return np.concatenate([force, torque])
+    return limited(np.concatenate([force, torque]), body.wrench_max)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import rotations
-from .arrays import Array
+from .arrays import Array, limited
 from .braking import ActuatedBody, MovingBody
 
 # Second-order control laws: natural frequencies of position (a few cm/s) and attitude, and their
@@ -54,9 +54,4 @@ def track_setpoint(own: PlacedBody, body: ActuatedBody, setpoint: Setpoint) -> A
     rate_error = setpoint.omega_rad_s - np.asarray(own.omega_rad_s)
     alpha = _ATTITUDE_RAD_S**2 * attitude_error + 2 * _DAMPING * _ATTITUDE_RAD_S * rate_error
     torque = setpoint.wrench[3:] + np.asarray(body.inertia) * alpha
-    return np.concatenate(
-        [
-            np.clip(force, -body.force_max_N, body.force_max_N),
-            np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m),
-        ]
-    )
+    return limited(np.concatenate([force, torque]), body.wrench_max)

@@ -66,4 +66,33 @@ def _slider() -> dict[str, Any]:
     }
 
 
-BODIES: dict[str, dict[str, Any]] = {"slider": _slider(), "tetra12": _tetra12()}
+def _atmos() -> dict[str, Any]:
+    """Return the free flyer ATMOS of KTH's planar laboratory: eight 1.5 N thrusters, two on each
+    corner.
+
+    Mass, inertia about the vertical, thrust and arm as published (P. Roque et al., "Towards Open-
+    Source and Modular Space Systems with ATMOS", 2025); the other moments, which a floor holds, are
+    taken equal. With any one thruster lost, force and torque stay controllable.
+    """
+    arm_m = 0.17
+    thrusters = [
+        {"position_m": (x * arm_m, y * arm_m, 0.0), "direction": direction, "thrust_N": 1.5}
+        for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))
+        for direction in ((-x, 0.0, 0.0), (0.0, -y, 0.0))
+    ]
+    return {
+        "mass_kg": 17.8,
+        "size_m": (2 * arm_m, 2 * arm_m, 0.4),
+        "inertia_kg_m2": (0.315,) * 3,
+        "force_max_N": 1.5,
+        "torque_max_N_m": 0.15,
+        "degrees_of_freedom": "planar",
+        "thrusters": tuple(thrusters),
+    }
+
+
+BODIES: dict[str, dict[str, Any]] = {
+    "slider": _slider(),
+    "tetra12": _tetra12(),
+    "atmos": _atmos(),
+}

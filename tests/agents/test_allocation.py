@@ -6,6 +6,7 @@ that change.
 from __future__ import annotations
 
 import numpy as np
+import planar_cases
 import pytest
 from chaserdock_agents.chaser.thrusters.allocation import Allocator, allocator_of
 from chaserdock_models.arrays import Array
@@ -129,3 +130,21 @@ def test_a_lost_thruster_costs_its_share_of_the_box_only() -> None:
     for lost in (0, 2):
         allowed = np.where(np.arange(len(full)) == lost, 0.0, full)
         assert all(allocator.allocate(corner, allowed).exact for corner in corners)
+
+
+def test_a_planar_body_gets_its_wrench_in_the_plane_and_ignores_the_rest() -> None:
+    body = planar_cases.scenario().chaser
+    allocator, full = allocator_of(body), thrusts_max(body.thrusters)
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        wrench = rng.uniform(-1.0, 1.0, 6) * [1.5, 1.5, 1.5, 0.15, 0.15, 0.15]
+        got = allocator.allocate(wrench, full)
+        assert got.exact
+        given = allocator.matrix @ got.thrusts_N
+        assert given[[0, 1, 5]] == pytest.approx(wrench[[0, 1, 5]], abs=1e-9)
+        assert given[[2, 3, 4]] == pytest.approx(np.zeros(3), abs=1e-12)
+    left = np.where(np.arange(8) == 3, 0.0, full)
+    far = allocator.allocate(np.array([9.0, 0.0, 5.0, 1.0, 1.0, 0.0]), left)
+    assert not far.exact
+    assert far.thrusts_N[3] == 0.0
+    assert (allocator.matrix @ far.thrusts_N)[0] == pytest.approx(3.0, abs=0.2)

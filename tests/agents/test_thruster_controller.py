@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import planar_cases
 import pytest
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
@@ -46,6 +47,16 @@ def reporting(s: Scenario) -> tuple[ThrusterController, Callable[[Odometry], Thr
         return pilot.observe(odometry)
 
     return pilot, observe
+
+
+def test_a_planar_chaser_reports_no_limits_out_of_the_plane_and_less_without_a_thruster() -> None:
+    s = planar_cases.scenario()
+    thrusters, observe = reporting(s)
+    assert limits(observe(at_rest(s, 0))) == pytest.approx([1.5, 1.5, 0.0, 0.0, 0.0, 0.15])
+    thrusters.report_failure(2, "stuck_off", 0.0, 0)
+    assert limits(thrusters.observe(at_rest(s, 1))) == pytest.approx(
+        0.7727 * np.array([1.5, 1.5, 0.0, 0.0, 0.0, 0.15]), rel=1e-3
+    )
 
 
 def test_a_report_states_impulse_moment_and_magnitude_of_the_pulses_since_the_last_one() -> None:

@@ -32,7 +32,6 @@ from chaserdock_controller.estimation.joint.state import (
     POSITION_DRIFT,
     TARGET,
     JointState,
-    empty_state,
     inject,
 )
 from chaserdock_controller.estimation.joint.tick import process_tick
@@ -72,33 +71,13 @@ from general_position import (
     target_state,
     turn_between,
 )
-from joint_cases import navigation, parameters
+from joint_cases import joint_state, navigation, parameters
 from msgspec.structs import replace
 from runge_kutta import rk4
 
 MASS_KG = 17.8
 CHASER_BODY = {"mass_kg": MASS_KG, "inertia_kg_m2": list(INERTIA)}
 SEEDS = pytest.mark.parametrize("seed", range(3))
-
-
-def joint_state(rng: np.random.Generator, chasers: int = 2, time_ns: int = 10**9) -> JointState:
-    """A state of the joint filter in general position with all correlations."""
-    target, extra = target_state(rng), rng.normal(0.0, 0.02, (chasers, CHASER - 12))
-    return replace(
-        empty_state(time_ns, chasers),
-        target_known=True,
-        alive=np.ones(chasers, dtype=bool),
-        position_m=target.position_m,
-        velocity_m_s=target.velocity_m_s,
-        q_wxyz=target.q_wxyz,
-        omega_rad_s=target.omega_rad_s,
-        positions_m=rng.uniform(-2.0, 2.0, (chasers, 3)),
-        velocities_m_s=rng.uniform(-0.1, 0.1, (chasers, 3)),
-        attitudes_wxyz=np.array([attitude(rng) for _ in range(chasers)]),
-        omegas_rad_s=rng.uniform(-0.2, 0.2, (chasers, 3)),
-        extra=extra,
-        covariance=covariance(rng, np.full(TARGET + CHASER * chasers, 3e-3)),
-    )
 
 
 def estimator_of(*states: JointState, **changes: Any) -> JointEstimator:

@@ -5,10 +5,11 @@ axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from chaserdock_models.arrays import Array
 from chaserdock_models.braking import BRAKE_TIME_S, brake_wrench
 
 Vector = tuple[float, float, float]
@@ -25,8 +26,7 @@ class Moving:
 class Actuated:
     mass_kg: float = 6.0
     inertia: Vector = (0.3, 0.6, 0.9)
-    force_max_N: float = 0.5
-    torque_max_N_m: float = 0.02
+    wrench_max: Array = field(default_factory=lambda: np.array([0.5] * 3 + [0.02] * 3))
 
 
 def test_slow_motion_decays_with_the_time_constant() -> None:
@@ -45,3 +45,9 @@ def test_velocity_is_relative_and_in_body_axes() -> None:
     quarter_turn_z = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
     moving = Moving((0.2, 0.0, 0.0), (0.0, 0.0, 0.0), quarter_turn_z)
     assert brake_wrench(moving, Actuated(), (0.1, 0.0, 0.0))[:3] == pytest.approx([0.0, 0.2, 0.0])
+
+
+def test_an_axis_without_authority_gets_no_command() -> None:
+    body = Actuated(wrench_max=np.array([0.5, 0.5, 0.0, 0.0, 0.0, 0.02]))
+    wrench = brake_wrench(Moving((0.1, -0.2, 0.05), (0.03, -0.02, 0.01)), body)
+    assert np.flatnonzero(wrench).tolist() == [0, 1, 5]

@@ -12,7 +12,9 @@ import numpy as np
 from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, length
+from chaserdock_models.plane import UP, flattened, lean_rad
 from chaserdock_protocol.messages import BodyTruth, DrawnBody, Tick, WorldTruth
+from chaserdock_protocol.scenario.planar import up_in_target
 
 from chaserdock.analysis.criteria import nearest_allowed_m
 
@@ -51,6 +53,9 @@ NOISE_SIGMAS = 5.0
 """Standard deviations of the world's random force in a tick. Normal errors exceed them once in 2
 million ticks.
 """
+
+OFF_FLOOR = 1e-6
+"""Motion of a body on a floor out of its plane (m, m/s, rad, rad/s) that counts as rounding."""
 
 CONSERVED_SHARE = 2e-3
 """Largest drift of what the untouched target conserves, as a share of its initial value. Larger:
@@ -245,7 +250,8 @@ class LinearMomentum(_OfChasers, Check):
         impulse = np.array(after.impulse_N_s) + np.array(drawn.force_N) * dt_s
         velocities = np.array(after.velocity_m_s) - np.array(before.velocity_m_s)
         gained = drawn.mass_kg * velocities - step.orbital_impulse[0]
-        error = length(gained - rotations.rotate(step.halfway, impulse))
+        error = gained - rotations.rotate(step.halfway, impulse)
+        error = length(flattened(error, UP) if self.scenario.chaser.is_planar else error)
         allowed = IMPULSE_FLOOR_N_S + (IMPULSE_SHARE + step.turned_rad) * (
             after.absolute_impulse_N_s + math.hypot(*drawn.force_N) * dt_s
         )
@@ -270,12 +276,42 @@ class AngularMomentum(_OfChasers, Check):
         spun = rotations.rotate(after.q_wxyz, inertia @ after.omega_rad_s)
         spun = spun - rotations.rotate(before.q_wxyz, inertia @ before.omega_rad_s)
         spun = spun - step.orbital_impulse[1]
-        error = length(spun - rotations.rotate(step.halfway, angular))
+        error = spun - rotations.rotate(step.halfway, angular)
+        error = length(error * UP if self.scenario.chaser.is_planar else error)
         allowed = ANGULAR_FLOOR_N_M_S + (IMPULSE_SHARE + step.turned_rad) * (
             float(np.abs(angular).sum()) + ARM_M * after.absolute_impulse_N_s
         )
         if error > allowed + NOISE_SIGMAS * self.view.mismatch.torque_noise_N_m * dt_s:
             self.violate(after.body, f"{error:.2e} N m s without a cause, {allowed:.2e} allowed")
+
+
+@dataclass
+class OnFloor(Check):
+    """Bodies on a floor (`chaser.degrees_of_freedom = "planar"`) stay at their height, to
+    ``OFF_FLOOR``, do not lean, and turn about the vertical only."""
+
+    name = "on the floor"
+
+    _heights_m: dict[str, float] = field(default_factory=dict)
+
+    def begin(self) -> None:
+        self._up = up_in_target(self.scenario)
+
+    @reads(BodyTruth)
+    def judge(self, body: BodyTruth) -> None:
+        if self._up is None:
+            return
+        height_m = self._heights_m.setdefault(body.body, body.position_m[2])
+        up = self._up if body.body == "target" else UP
+        off = {
+            "m off its height": abs(body.position_m[2] - height_m),
+            "m/s up or down": abs(body.velocity_m_s[2]),
+            "rad of lean": lean_rad(body.q_wxyz, up),
+            "rad/s about horizontal axes": length(flattened(body.omega_rad_s, up)),
+        }
+        for name, value in off.items():
+            if value > OFF_FLOOR:
+                self.violate(body.body, f"{value:.2e} {name}")
 
 
 @dataclass
@@ -320,8 +356,9 @@ class TargetMotion(Check):
             conserved["speed"] = length(np.array(body.velocity_m_s))
         if self.scenario.target.motion == "torque_free":
             momentum = rotations.rotate(np.array(body.q_wxyz), inertia @ omega)
-            axes = zip("xyz", momentum, strict=True)
-            conserved |= {f"angular momentum {axis}": float(x) for axis, x in axes}
+            axes = list(zip("xyz", momentum.tolist(), strict=True))
+            axes = axes[2:] if self.scenario.chaser.is_planar else axes
+            conserved |= {f"angular momentum {axis}": x for axis, x in axes}
         return conserved
 
     def _judge_in_orbit(self, step: FreeStep, drawn: DrawnBody) -> None:

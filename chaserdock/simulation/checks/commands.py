@@ -14,6 +14,7 @@ from chaserdock_protocol.messages import ActuatorCommand, Plan, Tick, WrenchComm
 
 from .causes import FOLLOWING_S, IN_LATE_NETWORK
 from .check import Check
+from .messages import NO_AUTHORITY
 from .reader import reads
 
 KNOWN_AFTER_S = 0.1
@@ -262,7 +263,7 @@ class PlanIsFlown(Check):
         if not 0 <= stage < len(plan.inputs) // 6:
             return
         planned = plan.inputs[6 * stage : 6 * stage + 6]
-        limits = self.scenario.chaser.wrench_max
+        limits = np.maximum(self.scenario.chaser.wrench_max, NO_AUTHORITY)
         error = np.abs(np.array([*command.force_N, *command.torque_N_m]) - planned) / limits
         if float(error.max()) > PLAN_SHARE:
             text = f"differs from its plan by {error.max():.2e} of the limits"

@@ -17,10 +17,12 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.scenario.faults import Fault
 
 from chaserdock.analysis.pose_errors import (
-    normalized_square,
+    Verticals,
     pose_covariance,
     pose_error,
+    pose_nees,
     relative_pose,
+    verticals_of,
 )
 
 from ..mission import SimulatedFlight
@@ -177,14 +179,15 @@ class CovarianceConsistency(Check):
             return
         true, known = ((np.array(x.position_m), np.array(x.q_wxyz)) for x in (truth, estimate))
         covariance = pose_covariance(estimate.covariance)
-        self.nees.append(float(normalized_square(pose_error(*true, *known), covariance)))
+        up = verticals_of(self.scenario)
+        self.nees.append(float(pose_nees(pose_error(*true, *known), covariance, up and up[0])))
         for relative in estimate.relative:
             own = self.view.states.get(f"chaser/{relative.chaser}")
             if own is None or own.body in self.view.touching:
                 continue
             if own.sim_time_ns == estimate.sim_time_ns:
                 values = self.relative_nees.setdefault(relative.chaser, [])
-                values.append(_relative_nees(relative, own, truth))
+                values.append(_relative_nees(relative, own, truth, up and up[1]))
 
     def end(self, flight: SimulatedFlight) -> None:
         if not self.view.causes.honest:
@@ -200,10 +203,13 @@ def _damages_sightings(fault: Fault, controller: str) -> bool:
     return (fault.kind, fault.process, fault.topic) == ("corrupt", controller, "sighting")
 
 
-def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth) -> float:
-    """Return the normalized squared error (6 on average if consistent) of the pose of a chaser
-    relative to the target."""
+def _relative_nees(
+    estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth, up: Verticals | None
+) -> float:
+    """Return the NEES (6 on average if consistent) of the pose of a chaser relative to the target.
+    ``up``: see ``pose_nees``.
+    """
     own_pose, target_pose = ((np.array(b.position_m), np.array(b.q_wxyz)) for b in (own, target))
     true = relative_pose(*own_pose, *target_pose)
     error = pose_error(*true, np.array(estimate.position_m), np.array(estimate.q_wxyz))
-    return float(normalized_square(error, np.reshape(estimate.covariance, (6, 6))))
+    return float(pose_nees(error, np.reshape(estimate.covariance, (6, 6)), up))

@@ -27,6 +27,7 @@ CHECKS: tuple[type[Check], ...] = (
     bodies.Displacement,
     bodies.LinearMomentum,
     bodies.AngularMomentum,
+    bodies.OnFloor,
     bodies.TargetMotion,
     bodies.TumbleFalls,
     commands.NoStaleCommand,

@@ -30,6 +30,10 @@ QUATERNION_ROUNDING = 1e-6
 """Largest deviation of a quaternion's length from 1 by rounding."""
 LIMIT_SHARE = 1.01
 """Share of a limit up to which chasers accept commands."""
+NO_AUTHORITY = 1e-9
+"""Stands for the limit (N, N m) of an axis along which a body on a floor cannot move: a command
+along it is wrong, however small.
+"""
 SYMMETRY = 1e-9
 """Largest asymmetry and negative eigenvalue of a covariance, as a share of its largest variance;
 rounding gives less.
@@ -169,7 +173,8 @@ def _within_limits(
     limits, thrusters = scenario.chaser.wrench_max, scenario.chaser.thrusters
     if single:
         limits = np.maximum(limits, np.abs(wrench_matrix(thrusters)) @ thrusts_max(thrusters))
-    shares = np.abs(np.array(wrenches).reshape(-1, 6)) / limits
+    # No share is allowed of an axis without authority.
+    shares = np.abs(np.array(wrenches).reshape(-1, 6)) / np.maximum(limits, NO_AUTHORITY)
     if len(shares) and (share := float(shares.max())) > LIMIT_SHARE:
         yield f"wrench of {share:.3f} of the body's limits"
 

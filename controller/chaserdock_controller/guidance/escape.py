@@ -73,7 +73,11 @@ class EscapePlanner:
         self._coast = coast_model(scenario, STEP_S if orbit is None else _COARSE_STEP_S)
         self._keep_out_m, self._final_m = limits.min_distance_target_m, limits.final_corridor_m
         self.sigmas = limits.estimate_margin_sigmas
-        self._acceleration_m_s2 = _FORCE_SHARE * float(body.wrench_max[:3].min()) / body.mass_kg
+        pushes = body.wrench_max[:3] > 0.0
+        # On a floor, body and WRF have the same vertical.
+        self._directions = _DIRECTIONS[~_DIRECTIONS[:, ~pushes].any(axis=1)]
+        largest_N = float(body.wrench_max[:3][pushes].min())
+        self._acceleration_m_s2 = _FORCE_SHARE * largest_N / body.mass_kg
         self._speed_m_s = abort_speed_m_s
 
     # -- moves -------------------------------------------------------------------------------------
@@ -158,7 +162,7 @@ class EscapePlanner:
                 self._mean_motion_rad_s,
                 self.duration_s,
             )
-            for direction in _DIRECTIONS
+            for direction in self._directions
         ]
         covariance = known.disturbed.covariance.copy()
         covariance[range(3, 6), range(3, 6)] += (_BURN_ERROR * impulse_m_s) ** 2

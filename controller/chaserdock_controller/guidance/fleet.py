@@ -10,6 +10,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import corridors_apart
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.planar import why_not_planar
 
 from chaserdock_controller.interfaces import LogEntry
 
@@ -119,9 +120,11 @@ class ChaserFleet:
         return [self._apply(c, now_s) for c in commands]
 
     def _apply(self, command: OperatorCommand, now_s: float) -> CommandResult:
-        reason = validation.why_unknown_chaser(
-            command.chaser, len(self.chasers)
-        ) or validation.why_stale(command, now_s)
+        reason = (
+            validation.why_unknown_chaser(command.chaser, len(self.chasers))
+            or validation.why_stale(command, now_s)
+            or why_not_planar(self.scenario, command.command, command.chaser, command.offset_m)
+        )
         if reason:
             return CommandResult(False, reason)
         chaser = self.chasers[command.chaser]

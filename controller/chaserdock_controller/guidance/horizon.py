@@ -9,8 +9,10 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, length
 from chaserdock_models.attitude_reference import facing_attitudes
+from chaserdock_models.plane import flattened
 from chaserdock_models.shape_distance import box_table, moved
 from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.planar import height_m, up_in_target
 
 from chaserdock_controller.bodies.target_body import TargetBody, TargetPath, predict_path
 from chaserdock_controller.interfaces import HorizonReference, RelativePose, TargetState
@@ -51,6 +53,10 @@ class ReferenceBuilder:
         self._scenario = scenario
         self._step_s = scenario.controller.dt_s
         self._stages = round(scenario.controller.horizon_s / scenario.controller.dt_s)
+        self._up = up_in_target(scenario)
+        if self._up is not None:
+            chasers = range(len(scenario.chasers))
+            self._heights_m = [height_m(scenario, i, self._up) for i in chasers]
         keeps = scenario.limits.min_distance_shape_m > 0.0
         self._boxes = box_table(scenario.target_model().boxes) if keeps else None
 
@@ -64,6 +70,8 @@ class ReferenceBuilder:
         offset = move.at(np.array([now_s]))[0][0]
         if isinstance(move, Escape):
             offset = rotations.rotate_inverse(target.q_wxyz, offset)
+        if self._up is not None:
+            offset = flattened(offset, self._up, self._heights_m[chaser.number])
         position = target.position_m + rotations.rotate(target.q_wxyz, offset)
         q_off = self._attitudes(chaser, offset[None], np.array([now_s])).reshape(4)
         return position, rotations.multiply(target.q_wxyz, q_off), offset
@@ -145,12 +153,28 @@ class ReferenceBuilder:
         Offsets, velocities and accelerations in TRF, each (N, K, 3); attitudes, body to TRF, (N, K,
         4).
         """
-        moves = [_motion(c, times_s, target) for c in chasers]
+        moves = [self._motion(c, times_s, target) for c in chasers]
         q_off = np.empty((len(chasers), len(times_s), 4))
         for row, c in enumerate(chasers):
             q_off[row] = rotations.normalize(self._attitudes(c, moves[row][0], times_s))
         positions, velocities, accelerations = (np.array(part) for part in zip(*moves, strict=True))
         return (positions, velocities, accelerations), q_off
+
+    def _motion(
+        self, chaser: ChaserMachine, times_s: Array, target: TargetPath
+    ) -> tuple[Array, Array, Array]:
+        """Return a chaser's offsets, velocities and accelerations (K, 3) in TRF at times (K,); in
+        the plane of the floor, if there is one.
+        """
+        move, up = chaser.state.move, self._up
+        motion = move.at(times_s)
+        if isinstance(move, Escape):
+            motion = reference.seen_from(target, *motion)
+        if up is None:
+            return motion
+        position, velocity, acceleration = motion
+        level = flattened(position, up, self._heights_m[chaser.number])
+        return level, flattened(velocity, up), flattened(acceleration, up)
 
     def _attitudes(self, chaser: ChaserMachine, offsets: Array, times_s: Array) -> Array:
         """Return reference attitudes, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or
@@ -159,7 +183,7 @@ class ReferenceBuilder:
         c, state = self._scenario.chasers[chaser.number], chaser.state
         q = np.array(c.q_wxyz)
         if self._scenario.approach.face_target or state.faces:
-            q = facing_attitudes(c.position_m, c.q_wxyz, offsets)
+            q = facing_attitudes(c.position_m, c.q_wxyz, offsets, self._up)
         if not state.turns:
             return q
         return rotations.multiply(q, calibration_turns(times_s - state.since_s))
@@ -172,12 +196,3 @@ class ReferenceBuilder:
         return np.minimum(
             self._scenario.limits.estimate_margin_sigmas * sigmas_m, _GREATEST_MARGIN_M
         )
-
-
-def _motion(
-    chaser: ChaserMachine, times_s: Array, target: TargetPath
-) -> tuple[Array, Array, Array]:
-    """Return a chaser's offsets, velocities and accelerations (K, 3) in TRF at times (K,)."""
-    move = chaser.state.move
-    motion = move.at(times_s)
-    return reference.seen_from(target, *motion) if isinstance(move, Escape) else motion

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, limited
 from chaserdock_models.braking import brake_wrench
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.messages import Odometry
@@ -86,11 +86,17 @@ def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[f
         before, k = (0.0, pitch), k + 1
 
 
-def search_attitude(q_start_wxyz: ArrayLike, camera: Camera, time_s: float) -> Array:
+def search_attitude(
+    q_start_wxyz: ArrayLike, camera: Camera, time_s: float, planar: bool = False
+) -> Array:
     """Return the attitude (4,), CRF to WRF, at ``time_s`` of a search that began at
     ``q_start_wxyz``.
+
+    ``planar``: the chaser cannot pitch, and turns on about its Z.
     """
-    yaw, pitch = search_angles(time_s, *field_of_view(camera))
+    yaw, pitch = SEARCH_RATE_RAD_S * time_s, 0.0
+    if not planar:
+        yaw, pitch = search_angles(time_s, *field_of_view(camera))
     return rotations.multiply(q_start_wxyz, rotations.exp([0.0, pitch, yaw]))
 
 
@@ -119,7 +125,7 @@ def turning_wrench(odometry: Odometry, body: Body, q_wxyz: Array, q_soon_wxyz: A
     torque = inertia * (_STIFFNESS * error + _DAMPING * (ahead - omega)) + rotations.cross(
         omega, inertia * omega
     )
-    wrench[3:] = np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m)
+    wrench[3:] = limited(torque, body.wrench_max[3:])
     return wrench
 
 
@@ -127,7 +133,9 @@ def search_wrench(
     odometry: Odometry, body: Body, camera: Camera, q_start_wxyz: Array, time_s: float
 ) -> Array:
     """Return force and torque (6,), body axes, of a chaser at ``time_s`` of its search."""
-    now, soon = (search_attitude(q_start_wxyz, camera, time_s + dt) for dt in (0.0, _STEP_S))
+    now, soon = (
+        search_attitude(q_start_wxyz, camera, time_s + dt, body.is_planar) for dt in (0.0, _STEP_S)
+    )
     return turning_wrench(odometry, body, now, soon)
 
 

@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from chaserdock_models import plane
 from chaserdock_models.arrays import Array
 from chaserdock_models.decimation import simplified
 from chaserdock_models.meshes import TriangleMesh, mass_properties, without_parts
@@ -278,10 +279,11 @@ _LIGHTEST_KG = 1e-3
 class Body(Section):
     """The body and actuators of every chaser."""
 
-    body: Literal["slider", "tetra12"] | None = Field(
+    body: Literal["slider", "tetra12", "atmos"] | None = Field(
         default=None,
-        description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters) or "
-        "`tetra12` (12 thrusters). Its values replace the defaults below.",
+        description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters), "
+        "`tetra12` (12 thrusters) or `atmos` (8 thrusters in a plane, for a floor). Its values "
+        "replace the defaults below.",
     )
     mass_kg: Positive = Field(default=30.0, description="Mass, kg. At least 1 g.")
     size_m: PositiveVector = Field(
@@ -298,6 +300,12 @@ class Body(Section):
         default="",
         description="Mesh that the cameras see in place of the body's cuboid, scaled to "
         "`size_m`; without it, the cuboid.",
+    )
+    degrees_of_freedom: Literal["spatial", "planar"] = Field(
+        default="spatial",
+        description="`spatial`: all bodies, the target too, move freely in six. `planar`: they are "
+        "on a floor, slide along x and y of WRF and turn about z "
+        "([world.md](world.md#bodies-on-a-floor)).",
     )
     probe_reach_m: Positive = Field(
         default=0.35,
@@ -354,9 +362,19 @@ class Body(Section):
         return self
 
     @property
+    def is_planar(self) -> bool:
+        """Whether bodies are on a floor."""
+        return self.degrees_of_freedom == "planar"
+
+    @property
     def wrench_max(self) -> Array:
-        """Largest force and torque (6,) per body axis, N and N m."""
-        return np.array([self.force_max_N] * 3 + [self.torque_max_N_m] * 3)
+        """Largest force and torque (6,) per body axis, N and N m; 0 along axes on which a floor
+        leaves no motion.
+        """
+        limits = np.array([self.force_max_N] * 3 + [self.torque_max_N_m] * 3)
+        if self.is_planar:
+            limits[np.delete(np.arange(6), plane.AXES)] = 0.0
+        return limits
 
     @property
     def inertia(self) -> tuple[float, float, float]:

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 
 from .faults import check_faults
 from .mounting import nominal_mounting, plume_free_thrusters
+from .planar import check_planar, check_planar_flight, up_in_target
 from .schema import MARKER_PERCEPTIONS
 from .thrusters import check_pulses, thrusts_max
 
@@ -45,6 +46,7 @@ def check_flight(scenario: FlightScenario) -> None:
     _check_references(scenario)
     _check_shape_distance(scenario)
     _check_named_chasers(scenario)
+    check_planar_flight(scenario)
     _check_perception(scenario)
     if scenario.chaser.actuation == "thrusters":
         check_pulses(
@@ -81,6 +83,7 @@ def check_flight(scenario: FlightScenario) -> None:
 def check_consistent(scenario: Scenario) -> None:
     """Run the checks that need the full scenario."""
     _check_start_positions(scenario)
+    check_planar(scenario)
     _check_orbit(scenario)
     _check_mesh(scenario)
     _check_success(scenario)
@@ -173,7 +176,8 @@ def _reference_pose(
     """Return an offset (3,) and the attitude (4,) of a chaser that holds there, in TRF."""
     c = scenario.chasers[chaser]
     if scenario.approach.face_target:
-        return offset_m, facing_attitudes(c.position_m, c.q_wxyz, offset_m)[0]
+        up = up_in_target(scenario)
+        return offset_m, facing_attitudes(c.position_m, c.q_wxyz, offset_m, up)[0]
     return offset_m, np.array(c.q_wxyz)
 
 

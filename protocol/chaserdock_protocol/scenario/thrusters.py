@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.thruster_bodies import BODIES
 from chaserdock_models.thruster_model import FailureKind
 from chaserdock_models.wrench_set import wrench_matrix, wrench_set
 from pydantic import Field, model_validator
@@ -99,16 +100,25 @@ def thrusts_max(thrusters: Sequence[Thruster]) -> Array:
 
 def check_layout(thrusters: Sequence[Thruster], wrench_max: Array) -> None:
     """Raise ValueError unless the thrusters can give every wrench within ``wrench_max`` (6,), on
-    all axes at once.
+    all axes at once on which that is not 0; nothing holds a body that lifts off its floor.
     """
     if not thrusters:
         raise ValueError(
-            "actuation thrusters needs thrusters, or a body with thrusters: slider, tetra12"
+            "actuation thrusters needs thrusters, or a body with thrusters: "
+            + ", ".join(sorted(BODIES))
         )
-    scale = wrench_set(wrench_matrix(thrusters)).box_scale(thrusts_max(thrusters), wrench_max)
+    axes, planar = np.flatnonzero(wrench_max), not wrench_max.all()
+    lifting = [k for k, t in enumerate(thrusters) if planar and t.direction[2]]
+    if lifting:
+        raise ValueError(
+            f"thrusters.{lifting[0]}.direction: pushes a planar body up or down; its third "
+            f"component must be 0 (got {thrusters[lifting[0]].direction[2]:g})"
+        )
+    scale = wrench_set(wrench_matrix(thrusters), axes).box_scale(thrusts_max(thrusters), wrench_max)
     if scale <= 1e-6:
         raise ValueError(
-            "thrusters cannot give force and torque in every direction: no 6-DoF control"
+            "thrusters cannot give force and torque in every direction: no "
+            + ("control of x, y and yaw" if planar else "6-DoF control")
         )
     if scale < 1.0:
         raise ValueError(

@@ -20,6 +20,7 @@ from .definitions import TARGET, engine_setup
 from .disturbances import Disturbances
 from .engine import BodyMotion
 from .engine_factory import make_engine
+from .floor import Floor, on_floor
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates, split_loads
 from .latch import ProbeLatch
 from .latching import ContactPairs, Latching
@@ -44,6 +45,8 @@ class Physics:
         self._scenario = scenario
         chasers = {f"chaser/{i}": chaser_plant(scenario, i) for i in range(len(scenario.chasers))}
         self.plants = {TARGET: target_plant(scenario)} | chasers
+        if scenario.chaser.is_planar:
+            self.plants = on_floor(scenario, self.plants)
         setup = engine_setup(scenario, self.plants)
         self._engine = make_engine(scenario.world.engine, setup)
         prescribed = PrescribedMotion(scenario) if scenario.target.motion != "torque_free" else None
@@ -55,6 +58,9 @@ class Physics:
         self._free_numbers = np.array([self._bodies.numbers[n] for n in self._free], dtype=np.int64)
         self._loads = np.zeros((len(self._free), 9))
         self._loads[:, :3] = [self.plants[name].moments_kg_m2 for name in self._free]
+        self._floor: Floor | None = None
+        if scenario.chaser.is_planar:
+            self._floor = Floor(self._engine, self._free_numbers.tolist())
         self._orbital: OrbitalForces | None = None
         if scenario.orbit is not None:
             self._orbital = OrbitalForces(
@@ -143,6 +149,8 @@ class Physics:
             wrench = wrenches.get(name, _NO_WRENCH)
             wrench = self._disturbances.added_to(wrench, name, self.step_count)
             self._loads[k, 3:] = self.plants[name].wrench_in_engine(wrench)
+        if self._floor is not None:
+            self._floor.carry(self._loads[:, 3:])
         if self.latches or self._orbital is not None:
             return self._advance_by_step(steps)
         bodies = self._bodies
@@ -159,6 +167,8 @@ class Physics:
             if touching:
                 touched.update(self._latching.process_contacts())
                 bodies.place_target()
+                if self._floor is not None:
+                    self._floor.hold()
         return touched
 
     def _advance_by_step(self, steps: int) -> set[tuple[str, str]]:
@@ -186,9 +196,12 @@ class Physics:
             bodies.step_count += 1
             latching.end_step()
             # A bounce may last a single step, so contacts are checked after each.
-            if engine.touching():
+            touching = engine.touching()
+            if touching:
                 touched.update(latching.process_contacts())
             bodies.place_target()
+            if self._floor is not None and (touching or jointed):
+                self._floor.hold()
         return touched
 
     def _apply_orbital(self, orbital: OrbitalForces, body: int, motion: BodyMotion) -> None:

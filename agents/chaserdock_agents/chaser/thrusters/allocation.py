@@ -48,17 +48,20 @@ class Allocation:
 
 
 class Allocator:
-    """Thruster allocation for one layout; ``scale`` (6,): unit of each axis in the norm."""
+    """Thruster allocation for one layout; ``scale`` (6,): unit of each axis in the norm, 0 for one
+    on which the body cannot move.
+    """
 
     def __init__(self, thrusters: Sequence[Thruster], scale: Array) -> None:
         self.matrix = wrench_matrix(thrusters)
-        self._full_N = thrusts_max(thrusters)
         # In units of the axes and of full thrust, or of what is far beyond them, all numbers are
         # near one.
-        most_N = _BEYOND / np.abs(self.matrix / scale[:, None]).max(axis=0)
+        self._axes = np.flatnonzero(scale)
+        self._scale = scale[self._axes]
+        rows = self.matrix[self._axes]
+        most_N = _BEYOND / np.abs(rows / self._scale[:, None]).max(axis=0)
         self._unit_N = np.minimum(thrusts_max(thrusters), most_N)
-        self._rows = self.matrix * self._unit_N / scale[:, None]
-        self._scale = scale
+        self._rows = rows * self._unit_N / self._scale[:, None]
         self._cost = self._unit_N / self._unit_N.max()
 
     def allocate(
@@ -71,7 +74,7 @@ class Allocator:
 
         Raises ValueError for numbers that are not finite, RuntimeError if the solver fails.
         """
-        target = wrench / self._scale
+        target = wrench[self._axes] / self._scale
         limits = thrusts_max_N / self._unit_N
         if not (np.isfinite(target).all() and np.isfinite(limits).all() and (limits >= 0.0).all()):
             raise ValueError("wrench and limits must be finite, limits not negative")
@@ -98,9 +101,9 @@ def _cheapest(rows: Array, cost: Array, target: Array, most: Array) -> tuple[Arr
 
     Return daqp's solution and flag.
     """
-    n = len(most)
+    n, axes = len(most), len(target)
     upper, lower = np.concatenate([most, target]), np.concatenate([np.zeros(n), target])
-    sense = np.array([0] * n + [_EQUALITY] * 6, dtype=np.int32)
+    sense = np.array([0] * n + [_EQUALITY] * axes, dtype=np.int32)
     x, _, flag, _ = daqp.solve(_REGULARIZATION * np.eye(n), cost, rows, upper, lower, sense)
     return x, flag
 
@@ -110,18 +113,18 @@ def _closest(rows: Array, target: Array, most: Array) -> tuple[Array, int]:
 
     Return daqp's solution and flag.
     """
-    n = len(most)
-    free = np.full(6, 1e30)
+    n, axes = len(most), len(target)
+    free = np.full(axes, 1e30)
     upper, lower = (
         np.concatenate([most, free, target]),
         np.concatenate([np.zeros(n), -free, target]),
     )
-    sense = np.array([0] * (n + 6) + [_EQUALITY] * 6, dtype=np.int32)
-    hessian = np.diag([_SMALL] * n + [1.0] * 6)
+    sense = np.array([0] * (n + axes) + [_EQUALITY] * axes, dtype=np.int32)
+    hessian = np.diag([_SMALL] * n + [1.0] * axes)
     x, _, flag, _ = daqp.solve(
         hessian,
-        np.zeros(n + 6),
-        np.ascontiguousarray(np.hstack([rows, np.eye(6)])),
+        np.zeros(n + axes),
+        np.ascontiguousarray(np.hstack([rows, np.eye(axes)])),
         upper,
         lower,
         sense,

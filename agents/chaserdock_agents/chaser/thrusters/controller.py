@@ -57,7 +57,7 @@ class ThrusterController:
         self._allocator = allocator_of(body)
         self._matrix = self._allocator.matrix
         self._box = body.wrench_max
-        self._set = wrench_set(self._matrix)
+        self._set = wrench_set(self._matrix, np.flatnonzero(self._box))
         self._modulator = Modulator(body.thrusters, body.modulation, scenario.timing)
         self._valves = Valves(body.thrusters)  # the chaser's model of the real valves
         self.health = ThrusterHealth(thrusts_max(body.thrusters))

@@ -15,6 +15,7 @@ from chaserdock_models.passive_safety import CoastNoise
 from chaserdock_models.rigid_body import RigidBody
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.navigation import NavigationErrors
+from chaserdock_protocol.scenario.planar import up_in_target
 from chaserdock_protocol.scenario.schema import EstimatorSection
 
 from chaserdock_controller.estimation.composite_body import stated_properties
@@ -72,6 +73,23 @@ BEARING = SightingNoise(white_ratio=1.0, view_ratio=1.0, view_time_s=25.0)
 """Bearings from images: light, markers and the pixel grid shift the centroid as long as the view
 stays the same.
 """
+
+
+@dataclass(frozen=True)
+class LevelFloor:
+    """A level floor. ``up_trf`` (3,): vertical in TRF, unit vector.
+
+    Sigmas of a tick. Errors of a real floor persist, so they are larger than those: a slope of
+    0.2 mrad that lasts for 100 ticks counts as much as 2 mrad in each.
+    """
+
+    up_trf: Vector3
+    lean_rad: float = 2e-3
+    """Slope of the floor, and of the body on it, per axis."""
+    vertical_m_s: float = 1e-3
+    """Vertical speed of TRF's or CRF's origin: 2 mrad of slope at 0.5 m/s."""
+    lean_rate_rad_s: float = 1e-3
+    """Rate about horizontal axes."""
 
 
 @dataclass(frozen=True)
@@ -246,6 +264,8 @@ class JointParameters:
     """Mean motion of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire. The
     target stays at the origin of the Hill frame, where these forces vanish.
     """
+    floor: LevelFloor | None = None
+    """Floor on which all bodies are; None in space."""
     camera_turn_rad: float = field(init=False)
     """Prior of the camera's turn. An error of the principal point acts as a turn, to first order.
     """
@@ -308,7 +328,17 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
         mean_motion_rad_s=0.0 if orbit is None else orbit.elements.mean_motion_rad_s,
         target_noise=_target_noise(scenario.estimator),
         shape=_far_noise(scenario),
+        floor=_floor(scenario),
     )
+
+
+def _floor(scenario: FlightScenario) -> LevelFloor | None:
+    """Return the floor on which the scenario's bodies are; None in space."""
+    up = up_in_target(scenario)
+    if up is None:
+        return None
+    x, y, z = up.tolist()
+    return LevelFloor((x, y, z))
 
 
 def _target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]:

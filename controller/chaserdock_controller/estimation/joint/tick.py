@@ -17,6 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 from chaserdock_controller.estimation.types import EstimatorEvent
 
+from .floor import keep_on_floor
 from .hypotheses import (
     FilterState,
     TargetRates,
@@ -101,6 +102,9 @@ def process_tick(
         report = max(results, key=lambda r: r[0].log_likelihood)[1]
         now = count_measurements(now, report.accepted, report.rejected)
         now = _check_cameras(now, old.hypotheses[0], report, seen, mounting, p, events)
+    if p.floor is not None:
+        level = tuple(keep_on_floor(h, p.floor) for h in now.hypotheses)
+        now = replace(now, hypotheses=level)
     now = _report_odometry(now, p, events)
     return choose(now, p.target, events), tuple(events)
 

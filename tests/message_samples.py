@@ -213,7 +213,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.ThrusterFaultCommand(chaser=1, thruster=3, kind="weak", factor=0.5, operator="me"),
     m.ArmingCommand(action="arm", operator="me"),
     m.ArmingReply(accepted=True, reason="armed by me"),
-    m.Kill(by="a button"),
+    m.Kill(**HEAD, by="a button"),
     m.OperatorCommand(**HEAD, command="goto", chaser=1, offset_m=V),
     m.CommandReply(**HEAD, command="goto", chaser=1, accepted=False, reason="no"),
     m.ControllerState(

@@ -33,6 +33,10 @@ class _EstimationOnly:
             sent.forget_before(inputs.time_ns)
         return TickOutputs(target=target)
 
+    def failed_parts(self) -> tuple[str, ...]:
+        """See ``ControllerCore.failed_parts``."""
+        return self._core.failed_parts()
+
     def doubts(self, chaser: int) -> bool:
         """See ``ControllerCore.doubts``."""
         return self._core.doubts(chaser)

@@ -182,7 +182,7 @@ INVALID = [
     # preparation
     ("scenario --show", "--show: needs a scenario"),
     ("scenario single --schema", "--schema: not with a scenario"),
-    ("scenario single --show --new", "--show, --new and --schema exclude each other"),
+    ("scenario single --show --new", "--show, --new, --schema and --flight exclude each other"),
     ("scenario single swap --show", "swap: one scenario only with --show and --new"),
     ("target nothing --markers a.pdf", "nothing"),
     ("target nothing", "nothing"),

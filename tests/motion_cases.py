@@ -23,7 +23,7 @@ from chaserdock_protocol.scenario import flight_scenario_json, parse_scenario
 from msgspec import structs
 
 from chaserdock.analysis.columns import Columns
-from chaserdock.analysis.motion import BodyMotion, Track, motion_columns
+from chaserdock.analysis.motion import KnownMotion, Track, motion_columns
 
 SYSTEM = "optitrack"
 REFERENCE_NS = 10_000_000
@@ -57,14 +57,14 @@ def table_of(motion: Track) -> Columns:
     return columns
 
 
-def true_motion(tracks: Mapping[str, Track]) -> BodyMotion:
+def true_motion(tracks: Mapping[str, Track]) -> KnownMotion:
     """The motions as ground truth."""
-    return BodyMotion({n: table_of(t) for n, t in tracks.items()}, {}, (), np.zeros(0))
+    return KnownMotion({n: table_of(t) for n, t in tracks.items()}, {}, (), np.zeros(0))
 
 
-def measured_motion(tracks: Mapping[str, Track], tick_s: np.ndarray) -> BodyMotion:
+def measured_motion(tracks: Mapping[str, Track], tick_s: np.ndarray) -> KnownMotion:
     """The motions as reference measurements."""
-    return BodyMotion({}, {n: table_of(t) for n, t in tracks.items()}, (SYSTEM,), tick_s)
+    return KnownMotion({}, {n: table_of(t) for n, t in tracks.items()}, (SYSTEM,), tick_s)
 
 
 def without_truth(

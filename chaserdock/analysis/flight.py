@@ -55,7 +55,7 @@ from numpy.typing import NDArray
 from .actuation import ImpulseTotals, OutputSource, commanded_output, true_output
 from .columns import Columns
 from .mass_properties import values_of
-from .motion import BodyMotion, MotionCollector, Track, motion_columns
+from .motion import KnownMotion, MotionCollector, Track, motion_columns
 from .pose_errors import POSE
 
 # Messages whose number or content depends on the wall clock: left out of the digest.
@@ -261,7 +261,7 @@ class RecordedFlight:
     scenario: Scenario
     run: dict[str, str]
     blas: dict[str, str]
-    motion: BodyMotion
+    motion: KnownMotion
     ticks: int
     flown_s: float
     impulses: dict[int, ImpulseTotals]

@@ -139,12 +139,12 @@ class MotionCollector:
         table = kept.setdefault(m.body, motion_columns())
         table.add((m.sim_time_ns / 1e9,), m.position_m, velocity, m.q_wxyz, omega, sigmas)
 
-    def finish(self, tick_s: Array) -> BodyMotion:
+    def finish(self, tick_s: Array) -> KnownMotion:
         """Return the motion. ``tick_s`` (K,): times of the ticks."""
-        return BodyMotion(self.truth, self.references, tuple(self.systems), tick_s)
+        return KnownMotion(self.truth, self.references, tuple(self.systems), tick_s)
 
 
-class BodyMotion(Mapping[str, Track]):
+class KnownMotion(Mapping[str, Track]):
     """Motion of the bodies (``target``, ``chaser/0`` …) at the ticks of a flight, from one source
     for all.
 

@@ -89,7 +89,7 @@ def send_arming(
     return _request(link, TO_ARM, action, request, timeout_s, "gateway", ArmingReply)
 
 
-Reply = TypeVar("Reply", bound=Struct)
+ReplyT = TypeVar("ReplyT", bound=Struct)
 
 
 def _request(
@@ -99,8 +99,8 @@ def _request(
     request: Struct,
     timeout_s: float,
     receiver: str,
-    kind: type[Reply],
-) -> Reply:
+    kind: type[ReplyT],
+) -> ReplyT:
     check_rights(link, what, rights)
     (key,) = rights.queries
     node = Node("operator", "operator", link)

@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from chaserdock_agents.gateway.axes import BodyPose
-from chaserdock_agents.gateway.odometry import BodyState, BodyTrack, MotionBounds
+from chaserdock_agents.gateway.axes import MeasuredPose
+from chaserdock_agents.gateway.odometry import BodyTrack, FittedState, MotionBounds
 from chaserdock_models import rotations as rot
 
 TICK_NS = 66_666_667
@@ -22,9 +22,9 @@ def truth(time_ns: int) -> tuple[np.ndarray, np.ndarray]:
     return P0 + V * time_ns / 1e9, rot.integrate(Q0, W, time_ns / 1e9)
 
 
-def pose(rng: np.random.Generator, time_ns: int, velocities: bool = False) -> BodyPose:
+def pose(rng: np.random.Generator, time_ns: int, velocities: bool = False) -> MeasuredPose:
     p, q = truth(time_ns)
-    return BodyPose(
+    return MeasuredPose(
         time_ns,
         p + rng.normal(0, SIGMA_M, 3),
         rot.multiply(q, rot.exp(rng.normal(0, SIGMA_RAD, 3))),
@@ -35,7 +35,7 @@ def pose(rng: np.random.Generator, time_ns: int, velocities: bool = False) -> Bo
     )
 
 
-def normalized(state: BodyState) -> list[float]:
+def normalized(state: FittedState) -> list[float]:
     """Squared normalized errors (of 3 each) of position, velocity, attitude and rate."""
     p, q = truth(state.time_ns)
     turn = rot.log(rot.multiply(rot.conjugate(state.q_wxyz), q))
@@ -101,7 +101,7 @@ def test_a_jump_is_refused_until_poses_agree_with_it() -> None:
     taken = []
     for k in range(20, 26):
         p = pose(rng, k * 10_000_000)
-        moved = BodyPose(
+        moved = MeasuredPose(
             p.time_ns, p.position_m + away, p.q_wxyz, p.position_covariance_m2,
             p.attitude_covariance_rad2,
         )  # fmt: skip

@@ -23,7 +23,7 @@ _FLU_OF_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
-class BodyPose:
+class MeasuredPose:
     """Measured pose of a body at ``time_ns`` of the host's clock.
 
     position_m (3,) in WRF, q_wxyz (4,) CRF (or TRF) to WRF, velocity_m_s (3,) of its origin in WRF
@@ -55,7 +55,7 @@ def why_unusable(sample: PoseSample) -> str:
     return ""
 
 
-def body_pose(sample: PoseSample, device: LabPose, time_ns: int) -> BodyPose:
+def body_pose(sample: PoseSample, device: LabPose, time_ns: int) -> MeasuredPose:
     """Return a usable sample in WRF and CRF (or TRF), at a time of the host's clock."""
     to_world = _ENU_OF_NED if device.world_axes == "ned" else rotations.IDENTITY
     to_flu = _FLU_OF_FRD if device.body_axes == "frd" else rotations.IDENTITY
@@ -72,7 +72,7 @@ def body_pose(sample: PoseSample, device: LabPose, time_ns: int) -> BodyPose:
             velocity = velocity + rotations.rotate(q_body, np.cross(omega, arm_m))
     to_crf = rotations.conjugate(rotations.multiply(rotations.conjugate(to_flu), q_mount))
     position_noise, attitude_noise = _noise(sample, device, to_world, to_crf)
-    return BodyPose(
+    return MeasuredPose(
         time_ns,
         position,
         q,

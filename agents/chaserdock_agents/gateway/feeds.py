@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from chaserdock_protocol.scenario.lab import LabCamera, LabDevice, LabPose, LabSection
 
-from .axes import BodyPose, body_pose, why_unusable
+from .axes import MeasuredPose, body_pose, why_unusable
 from .clock import DeviceClock
 from .devices import (
     CameraSource,
@@ -73,9 +73,9 @@ class PoseFeed:
         self.clock = DeviceClock(device.latency_s)
         self.track = BodyTrack(bounds)
         self.watch = DeviceWatch(f"{device.body} by {device.address}")
-        self.newest: BodyPose | None = None
+        self.newest: MeasuredPose | None = None
 
-    def take(self, sample: PoseSample) -> BodyPose | None:
+    def take(self, sample: PoseSample) -> MeasuredPose | None:
         """Take a sample of this body; return the pose if it is used."""
         self.watch.arrived(sample.arrived_ns)
         if reason := why_unusable(sample):
@@ -105,7 +105,7 @@ class PoseSystem:
     feeds: Mapping[str, PoseFeed]
     unknown: Counter[str]
 
-    def poll(self) -> Iterator[tuple[PoseFeed, BodyPose]]:
+    def poll(self) -> Iterator[tuple[PoseFeed, MeasuredPose]]:
         """Yield the usable poses that have arrived. Raises DeviceError if the device is gone."""
         for sample in self.source.poll():
             feed = self.feeds.get(sample.body) or self.feeds.get("")

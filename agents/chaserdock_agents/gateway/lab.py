@@ -17,7 +17,7 @@ from chaserdock_protocol.scenario.flight import flight_scenario
 from chaserdock_protocol.scenario.lab import LabSection
 
 from .actuation import RobotActuation
-from .axes import BodyPose, robot_axes
+from .axes import MeasuredPose, robot_axes
 from .devices import DeviceHost, DockingLatch, ImageArray, Robot, RobotCommand, open_device
 from .feeds import CameraFeed, PoseFeed, PoseSystem, open_poses
 from .safety import Obedience, RobotSight, limited_duty, limited_wrench
@@ -72,7 +72,7 @@ class Laboratory:
             for _ in system.poll():
                 pass
 
-    def read_references(self) -> Iterator[tuple[PoseFeed, BodyPose]]:
+    def read_references(self) -> Iterator[tuple[PoseFeed, MeasuredPose]]:
         """Yield the reference poses that have arrived. Raises DeviceError."""
         for system in self._references:
             yield from system.poll()

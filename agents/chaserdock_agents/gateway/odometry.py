@@ -15,7 +15,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 
-from .axes import BodyPose
+from .axes import MeasuredPose
 
 _LEAST_POSES = 4
 """Fewest poses in a line: at 100 Hz and 15 ticks a second there are six or seven."""
@@ -26,7 +26,7 @@ _LEAST_JUMPS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class BodyState:
+class FittedState:
     """State of a body at a time. position_m, velocity_m_s (3,) in WRF; q_wxyz (4,) CRF to WRF,
     omega_rad_s (3,) in CRF. Covariances (3, 3), of attitude and rate in CRF.
     """
@@ -61,8 +61,8 @@ class BodyTrack:
 
     def __init__(self, bounds: MotionBounds) -> None:
         self._bounds = bounds
-        self._poses: deque[BodyPose] = deque(maxlen=_MOST_POSES)
-        self._jumped: list[BodyPose] = []
+        self._poses: deque[MeasuredPose] = deque(maxlen=_MOST_POSES)
+        self._jumped: list[MeasuredPose] = []
         self.rejected = 0
         self.jumped_m = 0.0
 
@@ -71,11 +71,11 @@ class BodyTrack:
         """Return the time of the newest pose, None without one."""
         return self._poses[-1].time_ns if self._poses else None
 
-    def newest_poses(self) -> list[BodyPose]:
+    def newest_poses(self) -> list[MeasuredPose]:
         """Return the poses of the last half second, oldest first."""
         return [p for p in self._poses if p.time_ns > self._poses[-1].time_ns - 500_000_000]
 
-    def add(self, pose: BodyPose) -> bool:
+    def add(self, pose: MeasuredPose) -> bool:
         """Take a pose, in any order of time. Returns False if it is not used: a copy, older than
         what is kept, or a jump; poses that have jumped replace the others once they agree.
         """
@@ -104,12 +104,12 @@ class BodyTrack:
             poses.append(pose)
         return True
 
-    def _is_reachable(self, known: BodyPose, pose: BodyPose) -> bool:
+    def _is_reachable(self, known: MeasuredPose, pose: MeasuredPose) -> bool:
         apart_m = float(np.linalg.norm(pose.position_m - known.position_m))
         between_s = abs(pose.time_ns - known.time_ns) / 1e9
         return apart_m <= self._bounds.jump_m + self._bounds.speed_m_s * between_s
 
-    def at(self, time_ns: int, since_ns: int) -> BodyState | None:
+    def at(self, time_ns: int, since_ns: int) -> FittedState | None:
         """Return the state at ``time_ns`` from the poses after ``since_ns``, None if there are
         none, or too few for a velocity.
         """
@@ -123,7 +123,7 @@ class BodyTrack:
             fresh = older[len(fresh) - _LEAST_POSES :] + fresh
         return _by_line(fresh, time_ns) if len(fresh) >= _LEAST_POSES else None
 
-    def _by_velocities(self, poses: list[BodyPose], time_ns: int) -> BodyState:
+    def _by_velocities(self, poses: list[MeasuredPose], time_ns: int) -> FittedState:
         """Return the mean of the poses, each moved on by its own velocity and rate."""
         newest = poses[-1]
         places, turns, velocities, omegas = [], [], [], []
@@ -141,7 +141,7 @@ class BodyTrack:
         # Velocities of an estimator share their errors: their mean is no better than one.
         velocity_noise = np.eye(3) * b.velocity_sigma_m_s**2
         rate_noise = np.eye(3) * b.rate_sigma_rad_s**2
-        return BodyState(
+        return FittedState(
             time_ns,
             np.mean(places, axis=0),
             np.mean(velocities, axis=0),
@@ -156,7 +156,7 @@ class BodyTrack:
         )
 
 
-def _by_line(poses: list[BodyPose], time_ns: int) -> BodyState:
+def _by_line(poses: list[MeasuredPose], time_ns: int) -> FittedState:
     """Return the state at ``time_ns`` on lines through the positions and the attitudes."""
     at_s = np.array([(p.time_ns - time_ns) / 1e9 for p in poses])
     mean_s = float(at_s.mean())
@@ -176,7 +176,7 @@ def _by_line(poses: list[BodyPose], time_ns: int) -> BodyState:
     share = 1.0 / len(poses) + mean_s**2 / spread_s2
     position_noise = np.mean([p.position_covariance_m2 for p in poses], axis=0)
     attitude_noise = np.mean([p.attitude_covariance_rad2 for p in poses], axis=0)
-    return BodyState(
+    return FittedState(
         time_ns,
         place,
         velocity,

@@ -36,12 +36,12 @@ from chaserdock_protocol.transport import Node
 
 from .actuation import RobotActuation
 from .arming import ArmingRequests, listen_to_keys
-from .axes import BodyPose
+from .axes import MeasuredPose
 from .devices import DeviceError, DeviceHost, ImageArray
 from .feeds import PoseFeed
 from .images import image_message
 from .lab import Laboratory
-from .odometry import BodyState
+from .odometry import FittedState
 from .safety import SafetyGate
 
 _POLL_S = 0.002
@@ -199,7 +199,7 @@ class Gateway:
         except DeviceError as error:
             self._trip(str(error))
 
-    def _publish_reference(self, feed: PoseFeed, pose: BodyPose) -> None:
+    def _publish_reference(self, feed: PoseFeed, pose: MeasuredPose) -> None:
         measured_ns = pose.time_ns - self._start_ns
         if measured_ns < 0:
             return
@@ -329,7 +329,7 @@ def _sigma(covariance: Array) -> float:
     return math.sqrt(float(np.trace(covariance)) / 3.0)
 
 
-def odometry_of(state: BodyState, chaser: int, tick: int, time_ns: int) -> Odometry:
+def odometry_of(state: FittedState, chaser: int, tick: int, time_ns: int) -> Odometry:
     """Return a body's state at a tick as odometry."""
     return Odometry(
         tick=tick,

@@ -21,7 +21,7 @@ from .pose_samples import KEPT, is_finite, is_pose, stated, to_body_rotation, tu
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 
 Twist = Literal["child", "world", "none"]
-Reader = Callable[[Any, int, Twist], PoseSample]
+SampleReader = Callable[[Any, int, Twist], PoseSample]
 
 # px4_msgs/msg/VehicleOdometry
 _UNKNOWN, _NED, _FRD, _BODY_FRD = 0, 1, 2, 3
@@ -132,7 +132,7 @@ def of_vehicle_odometry(message: Any, arrived_ns: int, twist: Twist = "child") -
     )
 
 
-READERS: dict[str, Reader] = {
+READERS: dict[str, SampleReader] = {
     "nav_msgs/msg/Odometry": of_odometry,
     "geometry_msgs/msg/PoseStamped": of_pose,
     "geometry_msgs/msg/PoseWithCovarianceStamped": of_pose_with_covariance,

@@ -26,7 +26,7 @@ _GATE_SIGMAS = 5.0
 """Residual, in sigmas, that counts at most against a hypothesis: more would come from errors of the
 linearization, as the wrong pose of a single marker leans by tens of degrees.
 """
-Row = tuple[IntArray, Array, float, float]
+FloorRow = tuple[IntArray, Array, float, float]
 """Components of the error vector, derivatives of the measurement by them, residual, variance."""
 
 
@@ -45,7 +45,7 @@ def keep_on_floor(state: JointState, floor: LevelFloor) -> JointState:
     return inject(replace(state, covariance=covariance, log_likelihood=likelihood), error)
 
 
-def rows_of_bodies(state: JointState, floor: LevelFloor) -> Iterator[Row]:
+def rows_of_bodies(state: JointState, floor: LevelFloor) -> Iterator[FloorRow]:
     """Yield the rows of the target, if it is known, and of the chasers that are."""
     if state.target_known:
         velocity, omega = state.velocity_m_s, state.omega_rad_s
@@ -57,7 +57,7 @@ def rows_of_bodies(state: JointState, floor: LevelFloor) -> Iterator[Row]:
 
 def _of_body(
     start: int, q_wxyz: Array, velocity: Array, omega: Array, up: Array, floor: LevelFloor
-) -> Iterator[Row]:
+) -> Iterator[FloorRow]:
     """Yield the rows of a body whose components begin at ``start``; ``up`` (3,) in its axes."""
     vertical = np.array([start + VELOCITY.stop - 1])
     yield vertical, np.ones(1), -float(velocity[2]), floor.vertical_m_s**2

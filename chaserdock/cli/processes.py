@@ -178,6 +178,19 @@ def _check_devices(options: ProcessOptions, duration_s: float) -> None:
 @with_link_options()
 def chaser(
     number: ChaserArg,
+    camera: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS",
+            help="a camera of its own, as in [[lab.camera]] (docs/devices.md): images stay here",
+        ),
+    ] = "",
+    camera_latency: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=1.0, metavar="SECONDS", help="--camera: from exposure to arrival, at best"
+        ),
+    ] = 0.0,
     *,
     link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
@@ -193,8 +206,10 @@ def chaser(
         patience_s=timeout,
         stall_s=stall_s,
         watch_parent=watch_parent,
+        camera=camera,
+        camera_latency_s=camera_latency,
     )
-    start_process("chaser", options)
+    start_process("chaser-with-camera" if camera else "chaser", options)
 
 
 @with_link_options()

@@ -64,6 +64,7 @@ class ProcessOptions:
     ``out``. ``until``: the router ends when this process has joined and left. ``standby``: the
     controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM. ``ros``:
     for the bridge. ``dry_run``: a gateway sends nothing to robots.
+    ``camera``, ``camera_latency_s``: as in `[[lab.camera]]`, of a chaser with a camera of its own.
     """
 
     link: Link = field(default_factory=Link)
@@ -87,6 +88,8 @@ class ProcessOptions:
     signals: bool = True
     ros: RosLink = RosLink()
     dry_run: bool = False
+    camera: str = ""
+    camera_latency_s: float = 0.0
 
     def stop_signal(self) -> StopSignal:
         """Return the signal that stops the process."""

@@ -54,6 +54,8 @@ def test_drift_is_found_and_leaves_no_error_at_the_newest_stamp(drift: float) ->
     newest_host_s = 10.0 + (90.0 * 30 - 1) / 30
     stamp_ns = round((newest_host_s - 0.3) * (1.0 - drift) * 1e9)
     assert abs(clock.host_ns(stamp_ns) / 1e9 - newest_host_s) < 1 * MS
+    for shift_ns in (-40_000_000, 0, 90_000_000):
+        assert abs(clock.stamp_ns(clock.host_ns(stamp_ns + shift_ns)) - stamp_ns - shift_ns) <= 2
 
 
 @pytest.mark.parametrize("step_s", [-0.7, 0.7])

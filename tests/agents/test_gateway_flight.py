@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from chaserdock_agents.gateway import own_camera
 from chaserdock_protocol.process import ProcessOptions
 from virtual_lab import SCENARIO, SENT, Fault, fly, tracking_errors_m, two_free_flyers
 
@@ -22,10 +24,12 @@ def flown(
     seed: int = 1,
     faults: tuple[Any, ...] = (),
     seconds: float = 40.0,
-    **others: object,
+    cameras: bool = True,
+    **others: Any,
 ) -> tuple[SimulatedFlight, Any]:
     scenario = tmp_path / "lab.toml"
-    scenario.write_text(SCENARIO.replace("duration_s = 40.0", f"duration_s = {seconds}"))
+    text = SCENARIO.replace("duration_s = 40.0", f"duration_s = {seconds}")
+    scenario.write_text(text if cameras else text.partition("[[lab.camera]]")[0])
     lab = two_free_flyers(seed, faults)
     return fly(scenario, tmp_path / "run", lab, monkeypatch, **others), lab
 
@@ -46,6 +50,22 @@ def test_free_flyers_track_the_target(
     assert judged["success"] is True
     for chaser in judged["chasers"].values():
         assert chaser["steady"]["position_mse_m2"] < 2e-3**2
+
+
+@pytest.mark.slow
+def test_images_need_not_leave_the_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def with_camera(options: ProcessOptions) -> int:
+        address = f"virtual:{options.chaser}"
+        return own_camera.main(replace(options, camera=address, camera_latency_s=0.02))
+
+    both = {"chaser/0": with_camera, "chaser/1": with_camera}
+    flight, lab = flown(tmp_path, monkeypatch, cameras=False, **both)
+    assert not flight.crashes
+    assert set(flight.statuses.values()) == {0}
+    log = load_flight(flight.folder / "mission.mcap")
+    assert summary_of(log)["success"] is True
+    for errors in tracking_errors_m(lab, 28.0).values():
+        assert np.sqrt(np.mean(errors**2)) < 1e-3
 
 
 def test_nothing_moves_unless_it_is_armed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

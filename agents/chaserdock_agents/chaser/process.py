@@ -10,7 +10,15 @@ import cv2
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import create_fault_layer
-from chaserdock_protocol.messages import Image, JoinReply, MissionEnd, Presence, Sighting, Tick
+from chaserdock_protocol.messages import (
+    Event,
+    Image,
+    JoinReply,
+    MissionEnd,
+    Presence,
+    Sighting,
+    Tick,
+)
 from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
@@ -31,6 +39,11 @@ def main(options: ProcessOptions) -> int:
     """Run chaser ``options.chaser``; return 0 if the mission ended, 1 if stopped before, 2 if it
     could not join.
     """
+    return run_chaser(options, lambda chaser: None)
+
+
+def run_chaser(options: ProcessOptions, attach: Callable[[ChaserProcess], None]) -> int:
+    """Run a chaser as ``main`` does; ``attach`` connects what its robot has of its own."""
     cv2.setNumThreads(1)
     number = int(options.chaser or 0)
 
@@ -43,6 +56,7 @@ def main(options: ProcessOptions) -> int:
         )
         core = ChaserCore(scenario, number, realtime, instance, faults.reported_failures)
         chaser = ChaserProcess(node, core, options.stall_s)
+        attach(chaser)
         node.host.finish_startup()
         while not (chaser.ended or chaser.replaced or stop() or chaser.heartbeat.world_is_gone()):
             chaser.listen()
@@ -57,12 +71,13 @@ class ChaserProcess:
     """Connect one chaser's core to the network.
 
     Advertises and subscribes the topics, then starts the heartbeat. ``replaced``: this process was
-    lost, and the mission goes on with another one of its name.
+    lost, and the mission goes on with another one of its name. ``on_tick``: called with each tick.
     """
 
     def __init__(self, node: Node, core: ChaserCore, stall_s: float = DEFAULT_STALL_S) -> None:
         self.node, self.core = node, core
         self.ended = self.replaced = False
+        self.on_tick: Callable[[Tick], None] = lambda tick: None
         i, latest = core.number, core.realtime
         for topic in (topics.SIGHTING, topics.ACTUATORS, topics.LEASE):
             node.advertise(topic, i)
@@ -95,9 +110,27 @@ class ChaserProcess:
             case Tick() as tick:
                 self._begin_tick(tick, received)
             case Image() as image if self.core.realtime:
-                self._put_image(image)
+                self.look_at(image)
             case _:
                 self._step(received)
+
+    def look_at(self, image: Image) -> None:
+        """Have an image looked at in the background, in real time."""
+        self._put_image(image)
+
+    def warn(self, what: str, detail: str) -> None:
+        """Publish a warning of what is attached to the process."""
+        tick = self.core.inbox.tick
+        stamp = (-1, 0) if tick is None else (tick.tick, tick.sim_time_ns)
+        event = Event(
+            tick=stamp[0],
+            sim_time_ns=stamp[1],
+            process=self.node.name,
+            level="warning",
+            what=what,
+            detail=detail,
+        )
+        self.node.publish(topics.EVENT, event, self.node.name)
 
     def _begin_tick(self, tick: Tick, received: ReceivedMessage) -> None:
         if self.core.inbox.is_outdated(tick):
@@ -106,6 +139,7 @@ class ChaserProcess:
         if self.replaced:
             return
         self.heartbeat.in_flight.set()
+        self.on_tick(tick)
         self._step(received)
         if tick.revision == 0 and tick.tick % self.core.scenario.time.rate_hz == 0:
             health = create_health(self.node, tick.tick, tick.sim_time_ns)

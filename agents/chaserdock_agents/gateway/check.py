@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 
 from chaserdock_agents.chaser.perception import make_perception
@@ -202,7 +201,8 @@ class _Eyes:
                 f"images of {size[0]} x {size[1]}; the calibration is for {stated[0]} x {stated[1]}"
             )
             return
-        message: Image = image_message(self.scenario, self.feed.device.chaser, image, time_ns)
+        rate_hz, quality = self.scenario.time.rate_hz, self.scenario.camera.effects.jpeg_quality
+        message = image_message(rate_hz, quality, self.feed.device.chaser, image, time_ns)
         sighting = self._vision.look(message)
         if sighting is None:
             return

@@ -85,6 +85,11 @@ class DeviceClock:
         """Return the time of a stamp by the host's clock."""
         return stamp_ns + self._line_ns(stamp_ns) - self._least_delay_ns
 
+    def stamp_ns(self, host_ns: int) -> int:
+        """Return what the device's clock shows at a time of the host's clock."""
+        near_ns = host_ns + self._least_delay_ns - self._line_ns(self._bins[-1][0])
+        return host_ns + self._least_delay_ns - self._line_ns(near_ns)
+
     def _line_ns(self, stamp_ns: int) -> int:
         return self._offset_ns + round(self._drift * (stamp_ns - self._base_ns))
 

@@ -222,7 +222,8 @@ class Gateway:
         exposed_ns = time_ns - self._start_ns
         if exposed_ns <= 0 or chaser not in self._barrier.chasers:
             return
-        message = image_message(self._scenario, chaser, image, exposed_ns)
+        quality = self._scenario.camera.effects.jpeg_quality
+        message = image_message(self._timing.rate_hz, quality, chaser, image, exposed_ns)
         self._node.publish(topics.IMAGE, message, chaser)
 
     def _publish_odometry(self, tick: int) -> None:

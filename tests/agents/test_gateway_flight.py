@@ -58,7 +58,7 @@ def test_images_need_not_leave_the_robots(tmp_path: Path, monkeypatch: pytest.Mo
         address = f"virtual:{options.chaser}"
         return own_camera.main(replace(options, camera=address, camera_latency_s=0.02))
 
-    both = {"chaser/0": with_camera, "chaser/1": with_camera}
+    both: dict[str, Any] = {"chaser/0": with_camera, "chaser/1": with_camera}
     flight, lab = flown(tmp_path, monkeypatch, cameras=False, **both)
     assert not flight.crashes
     assert set(flight.statuses.values()) == {0}

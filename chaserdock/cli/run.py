@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.stall import DEFAULT_STALL_S
 
 from .options import (
@@ -21,10 +22,10 @@ from .options import (
     ModeOption,
     OutOpt,
     QuietOpt,
-    ScenarioArg,
     SeedOpt,
     SetOpt,
     StallOpt,
+    complete_scenario,
     errors_as_json,
     fail,
     show_of,
@@ -32,8 +33,21 @@ from .options import (
 
 
 def run(
-    scenario: ScenarioArg,
+    scenario: Annotated[
+        str | None,
+        typer.Argument(
+            help="scenario file, or name of a shipped scenario", autocompletion=complete_scenario
+        ),
+    ] = None,
     out: OutOpt = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="in place of a scenario: fly the simulation twin of a recorded flight, with its "
+            "start and commands, as RUN/twin.toml",
+        ),
+    ] = None,
     mode: ModeOpt = ModeOption.lockstep,
     seed: SeedOpt = None,
     overrides: SetOpt = None,
@@ -71,6 +85,7 @@ def run(
 
     show = show_of(quiet, as_json)
     with errors_as_json(as_json), stop_on_signals() as stop:
+        scenario = _flown(scenario, like)
         viewer_port = None
         if view:
             viewer_port = free_port(DEFAULT_HOST, None)
@@ -92,6 +107,22 @@ def run(
         )
     print_outcome(outcome, show)
     raise typer.Exit(outcome.status)
+
+
+def _flown(scenario: str | None, like: Path | None) -> str:
+    """Return the scenario to fly: the given one, or the file of a flight's twin."""
+    if (scenario is None) == (like is None):
+        raise fail("run: needs a scenario, or --like RUN, and not both")
+    if like is None:
+        assert scenario is not None
+        return scenario
+    from chaserdock.launch.twin import twin_of
+
+    from .scenario import as_toml
+
+    path = (like if like.is_dir() else like.parent) / "twin.toml"
+    write_atomically(path, as_toml(twin_of(like)))
+    return str(path)
 
 
 def announce_viewer(port: int, url: str) -> threading.Thread:

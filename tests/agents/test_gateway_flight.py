@@ -15,6 +15,7 @@ from virtual_lab import SCENARIO, SENT, Fault, fly, tracking_errors_m, two_free_
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
+from chaserdock.launch.twin import twin_of
 from chaserdock.simulation.mission import SimulatedFlight
 
 
@@ -50,6 +51,11 @@ def test_free_flyers_track_the_target(
     assert judged["success"] is True
     for chaser in judged["chasers"].values():
         assert chaser["steady"]["position_mse_m2"] < 2e-3**2
+    twin = twin_of(flight.folder)  # starts when the robots are armed, at rest
+    for own, offset_m in zip(twin.chasers, ((-0.2, 0.065, 0.0), (-0.015, -0.2, 0.02)), strict=True):
+        assert np.linalg.norm(np.subtract(own.start_offset_m, offset_m)) < 0.01
+        assert np.linalg.norm(own.start_velocity_m_s) < 3e-3
+    assert np.linalg.norm(np.degrees(twin.target.omega_rad_s) - [0.0, 0.0, 3.0]) < 0.1
 
 
 @pytest.mark.slow

@@ -71,8 +71,10 @@ def twin_of(log: LogSource) -> Scenario:
 
 def _start_of(track: Track, start_s: float) -> tuple[Array, Array, Array, Array]:
     """Return position (3,) and velocity (3,) in WRF, attitude (4,) and rate (3,) in body axes at a
-    time. If they were measured: by straight lines through the motion before it, when robots did not act, or where the log
-    begins there by parabolas through the motion after it.
+    time.
+
+    Of measured motion: by straight lines through what comes before, when robots did not act, or
+    where the log begins there by parabolas through what comes after.
     """
     time_s, degree = track.time_s, 1
     if not track.sigma_m.any():  # ground truth

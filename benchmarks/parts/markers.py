@@ -97,7 +97,7 @@ class Views:
         return int((inside.all(axis=(1, 2)) & facing).sum())
 
     def perception(self, method: Method = "default") -> Perception:
-        return Perception(self.camera, self.model, method)
+        return Perception(self.camera, self.model, method, small_markers=True)
 
     def random_views(self, count: int, near_m: float, far_m: float, seed: int) -> Iterator[View]:
         """Yield views at random attitudes, the centre in the middle 40 % of width and height, the

@@ -26,7 +26,7 @@ class Scene:
         self.camera, self.model = Camera.from_hfov(640, 480, HFOV), model
         self.renderer = Renderer(self.camera, model, None, Effects().point_spread_px)
         self.effects = CameraEffects(640, 480, Effects(), 11)
-        self.perception = Perception(self.camera, model)
+        self.perception = Perception(self.camera, model, small_markers=True)
 
     def image(self, position, q, number=0, light=(0.2, 0.3, -1.0)):
         exact = self.renderer.render(

@@ -103,6 +103,7 @@ def test_log_contains_every_topic_at_its_rate(short_flight: Path) -> None:
         topics.STATE,
         topics.TRUTH_PLUME,
         topics.SAFETY,
+        *(topics.KILL, topics.BODY_REFERENCE),  # of a laboratory
     )
     assert missing == {t.key for t in absent}
 

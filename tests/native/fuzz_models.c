@@ -26,9 +26,10 @@ static void free_rotation(void) {
 static void coast_room(void) {
     const int64_t steps = whole(1, 6), m = 4 * whole(1, 2);
     double *transitions = doubles(36 * (steps + 1), -3.0, 3.0), *states = doubles(6 * m, -3.0, 3.0);
-    double *straight = outputs(steps), *bent = outputs(steps), *work = outputs(6 * m);
-    NAME(coast_room)(steps, transitions, m, states, 0.0, straight, work);
-    NAME(coast_room)(steps, transitions, m, states, value(0.0, 1.0), bent, work);
+    double *straight = outputs(steps), *bent = outputs(steps), *work = outputs(6 * m),
+           *drift = doubles(6 * (steps + 1), -1.0, 1.0);
+    NAME(coast_room)(steps, transitions, drift, m, states, 0.0, straight, work);
+    NAME(coast_room)(steps, transitions, drift, m, states, value(0.0, 1.0), bent, work);
     for (int64_t k = 0; k < steps && !special_drawn; k++) CHECK(bent[k] <= straight[k]);
 }
 
@@ -36,14 +37,15 @@ static void coast_room(void) {
 static void coast_closest(void) {
     const int64_t steps = whole(1, 6), m = 4 * whole(1, 2), count = whole(0, steps);
     double *transitions = doubles(36 * (steps + 1), -3.0, 3.0), *states = doubles(6 * m, -3.0, 3.0);
-    double *covariance = doubles(36, -1.0, 1.0), *room = outputs(steps), *work = outputs(6 * m),
+    double *covariances = doubles(18 * count, -1.0, 1.0), *room = outputs(steps),
+           *work = outputs(6 * m), *drift = doubles(6 * (steps + 1), -1.0, 1.0),
            bulge_s = value(0.0, 1.0);
-    NAME(coast_room)(steps, transitions, m, states, bulge_s, room, work);
+    NAME(coast_room)(steps, transitions, drift, m, states, bulge_s, room, work);
     int64_t *columns = block((size_t)count * sizeof *columns);
     for (int64_t c = 0; c < count; c++) columns[c] = whole(0, steps - 1);
     Approaches found = {outputs(m), outputs(m), outputs(m)};
-    NAME(coast_closest)(count, columns, transitions, m, states, covariance, value(0.0, 1.0),
-                        bulge_s, &found);
+    NAME(coast_closest)(count, columns, transitions, drift, m, states, covariances,
+                        value(0.0, 1.0), bulge_s, &found);
     double least = 1e300;
     for (int64_t c = 0; c < count; c++) least = min_of(least, room[columns[c]]);
     for (int64_t n = 0; n < m && count && !special_drawn; n++) CHECK(found.away[n] >= least - 1e-9);

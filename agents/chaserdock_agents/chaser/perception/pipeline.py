@@ -113,11 +113,18 @@ class Perception:
     """Estimates the pose of one target model in the images of one camera.
 
     Stateless: `estimate` depends on its arguments only. ``method``: "default", or for the paper's
-    baseline "paper" (EPnP) or "paper_iterative". Raises ValueError for another method, or for an
-    unknown marker dictionary.
+    baseline "paper" (EPnP) or "paper_iterative". ``small_markers``: use markers too small for the
+    fit of their sides, too, as single photographs need; chasers fly without, as `simulate` draws
+    their measurements. Raises ValueError for another method, or for an unknown marker dictionary.
     """
 
-    def __init__(self, camera: Camera, model: TargetModel, method: Method = "default"):
+    def __init__(
+        self,
+        camera: Camera,
+        model: TargetModel,
+        method: Method = "default",
+        small_markers: bool = False,
+    ) -> None:
         if method not in get_args(Method):
             raise ValueError(
                 f"unknown perception method {method!r}; known: {', '.join(get_args(Method))}"
@@ -125,6 +132,7 @@ class Perception:
         self.camera = camera
         self.model = model
         self.method: Method = method
+        self._small_markers = small_markers
         self._dictionary = detect.dictionary_of(model.dictionary)
         self.table = pnp.MarkerTable.of(model)
         # Targets with many markers per face do not need the small ones that are lost at half size.
@@ -193,9 +201,13 @@ class Perception:
                 refined = refined.with_others(lost, self.refined(image, shifted, rows[lost]))
             lost = ~refined.good
             sigma = corners.coarse_sigma_px(self.camera, px[lost]) / pnp.SIGMA_FLOOR_PX
-            coarse = rows[lost], px[lost], sigma
+            if self._small_markers:
+                coarse = rows[lost], px[lost], sigma
             refined, rows = refined.part(refined.good), rows[refined.good]
         px, sigma = refined.corners_px, refined.relative_sigma
+        if not self._small_markers:
+            solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma)
+            return self._sighting(found.ids, solutions, self.table.ids[rows[used]], px[used])
         further = _Further(self, image, coarse)
         solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma, further.markers)
         if not solutions and thorough and len(coarse[0]):

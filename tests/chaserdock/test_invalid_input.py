@@ -26,7 +26,7 @@ INVALID = [
     ("keys init x", "`chaserdock keys` is now `chaserdock deploy --keys FOLDER`"),
     ("--nothing", "No such option: --nothing"),
     # run
-    ("run", "Missing argument"),
+    ("run", "needs a scenario, or --like RUN"),
     ("run nowhere", "nowhere: no such scenario file or shipped scenario; shipped: abort, "),
     ("run single extra", "extra"),
     ("run single --nothing", "No such option: --nothing"),

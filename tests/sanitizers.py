@@ -45,6 +45,7 @@ _TESTS = (
     "tests/architecture/test_native.py",
     "tests/agents/test_model_perception.py::test_search_for_the_sun_behind_a_target_is_spread_over_images",
     "tests/agents/test_perception.py",
+    "tests/agents/test_small_markers.py::test_one_far_marker_always_lists_its_true_pose",
     "tests/agents/test_views.py",
     "tests/controller/test_dynamics.py",
     "tests/controller/test_identification.py::test_the_transition_is_the_derivative_of_the_prediction",

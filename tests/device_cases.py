@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_agents.gateway import devices
-from chaserdock_agents.gateway.devices import DeviceHost, DeviceKind, RobotCommand
+from chaserdock_agents.gateway.devices import DeviceError, DeviceHost, DeviceKind, RobotCommand
 from harness import ROOT
 
 WAIT_S = 30.0
@@ -63,3 +63,30 @@ def command(
     """Return a command in general position that takes effect now."""
     values = (np.array(v, dtype=float) for v in (force, torque, duty))
     return RobotCommand(time.monotonic_ns(), *values)
+
+
+def poll_until(source: Any, number: int, publish: Any = lambda: None) -> list[Any]:
+    """Return what has arrived after ``publish`` had its effect; the first messages may be lost."""
+    polled: list[Any] = []
+
+    def arrived() -> bool:
+        publish()
+        polled.extend(source.poll())
+        return len(polled) >= number
+
+    wait_for(arrived)
+    return polled
+
+
+def complains(source: Any, said: str, publish: Any = lambda: None) -> None:
+    """Wait until a poll raises an error that says this."""
+
+    def raised() -> bool:
+        publish()
+        try:
+            source.poll()
+        except DeviceError as error:
+            return said in str(error)
+        return False
+
+    wait_for(raised)

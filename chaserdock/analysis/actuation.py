@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from chaserdock_models.arrays import Vector3
+from chaserdock_models.arrays import Vector3, limited
 from chaserdock_models.thruster_model import G0_M_S2
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import ActuatorCommand, BodyTruth
@@ -51,8 +51,8 @@ def commanded_output(command: ActuatorCommand, body: Body, tick_s: float) -> Tic
     """
     time_s = command.sim_time_ns / 1e9 + tick_s
     if body.actuation != "thrusters":
-        fx, fy, fz = np.clip(command.force_N, -body.force_max_N, body.force_max_N) * tick_s
-        tx, ty, tz = np.clip(command.torque_N_m, -body.torque_max_N_m, body.torque_max_N_m) * tick_s
+        wrench = np.array([*command.force_N, *command.torque_N_m])
+        fx, fy, fz, tx, ty, tz = (limited(wrench, body.wrench_max) * tick_s).tolist()
         total = float(abs(fx) + abs(fy) + abs(fz))
         return TickOutput(time_s, (fx, fy, fz), (tx, ty, tz), total, (), (), 0.0)
     open_s = np.zeros(len(body.thrusters))

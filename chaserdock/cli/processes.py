@@ -34,6 +34,17 @@ if TYPE_CHECKING:
     from chaserdock_protocol.process import ProcessOptions
 
 
+RecorderOpt = Annotated[bool, typer.Option(help="wait for a recorder before the first tick")]
+ConnectTimeoutOpt = Annotated[
+    float | None,
+    typer.Option(
+        min=0.1,
+        help="seconds to wait for a router and, before the first tick, for another process "
+        "to connect; unlimited by default",
+    ),
+]
+
+
 def start_process(name: str, options: ProcessOptions) -> None:
     """Run a process by its entry point (group ``chaserdock.processes``) and exit with its status:
     ``STOPPED`` where it did not end its work because of a signal.
@@ -53,19 +64,10 @@ def world(
     mode: ModeOpt = ModeOption.lockstep,
     seed: SeedOpt = None,
     overrides: SetOpt = None,
-    recorder: Annotated[
-        bool, typer.Option(help="wait for a recorder before the first tick")
-    ] = True,
+    recorder: RecorderOpt = True,
     *,
     link: LinkOptions,
-    timeout: Annotated[
-        float | None,
-        typer.Option(
-            min=0.1,
-            help="seconds to wait for a router and, before the first tick, for another process "
-            "to connect; unlimited by default",
-        ),
-    ] = None,
+    timeout: ConnectTimeoutOpt = None,
     rejoin_timeout: Annotated[
         float,
         typer.Option(min=0.0, help="lock-step: seconds to wait after all processes were lost"),
@@ -109,19 +111,10 @@ def gateway(
             help="look at the devices for so long, print what is found, and move nothing",
         ),
     ] = None,
-    recorder: Annotated[
-        bool, typer.Option(help="wait for a recorder before the first tick")
-    ] = True,
+    recorder: RecorderOpt = True,
     *,
     link: LinkOptions,
-    timeout: Annotated[
-        float | None,
-        typer.Option(
-            min=0.1,
-            help="seconds to wait for a router and, before the first tick, for another process "
-            "to connect; unlimited by default",
-        ),
-    ] = None,
+    timeout: ConnectTimeoutOpt = None,
     rejoin_timeout: Annotated[
         float, typer.Option(min=0.0, help="seconds to wait after all processes were lost")
     ] = 0.0,

@@ -10,7 +10,8 @@ import subprocess
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import msgspec
@@ -69,27 +70,48 @@ def check(
     ScenarioError, TransportError, or CheckError when the command or the log is unusable.
     """
     recorded = read_turns(log, process, ticks)
-    namespace = f"check-{uuid.uuid4().hex[:12]}"
-    node, endpoint = open_hub(namespace, _LEASE_MS, "world", "analysis")
-    try:
+    with hub("world") as (node, filled):
         ledger = Ledger(process, recorded.scenario)
         stand = TestStand(node, ledger, recorded.scenario_json)
-        filled = [
-            word.replace("{endpoint}", endpoint).replace("{namespace}", namespace)
-            for word in command
-        ]
-        child = start_process(filled)
-        try:
+        with running(filled(command)) as child:
             played = stand.fly(child, recorded.turns, start_s, patience_s)
-        finally:
-            end_process(child)
-    finally:
-        node.close()
     return Checked(list(ledger.findings.values()), played, ledger.messages)
 
 
-def start_process(command: list[str]) -> subprocess.Popen[bytes]:
-    """Start a command in a session of its own. Raises CheckError if it cannot be run."""
+@contextmanager
+def hub(name: str) -> Generator[tuple[Node, Callable[[list[str]], list[str]]]]:
+    """Open the node of a test stand in a namespace of its own, to which the process under test
+    connects; with what fills ``{endpoint}`` and ``{namespace}`` into its command. Raises
+    TransportError.
+    """
+    namespace = f"check-{uuid.uuid4().hex[:12]}"
+    node, endpoint = open_hub(namespace, _LEASE_MS, name, "analysis")
+
+    def filled(command: list[str]) -> list[str]:
+        return [
+            word.replace("{endpoint}", endpoint).replace("{namespace}", namespace)
+            for word in command
+        ]
+
+    try:
+        yield node, filled
+    finally:
+        node.close()
+
+
+@contextmanager
+def running(command: list[str]) -> Generator[subprocess.Popen[bytes]]:
+    """Run a command in a session of its own, and end its process group. Raises CheckError if it
+    cannot be run.
+    """
+    child = _start(command)
+    try:
+        yield child
+    finally:
+        _end(child)
+
+
+def _start(command: list[str]) -> subprocess.Popen[bytes]:
     try:
         return subprocess.Popen(
             command,
@@ -101,7 +123,7 @@ def start_process(command: list[str]) -> subprocess.Popen[bytes]:
         raise CheckError(f"{command[0]}: cannot be run: {error.strerror or error}") from None
 
 
-def end_process(child: subprocess.Popen[bytes]) -> None:
+def _end(child: subprocess.Popen[bytes]) -> None:
     """Terminate the process group, which is a session of its own."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         if child.poll() is None:

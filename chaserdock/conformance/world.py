@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import queue
 import time
-import uuid
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -33,13 +32,9 @@ from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from chaserdock_protocol.transport.network import unique_id
 from chaserdock_protocol.transport.session import EARLY_PERIOD_S
 
-from chaserdock.launch.launcher import open_hub
-
-from .harness import SILENT_TICKS, Checked, end_process, start_process
+from .harness import SILENT_TICKS, Checked, hub, running
 from .rules import WORDS, Finding
 
-_LEASE_MS = 60_000
-"""Time, ms, after which a silent world counts as lost: long, so that a slow one does not."""
 _WITHHELD_TICK, _WITHHELD_S = 3, 0.5
 """Tick in which one reply comes late, and by how much: a world in lock-step waits for it."""
 
@@ -51,21 +46,10 @@ def check_world(command: list[str], ticks: int, start_s: float, patience_s: floa
     to answer and to open the first tick, ``patience_s`` per tick. Raises TransportError and
     CheckError.
     """
-    namespace = f"check-{uuid.uuid4().hex[:12]}"
-    node, endpoint = open_hub(namespace, _LEASE_MS, "operator", "analysis")
-    try:
+    with hub("operator") as (node, filled):
         stand = WorldStand(node, patience_s)
-        filled = [
-            word.replace("{endpoint}", endpoint).replace("{namespace}", namespace)
-            for word in command
-        ]
-        child = start_process(filled)
-        try:
+        with running(filled(command)) as child:
             played = stand.fly(lambda: child.poll() is not None, ticks, start_s)
-        finally:
-            end_process(child)
-    finally:
-        node.close()
     return Checked(list(stand.findings.values()), played, sum(stand.counts.values()))
 
 

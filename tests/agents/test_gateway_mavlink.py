@@ -17,7 +17,15 @@ import numpy as np
 import pytest
 from chaserdock_agents.gateway.devices import DeviceError
 from chaserdock_agents.gateway.drivers import acknowledgements, command_stream, mavlink
-from device_cases import Clock, command, open_device, use_entry_points, wait_for
+from device_cases import (
+    Clock,
+    command,
+    complains,
+    open_device,
+    poll_until,
+    use_entry_points,
+    wait_for,
+)
 from general_position import matrix
 from harness import free_port
 
@@ -112,29 +120,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
 
 
 def poll_one(source: Any, send: Any) -> Any:
-    polled: list[Any] = []
-
-    def arrived() -> bool:
-        send()
-        polled.extend(source.poll())
-        return bool(polled)
-
-    wait_for(arrived)
-    return polled[0]
-
-
-def complains(source: Any, said: str, send: Any = lambda: None) -> None:
-    """Wait until a poll raises an error that says this."""
-
-    def raised() -> bool:
-        send()
-        try:
-            source.poll()
-        except DeviceError as error:
-            return said in str(error)
-        return False
-
-    wait_for(raised)
+    return poll_until(source, 1, send)[0]
 
 
 # -- poses -----------------------------------------------------------------------------------------

@@ -21,7 +21,15 @@ from chaserdock_agents.gateway.drivers import command_stream, ros2_camera, ros2_
 from chaserdock_agents.ros2.types import TYPES, type_hash
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.transport.zenoh_network import PlainSession
-from device_cases import Clock, command, open_device, use_entry_points, wait_for
+from device_cases import (
+    Clock,
+    command,
+    complains,
+    open_device,
+    poll_until,
+    use_entry_points,
+    wait_for,
+)
 from general_position import matrix
 from harness import ROOT, free_port
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
@@ -382,33 +390,6 @@ def peer(network: Peer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
     for shared, _ in left:
         shared.close()  # an open session would keep the process
     assert left == []  # every test closes its devices
-
-
-def poll_until(source: Any, number: int, publish: Any = lambda: None) -> list[Any]:
-    """Return what has arrived after ``publish`` had its effect; the first messages may be lost."""
-    polled: list[Any] = []
-
-    def arrived() -> bool:
-        publish()
-        polled.extend(source.poll())
-        return len(polled) >= number
-
-    wait_for(arrived)
-    return polled
-
-
-def complains(source: Any, said: str, publish: Any = lambda: None) -> None:
-    """Wait until a poll raises an error that says this."""
-
-    def raised() -> bool:
-        publish()
-        try:
-            source.poll()
-        except DeviceError as error:
-            return said in str(error)
-        return False
-
-    wait_for(raised)
 
 
 @pytest.mark.parametrize(

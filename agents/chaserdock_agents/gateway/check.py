@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
+from chaserdock_protocol.pose_image import NAME as STATISTICAL
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 
 from chaserdock_agents.chaser.perception import make_perception
@@ -21,7 +23,7 @@ from chaserdock_agents.chaser.vision import Vision
 from .clock import DeviceClock
 from .devices import DeviceError, DeviceHost, ImageArray
 from .feeds import CameraFeed, DeviceWatch, PoseFeed
-from .images import image_message
+from .images import image_message, why_other_size
 from .lab import Laboratory
 
 MILLIMETRES_FROM = 50.0
@@ -72,7 +74,7 @@ def _check(
 ) -> list[DeviceFinding]:
     assert scenario.lab is not None
     eyes = {c.device.chaser: _Eyes(scenario, c) for c in laboratory.cameras}
-    lost: dict[str, str] = {}
+    lost: list[str] = []
     end_ns = host.now_ns() + round(duration_s * 1e9)
     while host.now_ns() < end_ns:
         try:
@@ -82,7 +84,8 @@ def _check(
             for chaser, image, time_ns in laboratory.read_images():
                 eyes[chaser].look(image, time_ns)
         except DeviceError as error:
-            lost[str(error)] = str(error)
+            if str(error) not in lost:
+                lost.append(str(error))
             wait(0.1)
         wait(0.002)
     now_ns, findings = host.now_ns(), []
@@ -188,18 +191,17 @@ class _Eyes:
     newest: str = ""
     wrong_size: str = ""
     _vision: Vision = field(init=False)
+    _camera: Camera = field(init=False)
+    _sized: bool = field(init=False)
 
     def __post_init__(self) -> None:
         self._vision = Vision(make_perception(flight_scenario(self.scenario)))
+        self._camera = self.scenario.camera_model()
+        self._sized = self.scenario.perception.name != STATISTICAL
 
     def look(self, image: ImageArray, time_ns: int) -> None:
-        camera = self.scenario.camera_model()
-        size = (image.shape[1], image.shape[0])
-        stated = (camera.width_px, camera.height_px)
-        if size != stated and self.scenario.perception.name != "statistical":
-            self.wrong_size = (
-                f"images of {size[0]} x {size[1]}; the calibration is for {stated[0]} x {stated[1]}"
-            )
+        if self._sized and (other := why_other_size(image, self._camera)):
+            self.wrong_size = other
             return
         rate_hz, quality = self.scenario.time.rate_hz, self.scenario.camera.effects.jpeg_quality
         message = image_message(rate_hz, quality, self.feed.device.chaser, image, time_ns)

@@ -93,7 +93,7 @@ class Laboratory:
                 found.append(RobotSight(chaser, math.inf, age))
                 continue
             age_s = (now_ns - newest_ns) / 1e9
-            state = feed.track.at(newest_ns, newest_ns - 1)
+            state = feed.track.newest_state()
             speed = rate = 0.0
             if state is not None:
                 speed = float(np.linalg.norm(state.velocity_m_s))

@@ -63,6 +63,7 @@ class BodyTrack:
         self._bounds = bounds
         self._poses: deque[MeasuredPose] = deque(maxlen=_MOST_POSES)
         self._jumped: list[MeasuredPose] = []
+        self._newest_state: FittedState | None = None
         self.rejected = 0
         self.jumped_m = 0.0
 
@@ -70,6 +71,15 @@ class BodyTrack:
     def newest_ns(self) -> int | None:
         """Return the time of the newest pose, None without one."""
         return self._poses[-1].time_ns if self._poses else None
+
+    def newest_state(self) -> FittedState | None:
+        """Return the state at the newest pose, None if there are too few for a velocity. Computed
+        once for each pose, as robots are guarded far more often.
+        """
+        newest_ns = self.newest_ns
+        if self._newest_state is None and newest_ns is not None:
+            self._newest_state = self.at(newest_ns, newest_ns - 1)
+        return self._newest_state
 
     def newest_poses(self) -> list[MeasuredPose]:
         """Return the poses of the last half second, oldest first."""
@@ -92,9 +102,11 @@ class BodyTrack:
             self.jumped_m = float(np.linalg.norm(pose.position_m - poses[-1].position_m))
             poses.clear()
             poses.extend(self._jumped)
+            self._newest_state = None
             self._jumped.clear()
             return True
         self._jumped.clear()
+        self._newest_state = None
         if poses and pose.time_ns < poses[-1].time_ns:
             later = [poses.pop()]
             while poses and poses[-1].time_ns > pose.time_ns:

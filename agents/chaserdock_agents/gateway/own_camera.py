@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Tick
+from chaserdock_protocol.pose_image import NAME as STATISTICAL
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.lab import LabCamera
@@ -18,7 +19,7 @@ from chaserdock_agents.chaser.process import ChaserProcess, run_chaser
 from .clock import DeviceClock
 from .devices import DeviceError, DeviceHost
 from .feeds import CameraFeed
-from .images import image_message
+from .images import image_message, why_other_size
 
 _POLL_S = 0.002
 """Interval, s, at which the camera is asked for images."""
@@ -36,7 +37,9 @@ class OwnCamera:
     """Pass the images of a camera to its chaser, with their time of the mission."""
 
     def __init__(self, chaser: ChaserProcess, feed: CameraFeed, scenario: FlightScenario) -> None:
-        self._chaser, self._feed, self._scenario = chaser, feed, scenario
+        self._chaser, self._feed = chaser, feed
+        self._camera, self._rate_hz = scenario.camera_model(), scenario.time.rate_hz
+        self._sized = scenario.perception.name != STATISTICAL
         self._mission = DeviceClock()
         self._lost = ""
         self._now_s = chaser.node.host.now_s
@@ -49,18 +52,20 @@ class OwnCamera:
 
     def poll(self) -> float:
         """Pass on what has arrived; return after how many seconds to ask again."""
-        camera, number = self._scenario.camera_model(), self._chaser.core.number
         try:
             for image, time_ns in self._feed.poll():
                 if not self._mission.is_known:
                     continue
                 exposed_ns = self._mission.stamp_ns(time_ns)
-                size = (image.shape[1], image.shape[0])
-                if exposed_ns > 0 and self._fits(size, (camera.width_px, camera.height_px)):
-                    rate_hz = self._scenario.time.rate_hz
-                    self._chaser.look_at(
-                        image_message(rate_hz, _UNCOMPRESSED, number, image, exposed_ns)
-                    )
+                if exposed_ns <= 0:
+                    continue
+                if self._sized and (other := why_other_size(image, self._camera)):
+                    self._feed.watch.refused[other] += 1
+                    continue
+                number = self._chaser.core.number
+                self._chaser.look_at(
+                    image_message(self._rate_hz, _UNCOMPRESSED, number, image, exposed_ns)
+                )
         except DeviceError as error:
             if str(error) != self._lost:
                 self._chaser.warn("camera lost", str(error))
@@ -68,14 +73,6 @@ class OwnCamera:
             return _LOST_POLL_S
         self._lost = ""
         return _POLL_S
-
-    def _fits(self, size: tuple[int, int], stated: tuple[int, int]) -> bool:
-        fits = size == stated or self._scenario.perception.name == "statistical"
-        if not fits:
-            self._feed.watch.refused[
-                f"images of {size[0]} x {size[1]}; the calibration is for {stated[0]} x {stated[1]}"
-            ] += 1
-        return fits
 
 
 def main(options: ProcessOptions) -> int:

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..images import converted_rows
+
 Pixels = NDArray[np.uint8]
 
 
@@ -66,13 +68,8 @@ def raw_pixels(
         )
     padded = np.zeros(step * height, np.uint8)
     padded[: content.size] = content[: step * height]
-    pixels = padded.reshape(height, step)[:, :row]
-    if size == 2:  # the higher byte
-        pixels = pixels[:, (0 if big_endian else 1) :: 2]
-    if channels > 1:
-        pixels = pixels.reshape(height, width, channels)
-    pixels = np.ascontiguousarray(pixels)
-    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
+    rows = padded.reshape(height, step)
+    return converted_rows(rows, width, channels, size, conversion, big_endian)
 
 
 def compressed_pixels(data: Any) -> Pixels:

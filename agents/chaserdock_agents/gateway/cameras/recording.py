@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -40,7 +41,7 @@ def open_recording(address: str, options: OpeningOptions) -> RecordedTopic:
     )  # fmt: skip
 
 
-class RecordedTopic:
+class RecordedTopic(ABC):
     """Delivers the images of a topic in the order of the recording, with the times of their
     exposure.
     """
@@ -65,11 +66,12 @@ class RecordedTopic:
                 continue
             yield CapturedImage(pixels, time_ns, "exposure", None, sequence)
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  (no kind of recording holds a file open)
         """Do nothing: files are closed with the last image."""
 
+    @abstractmethod
     def _stored(self) -> Iterator[_Stored]:
-        raise NotImplementedError
+        """Yield the messages of the topic in order."""
 
 
 class McapTopic(RecordedTopic):

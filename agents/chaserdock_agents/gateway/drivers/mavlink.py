@@ -26,14 +26,7 @@ from chaserdock_protocol.errors import require_extra
 from chaserdock_protocol.transport.network import Undo
 
 from ..devices import DeviceError, DeviceHost, PoseSample, RobotCommand
-from .acknowledgements import (
-    COMPONENT_ARM_DISARM,
-    CUSTOM_MODE_ENABLED,
-    DO_SET_MODE,
-    FORCE,
-    Acknowledgements,
-)
-from .command_stream import CommandStream
+from .autopilot import AutopilotRobot
 from .options import read_options
 from .pose_samples import KEPT, is_finite, stated, turned
 from .shares import Maxima, wrench_shares
@@ -361,7 +354,7 @@ def deflections(force: Array, torque: Array) -> dict[str, int]:
     return {name: round(_FULL * float(share)) for name, share in full.items()}
 
 
-class MavlinkRobot:
+class MavlinkRobot(AutopilotRobot):
     """A robot under PX4 (its spacecraft: force x and y, torque z) or ArduSub (all six)."""
 
     body_axes, thrusters = "frd", 0
@@ -370,12 +363,10 @@ class MavlinkRobot:
         self._address, self._options = address, options
         self._link = _LINKS.acquire(address, lambda: MavlinkLink(address, host.now_ns))
         self._dialect = _dialect()
-        self._acknowledgements = Acknowledgements()
+        super().__init__(host.now_ns)
         self._beaten = threading.Event()
         self._kind = (-1, -1)
         self._end = self._link.listen(("HEARTBEAT", "COMMAND_ACK"), self._take)
-        self._stream = CommandStream(self._publish, host.now_ns)
-        self._was_armed = False
 
     def _take(self, message: Any, arrived_ns: int) -> None:
         if message.get_srcSystem() != self._options.system:
@@ -413,24 +404,9 @@ class MavlinkRobot:
         self._was_armed = True
         self._stream.start()
         time.sleep(_LEAD_S)
-        self._ask(DO_SET_MODE, "manual mode", CUSTOM_MODE_ENABLED, mode)
-        self._ask(COMPONENT_ARM_DISARM, "arming", 1.0, 0.0)
-        self._stream.arm()
+        self._arm_in(mode, "manual mode", "arming")
 
-    def stop(self) -> None:
-        """Command zero and disarm, in motion too, if this driver has armed. Does not wait."""
-        self._stream.disarm()
-        if not self._was_armed:
-            return
-        try:
-            self._command(COMPONENT_ARM_DISARM, 0, 0.0, FORCE)
-        except Exception:  # it was never heard, or is gone
-            return
-
-    def close(self) -> None:
-        """See `Robot`."""
-        self.stop()
-        self._stream.close()
+    def _release(self) -> None:
         self._end()
         _LINKS.release(self._address)
 
@@ -441,11 +417,6 @@ class MavlinkRobot:
             self._options.system, 1, command, attempt, param1, param2, *unused
         )
         self._link.send(self._options.system, message)
-
-    def _ask(self, command: int, what: str, param1: float, param2: float) -> None:
-        self._acknowledgements.ask(
-            command, what, lambda attempt: self._command(command, attempt, param1, param2)
-        )
 
 
 def manual_mode(autopilot: int, kind: int, options: MavlinkRobotOptions) -> float:

@@ -22,14 +22,7 @@ from numpy.typing import NDArray
 from chaserdock_agents.ros2.types import TYPES
 
 from ..devices import DeviceError, DeviceHost, RobotCommand
-from .acknowledgements import (
-    COMPONENT_ARM_DISARM,
-    CUSTOM_MODE_ENABLED,
-    DO_SET_MODE,
-    FORCE,
-    Acknowledgements,
-)
-from .command_stream import CommandStream
+from .autopilot import AutopilotRobot
 from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 from .shares import Maxima, wrench_shares
@@ -68,8 +61,8 @@ def motors(duty: Array, thrusters: tuple[int, ...]) -> NDArray[np.float32]:
     return control
 
 
-class Px4Robot:
-    """A robot with PX4. Nothing is sent before it is armed: others may use it until then."""
+class Px4Robot(AutopilotRobot):
+    """A robot with PX4."""
 
     body_axes = "frd"
 
@@ -77,7 +70,7 @@ class Px4Robot:
         self.thrusters = len(options.thrusters)
         self._options = options
         self._endpoints = RosEndpoints(options)
-        self._acknowledgements = Acknowledgements()
+        super().__init__(host.now_ns)
         try:
             where = f"{namespace.rstrip('/')}/fmu"
             self._endpoints.subscribe(
@@ -97,8 +90,6 @@ class Px4Robot:
         except BaseException:
             self._endpoints.close()
             raise
-        self._stream = CommandStream(self._publish, host.now_ns)
-        self._was_armed = False
 
     def _put(self, kind: str, *fields: Any) -> None:
         self._publishers[kind].publish(TYPES.types[f"px4_msgs/msg/{kind}"](*fields))
@@ -134,24 +125,9 @@ class Px4Robot:
             self._was_armed = True
             self._stream.start()
             time.sleep(_LEAD_S)
-        self._ask(DO_SET_MODE, "PX4, offboard mode", CUSTOM_MODE_ENABLED, _OFFBOARD)
-        self._ask(COMPONENT_ARM_DISARM, "PX4, arming", 1.0, 0.0)
-        self._stream.arm()
+        self._arm_in(_OFFBOARD, "PX4, offboard mode", "PX4, arming")
 
-    def stop(self) -> None:
-        """Command zero and disarm, in motion too, if this driver has armed. Does not wait."""
-        self._stream.disarm()
-        if not self._was_armed:
-            return
-        try:
-            self._command(COMPONENT_ARM_DISARM, 0, 0.0, FORCE)
-        except Exception:  # the session is gone: the stream has ended, too, and PX4 notices
-            return
-
-    def close(self) -> None:
-        """See `Robot`."""
-        self.stop()
-        self._stream.close()
+    def _release(self) -> None:
         self._endpoints.close()
 
     def _take(self, acknowledgement: Any) -> None:
@@ -161,11 +137,6 @@ class Px4Robot:
         target, source = (self._options.system, 1), (255, 1)  # component 1: the autopilot
         fields = (0, param1, param2, 0.0, 0.0, 0.0, 0.0, 0.0, command, *target, *source)
         self._put("VehicleCommand", *fields, attempt, True)
-
-    def _ask(self, command: int, what: str, param1: float, param2: float) -> None:
-        self._acknowledgements.ask(
-            command, what, lambda attempt: self._command(command, attempt, param1, param2)
-        )
 
 
 def _topic(kind: str) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 from chaserdock_models.camera import Camera
 
 from ..devices import CameraFrame, DeviceError, DeviceHost, ImageArray
+from ..images import converted_rows
 from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 from .ros2_poses import stamp_of
@@ -73,21 +74,16 @@ def grey_of_image(message: Any) -> ImageArray:
         raise UnreadableMessage(
             f"encoding {message.encoding!r} is not one of: {', '.join((*_TO_GREY, *_WIDE))}"
         )
-    code, channels = (None, 2) if wide else _TO_GREY[message.encoding]
-    if not (height and width and step >= width * channels and len(message.data) == step * height):
+    code, channels = (None, 1) if wide else _TO_GREY[message.encoding]
+    size = 2 if wide else 1
+    row = width * channels * size
+    if not (height and width and step >= row and len(message.data) == step * height):
         raise UnreadableMessage(
             f"{len(message.data)} bytes in rows of {step} for {width} x {height} pixels of "
             f"{message.encoding}"
         )
-    rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, : width * channels]
-    if wide:  # the more significant byte
-        return np.ascontiguousarray(rows[:, 0 if message.is_bigendian else 1 :: 2])
-    rows = np.ascontiguousarray(
-        rows.reshape(height, width, channels).squeeze(2)
-        if channels == 1
-        else rows.reshape(height, width, channels)
-    )
-    return rows if code is None else np.asarray(cv2.cvtColor(rows, code), np.uint8)
+    rows = np.asarray(message.data, np.uint8).reshape(height, step)
+    return converted_rows(rows, width, channels, size, code, bool(message.is_bigendian))
 
 
 def grey_of_compressed(message: Any) -> ImageArray:

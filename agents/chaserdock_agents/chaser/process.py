@@ -11,7 +11,6 @@ import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import create_fault_layer
 from chaserdock_protocol.messages import (
-    Event,
     Image,
     JoinReply,
     MissionEnd,
@@ -27,7 +26,7 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
 from .core import ChaserCore
-from .outbox import ChaserOutputs
+from .outbox import ChaserOutputs, Outbox
 
 _RECEIVE_TIMEOUT_S = 0.2
 """Interval, s, at which the process looks whether it was stopped or the world is gone. The latter
@@ -122,15 +121,9 @@ class ChaserProcess:
         """Publish a warning of what is attached to the process."""
         tick = self.core.inbox.tick
         stamp = (-1, 0) if tick is None else (tick.tick, tick.sim_time_ns)
-        event = Event(
-            tick=stamp[0],
-            sim_time_ns=stamp[1],
-            process=self.node.name,
-            level="warning",
-            what=what,
-            detail=detail,
-        )
-        self.node.publish(topics.EVENT, event, self.node.name)
+        outbox = Outbox(self.core.number)  # of its own, as other threads may call this
+        outbox.warn(what, detail, *stamp)
+        self._publish(outbox.take(), 0.0)
 
     def _begin_tick(self, tick: Tick, received: ReceivedMessage) -> None:
         if self.core.inbox.is_outdated(tick):

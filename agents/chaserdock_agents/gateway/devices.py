@@ -18,6 +18,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.failure_watch import text_of
 from chaserdock_protocol.messages import Latch
 from numpy.typing import NDArray
 
@@ -193,11 +194,11 @@ def open_device(
         driver = known[scheme].load()
     except Exception as error:  # a driver's import may raise anything
         raise DeviceError(
-            f"{kind} {address!r}: its driver cannot be loaded: {type(error).__name__}: {error}"
+            f"{kind} {address!r}: its driver cannot be loaded: {text_of(error)}"
         ) from error
     try:
         return driver(rest, options, host)
     except ChaserdockError as error:
         raise DeviceError(f"{kind} {address!r}: {error}") from error
     except Exception as error:  # a driver may raise anything
-        raise DeviceError(f"{kind} {address!r}: {type(error).__name__}: {error}") from error
+        raise DeviceError(f"{kind} {address!r}: {text_of(error)}") from error

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from chaserdock_protocol.failure_watch import text_of
 from numpy.typing import NDArray
 
 from ..images import converted_rows
@@ -229,5 +230,4 @@ def decode_image_message(
     except BadImageMessage:
         raise
     except (KeyError, ValueError, TypeError, AttributeError, struct.error, cv2.error) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise BadImageMessage(f"damaged {schema}: {reason}") from None
+        raise BadImageMessage(f"damaged {schema}: {text_of(error)}") from None

@@ -67,7 +67,8 @@ static double correlation(const Image *p, const ReadLimits *limits, const double
 EXPORT void NAME(read_markers)(const uint8_t *image, int64_t height, int64_t width,
                                const double *camera, const Lens *lens, const ReadLimits *limits,
                                const double *surface, const double *position,
-                               const double *margin, int64_t markers, const uint8_t *white, int64_t cells, const uint8_t *skip, double *px, double *finest,
+                               const double *margin, int64_t markers, const uint8_t *white,
+                               int64_t cells, const uint8_t *skip, double *px, double *finest,
                                double *found) {
     Image p = {image, height, width, camera, lens, NULL};
     const double *centres = surface + 12 * markers, *normals = surface + 15 * markers;

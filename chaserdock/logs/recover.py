@@ -29,7 +29,16 @@ from chaserdock_protocol.recording.scan import (
 from chaserdock_protocol.recording.summary import FileSummary, find_summary
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, MessageIndex, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    DataEnd,
+    Header,
+    MessageIndex,
+    Metadata,
+    Schema,
+)
 from mcap.records import Message as McapMessage
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
@@ -55,6 +64,7 @@ _WITH_LENGTHS: dict[int, Any] = {
     Opcode.MESSAGE_INDEX: MessageIndex,
     Opcode.ATTACHMENT: Attachment,
     Opcode.METADATA: Metadata,
+    Opcode.DATA_END: DataEnd,
 }
 """Records that state the lengths of their fields. A message does not: it counts only where another
 record follows it."""

@@ -30,13 +30,14 @@ from chaserdock_protocol.recording.scan import FileState, log_files, records, st
 from chaserdock_protocol.scenario import flight_scenario_json, scenario_from_json
 from chaserdock_protocol.transport import RawSample
 from harness import finished
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from message_samples import BY_TYPE
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.report import write_report
 from chaserdock.logs.info import info_of
-from chaserdock.logs.recover import recover
+from chaserdock.logs.recover import Recovered, loss_lines, recover
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 ONE_FILE = Rotation()
@@ -279,20 +280,73 @@ def test_lost_chunk_is_detected_without_a_checksum(tmp_path: Path) -> None:
         list(read_log(path))
 
 
-def test_recovery_skips_nothing_where_only_the_summary_is_damaged(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
+def thirty_messages(path: Path) -> tuple[bytes, int]:
+    """Write a log of 30 messages. Returns its bytes, and where the record begins that ends the
+    data.
+    """
     writer = LogWriter(path, lambda: 0.0)
     for k in range(30):
         writer.write(
             "recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=k)), 1
         )
     writer.close()
-    data = bytearray(path.read_bytes())
-    end_of_data = 8 + sum(9 + len(content) for _, content in records(path)) + 9 + 4
-    data[end_of_data] = 0  # no opcode
+    return path.read_bytes(), 8 + sum(9 + len(content) for _, content in records(path))
+
+
+def recovered(path: Path, data: bytes) -> Recovered:
+    """Recover damaged bytes of ``thirty_messages``, all of whose messages must be in the copy."""
     path.write_bytes(data)
-    found = recover(path, tmp_path / "b.mcap")
+    out = path.with_name("out.mcap")
+    found = recover(path, out)
+    assert [r.message.tick for r in read_log(out)] == list(range(30))
+    return found
+
+
+DATA_END_BYTES = 9 + 4
+FOOTER_BYTES = 9 + 20
+
+
+def test_recovery_skips_nothing_where_only_the_summary_is_damaged(tmp_path: Path) -> None:
+    data, end = thirty_messages(tmp_path / "a.mcap")
+    damaged = bytearray(data)
+    damaged[end + DATA_END_BYTES] = 0  # no opcode
+    found = recovered(tmp_path / "a.mcap", bytes(damaged))
     assert (found.messages, found.broken_records, found.skipped_bytes) == (30, 0, 0)
+
+
+@pytest.mark.parametrize("opcode", [0, int(Opcode.MESSAGE)])
+def test_recovery_ends_with_the_data_where_nothing_of_the_summary_is_left(
+    tmp_path: Path, opcode: int
+) -> None:
+    """Neither the footer nor the summary's first record states where the data end: the record that
+    ends them does.
+    """
+    data, end = thirty_messages(tmp_path / "a.mcap")
+    damaged = bytearray(data[:-FOOTER_BYTES])
+    damaged[end + DATA_END_BYTES] = opcode
+    found = recovered(tmp_path / "a.mcap", bytes(damaged))
+    assert found.ended
+    assert found.complete
+    assert (found.broken_records, found.skipped_bytes, found.cut_bytes) == (0, 0, 0)
+    assert loss_lines(found) == []
+
+
+@pytest.mark.parametrize("place", [0, 3, 10])  # its opcode, its length, the checksum over all data
+def test_recovery_loses_nothing_where_the_end_of_the_data_is_damaged(
+    tmp_path: Path, place: int
+) -> None:
+    data, end = thirty_messages(tmp_path / "a.mcap")
+    damaged = bytearray(data)
+    damaged[end + place] ^= 0x55
+    found = recovered(tmp_path / "a.mcap", bytes(damaged))
+    assert (found.ended, found.complete, found.lost_messages) == (True, True, 0)
+
+
+def test_recovery_says_that_a_log_without_an_end_of_its_data_was_not_closed(tmp_path: Path) -> None:
+    data, end = thirty_messages(tmp_path / "a.mcap")
+    found = recovered(tmp_path / "a.mcap", data[:end] + data[end + DATA_END_BYTES :])
+    assert (found.ended, found.lost_messages) == (False, 0)
+    assert loss_lines(found)[-1].startswith("the log was not closed")
 
 
 @pytest.mark.slow

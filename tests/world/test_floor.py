@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,9 +15,12 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.physics.engine import BodyMotion
+from chaserdock_world.physics.floor import Floor, on_floor
 from chaserdock_world.physics.simulation import TARGET, Physics
 from chaserdock_world.plant import Plant, chaser_plant, target_plant
 from engine_cases import both
+from general_position import matrix
 from planar_cases import HEIGHT_M, UP_TRF, scenario
 
 HZ = 960
@@ -82,6 +86,81 @@ def off_floor(physics: Physics, first: dict[str, BodyState]) -> float:
         ]
         worst = max(worst, float(np.abs(off).max()))
     return worst
+
+
+class StillEngine:
+    """Stand-in for an engine: bodies move as stated, until they are placed."""
+
+    def __init__(self, motions: list[BodyMotion]) -> None:
+        self.motions, self.placed = motions, dict[int, BodyState]()
+
+    def motion(self, body: int) -> BodyMotion:
+        return self.motions[body]
+
+    def place(self, body: int, state: BodyState) -> None:
+        self.placed[body] = state
+
+
+YAW, LEAN = rotations.exp((0.0, 0.0, 0.9)), rotations.exp((0.0, -3e-8, 0.0))
+LEVEL: dict[str, Any] = {
+    "position": (1.2, -0.7, 0.31),
+    "q_wxyz": YAW,
+    "velocity": (0.04, -0.03, 0.0),
+    "omega": (0.0, 0.0, 0.07),
+}
+"""A motion in the plane of a floor, axes of an engine."""
+OFF: dict[str, dict[str, Any]] = {
+    "higher": {"position": (1.2, -0.7, 0.31 + 3e-8)},
+    "leans forward": {"q_wxyz": rotations.multiply(YAW, LEAN)},
+    "leans aside": {"q_wxyz": rotations.multiply(YAW, rotations.exp((3e-8, 0.0, 0.0)))},
+    "sinks": {"velocity": (0.04, -0.03, -3e-8)},
+    "rolls": {"omega": (3e-8, 0.0, 0.07)},
+    "pitches": {"omega": (0.0, -3e-8, 0.07)},
+    "everything": {
+        "position": (1.2, -0.7, 0.28),
+        "q_wxyz": rotations.multiply(rotations.exp((0.2, -0.3, 0.0)), YAW),
+        "velocity": (0.04, -0.03, 0.05),
+        "omega": (-0.2, 0.1, 0.07),
+    },
+}
+
+
+@pytest.mark.parametrize("name", OFF)
+def test_the_floor_puts_a_body_back_into_the_plane_and_keeps_its_motion_there(name: str) -> None:
+    engine = StillEngine([cast(BodyMotion, tuple(LEVEL.values()))] * 3)
+    floor = Floor(cast(Any, engine), [0, 2])
+    floor.hold()
+    assert not engine.placed
+
+    engine.motions = [cast(BodyMotion, tuple((LEVEL | OFF[name]).values()))] * 3
+    floor.hold()
+    assert sorted(engine.placed) == [0, 2]
+    state = engine.placed[2]
+    assert state.position_m == pytest.approx(LEVEL["position"], abs=0.0)
+    assert state.velocity_m_s == pytest.approx(LEVEL["velocity"], abs=0.0)
+    assert matrix(state.q_wxyz) == pytest.approx(matrix(YAW), abs=1e-10)
+    assert matrix(state.q_wxyz) @ state.omega_rad_s == pytest.approx(LEVEL["omega"], abs=1e-10)
+
+
+def test_the_floor_carries_the_vertical_force_and_the_horizontal_torques() -> None:
+    loads = np.arange(1.0, 13.0).reshape(2, 6)
+    Floor(cast(Any, StillEngine([])), []).carry(loads)
+    assert loads.tolist() == [[1.0, 2.0, 0.0, 0.0, 0.0, 6.0], [7.0, 8.0, 0.0, 0.0, 0.0, 12.0]]
+
+
+def test_on_a_floor_bodies_turn_about_the_vertical_alone() -> None:
+    """Their third principal axis is the vertical through the centre of mass, with their moment
+    about it; about the others 1 N m tilts them by less than 1e-11 rad in a step of 1 ms.
+    """
+    s = scenario()
+    free = plants(s)
+    for name, plant in on_floor(s, free).items():
+        up, inertia = up_of(name), free[name].inertia_kg_m2
+        assert matrix(plant.frame.q_wxyz) @ [0.0, 0.0, 1.0] == pytest.approx(up, abs=1e-12)
+        assert plant.frame.offset_m == pytest.approx(free[name].centre_of_mass_m)
+        assert plant.moments_kg_m2[2] == pytest.approx(float(up @ inertia @ up))
+        assert 0.5 * 1e-3**2 / min(plant.moments_kg_m2[:2]) < 1e-11
+        assert plant.mass_kg == free[name].mass_kg
 
 
 @both

@@ -107,7 +107,11 @@ def test_a_doubled_exposure_is_used_once() -> None:
     assert results[0] == results[1]
 
 
-def test_parts_of_a_tick_hold_its_impulse_and_its_first_moment() -> None:
+@pytest.mark.parametrize("gap_s", [0.0, 0.4 * PERIOD_S, 1.3 * PERIOD_S])
+def test_parts_of_a_tick_hold_its_impulse_and_its_first_moment(gap_s: float) -> None:
+    """The last estimate may be older than what the impulse covers, as after a lost tick: what acted
+    in the gap before is unknown, so that parts there have none.
+    """
     rng = np.random.default_rng(4)
     given = AppliedImpulse(
         rng.normal(0, 1, 6), rng.normal(0, 0.01, 6), rng.uniform(1, 2, 6), measured=True
@@ -116,21 +120,29 @@ def test_parts_of_a_tick_hold_its_impulse_and_its_first_moment() -> None:
     flight = SyntheticFlight(SCENARIO, p.navigation, 2, 5)
     seen = flight.step({0: 0.011, 1: 0.048})
     time_ns = flight.time_ns
+    covered_from_ns = time_ns - round(PERIOD_S * 1e9)
+    begin_ns = covered_from_ns - round(gap_s * 1e9)
+    if gap_s:
+        early_ns = begin_ns + round(0.3 * gap_s * 1e9)
+        seen = [msgspec.structs.replace(seen[1], sim_time_ns=early_ns), *seen]
     chasers = (MeasuredChaser(0, given, contact=True), MeasuredChaser(1, given))
     record = FilterTick(
         time_ns=time_ns, parameters=p.target, covered_s=PERIOD_S, chasers=chasers, between=seen
     )
-    begin_ns = time_ns - round(PERIOD_S * 1e9)
     parts = split_tick(begin_ns, record)
     assert [q.time_ns for q in parts] == [*(s.sim_time_ns for s in seen), time_ns]
     total = sum(q.chasers[1].impulse.impulse for q in parts)
     np.testing.assert_allclose(total, given.impulse, rtol=1e-7)
-    # About the middle of the tick: each part's own moment, and its impulse times its lead.
-    middle_s, begin_s, moment = PERIOD_S / 2, 0.0, np.zeros(6)
+    # About the middle of what is covered: each part's own moment, and its impulse times its lead.
+    middle_s, moment, end_ns = PERIOD_S / 2, np.zeros(6), begin_ns
     for part in parts:
-        end_s = (part.time_ns - begin_ns) / 1e9
+        from_ns, end_ns = max(end_ns, covered_from_ns), part.time_ns
+        from_s, to_s = ((t - covered_from_ns) / 1e9 for t in (from_ns, max(end_ns, from_ns)))
         own = part.chasers[1].impulse
-        moment += own.moment + own.impulse * (middle_s - (begin_s + end_s) / 2)
-        begin_s = end_s
+        assert part.covered_s == pytest.approx(to_s - from_s, abs=1e-9)
+        share = (to_s - from_s) / PERIOD_S
+        np.testing.assert_allclose(own.impulse, share * given.impulse, rtol=1e-7)
+        np.testing.assert_allclose(own.magnitude, share * given.magnitude, rtol=1e-7)
+        moment += own.moment + own.impulse * (middle_s - (from_s + to_s) / 2)
     np.testing.assert_allclose(moment, given.moment, atol=1e-8)
-    assert [q.chasers[0].contact for q in parts] == [False, False, True]
+    assert [q.chasers[0].contact for q in parts] == [False] * len(seen) + [True]

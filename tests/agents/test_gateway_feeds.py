@@ -53,15 +53,13 @@ def sample(stamp_ns: int | None, arrived_ns: int, place: Array, q: Array) -> Pos
 def test_a_pose_was_measured_the_least_delay_before_the_fastest_arrive() -> None:
     rng, feed = np.random.default_rng(2), PoseFeed(pose_device(), BOUNDS)
     place, q = rng.normal(size=3), attitude(rng)
-    off_s = []
     for time_ns, arrived_ns, stamp_ns in measured():
         pose = feed.take(sample(stamp_ns, arrived_ns, place, q))
-        assert pose is feed.newest is not None
-        off_s.append((pose.time_ns - time_ns) / 1e9)
-    assert off_s == pytest.approx([0.0] * 40, abs=1e-9)
-    device = feed.device
-    assert pose.position_m == pytest.approx(place + matrix(q) @ device.position_m)
-    assert matrix(pose.q_wxyz) == pytest.approx(matrix(q) @ matrix(device.q_wxyz))
+        assert pose is not None
+        assert pose is feed.newest
+        assert abs(pose.time_ns - time_ns) <= 1
+        assert pose.position_m == pytest.approx(place + matrix(q) @ feed.device.position_m)
+        assert matrix(pose.q_wxyz) == pytest.approx(matrix(q) @ matrix(feed.device.q_wxyz))
 
 
 def test_a_pose_without_a_stamp_was_measured_the_latency_before_it_arrives() -> None:

@@ -156,6 +156,7 @@ def test_on_a_floor_bodies_turn_about_the_vertical_alone() -> None:
     free = plants(s)
     for name, plant in on_floor(s, free).items():
         up, inertia = up_of(name), free[name].inertia_kg_m2
+        assert plant.frame is not None
         assert matrix(plant.frame.q_wxyz) @ [0.0, 0.0, 1.0] == pytest.approx(up, abs=1e-12)
         assert plant.frame.offset_m == pytest.approx(free[name].centre_of_mass_m)
         assert plant.moments_kg_m2[2] == pytest.approx(float(up @ inertia @ up))

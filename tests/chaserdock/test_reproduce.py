@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from chaserdock.experiments.page import PageSection, Table, html, markdown
 from chaserdock.experiments.plan import Alone, ExperimentPlan, PlannedFlight
+from chaserdock.experiments.provenance import Provenance
 from chaserdock.experiments.reproduction import reproduce as reproduction
 from chaserdock.experiments.reproduction.content import pitch_rad, sections
 from chaserdock.experiments.reproduction.paper import BASELINE, PAPER_S, ROWS
@@ -45,7 +46,6 @@ from chaserdock.experiments.reproduction.plan import (
     needs_open,
     table_name,
 )
-from chaserdock.experiments.reproduction.provenance import Provenance
 from chaserdock.experiments.reproduction.reproduce import fly_and_report
 from chaserdock.experiments.reproduction.tables import (
     Summaries,

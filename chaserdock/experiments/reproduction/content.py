@@ -15,6 +15,7 @@ from chaserdock_protocol.scenario.bodies import Target
 
 from chaserdock.experiments.page import PageSection, Table
 from chaserdock.experiments.plan import ExperimentPlan
+from chaserdock.experiments.provenance import Provenance
 
 from .paper import BASELINE, PAPER_S, ROWS
 from .plan import (
@@ -34,7 +35,6 @@ from .plan import (
     mission_name,
     missions_of,
 )
-from .provenance import Provenance
 from .tables import (
     BAND,
     LOST_M,

@@ -16,6 +16,7 @@ from chaserdock_protocol.scenario.bodies import Target
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.experiments.plan import (
+    ONE_PROCESS,
     Alone,
     ExperimentError,
     ExperimentPlan,
@@ -147,8 +148,8 @@ _PACKAGES = (
 
 @cache
 def code_digest() -> str:
-    """Return a digest of the flying code and its scenarios, so that results of another version are
-    not reused. Raise ExperimentError unless all packages are installed.
+    """Return a digest of the flying code and its scenarios, so that flights of another version are
+    flown again. Raise ExperimentError unless all packages are installed.
     """
     digest = hashlib.sha256()
     own = Path(__file__).resolve().parent
@@ -168,12 +169,16 @@ def code_digest() -> str:
 
 
 def flight_of(
-    label: str, scenario: str, overrides: tuple[str, ...], alone: Alone | None = None, **varied: str
+    label: str,
+    scenario: str,
+    overrides: tuple[str, ...],
+    alone: Alone | None = None,
+    module: str = "",
+    **varied: str,
 ) -> PlannedFlight:
     """Return a flight of a shipped scenario, with this version of the code."""
-    path = find_scenario(scenario)
-    salt = code_digest()
-    return plan_flight(label, path, overrides, varied=varied, alone=alone, salt=salt)
+    path, code = find_scenario(scenario), code_digest()
+    return plan_flight(label, path, overrides, varied=varied, alone=alone, module=module, code=code)
 
 
 def _table(quick: bool, length: str) -> list[PlannedFlight]:
@@ -184,7 +189,8 @@ def _table(quick: bool, length: str) -> list[PlannedFlight]:
             for row in ROWS:
                 if draw in draws_of(quick, column, row):
                     sets = (*row.overrides, *settings, *dispersed_start(draw), length)
-                    out.append(flight_of(table_name(column, row, draw), SCENARIO, sets))
+                    name = table_name(column, row, draw)
+                    out.append(flight_of(name, SCENARIO, sets, module=ONE_PROCESS))
     return out
 
 

@@ -14,12 +14,12 @@ from chaserdock_protocol.output_files import write_atomically
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from chaserdock.experiments.page import html, markdown
 from chaserdock.experiments.plan import ExperimentError, ExperimentPlan
+from chaserdock.experiments.provenance import Provenance, provenance
 from chaserdock.experiments.worker import ExperimentProgress, Workers, fly_plan
 from chaserdock.launch.signals import stop_on_signals
 
 from .content import sections
 from .plan import code_digest, make_plan, needs_open
-from .provenance import Provenance, provenance
 from .tables import results_by_label
 
 TITLE = "Reproduction of the paper's results"

@@ -181,6 +181,26 @@ def flight_of(
     return plan_flight(label, path, overrides, varied=varied, alone=alone, module=module, code=code)
 
 
+FREE_STARTS = range(10)
+"""Seeds of the free starts (free_starts.py). More: their spread is better known; each takes half a
+minute of a core.
+"""
+_FREE_STARTS_MODULE = "chaserdock.experiments.reproduction.free_starts"
+
+
+def free_name(seed: int) -> str:
+    """Return the name of the flights of a free start."""
+    return f"free/{seed}"
+
+
+def _free_starts(quick: bool) -> list[PlannedFlight]:
+    """Return the free starts, each of which is fitted and flown in all rows; one if quick."""
+    return [
+        flight_of(free_name(k), SCENARIO, (OPEN, f"seed={k}"), module=_FREE_STARTS_MODULE)
+        for k in (FREE_STARTS[:1] if quick else FREE_STARTS)
+    ]
+
+
 def _table(quick: bool, length: str) -> list[PlannedFlight]:
     """Return the flights of the paper's table; the first start of every row comes first."""
     out = []
@@ -263,5 +283,6 @@ def make_plan(quick: bool) -> ExperimentPlan:
     length = f"duration_s={QUICK_S if quick else PAPER_S}"
     missions = [] if quick else _missions()
     return ExperimentPlan(
-        "reproduction", (*_explanations(length), *_table(quick, length), *missions)
+        "reproduction",
+        (*_explanations(length), *_free_starts(quick), *_table(quick, length), *missions),
     )

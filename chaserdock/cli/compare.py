@@ -85,6 +85,14 @@ def reproduce(
         int,
         typer.Option(min=1, help="concurrent flights; more than one disturbs the solve times"),
     ] = 1,
+    earlier: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PAGE",
+            help="an earlier reproduction.md: its cells stand, with their date and commit, where a "
+            "row is not flown",
+        ),
+    ] = None,
 ) -> None:
     """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and
     .html.
@@ -94,7 +102,7 @@ def reproduce(
     """
     from chaserdock.experiments.reproduction.reproduce import reproduce as fly_all
 
-    raise typer.Exit(fly_all(quick, out, jobs))
+    raise typer.Exit(fly_all(quick, out, jobs, earlier))
 
 
 def check(

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flies the controller alone, in this process, with perfect knowledge of the target's motion.
+"""Flies a scenario in this process: the controller alone, with perfect knowledge of the target's
+motion, or all of it on rendered images, for half the processor time of ``chaserdock run``.
 
 ``python -m chaserdock.experiments.controller_flight FOLDER`` reads a flight as JSON from standard
 input and writes ``FOLDER/summary.json``, as ``chaserdock run`` does for whole missions.
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from chaserdock.exit_codes import BAD_INPUT, DONE
 
 from .flight_record import FlightRecord, record_flight
 from .least_transient import gauss_times, least_square_integral
+from .perception import RenderedImages
 from .perfect_knowledge import PerfectEstimator
 from .plan import Alone, PlannedFlight
 
@@ -35,9 +37,20 @@ _FLOOR_S = 15.0
 
 def main() -> int:
     """Fly the flight on standard input; return the exit status."""
+    return write_summary(fly_planned)
+
+
+def fly_planned(flight: PlannedFlight) -> Mapping[str, Any]:
+    """Fly a planned flight: the controller alone, or, without ``alone``, on images."""
+    scenario = load_scenario(Path(flight.scenario), flight.overrides)
+    return fly_on_images(scenario) if flight.alone is None else fly_alone(scenario, flight.alone)
+
+
+def write_summary(fly: Callable[[PlannedFlight], Mapping[str, Any]]) -> int:
+    """Fly the flight on standard input and write its summary; return the exit status."""
     try:
         flight = msgspec.json.decode(sys.stdin.read(), type=PlannedFlight)
-        summary = fly_alone(load_scenario(Path(flight.scenario), flight.overrides), flight.alone)
+        summary = fly(flight)
     except ChaserdockError as error:
         print(f"chaserdock: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -48,13 +61,30 @@ def main() -> int:
 
 
 def fly_alone(scenario: Scenario, alone: Alone | None = None) -> Mapping[str, Any]:
-    """Fly a scenario. Returns the part of a summary (docs/summary.md) that judges a controller,
-    with the lower bound ``floor_m2_s`` on request.
+    """Fly a scenario with perfect knowledge. Returns the part of a summary (docs/summary.md) that
+    judges a controller, with the lower bound ``floor_m2_s`` on request.
     """
     alone = alone or Alone()
     delay_s = alone.delay_s
     flight = record_flight(scenario, solve_delay_s=None if delay_s is None else lambda _: delay_s)
-    late = flight.time_s >= scenario.settling_s
+    summary = _tracking_summary(scenario, flight, "the controller flew alone")
+    if alone.floor:
+        summary["floor_m2_s"] = position_error_floor(scenario, flight)
+    return summary
+
+
+def fly_on_images(scenario: Scenario) -> Mapping[str, Any]:
+    """Fly a scenario as ``chaserdock run`` does, with equal tracking errors. Returns the part of a
+    summary that ``fly_alone`` does.
+    """
+    flight = record_flight(scenario, RenderedImages(scenario))
+    return _tracking_summary(scenario, flight, "the flight was not recorded")
+
+
+def _tracking_summary(scenario: Scenario, flight: FlightRecord, why: str) -> dict[str, Any]:
+    """Return the tracking errors of a flight; ``why`` its success is not judged."""
+    until_s = scenario.steady_until_s or scenario.duration_s
+    late = (flight.time_s >= scenario.settling_s) & (flight.time_s < until_s)
     chasers: dict[str, Any] = {}
     for i in range(len(scenario.chasers)):
         position = flight.position_error_m[:, i] ** 2
@@ -69,18 +99,15 @@ def fly_alone(scenario: Scenario, alone: Alone | None = None) -> Mapping[str, An
             "min_distance_target_m": float(flight.target_distance_m[:, i].min()),
         }
     solve_s = {"p50": float(np.median(flight.solve_s)), "max": float(np.max(flight.solve_s))}
-    summary: dict[str, Any] = {
+    return {
         "scenario": scenario.name,
         "seed": scenario.seed,
         "sim_time_s": scenario.duration_s,
         "failures": [],
-        "not_judged": ["success: the controller flew alone, against no criteria"],
+        "not_judged": [f"success: {why}, against no criteria"],
         "chasers": chasers,
         "solver": {"solve_s": solve_s, "failures": flight.failed_solves},
     }
-    if alone.floor:
-        summary["floor_m2_s"] = position_error_floor(scenario, flight)
-    return summary
 
 
 def position_error_floor(scenario: Scenario, flight: FlightRecord) -> float:

@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
 from chaserdock.html_page import Markup, html_page, table
+
+_COLUMNS = 120
+"""Longest line of a paragraph in Markdown, characters, as in all pages of the repository."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +52,13 @@ def markdown(title: str, sections: Sequence[PageSection]) -> str:
             if isinstance(part, Table):
                 lines += _markdown_table(part)
             elif not isinstance(part, Markup):
-                lines += [part, ""]
+                lines += [*_wrapped(part), ""]
     return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _wrapped(text: str) -> list[str]:
+    """Return a paragraph in lines of the repository's length."""
+    return textwrap.wrap(text, _COLUMNS, break_long_words=False, break_on_hyphens=False)
 
 
 def _markdown_table(table: Table) -> list[str]:

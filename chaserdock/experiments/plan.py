@@ -14,6 +14,9 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from msgspec import Struct
 
+ONE_PROCESS = "chaserdock.experiments.controller_flight"
+"""Module of flights without recorder and network."""
+
 
 class ExperimentError(ChaserdockError):
     """An experiment cannot continue."""
@@ -33,10 +36,13 @@ class Alone(Struct, frozen=True):
 
 
 class PlannedFlight(Struct, frozen=True, kw_only=True):
-    """One flight: all processes of a mission, recorded and judged, or the controller ``alone``.
+    """One flight: all processes of a mission, recorded and judged, or one process of ``module``.
 
-    ``name``: digest of all that determines the flight. ``label``: its name within the experiment.
-    ``scenario``: path of its file. ``varied``: values in which flights of the plan differ.
+    ``name``: digest of the scenario and of how it is flown. ``label``: its name within the
+    experiment. ``scenario``: path of its file. ``varied``: values in which flights of the plan
+    differ. ``module``: Python module that reads this flight as JSON and writes ``summary.json``; ""
+    for a whole mission. ``alone``: settings of a flight of the controller alone. ``code``: digest
+    of the flying code; a result of other code is flown again. "" accepts any.
     """
 
     name: str
@@ -46,6 +52,8 @@ class PlannedFlight(Struct, frozen=True, kw_only=True):
     seed: int
     varied: dict[str, Any] = {}
     alone: Alone | None = None
+    module: str = ""
+    code: str = ""
 
 
 class ExperimentPlan(Struct, frozen=True):
@@ -63,13 +71,14 @@ def plan_flight(
     *,
     varied: dict[str, Any] | None = None,
     alone: Alone | None = None,
-    salt: str = "",
+    module: str = "",
+    code: str = "",
 ) -> PlannedFlight:
-    """Return a flight, named by a digest of the resolved scenario, ``alone`` and ``salt``. Raise
+    """Return a flight, named by a digest of the resolved scenario, ``alone`` and ``module``. Raise
     ScenarioError.
     """
     resolved = load_scenario(scenario, overrides, option="")
-    flown = salt + resolved.model_dump_json()
+    flown = module + resolved.model_dump_json()
     if alone is not None:
         _check_alone(resolved, alone)
         flown += json.dumps(msgspec.to_builtins(alone))
@@ -81,6 +90,8 @@ def plan_flight(
         seed=resolved.seed,
         varied=varied or {},
         alone=alone,
+        module=ONE_PROCESS if alone is not None and not module else module,
+        code=code,
     )
 
 

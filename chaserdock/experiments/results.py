@@ -195,7 +195,7 @@ def numbers_of(rows: list[ResultRow], column: str) -> list[float] | None:
 
 def repeat_command(flight: PlannedFlight) -> str:
     """Return the command that flies one flight of a campaign again."""
-    if flight.alone is not None:
+    if flight.module:
         return f"chaserdock campaign FILE --only {flight.label.removeprefix('run ')}"
     sets = " ".join(f"--set '{o}'" for o in flight.overrides)
     return f"chaserdock run {flight.scenario} {sets}"

@@ -2,7 +2,7 @@
 """Flies a plan: one process per flight, on this machine or on the workers of a Dask cluster.
 
 A flight that has ended leaves ``runs/NAME/result.json``, written atomically. Later calls skip it. A
-flight that crashed leaves none and is flown again.
+flight that crashed leaves none and is flown again, and so is, last, one of other code.
 """
 
 from __future__ import annotations
@@ -32,13 +32,15 @@ from msgspec import Struct
 from chaserdock.verdict import verdict_of
 
 from .plan import ExperimentError, ExperimentPlan, PlannedFlight
+from .provenance import Provenance, provenance
 
 Keep = Literal["failures", "all", "none"]
 
 
 class FlightOutcome(Struct, frozen=True):
-    """Outcome of a flight: exit status, summary (None after a crash), last line of output, and path
-    of a kept log.
+    """Outcome of a flight: exit status, summary (None after a crash), last line of output, path of
+    a kept log, where and when it was ``flown`` (None: by an earlier version), and by which
+    ``code``.
     """
 
     name: str
@@ -46,6 +48,8 @@ class FlightOutcome(Struct, frozen=True):
     summary: dict[str, Any] | None
     last_words: str
     log: str | None = None
+    flown: Provenance | None = None
+    code: str = ""
 
 
 ReportProgress = Callable[[int, int, PlannedFlight, FlightOutcome], None]
@@ -70,19 +74,22 @@ def fly_plan(
     report: ReportProgress,
     stop: threading.Event,
 ) -> dict[str, FlightOutcome]:
-    """Fly what has no result in ``folder`` yet, until ``stop``. Returns the outcomes by flight
-    name, in the plan's order.
+    """Fly what has no result in ``folder`` yet, then what has one of other code, until ``stop``.
+    Returns the outcomes by flight name, in the plan's order.
 
     Raise ExperimentError, and MissingPackageError for a cluster without Dask.
     """
     folder.mkdir(parents=True, exist_ok=True)
     outcomes = results_of(plan, folder)
     remaining = [f for f in plan.flights if f.name not in outcomes]
+    remaining += [f for f in plan.flights if f.name in outcomes and outcomes[f.name].code != f.code]
+    left = len(remaining)
     fly_all = _fly_here if workers.cluster is None else _fly_on_cluster
     for flight, outcome in fly_all(remaining, folder / "runs", workers, stop):
         write_result(folder, outcome)
         outcomes[flight.name] = outcome
-        report(len(outcomes), len(plan.flights), flight, outcome)
+        left -= 1
+        report(len(plan.flights) - left, len(plan.flights), flight, outcome)
     return {f.name: outcomes[f.name] for f in plan.flights if f.name in outcomes}
 
 
@@ -135,12 +142,12 @@ def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
         # flight finish.
         done = subprocess.run(
             [sys.executable, "-m", *_program(flight, out)],
-            input=msgspec.json.encode(flight).decode() if flight.alone is not None else None,
+            input=msgspec.json.encode(flight).decode() if flight.module else None,
             capture_output=True,
             text=True,
             errors="replace",
             start_new_session=True,
-            env=os.environ | SINGLE_THREADED if flight.alone is not None else None,
+            env=os.environ | SINGLE_THREADED if flight.module else None,
         )
         summary_file = out / "summary.json"
         summary = json.loads(summary_file.read_text()) if summary_file.is_file() else None
@@ -149,15 +156,16 @@ def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
         log = out / LOG_NAME
         kept = _move_log(log, logs / flight.name) if keep_log and log.is_file() else None
         last_words = output[-1].removeprefix("chaserdock: ") if output else ""
-        return FlightOutcome(flight.name, done.returncode, summary, last_words, kept)
+        flown = (provenance(), flight.code)
+        return FlightOutcome(flight.name, done.returncode, summary, last_words, kept, *flown)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _program(flight: PlannedFlight, out: Path) -> list[str]:
     """Return module and arguments that fly a flight and write ``out/summary.json``."""
-    if flight.alone is not None:
-        return ["chaserdock.experiments.controller_flight", str(out)]
+    if flight.module:
+        return [flight.module, str(out)]
     sets = [item for override in flight.overrides for item in ("--set", override)]
     return ["chaserdock", "run", flight.scenario, "--out", str(out), "--quiet", *sets]
 

@@ -16,6 +16,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow.parquet as pq
 import pytest
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
@@ -298,6 +299,36 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     assert list(outcomes) == [f.name for f in campaign.flights]
     assert outcomes[earlier.name].last_words == "earlier"
     assert progress == [2, 3, 4, 5, 6, 7, 8]
+
+
+def test_result_of_other_code_is_flown_again_after_what_has_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flights = tuple(
+        msgspec.structs.replace(f, code="new") for f in campaign_of(GRID, tmp_path).flights[:3]
+    )
+    write_result(tmp_path, FlightOutcome(flights[0].name, 0, summary([]), "", None, None, "old"))
+    write_result(tmp_path, FlightOutcome(flights[1].name, 0, summary([]), "", None, None, "new"))
+    flown: list[str] = []
+
+    def fly(flight: Any, *_: Any) -> FlightOutcome:
+        flown.append(flight.name)
+        return FlightOutcome(flight.name, 0, summary([]), "", None, None, flight.code)
+
+    monkeypatch.setattr("chaserdock.experiments.worker.fly", fly)
+    plan, progress, stop = ExperimentPlan("x", flights), [], threading.Event()
+
+    def report(ended: int, *_: Any) -> None:
+        progress.append(ended)
+        stop.set()
+
+    first = fly_plan(plan, tmp_path, Workers(), report, stop)
+    assert [first[f.name].code for f in flights] == ["old", "new", "new"]
+    stop.clear()
+    second = fly_plan(plan, tmp_path, Workers(), report, stop)
+    assert [second[f.name].code for f in flights] == ["new", "new", "new"]
+    assert flown == [flights[2].name, flights[0].name]
+    assert progress == [2, 3]
 
 
 def test_damaged_result_raises_an_error(tmp_path: Path) -> None:

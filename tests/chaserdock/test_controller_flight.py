@@ -5,6 +5,7 @@ transient.
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -13,10 +14,11 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.physics.simulation import prescribed_state
+from harness import SHORT
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chaserdock.experiments.controller_flight import fly_alone
+from chaserdock.experiments.controller_flight import fly_alone, fly_on_images
 from chaserdock.experiments.flight_record import record_flight
 from chaserdock.experiments.least_transient import gauss_times, least_square_integral
 from chaserdock.experiments.perfect_knowledge import PerfectEstimator
@@ -183,6 +185,17 @@ def test_no_flight_is_better_than_the_floor() -> None:
     position_mse_m2 = summary["chasers"]["0"]["position_mse_m2"]
     assert 1.0 < position_mse_m2 * 25.0 / summary["floor_m2_s"] < 1.2
     assert summary["solver"]["failures"] == 0
+
+
+@pytest.mark.slow
+def test_flight_on_images_has_the_errors_of_a_recorded_one(short_flight: Path) -> None:
+    recorded = json.loads((short_flight / "summary.json").read_text())["chasers"]
+    flown = fly_on_images(scenario("two-chaser-tracking", *SHORT))["chasers"]
+    assert recorded.keys() == flown.keys() == {"0", "1"}
+    for chaser, figures in flown.items():
+        known = {name: recorded[chaser][name] for name in figures}
+        for found, value in ((figures.pop("steady"), known.pop("steady")), (figures, known)):
+            assert found == pytest.approx(value, rel=1e-9)
 
 
 @pytest.mark.slow

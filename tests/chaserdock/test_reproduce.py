@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import math
 import re
+import subprocess
+from collections.abc import Mapping
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -20,9 +23,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chaserdock.experiments.page import PageSection, Table, html, markdown
-from chaserdock.experiments.plan import Alone, ExperimentPlan, PlannedFlight
+from chaserdock.experiments.plan import Alone, ExperimentError, ExperimentPlan, PlannedFlight
+from chaserdock.experiments.provenance import Provenance, provenance
+from chaserdock.experiments.reproduction import free_starts
 from chaserdock.experiments.reproduction import reproduce as reproduction
 from chaserdock.experiments.reproduction.content import pitch_rad, sections
+from chaserdock.experiments.reproduction.earlier import read_earlier
+from chaserdock.experiments.reproduction.flown import flights_section
+from chaserdock.experiments.reproduction.free_starts import (
+    SPEED_BOUND_M_S,
+    TOLERANCE,
+    drawn_start,
+    fitted,
+    fly_free_start,
+)
 from chaserdock.experiments.reproduction.paper import BASELINE, PAPER_S, ROWS
 from chaserdock.experiments.reproduction.plan import (
     CODE,
@@ -35,6 +49,7 @@ from chaserdock.experiments.reproduction.plan import (
     SCENARIO,
     TRACKING,
     WRITTEN,
+    code_digest,
     dispersed_start,
     draws_of,
     flight_of,
@@ -45,20 +60,22 @@ from chaserdock.experiments.reproduction.plan import (
     needs_open,
     table_name,
 )
-from chaserdock.experiments.reproduction.provenance import Provenance
 from chaserdock.experiments.reproduction.reproduce import fly_and_report
 from chaserdock.experiments.reproduction.tables import (
+    QUANTITIES,
+    Errors,
     Summaries,
     changes,
     comes_out,
     errors_of,
     over_two_minutes,
+    paper_value,
     results_by_label,
     spread,
     verdict,
 )
 from chaserdock.experiments.reproduction.trends import trend_rows
-from chaserdock.experiments.worker import results_of
+from chaserdock.experiments.worker import fly, results_of
 
 PATH = find_scenario(SCENARIO)
 plan = cache(make_plan)
@@ -69,7 +86,7 @@ def scenario_of(flight: PlannedFlight) -> Scenario:
 
 
 def table_flights(p: ExperimentPlan) -> list[PlannedFlight]:
-    return [f for f in p.flights if f.alone is None and f not in missions_of(p)]
+    return [f for f in p.flights if f.label.startswith("table/")]
 
 
 # -- the plan --------------------------------------------------------------------------------------
@@ -80,7 +97,8 @@ def test_every_flight_of_the_plan_is_valid_and_unique(quick: bool) -> None:
     flights = plan(quick).flights
     assert len({f.label for f in flights}) == len({f.name for f in flights}) == len(flights)
     single = [f for f in flights if f not in missions_of(plan(quick))]
-    assert {scenario_of(f).duration_s for f in single} == {QUICK_S if quick else PAPER_S}
+    whole = [f for f in single if not f.label.startswith("free/")]
+    assert {scenario_of(f).duration_s for f in whole} == {QUICK_S if quick else PAPER_S}
     assert len(flights) - len(single) == (0 if quick else 7)
 
 
@@ -240,7 +258,20 @@ def complete(p: ExperimentPlan) -> Summaries:
     """Results with the errors of the paper's baseline everywhere."""
     errors = BASELINE.position_mse_m2, BASELINE.orientation_mse_rad2
     missions = missions_of(p)
-    return {f.label: mission_result() if f in missions else result_of(*errors) for f in p.flights}
+    results = {
+        f.label: mission_result() if f in missions else result_of(*errors) for f in p.flights
+    }
+    return results | {name: free_result() for name in results if name.startswith("free/")}
+
+
+def free_result(factors: Mapping[str, float] | None = None) -> dict[str, Any]:
+    """A free start with the errors of the paper's baseline, times a factor in some rows."""
+    known = factors or {}
+    rows = {
+        row.name: {q: paper_value(BASELINE, q) * known.get(row.name, 1.0) for q in QUANTITIES}
+        for row in ROWS
+    }
+    return {"free": {"distance_m": 0.9, "angle_rad": 0.5, "met": True, "rows": rows}}
 
 
 def scale(results: Summaries, label: str, factor: float) -> None:
@@ -251,6 +282,11 @@ def scale(results: Summaries, label: str, factor: float) -> None:
 
 
 ABOUT = Provenance(date="2026-11-23", commit="0123456789ab-dirty", machine="a machine")
+
+
+def page_of(p: ExperimentPlan, results: Summaries, quick: bool = False, **options: Any) -> str:
+    flown = dict.fromkeys(results, ABOUT)
+    return markdown("t", sections(p, results, flown, quick, **options))
 
 
 @pytest.mark.parametrize(
@@ -372,7 +408,7 @@ def test_explanations_quote_measurements_or_say_unexplained() -> None:
     assert found["alpha=10 %"].startswith(
         "Position not separable from the start, which changes the baseline"
     )
-    assert explanations({})["T=0.5"] == "Unexplained."
+    assert explanations({})["T=0.5"] == explanations({})["alpha=10 %"] == "-"
 
 
 def test_trend_that_comes_out_needs_no_explanation() -> None:
@@ -439,15 +475,16 @@ def test_page_is_well_formed_and_escaped() -> None:
 
 def test_page_of_a_complete_plan_has_all_rows_and_its_provenance() -> None:
     p = plan(False)
-    parts = sections(p, complete(p), ABOUT, quick=False)
+    parts = sections(p, complete(p), dict.fromkeys(complete(p), ABOUT), quick=False)
     text = markdown("t", parts)
     assert "NOT COMPLETE" not in text
-    assert "2026-11-23, commit 0123456789ab-dirty, a machine" in text
+    assert "2026-11-23, commit 0123456789ab-dirty" in text
+    assert "Machine: a machine." in text
     assert 'navigation.grade = "exact"' in text
     assert "| baseline | 1.64 | 1 (1 to 1) met | 1 (1 to 1) met | 1 (1 to 1) met |" in text
     small = "0.0253 (0.0253 to 0.0253) smaller"
     assert f"| T=0.5 | 64.8 | - | {small} | 0.0253 smaller |" in text
-    assert f"| {CODE} | 7 of 9 | 7 of 9 | 0 of 27 |" in text
+    assert f"| {CODE} | 0 of 8 | 0 of 8 | 7 of 9 | 7 of 9 | 0 of 27 |" in text
     assert f"| {TRACKING} | ours | 1 | 0.057 | 0.980 | 1.400 | 0 docked at 97 s |" in text
     assert "at most 0.172 deg, 3.0 times the RMS, at 100 s" in text
     checker = _Checker()
@@ -458,11 +495,199 @@ def test_page_of_a_complete_plan_has_all_rows_and_its_provenance() -> None:
 
 def test_page_reports_missing_results() -> None:
     p = plan(True)
-    text = markdown("t", sections(p, {}, ABOUT, quick=True))
+    text = page_of(p, {}, quick=True)
     n = len(p.flights)
     assert f"NOT COMPLETE: {n} of {n} flights have no result" in text
     assert "chaserdock reproduce --quick" in text
     assert not re.search(r"\d met", text)
+    assert "Not judged: the trends of the table are not flown." in text
+
+
+def test_lines_of_the_page_are_short_but_for_tables() -> None:
+    lines = page_of(plan(False), complete(plan(False))).splitlines()
+    assert max(len(line) for line in lines if not line.startswith("| ")) <= 120
+
+
+def test_trends_lead_beside_what_a_constant_scores() -> None:
+    text = page_of(plan(False), complete(plan(False)))
+    lead = " ".join(text.split("## Trends")[0].split())
+    assert lead.index("are not reproduced. Of the trends") < lead.index("agreement of tracking")
+    assert "7 of 9 and 7 of 9, as those rows lie within 19 % of it" in lead
+    constant = "| a constant, the paper's baseline row | 0 of 8 | 0 of 8 | 7 of 9 | 7 of 9 | - |"
+    assert constant in lead
+    assert "| the paper | 8 of 8 | 8 of 8 | 9 of 9 | 9 of 9 | 3 of 27 |" in lead
+    assert text.index("## Trends") < text.index("## Free starts") < text.index("## Table: pos")
+
+
+def test_failed_flights_and_trends_of_a_chain_are_counted() -> None:
+    results = complete(plan(False))
+    for row in ROWS:
+        for draw in DRAWS:
+            errors = row.position_mse_m2, row.orientation_mse_rad2
+            results[table_name(CODE, row, draw)] = result_of(*errors)
+    results[table_name(CODE, BASELINE, 1)]["chasers"]["0"]["min_distance_target_m"] = 0.3
+    text = page_of(plan(False), results)
+    assert f"| {CODE} | 8 of 8 | 8 of 8 | 9 of 9 | 9 of 9 | 1 of 27 |" in text
+    assert f'The paper\'s trends are reproduced with "{CODE}".' in text
+
+
+# -- free starts -----------------------------------------------------------------------------------
+
+
+def test_free_start_is_fitted_to_the_baseline_row() -> None:
+    """Errors that grow with other powers, and each with the other parameter, too."""
+    tried: list[tuple[float, float]] = []
+
+    def errors_at(distance_m: float, angle_rad: float) -> Errors:
+        tried.append((distance_m, angle_rad))
+        position = 0.03 * distance_m**2.2 + 0.002 * angle_rad
+        return Errors(position, 0.008 * angle_rad**1.7 + 0.0004 * distance_m, 0.0, failed=False)
+
+    fit = fitted(errors_at)
+    assert fit.met
+    assert len(tried) <= 5
+    assert (fit.distance_m, fit.angle_rad) == tried[-1]
+    for q in QUANTITIES:
+        assert fit.errors.of(q) == pytest.approx(paper_value(BASELINE, q), rel=TOLERANCE)
+
+
+def test_start_that_cannot_meet_the_baseline_row_is_given_up() -> None:
+    fit = fitted(lambda *_: Errors(1.0, 1.0, 0.0, failed=False))
+    assert not fit.met
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_free_starts_are_valid_scenarios_and_repeatable(seed: int) -> None:
+    start = drawn_start(seed)
+    assert start.overrides(0.9, 0.5) == drawn_start(seed).overrides(0.9, 0.5)
+    assert start.overrides(0.9, 0.5) != drawn_start(seed + 1).overrides(0.9, 0.5)
+    s = load_scenario(PATH, start.overrides(0.9, 0.5))
+    offset, rotation = s.chasers[0].start_offset_m, s.chasers[0].start_rotation_rad
+    assert math.hypot(*offset) == pytest.approx(0.9)
+    assert offset[0] >= 0.0  # away from the target
+    assert math.hypot(*rotation) == pytest.approx(0.5)
+    assert np.abs(np.divide(s.target.omega_rad_s, (0.015, 0.045, 0.03)) - 1).max() <= 0.2
+    assert np.abs(s.chasers[0].start_velocity_m_s).max() <= SPEED_BOUND_M_S
+
+
+def test_free_start_flies_all_rows_from_the_fitted_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    flown: list[Scenario] = []
+
+    def fly(scenario: Scenario) -> dict[str, Any]:
+        flown.append(scenario)
+        factor = 1.1 if len(flown) == 1 else 1.0
+        own = result_of(*(factor * paper_value(BASELINE, q) for q in QUANTITIES))
+        return own | {"sim_time_s": PAPER_S}
+
+    monkeypatch.setattr(free_starts, "fly_alone", fly)
+    flight = next(f for f in plan(False).flights if f.label == "free/1")
+    found = fly_free_start(flight)["free"]
+    assert found["met"]
+    assert list(found["rows"]) == [row.name for row in ROWS]
+    assert flown[0].chasers[0].start_offset_m != flown[1].chasers[0].start_offset_m
+    rest = flown[1:]
+    assert {(s.chasers[0].start_offset_m, s.target.q_wxyz) for s in rest} == {
+        (rest[0].chasers[0].start_offset_m, rest[0].target.q_wxyz)
+    }
+    rows = [(s.controller.horizon_s, s.controller.dt_s, s.controller.falloff) for s in rest]
+    assert rows == [(row.horizon_s, row.dt_s, row.falloff) for row in ROWS]
+    assert {s.controller.solver for s in flown} == {"open"}
+
+
+def test_free_starts_are_judged_on_the_trends_with_their_spread() -> None:
+    results = complete(plan(False))
+    for k, factor in enumerate((1.05, 1.06, 1.5)):
+        results[f"free/{k}"] = free_result({"dt=1-5": factor})
+    results["free/3"]["free"]["met"] = False
+    text = page_of(plan(False), results)
+    assert "| dt=1/5 | +5.5 % | +0.0 % (+0.0 % to +50.0 %) | 2 of 9 | +23.6 % | " in text
+    conclusion = " ".join(text.split("## Table")[0].split())
+    assert (
+        "Of 10 starts, 9 meet the baseline row; the best of them brings out 1 of the 16 trends, "
+        "and those that come out from any start are dt=1/5 (position): a start "
+        "does not explain the paper's table." in conclusion
+    )
+
+
+def test_free_start_with_the_papers_table_explains_it() -> None:
+    results = complete(plan(False))
+    rows = {row.name: {q: paper_value(row, q) for q in QUANTITIES} for row in ROWS}
+    for name in [name for name in results if name.startswith("free/")]:
+        results[name]["free"]["rows"] = rows
+    text = page_of(plan(False), results)
+    assert "a start explains the paper's table." in " ".join(text.split())
+    assert "| free starts, controller alone | 8 of 8 | 8 of 8 | 9 of 9 | 9 of 9 | - |" in text
+
+
+# -- an earlier page -------------------------------------------------------------------------------
+
+EARLIER = f"""# A page
+## Result
+flown on 2026-11-20,
+commit fedcba987654, a machine.
+
+| chain | failed flights |
+| --- | ---: |
+| {CODE} | 11 of 27 |
+
+## Table: position
+
+| row | paper, 1e-2 m^2 | {WRITTEN} | {CODE} | {DEFAULT} |
+| --- | ---: | ---: | ---: | ---: |
+| baseline | 1.64 | - | 1.1 met | 1.2 met [2026-11-01 0123456789ab] |
+| T=10 | 126 | - | 4 (2 to 7) larger | 0.1 smaller |
+
+## Trends
+
+| trend | paper | {CODE} | {DEFAULT} | controller alone | explanation |
+| --- | --- | --- | --- | --- | --- |
+| T=10 | x 2; x 2 | +10.0 % yes; +9.0 % no | x 2 no; x 2 no | - | why \\| how |
+"""
+MARK = "[2026-11-20 fedcba987654]"
+
+
+def test_earlier_cells_stand_marked_where_a_row_is_not_flown() -> None:
+    p, page = plan(False), read_earlier(EARLIER)
+    results = complete(p)
+    for row in (ROWS[0], ROWS[2]):  # one start of three is missing
+        del results[table_name(CODE, row, 2)]
+    for draw in DRAWS:
+        del results[table_name(DEFAULT, BASELINE, draw)]
+    text = page_of(p, results, earlier=page)
+    assert f"| 1.1 met {MARK} | 1.2 met [2026-11-01 0123456789ab] |" in text
+    assert f"| 4 (2 to 7) larger {MARK} | 0.013 smaller |" in text
+    assert f"| +10.0 % yes; +9.0 % no {MARK} | x 2 no; x 2 no {MARK} | +0.0 %; +0.0 % |" in text
+    assert f"| {CODE} | 1 of 1 | 0 of 1 |" in text
+    assert "NOT COMPLETE: 5 of " in text
+    assert read_earlier(text).cells["Table: position", "T=10", CODE].endswith(MARK)
+
+
+def test_complete_rows_replace_earlier_cells() -> None:
+    text = page_of(plan(False), complete(plan(False)), earlier=read_earlier(EARLIER))
+    assert "[20" not in text
+
+
+@pytest.mark.parametrize("text", ["", "# A page\n## Result\n| a | b |\n| --- | --- |\n| 1 | 2 |\n"])
+def test_earlier_page_must_be_one_of_the_command(tmp_path: Path, text: str) -> None:
+    (tmp_path / "page.md").write_text(text)
+    with pytest.raises(ExperimentError, match=r"--earlier .*page\.md: not a page of"):
+        reproduction.reproduce(True, tmp_path / "out", 1, tmp_path / "page.md")
+
+
+def test_flights_section_counts_flights_by_row_date_and_commit() -> None:
+    p = plan(False)
+    flown = dict.fromkeys((f.label for f in p.flights), ABOUT)
+    flown[table_name(CODE, BASELINE, 2)] = Provenance(date="2026-11-24", commit="c", machine="b")
+    (text, table) = flights_section(p, flown).parts
+    assert isinstance(table, Table)
+    cells = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
+    one = "2 on 2026-11-23 at 0123456789ab-dirty; 1 on 2026-11-24 at c (of 3)"
+    assert cells["baseline"][CODE] == one
+    assert cells["missions"][WRITTEN] == "1 on 2026-11-23 at 0123456789ab-dirty (of 1)"
+    assert cells["free starts"]["controller alone"].endswith("(of 10)")
+    assert "Machine: a machine; b." in str(text)
+    planned = sum(int(n) for row in table.rows for n in re.findall(r"of (\d+)\)", " ".join(row)))
+    assert planned == len(p.flights)
 
 
 # -- flying ----------------------------------------------------------------------------------------
@@ -490,6 +715,26 @@ def test_result_with_other_settings_counts_as_not_flown() -> None:
         flight_of("a", SCENARIO, ()),
     ]
     assert len({f.name for f in flights}) == 4
+
+
+@pytest.mark.parametrize("alone", [None, Alone()])
+def test_table_flight_is_one_process_and_its_result_states_date_commit_and_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alone: Alone | None
+) -> None:
+    table = next(f for f in plan(False).flights if f.label == table_name(CODE, BASELINE, 0))
+    flight = table if alone is None else flight_of("a", SCENARIO, (), alone)
+    started: list[tuple[list[str], str]] = []
+
+    def start(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        started.append((command, options["input"]))
+        return subprocess.CompletedProcess(command, 2, "", "no summary")
+
+    monkeypatch.setattr("chaserdock.experiments.worker.subprocess", SimpleNamespace(run=start))
+    outcome = fly(flight, "none", tmp_path)
+    ((command, given_input),) = started
+    assert command[1:3] == ["-m", "chaserdock.experiments.controller_flight"]
+    assert msgspec.json.decode(given_input, type=PlannedFlight) == flight
+    assert (outcome.flown, outcome.code) == (provenance(), code_digest())
 
 
 def test_flight_that_crashes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

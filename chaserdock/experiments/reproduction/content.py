@@ -16,6 +16,9 @@ from chaserdock_protocol.scenario.bodies import Target
 from chaserdock.experiments.page import PageSection, Table
 from chaserdock.experiments.plan import ExperimentPlan
 
+from .earlier import NO_PAGE, EarlierPage
+from .flown import Flown, flights_section
+from .headline import Tables, free_section, result_section
 from .paper import BASELINE, PAPER_S, ROWS
 from .plan import (
     ATTITUDE_BOUND_RAD,
@@ -34,11 +37,10 @@ from .plan import (
     mission_name,
     missions_of,
 )
-from .provenance import Provenance
 from .tables import (
-    BAND,
     LOST_M,
     MIN_DISTANCE_M,
+    NONE,
     QUANTITIES,
     Quantity,
     Summaries,
@@ -47,10 +49,10 @@ from .tables import (
     paper_value,
     spread,
     verdict,
+    without_partial_rows,
 )
 from .trends import trend_rows
 
-NONE = "-"
 UNITS: dict[Quantity, tuple[float, str]] = {
     "position": (1e2, "1e-2 m^2"),
     "orientation": (1e3, "1e-3 rad^2"),
@@ -59,66 +61,30 @@ UNITS: dict[Quantity, tuple[float, str]] = {
 
 
 def sections(
-    plan: ExperimentPlan, results: Summaries, about: Provenance, quick: bool
+    plan: ExperimentPlan,
+    results: Summaries,
+    flown: Flown,
+    quick: bool,
+    earlier: EarlierPage = NO_PAGE,
 ) -> list[PageSection]:
-    """Return the whole page; ``quick``: of the quick plan."""
+    """Return the whole page; ``quick``: of the quick plan. Where a row is not flown completely, the
+    cells of the ``earlier`` page stand.
+    """
+    missing = sum(flight.label not in results for flight in plan.flights)
+    if earlier is not NO_PAGE:
+        results = without_partial_rows(results, tuple(COLUMNS), quick)
+    tables: Tables = {quantity: _table(results, quantity, earlier) for quantity in QUANTITIES}
+    trends = _trends(results, earlier)
     return [
-        _result(plan, results, about, quick),
-        *(_table(results, quantity) for quantity in QUANTITIES),
-        _trends(results),
-        *([] if quick else [_missions(plan, results)]),
-        _start(results),
+        result_section(results, tables, trends, (missing, len(plan.flights)), quick, earlier),
+        PageSection("Trends", (_TRENDS_TEXT, trends)),
+        free_section(results),
+        *(PageSection(f"Table: {q}", (_table_text(), tables[q])) for q in QUANTITIES),
+        *([] if quick else [_missions(plan, results, earlier)]),
+        _start(results, earlier),
+        flights_section(plan, flown),
         _method(quick),
     ]
-
-
-def _result(
-    plan: ExperimentPlan, results: Summaries, about: Provenance, quick: bool
-) -> PageSection:
-    """Return provenance, and how many figures of each column were met."""
-    rows = []
-    for column in COLUMNS:
-        cells = [_met(results, column, quantity) for quantity in QUANTITIES]
-        runs = [e for row in ROWS for e in cell(results, column, row).values()]
-        failed = f"{sum(e.failed for e in runs)} of {len(runs)}" if runs else NONE
-        rows.append((column, *cells, failed))
-    rows.append(("the paper", NONE, NONE, f"{sum(row.failed for row in ROWS)} of {3 * len(ROWS)}"))
-    missing = [f.label for f in plan.flights if f.label not in results]
-    command = "chaserdock reproduce --quick" if quick else "chaserdock reproduce"
-    parts: list[str | Table] = [
-        "The paper is Fourlas, Viswanathan, Satpute and Nikolakopoulos, Vision Based Docking of "
-        "Multiple Satellites with an "
-        f"Uncooperative Target (IFAC 2023). This page is the output of `{command}`; flown on "
-        f"{about}.",
-        f'Three chains fly the nine rows of its table, with images. "{WRITTEN}": the paper\'s '
-        "perception (EPnP), its moving average of all estimates and its solver OpEn, in its "
-        f"settings. \"{CODE}\": the same with OpenCV's iterative PnP, which the authors' public "
-        f'code calls in place of EPnP. "{DEFAULT}": the default settings of chaserdock.',
-        Table(
-            ("chain", "position rows met", "orientation rows met", "failed flights"), tuple(rows)
-        ),
-        f"A row is met if the median ratio of our error to the paper's is between {BAND[0]:.2f} "
-        f"and {BAND[1]:.2f}: a smaller "
-        "error is as much a difference as a larger one. OpenCV's EPnP has gross errors for "
-        "coplanar points, as on the single face of the target that a chaser sees most of the "
-        "time (tests/agents/test_perception.py).",
-    ]
-    if missing:
-        parts.insert(
-            0,
-            f"NOT COMPLETE: {len(missing)} of {len(plan.flights)} flights have no result (a dash); "
-            "the same command resumes them.",
-        )
-    return PageSection("Result", tuple(parts))
-
-
-def _met(results: Summaries, column: str, quantity: Quantity) -> str:
-    verdicts = [
-        verdict(spread(ratios).median)
-        for row in ROWS
-        if (ratios := _ratios(results, column, row, quantity))
-    ]
-    return f"{verdicts.count('met')} of {len(verdicts)}" if verdicts else NONE
 
 
 def _ratios(results: Summaries, column: str, row, quantity: Quantity) -> list[float]:
@@ -126,7 +92,7 @@ def _ratios(results: Summaries, column: str, row, quantity: Quantity) -> list[fl
     return [e.of(quantity) / paper for e in cell(results, column, row).values()]
 
 
-def _table(results: Summaries, quantity: Quantity) -> PageSection:
+def _table(results: Summaries, quantity: Quantity, earlier: EarlierPage) -> Table:
     """Return the nine rows of one error: ratios to the paper's values, with spread and verdict."""
     factor, unit = UNITS[quantity]
     rows = []
@@ -138,13 +104,15 @@ def _table(results: Summaries, quantity: Quantity) -> PageSection:
                 f"{_spread_text(ratios)} {verdict(spread(ratios).median)}" if ratios else NONE
             )
         rows.append((row.label, f"{paper_value(row, quantity) * factor:.3g}", *cells))
-    text = (
-        "Mean square error over two minutes. Ratio to the paper's: median (least to greatest) "
-        f"over the {len(DRAWS)} starts, "
-        "and the verdict on the median."
-    )
     header = ("row", f"paper, {unit}", *COLUMNS)
-    return PageSection(f"Table: {quantity}", (text, Table(header, tuple(rows))))
+    return earlier.fill(f"Table: {quantity}", Table(header, tuple(rows)))
+
+
+def _table_text() -> str:
+    return (
+        "Mean square error over two minutes. Ratio to the paper's: median (least to greatest) "
+        f"over the {len(DRAWS)} starts, and the verdict on the median."
+    )
 
 
 def _spread_text(values: Sequence[float]) -> str:
@@ -156,22 +124,22 @@ def _spread_text(values: Sequence[float]) -> str:
     )
 
 
-def _trends(results: Summaries) -> PageSection:
+_TRENDS_TEXT = (
+    "Change of the MSE from the baseline row of the same start, position; orientation "
+    "(median). yes: it has the paper's direction from every start and half to twice its "
+    "size. Controller alone: OpEn on perfect knowledge of the target, from the nominal "
+    "start. Spike: attitude error of the target estimate after 20 s."
+)
+
+
+def _trends(results: Summaries, earlier: EarlierPage) -> Table:
     """Return the changes from the baseline row and the spike, with explanations."""
     spike = [_spike_text(results.get(mission_name(TRACKING, column))) for column in (CODE, DEFAULT)]
     written = _spike_text(results.get(mission_name(TRACKING, WRITTEN)))
-    rows = [
-        *trend_rows(results),
-        ("two chasers: error at 100 s", "a spike", *spike, NONE, _spike_explanation(written)),
-    ]
-    text = (
-        "Change of the MSE from the baseline row of the same start, position; orientation "
-        "(median). yes: it has the paper's direction from every start and half to twice its "
-        "size. Controller alone: OpEn on perfect knowledge of the target, from the nominal "
-        "start. Spike: attitude error of the target estimate after 20 s."
-    )
+    why = NONE if written == NONE else _spike_explanation(written)
+    rows = [*trend_rows(results), ("two chasers: error at 100 s", "a spike", *spike, NONE, why)]
     header = ("trend", "paper", CODE, DEFAULT, "controller alone", "explanation")
-    return PageSection("Trends", (text, Table(header, tuple(rows), text=True)))
+    return earlier.fill("Trends", Table(header, tuple(rows), text=True))
 
 
 def _spike_text(summary: dict[str, Any] | None) -> str:
@@ -209,7 +177,7 @@ def _spike_explanation(written: str) -> str:
     )
 
 
-def _missions(plan: ExperimentPlan, results: Summaries) -> PageSection:
+def _missions(plan: ExperimentPlan, results: Summaries, earlier: EarlierPage) -> PageSection:
     """Return the section on the paper's missions of several chasers."""
     rows = []
     for flight in missions_of(plan):
@@ -234,7 +202,8 @@ def _missions(plan: ExperimentPlan, results: Summaries) -> PageSection:
         "scenarios: navigation grade lab, "
         "15 Hz, latency; the paper's chains fly its settings, with exact navigation."
     )
-    return PageSection("Missions", (text, Table(header, tuple(rows))))
+    table = earlier.fill("Missions", Table(header, tuple(rows)), keys=2)
+    return PageSection("Missions", (text, table))
 
 
 def _mission_cells(summary: dict[str, Any]) -> tuple[str, ...]:
@@ -266,16 +235,15 @@ def _worst(mean_squares: Sequence[float | None]) -> float | None:
     return max(known) if len(known) == len(mean_squares) else None
 
 
-def _start(results: Summaries) -> PageSection:
+def _start(results: Summaries, earlier: EarlierPage) -> PageSection:
     """Return how much the start contributes: other starts, and the lower bound."""
     nominal = errors_by_label(results, f"alone/{BASELINE.name}")
     rows = []
     for name in ("nominal", *STARTS):
         errors = nominal if name == "nominal" else errors_by_label(results, f"start/{name}")
-        if errors is not None:
-            rows.append(
-                (name, *(f"{errors.of(q) / paper_value(BASELINE, q):.2f}" for q in QUANTITIES))
-            )
+        ratios = [errors.of(q) / paper_value(BASELINE, q) for q in QUANTITIES] if errors else []
+        rows.append((name, *(f"{x:.2f}" for x in ratios)) if ratios else (name, NONE, NONE))
+    header = ("baseline row, controller alone", "position / paper", "orientation / paper")
     names = [f"alone/{BASELINE.name}", *map(floor_name, DRAWS)]
     floors = [(name, results[name]["floor_m2_s"] / PAPER_S) for name in names if name in results]
     parts: list[str | Table] = [
@@ -287,10 +255,7 @@ def _start(results: Summaries) -> PageSection:
         f"component of the offset within {OFFSET_BOUND_M:g} m, of the rotation vector within "
         f"{ROTATION_BOUND_RAD:g} rad, of the target's initial rotation within "
         f"{ATTITUDE_BOUND_RAD:g} rad, of its velocities within {100 * RATE_BOUND:.0f} %.",
-        Table(
-            ("baseline row, controller alone", "position / paper", "orientation / paper"),
-            tuple(rows),
-        ),
+        earlier.fill("Start", Table(header, tuple(rows))),
     ]
     if floors:
         least = min(value for _, value in floors)
@@ -337,7 +302,7 @@ def _method(quick: bool) -> PageSection:
             f'"{WRITTEN}" is flown in the baseline row only, because it does not depend on the '
             f'controller whether EPnP works; "{DEFAULT}" from one start in the other rows.',
             "All flights run in simulated time, so that a plan is never late unless a delay is "
-            "stated: the table's and the missions' as `chaserdock run` flies them, the controller "
-            "alone in one process, which flies the same (`tests/missions/test_in_process.py`).",
+            "stated: the missions as `chaserdock run` flies them, all others in one process "
+            "without a recorder, which flies the same (`tests/missions/test_in_process.py`).",
         ),
     )

@@ -16,6 +16,7 @@ from chaserdock_protocol.scenario.bodies import Target
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.experiments.plan import (
+    ONE_PROCESS,
     Alone,
     ExperimentError,
     ExperimentPlan,
@@ -147,8 +148,8 @@ _PACKAGES = (
 
 @cache
 def code_digest() -> str:
-    """Return a digest of the flying code and its scenarios, so that results of another version are
-    not reused. Raise ExperimentError unless all packages are installed.
+    """Return a digest of the flying code and its scenarios, so that flights of another version are
+    flown again. Raise ExperimentError unless all packages are installed.
     """
     digest = hashlib.sha256()
     own = Path(__file__).resolve().parent
@@ -168,12 +169,36 @@ def code_digest() -> str:
 
 
 def flight_of(
-    label: str, scenario: str, overrides: tuple[str, ...], alone: Alone | None = None, **varied: str
+    label: str,
+    scenario: str,
+    overrides: tuple[str, ...],
+    alone: Alone | None = None,
+    module: str = "",
+    **varied: str,
 ) -> PlannedFlight:
     """Return a flight of a shipped scenario, with this version of the code."""
-    path = find_scenario(scenario)
-    salt = code_digest()
-    return plan_flight(label, path, overrides, varied=varied, alone=alone, salt=salt)
+    path, code = find_scenario(scenario), code_digest()
+    return plan_flight(label, path, overrides, varied=varied, alone=alone, module=module, code=code)
+
+
+FREE_STARTS = range(10)
+"""Seeds of the free starts (free_starts.py). More: their spread is better known; each takes half a
+minute of a core.
+"""
+_FREE_STARTS_MODULE = "chaserdock.experiments.reproduction.free_starts"
+
+
+def free_name(seed: int) -> str:
+    """Return the name of the flights of a free start."""
+    return f"free/{seed}"
+
+
+def _free_starts(quick: bool) -> list[PlannedFlight]:
+    """Return the free starts, each of which is fitted and flown in all rows; one if quick."""
+    return [
+        flight_of(free_name(k), SCENARIO, (OPEN, f"seed={k}"), module=_FREE_STARTS_MODULE)
+        for k in (FREE_STARTS[:1] if quick else FREE_STARTS)
+    ]
 
 
 def _table(quick: bool, length: str) -> list[PlannedFlight]:
@@ -184,7 +209,8 @@ def _table(quick: bool, length: str) -> list[PlannedFlight]:
             for row in ROWS:
                 if draw in draws_of(quick, column, row):
                     sets = (*row.overrides, *settings, *dispersed_start(draw), length)
-                    out.append(flight_of(table_name(column, row, draw), SCENARIO, sets))
+                    name = table_name(column, row, draw)
+                    out.append(flight_of(name, SCENARIO, sets, module=ONE_PROCESS))
     return out
 
 
@@ -257,5 +283,6 @@ def make_plan(quick: bool) -> ExperimentPlan:
     length = f"duration_s={QUICK_S if quick else PAPER_S}"
     missions = [] if quick else _missions()
     return ExperimentPlan(
-        "reproduction", (*_explanations(length), *_table(quick, length), *missions)
+        "reproduction",
+        (*_explanations(length), *_free_starts(quick), *_table(quick, length), *missions),
     )

@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import msgspec
 from chaserdock_controller.nmpc.open_backend import missing_part
 from chaserdock_protocol.errors import errors_of_writing
 from chaserdock_protocol.output_files import write_atomically
@@ -18,34 +17,51 @@ from chaserdock.experiments.worker import ExperimentProgress, Workers, fly_plan
 from chaserdock.launch.signals import stop_on_signals
 
 from .content import sections
-from .plan import code_digest, make_plan, needs_open
-from .provenance import Provenance, provenance
+from .earlier import NO_PAGE, EarlierPage, read_earlier
+from .flown import flown_by_label
+from .plan import make_plan, needs_open
 from .tables import results_by_label
 
-TITLE = "Reproduction of the paper's results"
+TITLE = "Comparison with the paper's results"
 
 
-def reproduce(quick: bool, out: Path, jobs: int) -> int:
+def reproduce(quick: bool, out: Path, jobs: int, earlier: Path | None = None) -> int:
     """Fly what has no result yet; write ``reproduction.md`` and ``.html`` into ``out``; return the
     exit status.
 
-    Without the paper's solver its chain is left out, and the status is FAILED. Raise
-    ExperimentError or ScenarioError when a flight is not possible.
+    Cells of the ``earlier`` page stand where a row is not flown. Without the paper's solver its
+    chain is left out, and the status is FAILED. Raise ExperimentError or ScenarioError when a
+    flight is not possible.
     """
-    return fly_and_report(make_plan(quick), out.absolute(), quick, jobs)
+    page = NO_PAGE if earlier is None else _read_page(earlier)
+    return fly_and_report(make_plan(quick), out.absolute(), quick, jobs, page)
 
 
-def fly_and_report(plan: ExperimentPlan, out: Path, quick: bool = False, jobs: int = 1) -> int:
+def _read_page(path: Path) -> EarlierPage:
+    """Read an earlier page. Raise ExperimentError."""
+    try:
+        return read_earlier(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ExperimentError) as error:
+        raise ExperimentError(f"--earlier {path}: {error}") from None
+
+
+def fly_and_report(
+    plan: ExperimentPlan,
+    out: Path,
+    quick: bool = False,
+    jobs: int = 1,
+    earlier: EarlierPage = NO_PAGE,
+) -> int:
     """Fly any plan of the reproduction; return the exit status."""
     missing = missing_part()
     flights = tuple(f for f in plan.flights if missing is None or not needs_open(f))
     with errors_of_writing(out, ExperimentError):
         out.mkdir(parents=True, exist_ok=True)
-        about = begun(out)
         with stop_on_signals("stopping after the active flights") as stop:
             flyable = ExperimentPlan(plan.name, flights)
             outcomes = fly_plan(flyable, out, Workers(jobs), ExperimentProgress(), stop)
-        parts = sections(plan, results_by_label(plan, outcomes), about, quick)
+        results, flown = results_by_label(plan, outcomes), flown_by_label(plan, outcomes)
+        parts = sections(plan, results, flown, quick, earlier)
         for name, text in (
             ("reproduction.md", markdown(TITLE, parts)),
             ("reproduction.html", html(TITLE, parts)),
@@ -62,16 +78,6 @@ def fly_and_report(plan: ExperimentPlan, out: Path, quick: bool = False, jobs: i
         _report(f"chaserdock: the paper's chain was not flown: {missing}")
     complete = all(f.name in outcomes and outcomes[f.name].summary for f in plan.flights)
     return DONE if complete else FAILED
-
-
-def begun(out: Path) -> Provenance:
-    """Return when and where the first flight of this code into ``out`` began; later calls resume
-    it.
-    """
-    path = out / f"provenance-{code_digest()}.json"
-    if not path.exists():
-        write_atomically(path, msgspec.json.encode(provenance()))
-    return msgspec.json.decode(path.read_bytes(), type=Provenance)
 
 
 def _report(text: str) -> None:

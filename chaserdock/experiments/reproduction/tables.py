@@ -15,12 +15,14 @@ import numpy as np
 from chaserdock.experiments.plan import ExperimentPlan
 from chaserdock.experiments.worker import FlightOutcome
 
-from .paper import BASELINE, PAPER_S, PaperRow
-from .plan import DRAWS, NOMINAL_OFFSET_M, table_name
+from .paper import BASELINE, PAPER_S, ROWS, PaperRow
+from .plan import DRAWS, FREE_STARTS, NOMINAL_OFFSET_M, draws_of, free_name, table_name
 
 Summaries = dict[str, dict[str, Any]]
 """Summaries of flights by their label."""
 
+NONE = "-"
+"""Cell without a result."""
 BAND = (1.0 / 1.35, 1.35)
 """Ratios of a measured to the paper's value that count as met."""
 TREND_BAND = (0.5, 2.0)
@@ -128,6 +130,32 @@ def cell(results: Summaries, column: str, row: PaperRow) -> dict[int, Errors]:
     """Return the errors of a table cell by draw, as far as flown."""
     found = {draw: errors_by_label(results, table_name(column, row, draw)) for draw in DRAWS}
     return {draw: errors for draw, errors in found.items() if errors is not None}
+
+
+def without_partial_rows(results: Summaries, column_names: Sequence[str], quick: bool) -> Summaries:
+    """Return the results without those of table rows of which not all starts are flown."""
+    partial = {
+        table_name(column, row, draw)
+        for column in column_names
+        for row in ROWS
+        if set(cell(results, column, row)) != set(draws_of(quick, column, row))
+        for draw in DRAWS
+    }
+    return {label: summary for label, summary in results.items() if label not in partial}
+
+
+def free_errors(results: Summaries) -> list[Mapping[str, Mapping[str, float]]]:
+    """Return the errors by row and quantity of the free starts that meet the baseline row."""
+    found = (results[name]["free"] for k in FREE_STARTS if (name := free_name(k)) in results)
+    return [free["rows"] for free in found if free["met"]]
+
+
+def free_changes(results: Summaries, row: PaperRow, quantity: Quantity) -> list[float]:
+    """Return the changes of a row from the baseline row, as shares, from every free start."""
+    return [
+        rows[row.name][quantity] / rows[BASELINE.name][quantity] - 1.0
+        for rows in free_errors(results)
+    ]
 
 
 def paper_value(row: PaperRow, quantity: Quantity) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from .paper import BASELINE, ROWS, PaperRow
 from .plan import CODE, DEFAULT, DELAYS_S, STAGE_WEIGHTS
 from .tables import (
+    NONE,
     QUANTITIES,
     Quantity,
     Summaries,
@@ -19,8 +20,6 @@ from .tables import (
     paper_change,
     spread,
 )
-
-NONE = "-"
 
 
 def trend_rows(results: Summaries) -> list[tuple[str, ...]]:
@@ -36,7 +35,7 @@ def trend_rows(results: Summaries) -> list[tuple[str, ...]]:
             NONE if None in alone else "; ".join(change_text(x) for x in alone if x is not None)
         )
         why = explanation(results, row)
-        same = next((label for label, *_, earlier in out if earlier == why), None)
+        same = next((label for label, *_, known in out if known == why != NONE), None)
         out.append(
             (row.label, paper, *chains, alone_text, why if same is None else f"As for {same}.")
         )
@@ -69,7 +68,7 @@ def _alone_change(results: Summaries, name: str, quantity: Quantity) -> float | 
 
 def explanation(results: Summaries, row: PaperRow) -> str:
     """Return what was measured about a trend that does not appear in both errors of the paper's
-    chain.
+    chain; NONE if a measurement is missing.
     """
     values = [changes(results, CODE, row, q) for q in QUANTITIES]
     if all(
@@ -83,7 +82,7 @@ def explanation(results: Summaries, row: PaperRow) -> str:
         texts.append(_by_stage_weights(results, row))
     if row.falloff:
         texts.append(_by_spread(results, row))
-    return " ".join(filter(None, texts)) or "Unexplained."
+    return " ".join(texts) if all(texts) else NONE
 
 
 def _by_delay(results: Summaries, row: PaperRow) -> str:

@@ -152,6 +152,7 @@ def main() -> int:
         return 0
     figures: Figures = {}
     flown: set[tuple[str, int]] = set()
+    broken: list[str] = []
     print("| bug | scenario | seed | invariant |\n| --- | --- | --- | --- |", flush=True)
     for bug in bugs:
         try:
@@ -159,7 +160,9 @@ def main() -> int:
             found = hunt(bug, *((bug.known_seed,) * 2 if options.known else seeds))
         except RuntimeError as error:  # the other bugs are hunted nevertheless
             print(error, file=sys.stderr, flush=True)
-            found = None
+            print(f"| {bug.name}: {bug.text} | {bug.scenario} | not flown | |", flush=True)
+            broken.append(bug.name)
+            continue
         figures[bug.name] = 0 if found is None else found.seed
         seed, invariant = ("not found", "") if found is None else (found.seed, found.invariant)
         print(f"| {bug.name}: {bug.text} | {bug.scenario} | {seed} | {invariant} |", flush=True)
@@ -169,8 +172,9 @@ def main() -> int:
             print(f"{bug.name}: {found.text}", file=sys.stderr, flush=True)
     missed = [name for name, seed in figures.items() if not seed]
     print(
-        f"{len(bugs) - len(missed)} of {len(bugs)} found"
+        f"{len(figures) - len(missed)} of {len(figures)} found"
         + (f"; not: {', '.join(missed)}" if missed else "")
+        + (f"; not flown, see above: {', '.join(broken)}" if broken else "")
     )
     wrong = [
         (*case, found)
@@ -184,7 +188,7 @@ def main() -> int:
         )
     if flown and not wrong:
         print(f"all {len(flown)} seeds that found a bug pass without it")
-    return 1 if missed or wrong else 0
+    return 1 if missed or broken or wrong else 0
 
 
 if __name__ == "__main__":

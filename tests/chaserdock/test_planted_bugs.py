@@ -6,6 +6,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import planted_bugs as benchmark
 import pytest
 from harness import ROOT
 
@@ -20,6 +21,25 @@ def test_every_patch_applies() -> None:
     status, text = planted_bugs("--check")
     assert status == 0, text
     assert int(text.split()[0]) >= 20
+
+
+def test_a_bug_that_cannot_be_flown_does_not_count_as_missed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As one in C where the compiler is missing."""
+
+    def hunt(bug: benchmark.PlantedBug, *_: int) -> benchmark.FailedSeed | None:
+        if bug.name.startswith("01"):
+            raise RuntimeError("does not compile")
+        return benchmark.FailedSeed(11, "liveness", "stands") if bug.name[:2] == "02" else None
+
+    monkeypatch.setattr(benchmark, "hunt", hunt)
+    monkeypatch.setattr(benchmark, "simulate", lambda *_: None)
+    monkeypatch.setattr(sys, "argv", ["planted_bugs.py", "--only", "01", "02", "03"])
+    assert benchmark.main() == 1
+    said = capsys.readouterr()
+    assert "1 of 2 found; not: 03-missing-gate; not flown, see above: 01-nmpc" in said.out
+    assert "does not compile" in said.err
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ properties. Fast.
 The chasers move with the target as if they were fixed to it, and the filter gets the impulses that
 this takes, so that no controller is involved. Sightings are those of rendered images, or with
 statistical perception drawn ones, to which ``ViewErrors`` adds what images have and drawn ones
-lack: errors that persist with the view, as the filter expects them.
+lack: errors that persist with the view, as the filter expects them of images.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Sighting
-from chaserdock_protocol.scenario import Scenario, flight_scenario
+from chaserdock_protocol.scenario import FlightScenario, Scenario, flight_scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import target_plant
 from chaserdock_world.sensors.errors import OdometrySensor
@@ -120,9 +120,9 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     )
     camera = RenderedImages(scenario)
     sensor = OdometrySensor(scenario)
-    estimator = JointEstimator(parameters_of(flight), len(flight.chasers))
-    chasers, before, nees = range(len(scenario.chasers)), None, []
     drawn = scenario.perception.name == "statistical"
+    estimator = JointEstimator(_parameters(flight, images=drawn), len(flight.chasers))
+    chasers, before, nees = range(len(scenario.chasers)), None, []
     views = [ViewErrors(estimator.parameters, scenario.seed, i) for i in chasers]
     for tick in range(ticks):
         now_ns, q, omega = timing.tick_time_ns(tick), qs[tick], omegas[tick]
@@ -175,6 +175,14 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
         centre_nees=float(away @ np.linalg.solve(found.covariance[1:4, 1:4], away)),
         nees=float(np.mean(nees)) if nees else math.nan,
     )
+
+
+def _parameters(flight: FlightScenario, images: bool) -> JointParameters:
+    """Return the filter's parameters for a flight, or for the same one with images of markers."""
+    if not images:
+        return parameters_of(flight)
+    perception = flight.perception.model_copy(update={"name": "default"})
+    return parameters_of(flight.model_copy(update={"perception": perception}))
 
 
 def _impulse(scenario: Scenario, before: BodyState, after: BodyState) -> Array:

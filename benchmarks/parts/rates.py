@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from argparse import ArgumentParser
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import fmean, stdev
 
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
@@ -62,7 +65,7 @@ def fly_at(name: str, overrides: tuple[str, ...], seed: int) -> RatedFlight:
 def fly_rates(options: Options) -> Figures:
     """Fly four scenarios with thrusters at six rates with three carriers each, and state how many
     flights succeed and the mean NEES of the relative poses. Combinations that validation refuses
-    are named.
+    are named. An option chooses scenarios, rates, carriers, seeds, and the file of results.
     """
     figures: Figures = {}
     names, rates, carriers = options.scenarios, options.rates_hz, options.carriers
@@ -97,16 +100,30 @@ def fly_combination(name: str, rate_hz: int, carrier_hz: int, options: Options) 
         RatedFlight.line,
         jobs=options.jobs,
     )
-    values = [value for flight in flights for value in flight.nees]
     successes = sum(not flight.missed for flight in flights)
-    mean = sum(values) / len(values) if values else float("nan")
-    print(f"{label}: {successes} of {len(flights)}, NEES {mean:.2f} of 6", flush=True)
+    mean, sigma = mean_nees(flights)
+    print(
+        f"{label}: {successes} of {len(flights)}, NEES {mean:.2f} +- {sigma:.2f} of 6", flush=True
+    )
     key = f"{name}_{rate_hz}_{carrier_hz}".replace("-", "_")
     return {
         f"{key}_flights": len(flights),
         f"{key}_successes": successes,
         f"{key}_relative_nees": mean,
+        f"{key}_relative_nees_sigma": sigma,
     }
+
+
+def mean_nees(flights: Sequence[RatedFlight]) -> tuple[float, float]:
+    """Return the mean NEES of all relative poses, and its standard error.
+
+    A flight is one sample: the errors of its cameras are constant, and its chasers have the target
+    in common. NaN without samples.
+    """
+    means = [fmean(flight.nees) for flight in flights if flight.nees]
+    if not means:
+        return math.nan, math.nan
+    return fmean(means), stdev(means) / math.sqrt(len(means)) if len(means) > 1 else math.nan
 
 
 def _add_options(parser: ArgumentParser) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from common import (
 )
 from harness import ROOT
 from parts import scale
+from parts.rates import RatedFlight, mean_nees
 
 COMMANDS = sorted(
     path.stem
@@ -126,6 +128,17 @@ def test_results_are_kept_and_not_flown_again(tmp_path: Path) -> None:
     KeptResults(path, {"part": "b", "set": []}, Flown).of(range(1), fly)
     assert again[:2] == first == [Flown(0, ()), Flown(1, ("late",))]
     assert flown == [0, 1, 2, 0]
+
+
+def test_a_flight_of_several_chasers_is_one_sample_of_the_nees() -> None:
+    flights = [
+        RatedFlight((), (4.0, 6.0)),
+        RatedFlight((), (8.0, 10.0)),
+        RatedFlight(("crash",), ()),
+    ]
+    mean, sigma = mean_nees(flights)
+    assert (mean, sigma) == pytest.approx((7.0, 2.0))
+    assert all(map(math.isnan, mean_nees(flights[2:])))
 
 
 def test_a_part_below_its_bar_fails_the_command_after_the_others(

@@ -17,11 +17,13 @@ from chaserdock_controller.estimation.joint.measurements import (
     measurement,
     mounting_of,
     predict_sighting,
+    sighting_covariance,
 )
 from chaserdock_controller.estimation.joint.parameters import (
     GATE_CHI_SQUARE,
     GATE_CHI_SQUARE_3,
     SightingNoise,
+    parameters_of,
 )
 from chaserdock_controller.estimation.joint.prediction import disturbance, predict
 from chaserdock_controller.estimation.joint.state import (
@@ -48,7 +50,7 @@ from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.messages import Odometry, PoseSolution
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from flight_cases import scenario
 from joint_cases import PERIOD_S, SyntheticFlight, changed, navigation, odometry_in, parameters
@@ -295,6 +297,24 @@ def test_covariance_of_another_size_is_refused() -> None:
 def test_gates_are_quantiles_of_chi_square() -> None:
     assert pytest.approx(chi2.ppf(0.9999, 3), rel=1e-12) == GATE_CHI_SQUARE_3
     assert pytest.approx(chi2.ppf(0.9999, 6), rel=1e-12) == GATE_CHI_SQUARE
+
+
+@pytest.mark.parametrize("markers", [0, 1, 5])
+def test_drawn_sightings_count_with_the_stated_covariance(markers: int) -> None:
+    """They have white errors of it only: nothing persists with a view, and nothing is added."""
+    drawn = scenario(perception={"name": "statistical"})
+    p = parameters_of(drawn)
+    noise = p.sighting_noise(markers)
+    assert (noise.white_ratio, noise.view_ratio) == (1.0, 0.0)
+    stated = np.diag([1e-11, 1e-11, 1e-9, 1e-10, 1e-10, 1e-11])
+    solution = PoseSolution(
+        position_m=(0.0, 0.0, 1.0),
+        q_wxyz=(1.0, 0.0, 0.0, 0.0),
+        covariance=vector(stated),
+        reprojection_rms_px=0.0,
+    )
+    np.testing.assert_array_equal(sighting_covariance(solution, p), stated)
+    assert parameters_of(scenario()).sighting_noise(markers).view_ratio > 0.0
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ same poses.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +14,15 @@ from chaserdock_agents.chaser.perception import PerceptionResult, make_perceptio
 from chaserdock_agents.chaser.sighting import decode_image, look
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.rendering.cameras import Cameras, States
 from chaserdock_world.rendering.pose_cameras import PoseCameras, make_cameras
 from harness import ROOT
+
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summary_of
+from chaserdock.simulation.mission import simulate
 
 POSES = 160
 RANGE_M = (0.4, 1.5)
@@ -109,6 +115,32 @@ def test_its_errors_and_covariances_are_those_of_images(
 @pytest.mark.slow
 def test_its_errors_follow_its_covariance(both: tuple[Measured, Measured]) -> None:
     assert np.mean(both[1].nees) == pytest.approx(6.0, abs=1.0)
+
+
+@pytest.mark.slow(minutes=0.5)
+@pytest.mark.parametrize("rate_hz", [5, 30])
+@pytest.mark.parametrize("name", ["docking-contact", "single-thrusters"])
+def test_the_filter_knows_how_large_its_errors_are(name: str, rate_hz: int, tmp_path: Path) -> None:
+    """The NEES of the relative pose is that of a consistent estimate, on both sides. The cameras
+    are exact, as a flight draws their constant errors only once.
+    """
+    found = []
+    for seed in range(4):
+        overrides = (
+            *(f"navigation.camera_{key}=0.0" for key in ("turn_deg", "shift_m", "focal_share")),
+            f"time.rate_hz={rate_hz}",
+            f"time.image_hz={rate_hz}",
+            f"chaser.modulation.carrier_hz={rate_hz}",
+            "duration_s=15.0",
+            "settling_s=5.0",
+            "timeline=[]",
+            'perception.name="statistical"',
+            f"seed={seed}",
+        )
+        simulate(find_scenario(name), tmp_path / f"{seed}", overrides)
+        flight = load_flight(tmp_path / f"{seed}" / "mission.mcap")
+        found.append(summary_of(flight)["chasers"]["0"]["relative_estimate"]["nees_mean"])
+    assert 4.5 <= np.mean(found) <= 7.5
 
 
 def test_measurements_depend_on_seed_chaser_and_number_only() -> None:

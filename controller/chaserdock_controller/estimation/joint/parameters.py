@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -65,9 +65,9 @@ SHAPE = SightingNoise(white_ratio=1.0, view_ratio=1.6, view_time_s=30.0, units_t
 """Sightings by shape: errors of geometry and shading change only with the view and are alike in the
 images of several cameras (docs/markerless.md).
 """
-RANGING = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
-"""Sightings of `[ranging]`, without images: range, bearing and attitude have white errors of the
-stated size.
+DRAWN = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
+"""Sightings without images, of markers or by `[ranging]`: the perception ``statistical`` draws
+white errors of the stated size.
 """
 BEARING = SightingNoise(white_ratio=1.0, view_ratio=1.0, view_time_s=25.0)
 """Bearings from images: light, markers and the pixel grid shift the centroid as long as the view
@@ -309,7 +309,7 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
     rate_hz, orbit = scenario.time.rate_hz, scenario.orbit
     xx, xy, xz, _, yy, yz, _, _, zz = target.inertia_tensor.reshape(-1).tolist()
     lasting_N = scenario.limits.passive_safety_force_N
-    return JointParameters(
+    parameters = JointParameters(
         target=TargetParameters(
             motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
             inertia_ratios=((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)),
@@ -327,9 +327,10 @@ def parameters_of(scenario: FlightScenario) -> JointParameters:
         lasting_force_N=JointParameters.lasting_force_N if lasting_N is None else lasting_N,
         mean_motion_rad_s=0.0 if orbit is None else orbit.elements.mean_motion_rad_s,
         target_noise=_target_noise(scenario.estimator),
-        shape=_far_noise(scenario),
+        shape=SHAPE if scenario.ranging is None else BEARING,
         floor=_floor(scenario),
     )
+    return _of_drawn(parameters) if scenario.perception.name == "statistical" else parameters
 
 
 def _floor(scenario: FlightScenario) -> LevelFloor | None:
@@ -352,11 +353,18 @@ def _target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]
     }
 
 
-def _far_noise(scenario: FlightScenario) -> SightingNoise:
-    """Return the errors of sightings without markers."""
-    if scenario.ranging is None:
-        return SHAPE
-    return RANGING if scenario.perception.name == "statistical" else BEARING
+def _of_drawn(parameters: JointParameters) -> JointParameters:
+    """Return the parameters for sightings that are drawn with the stated covariance, which is
+    never singular.
+    """
+    return replace(
+        parameters,
+        single_marker=DRAWN,
+        several_markers=DRAWN,
+        shape=DRAWN,
+        floor_sighting_m=0.0,
+        floor_sighting_rad=0.0,
+    )
 
 
 def rows_of(matrix: Array) -> Matrix9:

@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 from common import Figures, Group, KeptResults, Options, seeds_of
 
-CLOSEST_M = 0.6
-"""Distance of centres, m, below which two bodies may touch: the largest is 0.55 m across."""
 TRACKED_M = 0.01
 """Largest error, m, in the last five seconds of a flight that still tracks."""
 SECONDS = 40.0
@@ -34,7 +32,7 @@ class LabFlight:
     error_m: float
     rms_m: float
     speed_m_s: float
-    closest_m: float
+    clearance_m: float
     latency_p99_s: float
     crash: str = ""
 
@@ -43,7 +41,7 @@ class LabFlight:
         """Return ``tracks``, ``stopped``, or what is wrong."""
         if self.crash:
             return "crash"
-        if self.closest_m < CLOSEST_M:
+        if self.clearance_m <= 0.0:
             return "contact"
         if self.reason:
             return "stopped" if self.speed_m_s < 0.02 else "moves although stopped"
@@ -64,10 +62,10 @@ def fly_laboratory(with_faults: bool, seed: int) -> LabFlight:
         at_s = float(rng.uniform(2.0, 25.0))
         until_s = at_s + float(rng.exponential(4.0))
         faults.append(virtual.Fault(kind, at_s, until_s, int(rng.integers(2))))
-    lab = virtual.two_free_flyers(seed, faults)
+    text, lab = virtual.flight_of("tracking", seed, faults)
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         scenario = Path(folder) / "lab.toml"
-        scenario.write_text(virtual.SCENARIO)
+        scenario.write_text(text)
         flight = virtual.fly(scenario, Path(folder) / "run", lab, patch)
     reasons = re.findall(r"disarmed: (.*)", flight.output)
     end_s = (lab.history[-1][0] - (lab.begun_ns or 0)) / 1e9
@@ -80,7 +78,7 @@ def fly_laboratory(with_faults: bool, seed: int) -> LabFlight:
         float(late.max(initial=0.0)),
         float(np.sqrt(np.mean(steady**2))) if len(steady) else math.nan,
         max(float(np.linalg.norm(b.velocity)) for b in lab.chasers.values()),
-        lab.closest_m,
+        lab.clearance_m,
         float(np.quantile(virtual.LATENCIES_S, 0.99)) if virtual.LATENCIES_S else math.nan,
         "; ".join(flight.crashes),
     )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from chaserdock_agents.gateway import own_camera
 from chaserdock_protocol.process import ProcessOptions
-from virtual_lab import SCENARIO, SENT, Fault, fly, tracking_errors_m, two_free_flyers
+from virtual_lab import SENT, Fault, flight_of, fly, tracking_errors_m
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
@@ -29,9 +29,8 @@ def flown(
     **others: Any,
 ) -> tuple[SimulatedFlight, Any]:
     scenario = tmp_path / "lab.toml"
-    text = SCENARIO.replace("duration_s = 40.0", f"duration_s = {seconds}")
-    scenario.write_text(text if cameras else text.partition("[[lab.camera]]")[0])
-    lab = two_free_flyers(seed, faults)
+    text, lab = flight_of("tracking", seed, faults, cameras)
+    scenario.write_text(text.replace("duration_s = 40.0", f"duration_s = {seconds}"))
     return fly(scenario, tmp_path / "run", lab, monkeypatch, **others), lab
 
 
@@ -56,6 +55,25 @@ def test_free_flyers_track_the_target(
         assert np.linalg.norm(np.subtract(own.start_offset_m, offset_m)) < 0.01
         assert np.linalg.norm(own.start_velocity_m_s) < 3e-3
     assert np.linalg.norm(np.degrees(twin.target.omega_rad_s) - [0.0, 0.0, 3.0]) < 0.1
+
+
+@pytest.mark.slow(minutes=3)
+@pytest.mark.parametrize("name", ["planar-docking", "free-flyer-docking"])
+def test_robots_dock_by_probe_and_port_alone(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text, lab = flight_of(name, 1)
+    scenario = tmp_path / "lab.toml"
+    scenario.write_text(text)
+    flight = fly(scenario, tmp_path / "run", lab, monkeypatch)
+    assert not flight.crashes
+    assert "disarmed" not in flight.output
+    for probe in lab.probes.values():
+        assert probe.is_latched
+        assert probe.misses == probe.refusals == []
+    assert lab.clearance_m > 0.02
+    judged = summary_of(load_flight(flight.folder / "mission.mcap"))
+    assert judged["success"] is True
 
 
 @pytest.mark.slow
@@ -145,6 +163,5 @@ def test_the_topic_kills_within_a_tick(tmp_path: Path, monkeypatch: pytest.Monke
     assert lab.begun_ns is not None
     newest_ns = max(at_ns for at_ns, _ in SENT)
     assert (newest_ns - lab.begun_ns) / 1e9 < 2.3
-    for force, torque in lab.wrench.values():
-        assert not force.any()
-        assert not torque.any()
+    for actuators in lab.actuators.values():
+        assert np.abs(actuators.output).max() < 1e-9

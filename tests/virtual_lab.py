@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -140,6 +140,43 @@ def install(monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
     monkeypatch.setattr(devices, "entry_points", found)
     SENT.clear()
     LATENCIES_S.clear()
+
+
+class GatewayKilled(BaseException):
+    """Ends the gateway from within a device, as SIGKILL does."""
+
+
+def killed_and_restarted(
+    lab: Any, after_s: float, absent_s: float, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[ProcessOptions], int]:
+    """Return a gateway that is killed so long after its first command, and started again after
+    ``absent_s``.
+    """
+    poll, stop = _MotionCapture.poll, _Robot.stop
+
+    def dying(device: _MotionCapture) -> list[PoseSample]:
+        now_ns = device.host.now_ns()
+        if lab.begun_ns is not None and now_ns - lab.begun_ns > after_s * 1e9:
+            raise GatewayKilled
+        return poll(device)
+
+    def main(options: ProcessOptions) -> int:
+        resumable = replace(options, resume=options.out.with_name("begun.json"))
+        monkeypatch.setattr(_MotionCapture, "poll", dying)
+        monkeypatch.setattr(_Robot, "stop", lambda device: None)  # nobody stops the robots
+        try:
+            return gateway.main(resumable)
+        except GatewayKilled:
+            monkeypatch.setattr(_MotionCapture, "poll", poll)
+            monkeypatch.setattr(_Robot, "stop", stop)
+        node = Node("time", "operator", options.link)
+        for _ in range(round(absent_s / 0.1)):  # time of the laboratory, which goes on
+            node.host.sleep(0.1)
+            lab.advance(round(node.host.now_s() * 1e9))
+        node.close()
+        return gateway.main(resumable)
+
+    return main
 
 
 def arm_when_ready(options: ProcessOptions, give_up_s: float = 20.0) -> int:

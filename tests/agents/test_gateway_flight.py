@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 from chaserdock_agents.gateway import own_camera
 from chaserdock_protocol.process import ProcessOptions
-from virtual_lab import SENT, Fault, flight_of, fly, tracking_errors_m
+from chaserdock_protocol.transport import Node
+from virtual_lab import (
+    SENT,
+    Fault,
+    arm_when_ready,
+    flight_of,
+    fly,
+    killed_and_restarted,
+    tracking_errors_m,
+)
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
@@ -140,8 +149,6 @@ def test_a_camera_that_fails_stops_nothing_that_is_safe(
 def kill_by_topic(options: ProcessOptions) -> int:
     from chaserdock_protocol import topics
     from chaserdock_protocol.messages import Kill
-    from chaserdock_protocol.transport import Node
-    from virtual_lab import arm_when_ready
 
     assert arm_when_ready(options) == 0
     node = Node("operator", "operator", options.link)
@@ -165,3 +172,43 @@ def test_the_topic_kills_within_a_tick(tmp_path: Path, monkeypatch: pytest.Monke
     assert (newest_ns - lab.begun_ns) / 1e9 < 2.3
     for actuators in lab.actuators.values():
         assert np.abs(actuators.output).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_a_gateway_that_was_killed_takes_the_mission_up_again_disarmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed_s, absent_s, armed_s = 12.0, 4.0, 20.0
+    at_rest: list[float] = []
+
+    def arm_twice(options: ProcessOptions) -> int:
+        assert arm_when_ready(options) == 0
+        node = Node("operator", "operator", options.link)
+        node.host.sleep(armed_s)
+        node.close()
+        at_rest.extend(float(np.linalg.norm(b.velocity)) for b in lab.chasers.values())
+        return arm_when_ready(options)
+
+    text, lab = flight_of("tracking", 1)
+    scenario = tmp_path / "lab.toml"
+    scenario.write_text(text)
+    flight = fly(
+        scenario,
+        tmp_path / "run",
+        lab,
+        monkeypatch,
+        world=killed_and_restarted(lab, killed_s, absent_s, monkeypatch),
+        operator=arm_twice,
+    )
+    assert not flight.crashes
+    assert set(flight.statuses.values()) == {0}  # controller, chasers and recorder survive
+    assert flight.output.count("the world is back, and the mission goes on") == 4
+    assert lab.begun_ns is not None
+    sent_s = np.array([at_ns - lab.begun_ns for at_ns, _ in SENT]) / 1e9
+    assert not ((sent_s > killed_s) & (sent_s < armed_s)).any()  # nothing moves before arm
+    assert len(at_rest) == 2
+    assert max(at_rest) < 5e-3
+    assert "world: completed at 40.00 s" in flight.output
+    for errors in tracking_errors_m(lab, 35.0).values():
+        assert errors.max() < 0.02
+    assert not (tmp_path / "begun.json").exists()

@@ -42,8 +42,11 @@ from .feeds import PoseFeed
 from .images import image_message
 from .lab import Laboratory
 from .odometry import FittedState
+from .resume import BegunMission, begun_mission, digest_of, forget_mission, note_mission
 from .safety import SafetyGate
 
+_NS = 1_000_000_000
+"""Nanoseconds of a second."""
 _POLL_S = 0.002
 """Interval, s, at which devices are read and commands sent: the latency that the gateway adds."""
 _LONGEST_SOURCE = 200
@@ -69,8 +72,13 @@ def main(options: ProcessOptions) -> int:
         node = open_world_node(realtime)
         now_s = node.host.now_s
         host = DeviceHost(lambda: round(now_s() * 1e9))
+        path = options.resume
+        begun = None if path is None else begun_mission(path, scenario, host.now_ns())
         laboratory = Laboratory(scenario, host, options.dry_run)
-        return Gateway(scenario, realtime, node, laboratory).run(options.stop_signal())
+        status = Gateway(scenario, realtime, node, laboratory, begun).run(options.stop_signal())
+        if path is not None:
+            forget_mission(path)
+        return status
     except ChaserdockError as error:
         print_status("gateway", str(error))
         return 2
@@ -82,10 +90,17 @@ def main(options: ProcessOptions) -> int:
 
 
 class Gateway:
-    """Fly one mission on the devices of a laboratory."""
+    """Fly one mission on the devices of a laboratory. ``begun``: take up this one again, which
+    another gateway has begun; robots are disarmed.
+    """
 
     def __init__(
-        self, scenario: Scenario, options: ProcessOptions, node: Node, laboratory: Laboratory
+        self,
+        scenario: Scenario,
+        options: ProcessOptions,
+        node: Node,
+        laboratory: Laboratory,
+        begun: BegunMission | None = None,
     ) -> None:
         assert scenario.lab is not None
         self._scenario, self._node, self._lab = scenario, node, laboratory
@@ -93,6 +108,7 @@ class Gateway:
         self._gate = SafetyGate(scenario.lab.safety)
         self._requests = ArmingRequests()
         self._start_ns = 0
+        self._begun, self._resume = begun, options.resume
         self._used_ns: dict[int, int] = {}
         self._commanded_ns: dict[int, int] = {}
         self._missing: set[int] = set()
@@ -116,7 +132,9 @@ class Gateway:
             self._command_latch,
             scenario.controller.command_lifetime_s,
         )
-        self._host = open_mission(scenario, options, node, commands)
+        self._host = open_mission(
+            scenario, options, node, commands, None if begun is None else begun.run_id
+        )
         self._barrier = self._host.barrier
         self._barrier.take_other = self._take_other
 
@@ -133,11 +151,25 @@ class Gateway:
             reason = self._host.wait_for_processes(stop) or self._wait_for_poses(stop)
             if reason:
                 return self._host.end(0, reason, complete=False)
-            self._start_ns = self._now_ns()
+            self._begin()
             return self._fly(stop)
         finally:
             end_keys()
             self._lab.stop()
+
+    def _begin(self) -> None:
+        """Let the mission's time begin, or go on from its beginning by another gateway."""
+        if self._begun is not None:
+            self._start_ns = self._begun.start_ns
+            return
+        self._start_ns = self._now_ns()
+        if self._resume is not None:
+            begun = BegunMission(
+                run_id=self._host.run_id,
+                start_ns=self._start_ns,
+                scenario=digest_of(self._scenario),
+            )
+            note_mission(self._resume, begun)
 
     def _wait_for_poses(self, stop: StopSignal) -> str:
         """Read the devices until each robot has odometry; return why there is none, else
@@ -162,7 +194,9 @@ class Gateway:
         return "stopped before the first tick"
 
     def _fly(self, stop: StopSignal) -> int:
-        for tick in range(self._scenario.ticks + 1):
+        first = self._mission_ns() * self._timing.rate_hz // _NS + 1 if self._begun else 0
+        first = min(first, self._scenario.ticks)
+        for tick in range(first, self._scenario.ticks + 1):
             self._work_until(self._start_ns + self._timing.tick_time_ns(tick))
             self._publish_odometry(tick)
             self._publish_docking(tick)
@@ -170,6 +204,8 @@ class Gateway:
                 return self._host.end(tick, "completed", complete=True)
             # Cameras run freely: no image belongs to a tick, and no tick waits for one.
             self._barrier.open_tick(tick, images=False)
+            if tick == first > 0:
+                self._barrier.publish_warning("gateway restarted", "robots are disarmed")
             if stop() or self._barrier.lost_all_chasers(self._host.options.rejoin_s, stop):
                 reason = "stopped" if stop() else "no chaser is left"
                 return self._host.end(tick, reason, complete=False)
@@ -205,7 +241,7 @@ class Gateway:
             return
         body = feed.device.body
         message = BodyReference(
-            tick=measured_ns * self._timing.rate_hz // 1_000_000_000,
+            tick=measured_ns * self._timing.rate_hz // _NS,
             sim_time_ns=measured_ns,
             body=body,
             source=feed.device.address[:_LONGEST_SOURCE],
@@ -230,7 +266,7 @@ class Gateway:
         time_ns = self._timing.tick_time_ns(tick)
         host_ns = self._start_ns + time_ns
         for chaser, feed in self._lab.odometry.items():
-            since_ns = self._used_ns.get(chaser, host_ns - 1_000_000_000 // self._timing.rate_hz)
+            since_ns = self._used_ns.get(chaser, host_ns - _NS // self._timing.rate_hz)
             state = feed.track.at(host_ns, since_ns)
             if state is None:
                 if chaser not in self._missing:

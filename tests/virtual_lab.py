@@ -5,6 +5,7 @@ own thread of control, so that a flight is deterministic.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -196,6 +197,16 @@ def arm_when_ready(options: ProcessOptions, give_up_s: float = 20.0) -> int:
         node.close()
 
 
+def arm_again(options: ProcessOptions, after_s: float) -> int:
+    """Arm when ready, and again so long after; return 0 if both were done."""
+    if arm_when_ready(options):
+        return 1
+    node = Node("operator", "operator", options.link)
+    node.host.sleep(after_s)
+    node.close()
+    return arm_when_ready(options)
+
+
 def fly(
     scenario: Path, folder: Path, lab: Any, monkeypatch: pytest.MonkeyPatch, **others: Any
 ) -> SimulatedFlight:
@@ -206,14 +217,18 @@ def fly(
 
 
 def flight_of(
-    name: str, seed: int, faults: Sequence[Any] = (), cameras: bool = True
+    name: str,
+    seed: int,
+    faults: Sequence[Any] = (),
+    cameras: bool = True,
+    camera_hz: float = 29.4,
 ) -> tuple[str, Any]:
     """Return the scenario ``name`` of the emulated laboratory, on virtual devices, and the
-    laboratory. Cameras expose at 29 Hz; without ``cameras`` they are not the gateway's.
+    laboratory. Cameras run freely; without ``cameras`` they are not the gateway's.
     """
     text = (FOLDER / name / "scenario.toml").read_text(encoding="utf-8").partition("[[lab.")[0]
     setup = emulated.read_setup(FOLDER / name / "lab.toml", seed)
-    setup.optics = emulated.Optics(setup.optics.place)
+    setup.optics = emulated.Optics(setup.optics.place, rate_hz=camera_hz)
     parts = [text, "[perception]\nname = 'statistical'\n"]
     for i in setup.chasers:
         own = f"address = 'virtual:{i}'\n"
@@ -233,17 +248,22 @@ def flight_of(
 _CAPTURE = "address = 'virtual:'\nlatency_s = 0.004\n"
 
 
-def tracking_errors_m(lab: Any, after_s: float) -> dict[int, np.ndarray]:
-    """Return the distance of each chaser from its place beside the target, from ``after_s`` after
-    the first command on.
+PLACES = {0: np.array([-1.0, 0.0, 0.0]), 1: np.array([0.0, -1.0, 0.0])}
+"""Where the chasers of ``tracking`` are to be beside the target, m."""
+
+
+def tracking_errors_m(
+    lab: Any, after_s: float, before_s: float = math.inf
+) -> dict[int, np.ndarray]:
+    """Return the distance of each chaser from its place beside the target, between two times after
+    the first command.
     """
     assert lab.begun_ns is not None
-    places = {0: np.array([-1.0, 0.0, 0.0]), 1: np.array([0.0, -1.0, 0.0])}
     errors: dict[int, list[float]] = {0: [], 1: []}
     for time_ns, states in lab.history:
-        if time_ns - lab.begun_ns < after_s * 1e9:
+        if not after_s * 1e9 <= time_ns - lab.begun_ns < before_s * 1e9:
             continue
         p, r = states["target"]
-        for i, place in places.items():
+        for i, place in PLACES.items():
             errors[i].append(float(np.linalg.norm(states[f"chaser/{i}"][0] - p - r.apply(place))))
     return {i: np.array(e) for i, e in errors.items()}

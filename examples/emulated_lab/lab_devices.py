@@ -88,8 +88,9 @@ class Exposure:
 
 @dataclass(frozen=True)
 class Optics:
-    """The cameras, one on each robot: ``place`` in its axes; delays from exposure to arrival: the
-    least, and the mean beyond it.
+    """The cameras, one on each robot: ``place`` in its axes, to which each is mounted with errors,
+    and focal length off by a share; delays from exposure to arrival: the least, and the mean beyond
+    it.
     """
 
     place: np.ndarray = field(default_factory=lambda: np.array([0.07, 0.0, 0.075]))
@@ -99,6 +100,9 @@ class Optics:
     rate_hz: float = 29.4
     least_delay_s: float = 0.02
     more_delay_s: float = 0.004
+    turn_sigma_deg: float = 0.05
+    shift_sigma_m: float = 0.0005
+    focal_sigma: float = 0.0005
 
 
 @dataclass
@@ -140,6 +144,16 @@ class Laboratory:
         uniform = self.rng.uniform
         self.capture_clock = Clock(uniform(-0.5, 0.5), uniform(-5e-5, 5e-5))
         self.camera_clocks = {i: Clock(uniform(-5, 5), uniform(-5e-5, 5e-5)) for i in self.chasers}
+        optics, mounting = setup.optics, np.random.default_rng([seed, 13])
+        self._lenses = {
+            i: (
+                optics.place + mounting.normal(0.0, optics.shift_sigma_m, 3),
+                Rotation.from_rotvec(mounting.normal(0.0, optics.turn_sigma_deg, 3), degrees=True)
+                * CAMERA_AXES,
+                1.0 + mounting.normal(0.0, optics.focal_sigma),
+            )
+            for i in self.chasers
+        }
         period_ns = round(1e9 / setup.optics.rate_hz)
         self._next_exposure = {i: period_ns * i // len(self.chasers) for i in self.chasers}
 
@@ -267,14 +281,15 @@ class Laboratory:
         if lost or self.has("camera frozen", i):
             return
         optics, body = self.setup.optics, self.chasers[i]
-        axes = body.rotation * CAMERA_AXES
-        lens = body.position + body.rotation.apply(optics.place)
+        place, turn, focal = self._lenses[i]
+        axes, lens = body.rotation * turn, body.position + body.rotation.apply(place)
         stamp_ns = self.camera_clocks[i].stamp_ns(self.now_ns)
         if self.has("camera clock steps", i):
             stamp_ns += 700_000_000
         exposure = Exposure(
             stamp_ns,
-            axes.inv().apply(self.target.position - lens),
+            # A longer lens shows the target as if it were nearer.
+            axes.inv().apply(self.target.position - lens) / (1.0, 1.0, focal),
             wxyz(axes.inv() * self.target.rotation),
             int(self.rng.integers(2**31)),
         )

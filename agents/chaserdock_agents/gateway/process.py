@@ -53,6 +53,10 @@ _LONGEST_SOURCE = 200
 """Characters of a device's address that a message repeats."""
 _POSE_PATIENCE_S = 10.0
 """Wait, s, for the first odometry of all robots: devices were opened long before."""
+_BLIND_NS = 1_000_000_000
+"""Time without a new image of a chaser, ns, after which it is warned of: several images of any
+camera.
+"""
 _SETTLING_NS = 200_000_000
 """Time, ns, whose poses must give the first odometry."""
 
@@ -112,6 +116,8 @@ class Gateway:
         self._used_ns: dict[int, int] = {}
         self._commanded_ns: dict[int, int] = {}
         self._missing: set[int] = set()
+        self._image_ns: dict[int, int] = {}
+        self._blind: set[int] = set()
         self._actuation = {
             f"chaser/{i}": RobotActuation(scenario.chaser, self._timing)
             for i in range(self._chasers)
@@ -200,6 +206,7 @@ class Gateway:
             self._work_until(self._start_ns + self._timing.tick_time_ns(tick))
             self._publish_odometry(tick)
             self._publish_docking(tick)
+            self._warn_of_blind_chasers()
             if tick == self._scenario.ticks:
                 return self._host.end(tick, "completed", complete=True)
             # Cameras run freely: no image belongs to a tick, and no tick waits for one.
@@ -260,7 +267,18 @@ class Gateway:
             return
         quality = self._scenario.camera.effects.jpeg_quality
         message = image_message(self._timing.rate_hz, quality, chaser, image, exposed_ns)
+        self._image_ns[chaser] = self._mission_ns()
+        self._blind.discard(chaser)
         self._node.publish(topics.IMAGE, message, chaser)
+
+    def _warn_of_blind_chasers(self) -> None:
+        """Publish once for each time that a camera is silent, or repeats an image."""
+        for camera in self._lab.cameras:
+            chaser = camera.device.chaser
+            silent_ns = self._mission_ns() - self._image_ns.get(chaser, 0)
+            if silent_ns > _BLIND_NS and chaser not in self._blind:
+                self._blind.add(chaser)
+                self._barrier.publish_warning("no new image", f"chaser {chaser}")
 
     def _publish_odometry(self, tick: int) -> None:
         time_ns = self._timing.tick_time_ns(tick)

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_agents.gateway import own_camera
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import ArmingCommand, ArmingReply, Kill
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.transport import Node
 from virtual_lab import (
@@ -24,10 +26,12 @@ from virtual_lab import (
     tracking_errors_m,
 )
 
+import chaserdock
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
 from chaserdock.launch.twin import twin_of
 from chaserdock.simulation.mission import SimulatedFlight
+from chaserdock.simulation.network import SimulatedHost
 
 
 def flown(
@@ -152,10 +156,64 @@ def test_a_camera_that_fails_stops_nothing_that_is_safe(
         assert np.sqrt(np.mean(errors**2)) < 3e-3
 
 
-def kill_by_topic(options: ProcessOptions) -> int:
-    from chaserdock_protocol import topics
-    from chaserdock_protocol.messages import Kill
+ARMING_S = 2.0
 
+
+def arm_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let robots take a while to be armed, in the background, as those under PX4 do."""
+    worker = SimulatedHost.worker
+
+    def slow(host: Any, call: Any) -> Any:
+        if host.name != "world":
+            return worker(host, call)
+
+        def put(item: Any) -> None:
+            scheduler = host._scheduler
+            scheduler.call_at(scheduler.now_s + ARMING_S, call, args=(item,))
+
+        return put, lambda: None
+
+    monkeypatch.setattr(SimulatedHost, "worker", slow)
+
+
+def test_the_mission_goes_on_while_robots_are_armed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm_slowly(monkeypatch)
+    flight, lab = flown(tmp_path, monkeypatch, seconds=4.0)
+    assert not flight.crashes
+    assert lab.begun_ns is not None
+    ticks_s = [
+        tick.sim_time_ns / 1e9 for tick in chaserdock.open_log(flight.folder).messages("world/tick")
+    ]
+    assert np.diff(ticks_s).max() < 0.07
+    assert "actuators stopped" not in flight.output
+
+
+def test_disarming_wins_over_arming(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arm_slowly(monkeypatch)
+
+    def disarm_meanwhile(options: ProcessOptions) -> int:
+        node = Node("operator", "operator", options.link)
+        arm = ArmingCommand(action="arm", operator="one")
+        node.host.sleep(1.0)
+        node.query(topics.ARMING_KEY, arm, ArmingReply, 0.1)
+        again = node.query(topics.ARMING_KEY, arm, ArmingReply, 0.5)
+        assert again is not None
+        assert not again.accepted
+        assert again.reason == "robots are being armed"
+        disarm = ArmingCommand(action="disarm", operator="two")
+        assert node.query(topics.ARMING_KEY, disarm, ArmingReply, 0.5) is not None
+        node.close()
+        return 0
+
+    flight, _ = flown(tmp_path, monkeypatch, seconds=4.0, operator=disarm_meanwhile)
+    assert not flight.crashes
+    assert "arm refused: disarmed by two" in flight.output
+    assert SENT == []
+
+
+def kill_by_topic(options: ProcessOptions) -> int:
     assert arm_when_ready(options) == 0
     node = Node("operator", "operator", options.link)
     try:

@@ -117,12 +117,17 @@ class Laboratory:
         return tuple(found)
 
     def arm(self) -> None:
-        """Let the robots obey. Raises DeviceError if one refuses."""
-        for obedience in self.obedience.values():
-            obedience.restart()
+        """Let the robots obey, one after the other. Raises DeviceError if one refuses. Only this
+        may run on another thread.
+        """
         if not self._dry_run:
             for robot in self.robots.values():
                 robot.arm()
+
+    def forget_motion(self) -> None:
+        """Judge the robots' obedience from now on."""
+        for obedience in self.obedience.values():
+            obedience.restart()
 
     def send(
         self, chaser: int, actuation: RobotActuation, output: tuple[Array, Array, Array]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 
 import cv2
 import numpy as np
@@ -35,7 +36,7 @@ from chaserdock_protocol.scenario import Scenario, ScenarioError
 from chaserdock_protocol.transport import Node
 
 from .actuation import RobotActuation
-from .arming import ArmingRequests, listen_to_keys
+from .arming import Answer, ArmingRequests, listen_to_keys
 from .axes import MeasuredPose
 from .devices import DeviceError, DeviceHost, ImageArray
 from .feeds import PoseFeed
@@ -43,7 +44,7 @@ from .images import image_message
 from .lab import Laboratory
 from .odometry import FittedState
 from .resume import BegunMission, begun_mission, digest_of, forget_mission, note_mission
-from .safety import SafetyGate
+from .safety import RobotSight, SafetyGate
 
 _NS = 1_000_000_000
 """Nanoseconds of a second."""
@@ -111,6 +112,11 @@ class Gateway:
         self._timing, self._chasers = scenario.timing, len(scenario.chasers)
         self._gate = SafetyGate(scenario.lab.safety)
         self._requests = ArmingRequests()
+        self._arming: tuple[str, Answer] | None = None
+        self._armed: deque[str] = deque()
+        self._is_disarmed_meanwhile = False
+        self._arm_robots, end_arming = node.host.worker(self._ask_robots)
+        node.on_close(end_arming)
         self._start_ns = 0
         self._begun, self._resume = begun, options.resume
         self._used_ns: dict[int, int] = {}
@@ -343,31 +349,67 @@ class Gateway:
         ages = {i: (now_ns - at_ns) / 1e9 for i, at_ns in self._commanded_ns.items()}
         sights = self._lab.sights(ages)
         for action, by, answer in self._requests.take():
+            if action == "arm":
+                self._begin_arming(by, answer, sights)
+                continue
             accepted, reason = self._gate.request(action, by, sights)
-            if accepted and action == "arm":
-                accepted, reason = self._arm_robots(reason)
-            elif accepted:
+            if accepted:
+                self._is_disarmed_meanwhile = True
                 self._lab.stop()
-            self._barrier.publish_warning(
-                f"{action} {'accepted' if accepted else 'refused'}", reason
-            )
-            answer(ArmingReply(accepted=accepted, reason=reason))
+            self._answer(action, accepted, reason, answer)
+        self._end_arming(sights)
         if reason := self._gate.check(sights):
             self._lab.stop()
             self._barrier.publish_warning("disarmed", reason)
 
-    def _arm_robots(self, reason: str) -> tuple[bool, str]:
+    def _answer(self, action: str, accepted: bool, reason: str, answer: Answer) -> None:
+        done = "accepted" if accepted else "refused"
+        self._barrier.publish_warning(f"{action} {done}", reason)
+        answer(ArmingReply(accepted=accepted, reason=reason))
+
+    def _begin_arming(self, by: str, answer: Answer, sights: tuple[RobotSight, ...]) -> None:
+        """Have the robots armed in the background, as they answer after a second, unless something
+        forbids it.
+        """
+        refusal = "robots are being armed" if self._arming else self._gate.refusal(sights)
+        if refusal:
+            self._answer("arm", False, refusal, answer)
+            return
+        self._arming, self._is_disarmed_meanwhile = (by, answer), False
+        self._arm_robots(None)
+
+    def _ask_robots(self, _: None) -> None:
         try:
             self._lab.arm()
+            self._armed.append("")
         except DeviceError as error:
+            self._armed.append(str(error))
+
+    def _end_arming(self, sights: tuple[RobotSight, ...]) -> None:
+        """Let commands pass once all robots are armed; stop them if one is not, or if they were
+        disarmed meanwhile.
+        """
+        if self._arming is None or not self._armed:
+            return
+        (by, answer), self._arming = self._arming, None
+        error = self._armed.popleft()
+        if error:
+            accepted, reason = False, self._gate.trip(error)
+        elif self._is_disarmed_meanwhile:
+            accepted, reason = False, self._gate.reason
+        else:
+            accepted, reason = self._gate.request("arm", by, sights)
+        if accepted:
+            self._lab.forget_motion()
+            self._commanded_ns.clear()  # ages count from now on
+        else:
             self._lab.stop()
-            return False, self._gate.trip(str(error))
-        self._commanded_ns.clear()  # ages count from now on
-        return True, reason
+        self._answer("arm", accepted, reason, answer)
 
     def _trip(self, reason: str) -> None:
         if self._gate.is_armed or reason != self._gate.reason:
             self._gate.trip(reason)
+            self._is_disarmed_meanwhile = True
             self._lab.stop()
             self._barrier.publish_warning("disarmed", reason)
 

@@ -213,7 +213,8 @@ def fly(
     """Fly a scenario with ``[lab]`` on a virtual laboratory, armed as soon as it can be."""
     install(monkeypatch, lab)
     processes = {"world": gateway.main, "operator": arm_when_ready, **others}
-    return simulate(scenario, folder, ("simulation.mode='realtime'",), others=processes)
+    overrides = ("simulation.mode='realtime'", "camera.effects.jpeg_quality=0")  # images are poses
+    return simulate(scenario, folder, overrides, others=processes)
 
 
 def flight_of(

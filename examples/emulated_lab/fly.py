@@ -23,6 +23,8 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 ARM_WITHIN_S = 60.0
 SETTLE_S = 12.0
+RECORDED_WITHIN_S = 300.0
+ABSENT_S = 3.0  # from the end of a gateway that is killed to the start of the next one
 # Numerics on one thread each, as several processes share the cores.
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
@@ -65,8 +67,9 @@ class Flight:
             )
 
     def start_gateway(self, *sets: str) -> None:
-        listen = ["-l", self.endpoint, *(x for text in sets for x in ("--set", text))]
-        self.start("gateway", "-m", "chaserdock", "gateway", self.scenario, *listen)
+        options = ["-l", self.endpoint, "--resume", self.out / "begun.json"]
+        options += [word for text in sets for word in ("--set", text)]
+        self.start("gateway", "-m", "chaserdock", "gateway", self.scenario, *options)
 
     def start_others(self) -> None:
         for name, *words in (
@@ -97,6 +100,14 @@ class Flight:
                 raise TimeoutError(f"not armed within {ARM_WITHIN_S:g} s")
             time.sleep(0.5)
 
+    def restart_gateway(self, *sets: str) -> None:
+        """Kill the gateway, start it again and arm."""
+        self.processes["gateway"].kill()
+        self.processes["gateway"].wait()
+        time.sleep(ABSENT_S)
+        self.start_gateway(*sets)
+        self.arm()
+
     def end(self) -> None:
         """Interrupt what still runs, the laboratory last."""
         for name in [n for n in self.processes if n != "laboratory"] + ["laboratory"]:
@@ -109,12 +120,13 @@ class Flight:
                     process.kill()
 
 
-def fly(name: str, out: Path, seed: int, extra: list[str], sets: list[str]) -> int:
+def fly(a: argparse.Namespace) -> int:
     """Fly to the end of the mission; return the status of its judgement."""
-    flight = Flight(name, out, seed, extra)
+    extra = [word for text in a.fault for word in ("--fault", text)]
+    flight = Flight(a.flight, a.out, a.seed, extra)
     try:
         flight.wait_for("laboratory", "ready", 30.0)
-        flight.start_gateway(*sets)
+        flight.start_gateway(*a.set)
         flight.start_others()
         flight.wait_for("gateway", "waiting for", 60.0)
         flight.arm()
@@ -122,11 +134,14 @@ def fly(name: str, out: Path, seed: int, extra: list[str], sets: list[str]) -> i
             time.sleep(SETTLE_S)
         for i in flight.docking:
             flight.command("approach", str(i))
+        if a.kill_gateway is not None:
+            time.sleep(a.kill_gateway)
+            flight.restart_gateway(*a.set)
         flight.processes["gateway"].wait()
-        flight.processes["recorder"].wait(300.0)
+        flight.processes["recorder"].wait(RECORDED_WITHIN_S)
     finally:
         flight.end()
-    judge = [sys.executable, "-m", "chaserdock", "judge", str(out / "run")]
+    judge = [sys.executable, "-m", "chaserdock", "judge", str(a.out / "run")]
     return subprocess.run(judge, check=False).returncode
 
 
@@ -140,9 +155,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the laboratory")
     parser.add_argument("--set", action="append", default=[], help="override a scenario value")
     parser.add_argument("--fault", action="append", default=[], help="see main.py")
-    a = parser.parse_args()
-    extra = [word for text in a.fault for word in ("--fault", text)]
-    sys.exit(fly(a.flight, a.out, a.seed, extra, a.set))
+    parser.add_argument(
+        "--kill-gateway", type=float, metavar="S", help="so long after the last command; restart it"
+    )
+    sys.exit(fly(parser.parse_args()))
 
 
 if __name__ == "__main__":

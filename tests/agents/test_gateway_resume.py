@@ -50,12 +50,6 @@ def test_a_file_that_does_not_fit_is_named(scenario: Scenario, tmp_path: Path) -
         begun_mission(path, scenario, 10)
     with pytest.raises(ResumeError, match="cannot be read: Is a directory"):
         begun_mission(tmp_path, scenario, 10)
-    with pytest.raises(ResumeError, match="cannot be written: No such file"):
-        note_mission(tmp_path / "no" / "file", begun_mission_of(scenario))
-
-
-def begun_mission_of(scenario: Scenario) -> BegunMission:
-    return BegunMission(run_id="r1", start_ns=7, scenario=digest_of(scenario))
 
 
 @pytest.mark.parametrize("resumed", [False, True])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import msgspec
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import Scenario
 
 
@@ -53,13 +54,8 @@ def begun_mission(path: Path, scenario: Scenario, now_ns: int) -> BegunMission |
 
 
 def note_mission(path: Path, begun: BegunMission) -> None:
-    """Write the file of a mission. Raises ResumeError."""
-    part = path.with_name(f"{path.name}.part")
-    try:
-        part.write_bytes(msgspec.json.encode(begun))
-        part.replace(path)
-    except OSError as error:
-        raise ResumeError(f"{path}: cannot be written: {error.strerror}") from None
+    """Write the file of a mission. Raises WriteError."""
+    write_atomically(path, msgspec.json.encode(begun))
 
 
 def forget_mission(path: Path) -> None:

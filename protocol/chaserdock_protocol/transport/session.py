@@ -44,7 +44,7 @@ _MOST_REPLACED = 256
 """Instances that are remembered as replaced: more than any mission restarts processes; bounds the
 memory under forged ones.
 """
-_SUCCESSOR_AFTER_S = 2.0
+SUCCESSOR_AFTER_S = 2.0
 """Silence of the world, s, after which a process asks once a second whether another one has taken
 up its mission: two presences are missing.
 """
@@ -226,7 +226,7 @@ class Heartbeat:
         self._node = node
         self._instance = instance
         self._stall_s, self._without_world = stall_s, StallTimer(node.host.now_s)
-        self._ask_at_s = _SUCCESSOR_AFTER_S
+        self._ask_at_s = SUCCESSOR_AFTER_S
         self.waiting_for: tuple[str, ...] = ()
         self.hangs: Callable[[], bool] = lambda: False
         """Whether the process' loop has stopped: its presence, published in the background, then
@@ -283,7 +283,7 @@ class Heartbeat:
     def world_heard(self) -> None:
         """Note that the world has sent a message."""
         self._without_world.reset()
-        self._ask_at_s = _SUCCESSOR_AFTER_S
+        self._ask_at_s = SUCCESSOR_AFTER_S
 
     def world_is_gone(self) -> bool:
         """Return, and print, whether the world has been silent for too long. In real time another

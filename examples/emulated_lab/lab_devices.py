@@ -18,12 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lab_bodies import STEP_S, Actuators, Body, Port, Probe, apart_m, shaft_apart_m
+from lab_bodies import STEP_S, Actuators, Body, Port, Probe, apart_m, cross, shaft_apart_m
 from scipy.spatial.transform import Rotation
 
 LOST_S = 0.3  # without commands, robots stop by themselves: COM_OF_LOSS_T of PX4
 # Camera axes (x right, y down, z forward) in body axes (x forward, z up).
 CAMERA_AXES = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+NOTHING = (np.zeros(3), np.zeros(3))
 
 FAULTS = (
     "camera frozen",
@@ -233,14 +235,14 @@ class Laboratory:
             if self.has("robot does not obey", i) and body.is_on:
                 output = np.array([2.5, 1.0, -0.5, 0.0, 0.0, 0.004])
             force, torque = body.rotation.apply(output[:3]), output[3:]
-            if i in self.probes:
-                touch, twist = self.probes[i].load(body, self.target)
+            touch, twist = self.probes[i].load(body, self.target) if i in self.probes else NOTHING
+            if touch.any():
                 tip, _ = body.at(self.probes[i].tip)
                 inverse = body.rotation.inv()
                 force = force + touch
-                torque = torque + inverse.apply(twist + np.cross(tip - body.position, touch))
+                torque = torque + inverse.apply(twist + cross(tip - body.position, touch))
                 target_force -= touch
-                target_torque -= twist + np.cross(tip - self.target.position, touch)
+                target_torque -= twist + cross(tip - self.target.position, touch)
             body.move(force, torque)
         self.target.move(target_force, self.target.rotation.inv().apply(target_torque))
 

@@ -20,7 +20,7 @@ from chaserdock_agents.gateway.safety import (
 )
 from chaserdock_models.clock import Timing
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import ActuatorCommand, ArmingReply, ThrusterPulse
+from chaserdock_protocol.messages import ActuatorCommand, ArmingCommand, ArmingReply, ThrusterPulse
 from chaserdock_protocol.scenario.bodies import Body
 from chaserdock_protocol.scenario.lab import LabSafety
 
@@ -117,6 +117,7 @@ def test_kill_is_final() -> None:
 
 def test_requests_that_stop_come_first() -> None:
     requests = ArmingRequests()
+    requests.not_yet = ""
     said: list[ArmingReply] = []
     for action in ("arm", "disarm", "kill"):
         requests.add(action, "me", said.append)
@@ -235,3 +236,16 @@ def test_duty_of_every_period_is_held_for_a_period_though_commands_are_late(late
     assert [round(float(duty[3]), 3) for _, duty in sent] == [0.1, 0.2, 0.3, 0.4, 0.5, 0.0]
     times_ns = np.array([t for t, _ in sent])
     assert np.abs(np.diff(times_ns) - PERIOD_NS).max() <= 4_000_000
+
+
+def test_arm_is_refused_at_once_before_the_mission_begins() -> None:
+    requests, replies = ArmingRequests(), []
+    requests.submit(ArmingCommand(action="arm", operator="one"), replies.append)
+    requests.submit(ArmingCommand(action="kill", operator="two"), replies.append)
+    assert [(r.accepted, r.reason) for r in replies] == [(False, "the mission has not begun")]
+    requests.not_yet = ""
+    requests.submit(ArmingCommand(action="arm", operator="three"), replies.append)
+    assert [(action, by) for action, by, _ in requests.take()] == [
+        ("kill", "two"),
+        ("arm", "three"),
+    ]

@@ -119,6 +119,8 @@ class Gateway:
         node.on_close(end_arming)
         self._start_ns = 0
         self._begun, self._resume = begun, options.resume
+        if begun is not None:  # a recorder that is behind holds up no mission that goes on
+            options = dataclasses.replace(options, recorder_expected=False)
         self._used_ns: dict[int, int] = {}
         self._commanded_ns: dict[int, int] = {}
         self._missing: set[int] = set()
@@ -164,6 +166,7 @@ class Gateway:
             if reason:
                 return self._host.end(0, reason, complete=False)
             self._begin()
+            self._requests.not_yet = ""
             return self._fly(stop)
         finally:
             end_keys()

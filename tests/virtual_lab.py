@@ -246,7 +246,7 @@ def flight_of(
     return "".join(parts), Laboratory(setup, seed, faults)
 
 
-_CAPTURE = "address = 'virtual:'\nlatency_s = 0.004\n"
+_CAPTURE = "address = 'virtual:'\nlatency_s = 0.004\nsigma_m = 3e-4\nsigma_deg = 0.03\n"
 
 
 PLACES = {0: np.array([-1.0, 0.0, 0.0]), 1: np.array([0.0, -1.0, 0.0])}

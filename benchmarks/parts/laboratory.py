@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_models import rotations
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_world.sensors.errors import camera_errors
 from common import Figures, Group, KeptResults, Options, seeds_of
 
 import chaserdock
@@ -95,15 +97,21 @@ def fly_laboratory(name: str, with_faults: bool, seed: int) -> LabFlight:
     # Without faults it is compared with the world, whose cameras expose at each tick.
     camera_hz = 29.4 if with_faults else CAPTURE[3]
     text, lab = virtual.flight_of(name, seed, faults, camera_hz=camera_hz)
+    if not with_faults:  # cameras are mounted as in the world's flight of this seed
+        path = virtual.FOLDER / name / "scenario.toml"
+        scenario = load_scenario(path, (f"seed={seed}",))
+        for i in lab.chasers:
+            error = camera_errors(scenario, i)
+            lab.mount(i, error.turn_rad, error.shift_m, error.focal_share)
     others: dict[str, Any] = {}
     killed_s = next((f.at_s for f in faults if f.kind == KILLED), None)
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         if killed_s is not None:
             others["world"] = virtual.killed_and_restarted(lab, killed_s, RESTARTED_S, patch)
             others["operator"] = partial(virtual.arm_again, after_s=killed_s + ARMED_AGAIN_S)
-        scenario = Path(folder) / "lab.toml"
-        scenario.write_text(text)
-        flight = virtual.fly(scenario, Path(folder) / "run", lab, patch, **others)
+        path = Path(folder) / "lab.toml"
+        path.write_text(text)
+        flight = virtual.fly(path, Path(folder) / "run", lab, patch, **others)
         held = held_reasons(Path(folder) / "run")
     reasons = re.findall(r"disarmed: (.*)", flight.output)
     begun_ns = lab.history[0][0] if lab.begun_ns is None else lab.begun_ns

@@ -146,18 +146,22 @@ class Laboratory:
         uniform = self.rng.uniform
         self.capture_clock = Clock(uniform(-0.5, 0.5), uniform(-5e-5, 5e-5))
         self.camera_clocks = {i: Clock(uniform(-5, 5), uniform(-5e-5, 5e-5)) for i in self.chasers}
+        self._lenses: dict[int, tuple[np.ndarray, Rotation, float]] = {}
         optics, mounting = setup.optics, np.random.default_rng([seed, 13])
-        self._lenses = {
-            i: (
-                optics.place + mounting.normal(0.0, optics.shift_sigma_m, 3),
-                Rotation.from_rotvec(mounting.normal(0.0, optics.turn_sigma_deg, 3), degrees=True)
-                * CAMERA_AXES,
-                1.0 + mounting.normal(0.0, optics.focal_sigma),
-            )
-            for i in self.chasers
-        }
+        for i in self.chasers:
+            turn, shift = mounting.normal(size=(2, 3))
+            turn_rad = turn * math.radians(optics.turn_sigma_deg)
+            focal = mounting.normal(0.0, optics.focal_sigma)
+            self.mount(i, turn_rad, shift * optics.shift_sigma_m, focal)
         period_ns = round(1e9 / setup.optics.rate_hz)
         self._next_exposure = {i: period_ns * i // len(self.chasers) for i in self.chasers}
+
+    def mount(self, chaser: int, turn_rad: np.ndarray, shift_m: np.ndarray, focal: float) -> None:
+        """Mount a camera with errors: a rotation vector and a shift, robot's axes, and a share of
+        the focal length.
+        """
+        turn = Rotation.from_rotvec(turn_rad) * CAMERA_AXES
+        self._lenses[chaser] = (self.setup.optics.place + shift_m, turn, 1.0 + focal)
 
     # -- robots ------------------------------------------------------------------------------------
 

@@ -124,9 +124,16 @@ class _Entry:
         return self.driver
 
 
-def install(monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
-    """Let the scheme ``virtual`` open the devices of a laboratory."""
-    kinds = {"camera": _Camera, "pose": _MotionCapture, "robot": _Robot, "latch": _Latch}
+def install(monkeypatch: pytest.MonkeyPatch, lab: Any, latch: Any = None) -> None:
+    """Let the scheme ``virtual`` open the devices of a laboratory; its latches, or those that
+    ``latch()`` makes.
+    """
+    kinds: dict[str, Any] = {
+        "camera": _Camera,
+        "pose": _MotionCapture,
+        "robot": _Robot,
+        "latch": _Latch if latch is None else lambda lab, host, chaser: latch(),
+    }
 
     def found(group: str) -> list[_Entry]:
         kind = next(k for k, g in devices.GROUPS.items() if g == group)
@@ -247,6 +254,15 @@ def flight_of(
 
 
 _CAPTURE = "address = 'virtual:'\nlatency_s = 0.004\nsigma_m = 3e-4\nsigma_deg = 0.03\n"
+
+
+SCENARIO = flight_of("tracking", 0)[0]
+"""Two free flyers that track a turning target, each 1 m from it."""
+
+
+def two_free_flyers(seed: int, faults: Sequence[Any] = ()) -> Any:
+    """Return the laboratory of ``SCENARIO``."""
+    return flight_of("tracking", seed, faults)[1]
 
 
 PLACES = {0: np.array([-1.0, 0.0, 0.0]), 1: np.array([0.0, -1.0, 0.0])}

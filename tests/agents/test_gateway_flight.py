@@ -16,6 +16,7 @@ from chaserdock_protocol.messages import ArmingCommand, ArmingReply, Kill
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.transport import Node
 from virtual_lab import (
+    SCENARIO,
     SENT,
     Fault,
     arm_again,
@@ -24,6 +25,7 @@ from virtual_lab import (
     fly,
     killed_and_restarted,
     tracking_errors_m,
+    two_free_flyers,
 )
 
 import chaserdock
@@ -243,9 +245,9 @@ def test_a_gateway_that_was_killed_takes_the_mission_up_again_disarmed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     killed_s, absent_s, armed_s = 12.0, 4.0, 20.0
-    text, lab = flight_of("tracking", 1)
+    lab = two_free_flyers(1)
     scenario = tmp_path / "lab.toml"
-    scenario.write_text(text)
+    scenario.write_text(SCENARIO)
     flight = fly(
         scenario,
         tmp_path / "run",

@@ -17,7 +17,6 @@ import subprocess
 import sys
 import time
 import tomllib
-from importlib.metadata import entry_points
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
@@ -147,8 +146,6 @@ def fly(a: argparse.Namespace) -> int:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Fly on an emulated laboratory.")
-    if not entry_points(group="chaserdock.latches", name="emulated-latch"):
-        parser.error(f"the driver of its latches is missing: pip install --no-deps {FOLDER}")
     flights = sorted(path.parent.name for path in FOLDER.glob("*/lab.toml"))
     parser.add_argument("flight", choices=flights)
     parser.add_argument("--out", type=Path, required=True, help="folder for log and output")

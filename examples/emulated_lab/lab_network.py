@@ -156,35 +156,29 @@ def obey(lab: Laboratory, number: int, *command: np.ndarray) -> None:
 
 
 class Latch:
-    """The probe of a robot: states whether it touches, is armed and latched, and takes commands."""
+    """The probe of a robot: states whether it touches and is latched, and takes commands."""
 
     PERIOD_NS = 20 * MILLISECOND_NS
 
     def __init__(self, lab: Laboratory, number: int, network: RosNetwork) -> None:
         self._probe = lab.probes[number]
         where, kind = f"/robot{number}/latch", "std_msgs/msg/Bool"
-        self._publishers = {
-            name: network.publisher(f"{where}/{name}", kind)
-            for name in ("contact", "armed", "latched")
-        }
-        network.subscribe(f"{where}/arm", kind, self._command)
+        self._contact = network.publisher(f"{where}/contact", kind)
+        self._latched = network.publisher(f"{where}/latched", kind)
+        network.subscribe(f"{where}/command", kind, self._command)
         self._due_ns = 0
 
     def _command(self, message: Any) -> None:
-        self._probe.command("arm" if message.data else "release")
+        if bool(message.data) != self._probe.is_armed:  # it is repeated
+            self._probe.command("arm" if message.data else "release")
 
     def tick(self, now_ns: int) -> None:
         if now_ns < self._due_ns:
             return
         self._due_ns = now_ns + self.PERIOD_NS
-        probe = self._probe
-        touched, probe.has_touched = probe.has_touched, False
-        for name, value in (
-            ("contact", touched),
-            ("armed", probe.is_armed),
-            ("latched", probe.is_latched),
-        ):
-            self._publishers[name].publish(data=bool(value))
+        touched, self._probe.has_touched = self._probe.has_touched, False
+        self._contact.publish(data=touched)
+        self._latched.publish(data=bool(self._probe.is_latched))
 
 
 class RosCamera:

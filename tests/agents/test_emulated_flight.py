@@ -17,26 +17,9 @@ from virtual_lab import FOLDER
 
 import chaserdock
 
-NAME = "emulated-latch"
 
-
-@pytest.fixture
-def drivers(tmp_path: Path) -> str:
-    """Install the latches' driver as pip would; return the folder."""
-    folder = tmp_path / "drivers"
-    info = folder / "emulated_lab-0.1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: emulated-lab\nVersion: 0.1.0\n")
-    (info / "entry_points.txt").write_text(f"[chaserdock.latches]\n{NAME} = lab_latch:open_latch\n")
-    (folder / "lab_latch.py").write_text((FOLDER / "lab_latch.py").read_text())
-    return str(folder)
-
-
-def flown(
-    flight: str, out: Path, drivers: str, monkeypatch: pytest.MonkeyPatch, *options: str
-) -> tuple[str, dict[str, Any]]:
+def flown(flight: str, out: Path, *options: str) -> tuple[str, dict[str, Any]]:
     """Fly; return the gateway's output, and what the laboratory saw."""
-    monkeypatch.setenv("PYTHONPATH", drivers)
     command = [sys.executable, str(FOLDER / "fly.py"), flight, "--out", str(out), *options]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     seen = out / "laboratory.json"
@@ -54,11 +37,9 @@ def assert_safe(said: str, seen: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow(minutes=2)
-def test_tracking_over_real_topics_measures_the_target_and_is_safe(
-    tmp_path: Path, drivers: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tracking_over_real_topics_measures_the_target_and_is_safe(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    said, seen = flown("tracking", out, drivers, monkeypatch, "--set", "duration_s=20.0")
+    said, seen = flown("tracking", out, "--set", "duration_s=20.0")
     assert_safe(said, seen)
     log = chaserdock.open_log(out / "run")
     poses = {m.sim_time_ns: m for m in log.messages("reference/body/target")}
@@ -74,21 +55,17 @@ def test_tracking_over_real_topics_measures_the_target_and_is_safe(
 
 
 @pytest.mark.slow(minutes=3)
-def test_a_free_flyer_docks_over_real_topics_or_stops_with_a_reason(
-    tmp_path: Path, drivers: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    said, seen = flown("free-flyer-docking", tmp_path / "out", drivers, monkeypatch)
+def test_a_free_flyer_docks_over_real_topics_or_stops_with_a_reason(tmp_path: Path) -> None:
+    said, seen = flown("free-flyer-docking", tmp_path / "out")
     assert_safe(said, seen)
     assert seen["latched"] == [0] or "disarmed: " in said or seen["speeds_m_s"][0] < 0.1
 
 
 @pytest.mark.slow(minutes=2)
-def test_a_gateway_that_is_killed_and_restarted_goes_on(
-    tmp_path: Path, drivers: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gateway_that_is_killed_and_restarted_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ("--set", "duration_s=45.0", "--kill-gateway", "8")
-    said, seen = flown("tracking", out, drivers, monkeypatch, *options)
+    said, seen = flown("tracking", out, *options)
     assert_safe(said, seen)
     assert "gateway restarted: robots are disarmed" in said
     assert said.count("arm accepted") == 2

@@ -60,17 +60,17 @@ def test_free_flyers_track_the_target(
     assert not flight.crashes
     assert set(flight.statuses.values()) == {0}
     for errors in tracking_errors_m(lab, 28.0).values():
-        assert np.sqrt(np.mean(errors**2)) < 1e-3
+        assert np.sqrt(np.mean(errors**2)) < 3e-3  # cameras are mounted to 0.5 mm and 0.05 deg
     assert "disarmed" not in flight.output
     assert "no odometry" not in flight.output
     judged = summary_of(load_flight(flight.folder / "mission.mcap"))
     assert judged["success"] is True
     for chaser in judged["chasers"].values():
-        assert chaser["steady"]["position_mse_m2"] < 2e-3**2
+        assert chaser["steady"]["position_mse_m2"] < 3e-3**2
     twin = twin_of(flight.folder)  # starts when the robots are armed, at rest
     for own, offset_m in zip(twin.chasers, ((-0.2, 0.065, 0.0), (-0.015, -0.2, 0.02)), strict=True):
         assert np.linalg.norm(np.subtract(own.start_offset_m, offset_m)) < 0.01
-        assert np.linalg.norm(own.start_velocity_m_s) < 3e-3
+        assert np.linalg.norm(own.start_velocity_m_s) < 15e-3  # from what follows the start
     assert np.linalg.norm(np.degrees(twin.target.omega_rad_s) - [0.0, 0.0, 3.0]) < 0.1
 
 
@@ -106,14 +106,48 @@ def test_images_need_not_leave_the_robots(tmp_path: Path, monkeypatch: pytest.Mo
     log = load_flight(flight.folder / "mission.mcap")
     assert summary_of(log)["success"] is True
     for errors in tracking_errors_m(lab, 28.0).values():
-        assert np.sqrt(np.mean(errors**2)) < 1e-3
+        assert np.sqrt(np.mean(errors**2)) < 3e-3  # cameras are mounted to 0.5 mm and 0.05 deg
 
 
 def test_nothing_moves_unless_it_is_armed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flight, _ = flown(tmp_path, monkeypatch, seconds=3.0, operator=lambda options: 0)
+    def kill(options: ProcessOptions) -> int:
+        node = Node("operator", "operator", options.link)
+        node.host.sleep(3.0)
+        killed = node.query(topics.ARMING_KEY, ArmingCommand(action="kill"), ArmingReply, 1.0)
+        node.close()
+        return 0 if killed is not None and killed.accepted else 1
+
+    flight, _ = flown(tmp_path, monkeypatch, seconds=3.0, operator=kill)
     assert not flight.crashes
+    assert not flight.stalled
     assert SENT == []
-    assert flight.statuses["world"] == 0
+    assert (flight.statuses["operator"], flight.statuses["world"]) == (0, 1)
+    assert "world: killed at 0.00 s" in flight.output
+
+
+@pytest.mark.slow
+def test_robots_may_be_armed_late_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is commanded to disarmed robots is not taken for their motion."""
+
+    def arm_late(options: ProcessOptions) -> int:
+        node = Node("operator", "operator", options.link)
+        node.host.sleep(15.0)
+        assert arm_when_ready(options) == 0
+        node.host.sleep(5.0)
+        disarm = ArmingCommand(action="disarm", operator="me")
+        assert node.query(topics.ARMING_KEY, disarm, ArmingReply, 1.0) is not None
+        node.host.sleep(5.0)
+        node.close()
+        return arm_when_ready(options)
+
+    flight, lab = flown(tmp_path, monkeypatch, operator=arm_late)
+    assert not flight.crashes
+    assert "disarmed: chaser" not in flight.output
+    assert "contradicts the estimate" not in flight.output
+    for errors in tracking_errors_m(lab, 35.0).values():
+        assert errors.max() < 0.02
 
 
 FAULTS = {
@@ -206,6 +240,8 @@ def test_disarming_wins_over_arming(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert again.reason == "robots are being armed"
         disarm = ArmingCommand(action="disarm", operator="two")
         assert node.query(topics.ARMING_KEY, disarm, ArmingReply, 0.5) is not None
+        node.host.sleep(2.0)
+        node.query(topics.ARMING_KEY, ArmingCommand(action="kill"), ArmingReply, 0.5)
         node.close()
         return 0
 

@@ -163,10 +163,10 @@ class Gateway:
         end_keys = listen_to_keys(self._requests)
         try:
             reason = self._host.wait_for_processes(stop) or self._wait_for_poses(stop)
+            reason = reason or self._wait_for_arming(stop)
             if reason:
                 return self._host.end(0, reason, complete=False)
             self._begin()
-            self._requests.not_yet = ""
             return self._fly(stop)
         finally:
             end_keys()
@@ -174,11 +174,9 @@ class Gateway:
 
     def _begin(self) -> None:
         """Let the mission's time begin, or go on from its beginning by another gateway."""
-        if self._begun is not None:
-            self._start_ns = self._begun.start_ns
-            return
-        self._start_ns = self._now_ns()
-        if self._resume is not None:
+        self._start_ns = self._now_ns() if self._begun is None else self._begun.start_ns
+        self._expect_images()
+        if self._begun is None and self._resume is not None:
             begun = BegunMission(
                 run_id=self._host.run_id,
                 start_ns=self._start_ns,
@@ -208,20 +206,38 @@ class Gateway:
             self._barrier.process_until(self._node.host.now_s() + _POLL_S)
         return "stopped before the first tick"
 
+    def _wait_for_arming(self, stop: StopSignal) -> str:
+        """Guard the robots until they are armed; return why they are not, else nothing."""
+        print_status("gateway", "waiting for `chaserdock command arm`")
+        self._requests.not_yet = ""
+        while not stop() and self._gate.state != "killed":
+            self._read()
+            self._guard()
+            if self._gate.is_armed:
+                return ""
+            self._barrier.process_until(self._node.host.now_s() + _POLL_S)
+        return "killed" if self._gate.state == "killed" else "stopped before the first tick"
+
     def _fly(self, stop: StopSignal) -> int:
+        """Open the ticks of the mission while robots are armed: flight software would take what it
+        commands to disarmed ones for their motion. Time goes on meanwhile.
+        """
         first = self._mission_ns() * self._timing.rate_hz // _NS + 1 if self._begun else 0
-        first = min(first, self._scenario.ticks)
-        for tick in range(first, self._scenario.ticks + 1):
+        for tick in range(min(first, self._scenario.ticks), self._scenario.ticks + 1):
             self._work_until(self._start_ns + self._timing.tick_time_ns(tick))
+            if tick == self._scenario.ticks:
+                return self._host.end(tick, "completed", complete=True)
+            if stop():
+                return self._host.end(tick, "stopped", complete=False)
+            if not self._gate.is_armed:
+                continue
             self._publish_odometry(tick)
             self._publish_docking(tick)
             self._warn_of_blind_chasers()
-            if tick == self._scenario.ticks:
-                return self._host.end(tick, "completed", complete=True)
             # Cameras run freely: no image belongs to a tick, and no tick waits for one.
             self._barrier.open_tick(tick, images=False)
             if tick == first > 0:
-                self._barrier.publish_warning("gateway restarted", "robots are disarmed")
+                self._barrier.publish_warning("gateway restarted", "the mission goes on")
             if stop() or self._barrier.lost_all_chasers(self._host.options.rejoin_s, stop):
                 reason = "stopped" if stop() else "no chaser is left"
                 return self._host.end(tick, reason, complete=False)
@@ -253,7 +269,7 @@ class Gateway:
 
     def _publish_reference(self, feed: PoseFeed, pose: MeasuredPose) -> None:
         measured_ns = pose.time_ns - self._start_ns
-        if measured_ns < 0:
+        if not self._start_ns or measured_ns < 0:
             return
         body = feed.device.body
         message = BodyReference(
@@ -272,7 +288,7 @@ class Gateway:
 
     def _publish_image(self, chaser: int, image: ImageArray, time_ns: int) -> None:
         exposed_ns = time_ns - self._start_ns
-        if exposed_ns <= 0 or chaser not in self._barrier.chasers:
+        if not self._gate.is_armed or exposed_ns <= 0 or chaser not in self._barrier.chasers:
             return
         quality = self._scenario.camera.effects.jpeg_quality
         message = image_message(self._timing.rate_hz, quality, chaser, image, exposed_ns)
@@ -280,11 +296,14 @@ class Gateway:
         self._blind.discard(chaser)
         self._node.publish(topics.IMAGE, message, chaser)
 
+    def _expect_images(self) -> None:
+        self._image_ns = {c.device.chaser: self._mission_ns() for c in self._lab.cameras}
+
     def _warn_of_blind_chasers(self) -> None:
         """Publish once for each time that a camera is silent, or repeats an image."""
         for camera in self._lab.cameras:
             chaser = camera.device.chaser
-            silent_ns = self._mission_ns() - self._image_ns.get(chaser, 0)
+            silent_ns = self._mission_ns() - self._image_ns[chaser]
             if silent_ns > _BLIND_NS and chaser not in self._blind:
                 self._blind.add(chaser)
                 self._barrier.publish_warning("no new image", f"chaser {chaser}")
@@ -293,7 +312,10 @@ class Gateway:
         time_ns = self._timing.tick_time_ns(tick)
         host_ns = self._start_ns + time_ns
         for chaser, feed in self._lab.odometry.items():
-            since_ns = self._used_ns.get(chaser, host_ns - _NS // self._timing.rate_hz)
+            # Poses of a pause are no line: bodies come to rest meanwhile.
+            newest_ns = host_ns - _NS // self._timing.rate_hz
+            oldest_ns = 2 * newest_ns - host_ns
+            since_ns = max(oldest_ns, self._used_ns.get(chaser, newest_ns))
             state = feed.track.at(host_ns, since_ns)
             if state is None:
                 if chaser not in self._missing:
@@ -359,7 +381,8 @@ class Gateway:
                 self._is_disarmed_meanwhile = True
                 self._lab.stop()
             self._answer(action, accepted, reason, answer)
-        self._end_arming(sights)
+        if self._end_arming(sights):
+            return  # ages of commands count from now on
         if reason := self._gate.check(sights):
             self._lab.stop()
             self._barrier.publish_warning("disarmed", reason)
@@ -387,12 +410,12 @@ class Gateway:
         except DeviceError as error:
             self._armed.append(str(error))
 
-    def _end_arming(self, sights: tuple[RobotSight, ...]) -> None:
-        """Let commands pass once all robots are armed; stop them if one is not, or if they were
-        disarmed meanwhile.
+    def _end_arming(self, sights: tuple[RobotSight, ...]) -> bool:
+        """Let commands pass once all robots are armed, and return whether they are; stop them if
+        one is not, or if they were disarmed meanwhile.
         """
         if self._arming is None or not self._armed:
-            return
+            return False
         (by, answer), self._arming = self._arming, None
         error = self._armed.popleft()
         if error:
@@ -403,10 +426,12 @@ class Gateway:
             accepted, reason = self._gate.request("arm", by, sights)
         if accepted:
             self._lab.forget_motion()
-            self._commanded_ns.clear()  # ages count from now on
+            self._commanded_ns.clear()
+            self._expect_images()
         else:
             self._lab.stop()
         self._answer("arm", accepted, reason, answer)
+        return accepted
 
     def _trip(self, reason: str) -> None:
         if self._gate.is_armed or reason != self._gate.reason:

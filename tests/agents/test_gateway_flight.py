@@ -71,7 +71,7 @@ def test_free_flyers_track_the_target(
     for own, offset_m in zip(twin.chasers, ((-0.2, 0.065, 0.0), (-0.015, -0.2, 0.02)), strict=True):
         assert np.linalg.norm(np.subtract(own.start_offset_m, offset_m)) < 0.01
         assert np.linalg.norm(own.start_velocity_m_s) < 15e-3  # from what follows the start
-    assert np.linalg.norm(np.degrees(twin.target.omega_rad_s) - [0.0, 0.0, 3.0]) < 0.1
+    assert np.linalg.norm(np.degrees(twin.target.omega_rad_s) - [0.0, 0.0, 3.0]) < 0.5
 
 
 @pytest.mark.slow(minutes=3)

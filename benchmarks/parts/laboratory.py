@@ -35,7 +35,8 @@ SECONDS = {"tracking": 25.0, "planar-docking": 40.0, "free-flyer-docking": 40.0}
 
 @dataclass(frozen=True)
 class LabFlight:
-    """How a flight ended. ``reason``: why the robots were stopped, empty if they were not.
+    """How a flight ended. ``reason``: why the robots were stopped since they were last armed, empty
+    if they were not.
     ``held``: why a chaser that is not latched waits, by the controller. ``error_m``: largest error
     of tracking in the last five seconds; ``speed_m_s``: of the fastest robot at the end.
     """
@@ -113,7 +114,8 @@ def fly_laboratory(name: str, with_faults: bool, seed: int) -> LabFlight:
         path.write_text(text)
         flight = virtual.fly(path, Path(folder) / "run", lab, patch, **others)
         held = held_reasons(Path(folder) / "run")
-    reasons = re.findall(r"disarmed: (.*)", flight.output)
+    since_armed = flight.output.rpartition("arm accepted")[2]
+    reasons = re.findall(r"disarmed: (.*)", since_armed)
     begun_ns = lab.history[0][0] if lab.begun_ns is None else lab.begun_ns
     end_s = (lab.history[-1][0] - begun_ns) / 1e9
     late = steady = np.zeros(0)

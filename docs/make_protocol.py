@@ -16,7 +16,11 @@ from chaserdock_protocol import messages, topics
 from chaserdock_protocol.codec import MAX_BYTES, UNIT_QUATERNION_TOLERANCE
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE
-from chaserdock_protocol.transport.session import EARLY_PERIOD_S, STEADY_PERIOD_S
+from chaserdock_protocol.transport.session import (
+    EARLY_PERIOD_S,
+    STEADY_PERIOD_S,
+    SUCCESSOR_AFTER_S,
+)
 from msgspec import Struct
 from msgspec import inspect as shapes
 
@@ -110,6 +114,9 @@ the session has not yet learnt who answers it. Repeat it until a reply arrives, 
    process whose presence was received, with its instance, and in `world` the session of the
    mission's world. Do so each {EARLY_PERIOD_S:g} s; after the first tick, each {STEADY_PERIOD_S:g}
    s is enough.
+5. In real time, when the world is silent for {SUCCESSOR_AFTER_S:g} s, query `{topics.JOIN_KEY}`
+   again each {STEADY_PERIOD_S:g} s, with the same instance. A reply with the same `run_id` and
+   another `source` is of a gateway that takes up the mission, and is the world from then on.
 
 Zenoh propagates declarations one by one, so that an early message may miss a subscriber. A writer
 whose presence reaches a reader knows all subscriptions that the reader declared before. The world

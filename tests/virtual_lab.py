@@ -5,11 +5,11 @@ own thread of control, so that a flight is deterministic.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from chaserdock_agents.gateway.devices import (
     CameraFrame,
     DeviceError,
     DeviceHost,
+    LatchReading,
     PoseSample,
     RobotCommand,
 )
@@ -29,18 +30,14 @@ from chaserdock_protocol.messages import ArmingCommand, ArmingReply
 from chaserdock_protocol.pose_image import encode_pose
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.transport import Node
-from scipy.spatial.transform import Rotation
 
 from chaserdock.simulation.mission import SimulatedFlight, simulate
 
-_PATH = Path(__file__).parents[1] / "examples" / "emulated_lab" / "laboratory.py"
-_SPEC = importlib.util.spec_from_file_location("emulated_laboratory", _PATH)
-assert _SPEC is not None
-assert _SPEC.loader is not None
-emulated = importlib.util.module_from_spec(_SPEC)
-sys.modules[_SPEC.name] = emulated
-_SPEC.loader.exec_module(emulated)
-Fault, Body, Laboratory = emulated.Fault, emulated.Body, emulated.Laboratory
+FOLDER = Path(__file__).parents[1] / "examples" / "emulated_lab"
+sys.path.append(str(FOLDER))
+emulated = import_module("lab_devices")
+
+Fault, Laboratory = emulated.Fault, emulated.Laboratory
 
 
 @dataclass
@@ -60,6 +57,10 @@ class _MotionCapture(_Device):
         now_ns = self.host.now_ns()
         captured = self.lab.copied if self.from_copy else self.lab.captured
         self.lab.advance(now_ns)
+        if not self.from_copy and self.lab.begun_ns is not None:
+            for chaser, body in self.lab.chasers.items():
+                if body.is_on:  # as drivers go on to send while their process lives
+                    self.lab.hear(chaser, now_ns)
         found = []
         while captured and captured[0][0] <= now_ns:
             at_ns, c = captured.popleft()
@@ -83,9 +84,9 @@ class _Camera(_Device):
 
 class _Robot(_Device):
     def send(self, command: RobotCommand) -> None:
+        now_ns, wrench = self.host.now_ns(), (command.force_N, command.torque_N_m)
         try:
-            now_ns = self.host.now_ns()
-            self.lab.command(self.chaser, command.force_N, command.torque_N_m, now_ns)
+            self.lab.command(self.chaser, *wrench, now_ns, command.duty)
         except ConnectionError as error:
             raise DeviceError(str(error)) from None
         SENT.append((now_ns, self.chaser))
@@ -94,6 +95,18 @@ class _Robot(_Device):
         self.lab.stop(self.chaser, self.host.now_ns())
 
     def arm(self) -> None: ...
+
+
+class _Latch(_Device):
+    def poll(self) -> LatchReading:
+        self.lab.advance(self.host.now_ns())
+        probe = self.lab.probes[self.chaser]
+        touched, probe.has_touched = probe.has_touched, False
+        return LatchReading(touched, probe.is_armed, probe.is_latched)
+
+    def command(self, latch: str) -> None:
+        self.lab.advance(self.host.now_ns())
+        self.lab.probes[self.chaser].command(latch)
 
 
 SENT: list[tuple[int, int]] = []
@@ -111,9 +124,16 @@ class _Entry:
         return self.driver
 
 
-def install(monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
-    """Let the scheme ``virtual`` open the devices of a laboratory."""
-    kinds = {"camera": _Camera, "pose": _MotionCapture, "robot": _Robot}
+def install(monkeypatch: pytest.MonkeyPatch, lab: Any, latch: Any = None) -> None:
+    """Let the scheme ``virtual`` open the devices of a laboratory; its latches, or those that
+    ``latch()`` makes.
+    """
+    kinds: dict[str, Any] = {
+        "camera": _Camera,
+        "pose": _MotionCapture,
+        "robot": _Robot,
+        "latch": _Latch if latch is None else lambda lab, host, chaser: latch(),
+    }
 
     def found(group: str) -> list[_Entry]:
         kind = next(k for k, g in devices.GROUPS.items() if g == group)
@@ -123,11 +143,48 @@ def install(monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
                 return _MotionCapture(lab, host, from_copy=True)
             return kinds[kind](lab, host, int(rest or 0))
 
-        return [_Entry("virtual", opened)] if kind in kinds else []
+        return [_Entry("virtual", opened)]
 
     monkeypatch.setattr(devices, "entry_points", found)
     SENT.clear()
     LATENCIES_S.clear()
+
+
+class GatewayKilled(BaseException):
+    """Ends the gateway from within a device, as SIGKILL does."""
+
+
+def killed_and_restarted(
+    lab: Any, after_s: float, absent_s: float, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[ProcessOptions], int]:
+    """Return a gateway that is killed so long after its first command, and started again after
+    ``absent_s``.
+    """
+    poll, stop = _MotionCapture.poll, _Robot.stop
+
+    def dying(device: _MotionCapture) -> list[PoseSample]:
+        now_ns = device.host.now_ns()
+        if lab.begun_ns is not None and now_ns - lab.begun_ns > after_s * 1e9:
+            raise GatewayKilled
+        return poll(device)
+
+    def main(options: ProcessOptions) -> int:
+        resumable = replace(options, resume=options.out.with_name("begun.json"))
+        monkeypatch.setattr(_MotionCapture, "poll", dying)
+        monkeypatch.setattr(_Robot, "stop", lambda device: None)  # nobody stops the robots
+        try:
+            return gateway.main(resumable)
+        except GatewayKilled:
+            monkeypatch.setattr(_MotionCapture, "poll", poll)
+            monkeypatch.setattr(_Robot, "stop", stop)
+        node = Node("time", "operator", options.link)
+        for _ in range(round(absent_s / 0.1)):  # time of the laboratory, which goes on
+            node.host.sleep(0.1)
+            lab.advance(round(node.host.now_s() * 1e9))
+        node.close()
+        return gateway.main(resumable)
+
+    return main
 
 
 def arm_when_ready(options: ProcessOptions, give_up_s: float = 20.0) -> int:
@@ -147,97 +204,83 @@ def arm_when_ready(options: ProcessOptions, give_up_s: float = 20.0) -> int:
         node.close()
 
 
+def arm_again(options: ProcessOptions, after_s: float) -> int:
+    """Arm when ready, and again so long after; return 0 if both were done."""
+    if arm_when_ready(options):
+        return 1
+    node = Node("operator", "operator", options.link)
+    node.host.sleep(after_s)
+    node.close()
+    return arm_when_ready(options)
+
+
 def fly(
     scenario: Path, folder: Path, lab: Any, monkeypatch: pytest.MonkeyPatch, **others: Any
 ) -> SimulatedFlight:
     """Fly a scenario with ``[lab]`` on a virtual laboratory, armed as soon as it can be."""
     install(monkeypatch, lab)
     processes = {"world": gateway.main, "operator": arm_when_ready, **others}
-    return simulate(scenario, folder, ("simulation.mode='realtime'",), others=processes)
+    overrides = ("simulation.mode='realtime'", "camera.effects.jpeg_quality=0")  # images are poses
+    return simulate(scenario, folder, overrides, others=processes)
 
 
-SCENARIO = """
-extends = "two-chaser-tracking"
-name = "virtual-lab"
-duration_s = 40.0
-[camera]
-effects.jpeg_quality = 0
-[perception]
-name = "statistical"
-[success]
-steady_position_rms_m = 0.008
-[lab.safety]
-volume = { lower_m = [-2.0, -2.0, -2.0], upper_m = [2.0, 2.0, 2.0] }
-max_speed_m_s = 0.3
-[[lab.odometry]]
-body = "chaser/0"
-address = "virtual:"
-name = "robot0"
-latency_s = 0.004
-[[lab.odometry]]
-body = "chaser/1"
-address = "virtual:"
-name = "robot1"
-latency_s = 0.004
-[[lab.robot]]
-chaser = 0
-address = "virtual:0"
-[[lab.robot]]
-chaser = 1
-address = "virtual:1"
-[[lab.reference]]
-body = "target"
-address = "virtual:reference"
-name = "target"
-latency_s = 0.004
-[[lab.reference]]
-body = "chaser/0"
-address = "virtual:reference"
-name = "robot0"
-latency_s = 0.004
-[[lab.reference]]
-body = "chaser/1"
-address = "virtual:reference"
-name = "robot1"
-latency_s = 0.004
-[[lab.camera]]
-chaser = 0
-address = "virtual:0"
-latency_s = 0.02
-[[lab.camera]]
-chaser = 1
-address = "virtual:1"
-latency_s = 0.02
-"""
+def flight_of(
+    name: str,
+    seed: int,
+    faults: Sequence[Any] = (),
+    cameras: bool = True,
+    camera_hz: float = 29.4,
+) -> tuple[str, Any]:
+    """Return the scenario ``name`` of the emulated laboratory, on virtual devices, and the
+    laboratory. Cameras run freely; without ``cameras`` they are not the gateway's.
+    """
+    text = (FOLDER / name / "scenario.toml").read_text(encoding="utf-8").partition("[[lab.")[0]
+    setup = emulated.read_setup(FOLDER / name / "lab.toml", seed)
+    setup.optics = emulated.Optics(setup.optics.place, rate_hz=camera_hz)
+    parts = [text, "[perception]\nname = 'statistical'\n"]
+    for i in setup.chasers:
+        own = f"address = 'virtual:{i}'\n"
+        parts.append(f"[[lab.odometry]]\nbody = 'chaser/{i}'\nname = 'robot{i}'\n{_CAPTURE}")
+        parts.append(f"[[lab.robot]]\nchaser = {i}\n{own}")
+        if cameras:
+            parts.append(f"[[lab.camera]]\nchaser = {i}\n{own}latency_s = 0.02\n")
+        if i in setup.probes:
+            parts.append(f"[[lab.latch]]\nchaser = {i}\n{own}")
+    for body in ("target", *setup.chasers):
+        known = ("target", "target") if body == "target" else (f"chaser/{body}", f"robot{body}")
+        parts.append("[[lab.reference]]\nbody = '{}'\nname = '{}'\n".format(*known))
+        parts.append(_CAPTURE.replace("virtual:", "virtual:reference"))
+    return "".join(parts), Laboratory(setup, seed, faults)
+
+
+_CAPTURE = "address = 'virtual:'\nlatency_s = 0.004\nsigma_m = 3e-4\nsigma_deg = 0.03\n"
+
+
+SCENARIO = flight_of("tracking", 0)[0]
 """Two free flyers that track a turning target, each 1 m from it."""
 
 
 def two_free_flyers(seed: int, faults: Sequence[Any] = ()) -> Any:
     """Return the laboratory of ``SCENARIO``."""
-    target = Body(np.zeros(3), Rotation.identity(), omega=np.array([0.0, 0.0, math.radians(3.0)]))
-    chasers = {
-        0: Body(np.array([-1.2, 0.03, 0.0]), Rotation.from_rotvec([0.2, 0.0, 0.0])),
-        1: Body(
-            np.array([0.02, -1.2, 0.02]),
-            Rotation.from_rotvec([0.0, 0.0, math.pi / 2])
-            * Rotation.from_rotvec([-0.2, 0.03, -0.03]),
-        ),
-    }
-    inertia = (0.1625, 0.1625, 0.3125)
-    return Laboratory(chasers, target, (0.07, 0.0, 0.075), 30.0, inertia, seed, faults)
+    return flight_of("tracking", seed, faults)[1]
 
 
-def tracking_errors_m(lab: Any, after_s: float) -> dict[int, np.ndarray]:
-    """Return the distance of each chaser from its place beside the target, from ``after_s`` after
-    the first command on.
+PLACES = {0: np.array([-1.0, 0.0, 0.0]), 1: np.array([0.0, -1.0, 0.0])}
+"""Where the chasers of ``tracking`` are to be beside the target, m."""
+
+
+def tracking_errors_m(
+    lab: Any, after_s: float, before_s: float = math.inf
+) -> dict[int, np.ndarray]:
+    """Return the distance of each chaser from its place beside the target, between two times after
+    the first command.
     """
     assert lab.begun_ns is not None
-    places = {0: np.array([-1.0, 0.0, 0.0]), 1: np.array([0.0, -1.0, 0.0])}
     errors: dict[int, list[float]] = {0: [], 1: []}
     for time_ns, states in lab.history:
-        if time_ns - lab.begun_ns < after_s * 1e9:
+        if not after_s * 1e9 <= time_ns - lab.begun_ns < before_s * 1e9:
             continue
         p, r = states["target"]
-        for i, place in places.items():
+        for i, place in PLACES.items():
             errors[i].append(float(np.linalg.norm(states[f"chaser/{i}"][0] - p - r.apply(place))))
     return {i: np.array(e) for i, e in errors.items()}

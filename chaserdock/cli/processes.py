@@ -112,6 +112,13 @@ def gateway(
         ),
     ] = None,
     recorder: RecorderOpt = True,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            help="file that keeps which mission has begun: started with the same one after it was "
+            "killed, the gateway takes the mission up again, disarmed"
+        ),
+    ] = None,
     *,
     link: LinkOptions,
     timeout: ConnectTimeoutOpt = None,
@@ -137,6 +144,7 @@ def gateway(
         rejoin_s=rejoin_timeout,
         watch_parent=watch_parent,
         dry_run=dry_run,
+        resume=resume,
     )
     if check is not None:
         _check_devices(options, check)

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import random
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 from chaserdock_protocol import codec, topics
@@ -81,13 +81,17 @@ class SimulatedNetwork:
         self.links = Links(scheduler, conditions, seed, lockstep, self.traffic)
         self._seed = seed
         self._connections: dict[str, SimulatedConnection] = {}
+        self._opened: Counter[str] = Counter()
         self._subscriptions: list[_Subscription] = []
         self._routes: dict[str, list[_Subscription]] = {}
 
     def open(self, name: str) -> tuple[Connection, Host]:
         """Connect a process. One that is started again replaces its earlier connection."""
         host = SimulatedHost(name, self)
-        self._connections[name] = SimulatedConnection(self, name, host)
+        self._opened[name] += 1
+        number = self._opened[name]
+        source = name if number == 1 else f"{name}#{number}"
+        self._connections[name] = SimulatedConnection(self, name, host, source)
         for subscription in self._subscriptions:
             self._declare(subscription, name)
         return self._connections[name], host
@@ -202,6 +206,13 @@ class SimulatedNetwork:
             if other.name != name:
                 self.links.deliver(name, other.name, lambda other=other: other.review(name))
 
+    def tell_who_lives(self, watcher: SimulatedConnection) -> None:
+        """Let a process check all that have appeared before, once the news has reached it."""
+        for name, other in self._connections.items():
+            if other.token and other is not watcher:
+                review = partial(watcher.review, name)
+                self.links.deliver(name, watcher.name, review)
+
     # -- declarations ------------------------------------------------------------------------------
 
     def subscribe(
@@ -264,11 +275,15 @@ class _SimulatedQuery:
 
 
 class SimulatedConnection:
-    """A ``Connection`` to a simulated network."""
+    """A ``Connection`` to a simulated network. ``source``: as a session has, one of its own for
+    each process that is started again.
+    """
 
-    def __init__(self, network: SimulatedNetwork, name: str, host: SimulatedHost) -> None:
+    def __init__(
+        self, network: SimulatedNetwork, name: str, host: SimulatedHost, source: str
+    ) -> None:
         self.network, self.name, self.host = network, name, host
-        self.source = name
+        self.source = source
         self.closed = False
         self.token = ""
         self.queryables: dict[str, Callable[[Query], None]] = {}
@@ -331,6 +346,7 @@ class SimulatedConnection:
 
     def watch_liveliness(self, expression: str, changed: Callable[[str, bool], None]) -> None:
         self._watchers.append((expression, changed))
+        self.network.tell_who_lives(self)
 
     def review(self, name: str) -> None:
         """Tell the watchers if another process has appeared or disappeared."""

@@ -63,7 +63,8 @@ class ProcessOptions:
     world waits after it lost all processes. ``by_run``: the recorder creates one folder per run in
     ``out``. ``until``: the router ends when this process has joined and left. ``standby``: the
     controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM. ``ros``:
-    for the bridge. ``dry_run``: a gateway sends nothing to robots.
+    for the bridge. ``dry_run``: a gateway sends nothing to robots. ``resume``: file by which it
+    takes up a mission again.
     ``camera``, ``camera_latency_s``: as in `[[lab.camera]]`, of a chaser with a camera of its own.
     """
 
@@ -88,6 +89,7 @@ class ProcessOptions:
     signals: bool = True
     ros: RosLink = RosLink()
     dry_run: bool = False
+    resume: Path | None = None
     camera: str = ""
     camera_latency_s: float = 0.0
 

@@ -76,3 +76,15 @@ def test_a_short_burst_of_delays_is_no_step() -> None:
     deliver(clock, 2.0, 30, 0.05, begin_s=1005.4)
     assert clock.steps == 0
     assert abs(clock.offset_s - 0.05) < 1 * MS
+
+
+def test_a_device_that_falls_behind_and_catches_up_has_not_stepped() -> None:
+    """Its messages come later and later, then in a burst: as on a machine that is overloaded."""
+    clock, rate_hz = DeviceClock(), 100
+    deliver(clock, 5.0, rate_hz, 0.05)
+    behind_s = [*np.linspace(0.0, 0.2, 2 * rate_hz), *np.linspace(0.2, 0.0, rate_hz // 4)]
+    for k, late_s in enumerate(behind_s):
+        host_s = 1005.0 + k / rate_hz
+        stamp_ns = round((host_s - 0.05) * 1e9)
+        assert not clock.add(stamp_ns, round((host_s + late_s) * 1e9))
+        assert abs(clock.host_ns(stamp_ns) / 1e9 - host_s) < 1.5 * MS

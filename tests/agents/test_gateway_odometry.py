@@ -131,3 +131,15 @@ def test_without_new_poses_there_is_no_odometry() -> None:
         track.add(pose(rng, k * 10_000_000))
     assert track.at(200_000_000, 110_000_000) is None
     assert BodyTrack(BOUNDS).at(200_000_000, 0) is None
+
+
+def test_poses_whose_times_are_pushed_together_give_no_velocity() -> None:
+    rng, track = np.random.default_rng(2), BodyTrack(BOUNDS)
+    for k in range(8):
+        track.add(pose(rng, 1_000_000_000 + k * 100_000))
+    assert track.newest_state() is None
+    for k in range(1, 4):
+        track.add(pose(rng, 1_000_000_000 + k * 10_000_000))
+    state = track.newest_state()
+    assert state is not None
+    assert np.linalg.norm(state.velocity_m_s - V) < 0.1

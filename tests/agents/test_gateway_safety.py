@@ -20,7 +20,7 @@ from chaserdock_agents.gateway.safety import (
 )
 from chaserdock_models.clock import Timing
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import ActuatorCommand, ArmingReply, ThrusterPulse
+from chaserdock_protocol.messages import ActuatorCommand, ArmingCommand, ArmingReply, ThrusterPulse
 from chaserdock_protocol.scenario.bodies import Body
 from chaserdock_protocol.scenario.lab import LabSafety
 
@@ -117,6 +117,7 @@ def test_kill_is_final() -> None:
 
 def test_requests_that_stop_come_first() -> None:
     requests = ArmingRequests()
+    requests.not_yet = ""
     said: list[ArmingReply] = []
     for action in ("arm", "disarm", "kill"):
         requests.add(action, "me", said.append)
@@ -181,15 +182,28 @@ def test_a_wrench_acts_from_its_effective_time_on() -> None:
     assert not output[0].any()
 
 
+PERIOD_NS = 1_000_000_000 // BODY.modulation.carrier_hz
+FIRST_NS = TIMING.effective_ns(0)
+"""When the first carrier period begins."""
+
+
+def pulse(thruster: int, begin_ns: int, share: float) -> ThrusterPulse:
+    """Return a pulse in the middle of a carrier period."""
+    width_ns = round(share * PERIOD_NS)
+    open_ns = begin_ns + (PERIOD_NS - width_ns) // 2
+    return ThrusterPulse(thruster=thruster, open_ns=open_ns, close_ns=open_ns + width_ns)
+
+
+def duties(actuation: RobotActuation, begin_ns: int, end_ns: int) -> list[tuple[int, np.ndarray]]:
+    """Return times and duties of the outputs between two times, looked for each 2 ms."""
+    outputs = ((t, actuation.take(t)) for t in range(begin_ns, end_ns, 2_000_000))
+    return [(t, output[2]) for t, output in outputs if output is not None]
+
+
 def test_duty_of_a_carrier_period_is_the_share_of_its_pulses() -> None:
     actuation = RobotActuation(BODY, TIMING)
-    period_ns = 1_000_000_000 // BODY.modulation.carrier_hz
-    begin_ns = 10 * period_ns
-    pulses = (
-        ThrusterPulse(thruster=2, open_ns=begin_ns, close_ns=begin_ns + period_ns // 4),
-        ThrusterPulse(thruster=5, open_ns=begin_ns + period_ns // 2, close_ns=begin_ns + period_ns),
-        ThrusterPulse(thruster=7, open_ns=begin_ns, close_ns=begin_ns + period_ns // 2),
-    )
+    begin_ns = FIRST_NS + 10 * PERIOD_NS
+    pulses = (pulse(2, begin_ns, 0.25), pulse(5, begin_ns, 0.5), pulse(7, begin_ns, 0.5))
     step = TIMING.step_of_time(begin_ns)
     actuation.command(command(9, pulses=pulses, isolated=(7,)), step, step)
     output = actuation.take(TIMING.time_ns(step))
@@ -202,6 +216,36 @@ def test_duty_of_a_carrier_period_is_the_share_of_its_pulses() -> None:
         np.concatenate([force, torque]), wrench_matrix(BODY.thrusters) @ expected, atol=1e-6
     )
     assert actuation.take(TIMING.time_ns(step) + 1000) is None
-    after = actuation.take(begin_ns + period_ns + 1000)
+    after = actuation.take(begin_ns + PERIOD_NS + 1000)
     assert after is not None
     assert not after[2].any()
+
+
+@pytest.mark.parametrize("late_ms", [0, 30])
+def test_duty_of_every_period_is_held_for_a_period_though_commands_are_late(late_ms: int) -> None:
+    actuation, sent = RobotActuation(BODY, TIMING), []
+    for k in range(5):
+        begin_ns = FIRST_NS + k * PERIOD_NS
+        arrived_ns = begin_ns + late_ms * 1_000_000
+        sent += duties(actuation, begin_ns, arrived_ns)
+        step = TIMING.step_of_time(begin_ns)
+        changed = command(k, pulses=(pulse(3, begin_ns, 0.1 * (k + 1)),))
+        actuation.command(changed, step, TIMING.step_of_time(arrived_ns))
+        sent += duties(actuation, arrived_ns + 2_000_000, begin_ns + PERIOD_NS)
+    sent += duties(actuation, FIRST_NS + 5 * PERIOD_NS, FIRST_NS + 7 * PERIOD_NS)
+    assert [round(float(duty[3]), 3) for _, duty in sent] == [0.1, 0.2, 0.3, 0.4, 0.5, 0.0]
+    times_ns = np.array([t for t, _ in sent])
+    assert np.abs(np.diff(times_ns) - PERIOD_NS).max() <= 4_000_000
+
+
+def test_arm_is_refused_at_once_before_the_mission_begins() -> None:
+    requests, replies = ArmingRequests(), []
+    requests.submit(ArmingCommand(action="arm", operator="one"), replies.append)
+    requests.submit(ArmingCommand(action="kill", operator="two"), replies.append)
+    assert [(r.accepted, r.reason) for r in replies] == [(False, "the mission has not begun")]
+    requests.not_yet = ""
+    requests.submit(ArmingCommand(action="arm", operator="three"), replies.append)
+    assert [(action, by) for action, by, _ in requests.take()] == [
+        ("kill", "two"),
+        ("arm", "three"),
+    ]

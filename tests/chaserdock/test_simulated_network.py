@@ -278,6 +278,28 @@ def test_a_partition_beyond_the_lease_ends_liveliness_and_its_end_restores_it() 
     assert changes[2][0] == pytest.approx(1.0 + 4.0, abs=0.01)
 
 
+def test_a_world_that_is_started_again_learns_who_lives_and_is_another_session() -> None:
+    changes: list[tuple[str, bool]] = []
+    sources: list[str] = []
+
+    def run(scheduler: Scheduler) -> None:
+        section = SimulationSection.model_validate({"mode": "realtime"})
+        network = SimulatedNetwork(scheduler, section, 0, lockstep=False)
+        chaser = Node("chaser/0", "chaser", Link(network=network))
+        chaser.declare_liveliness()
+        for _ in range(2):
+            world = Node("world", "world", Link(network=network))
+            sources.append(world.source)
+            world.watch_liveliness(lambda name, alive: changes.append((name, alive)))
+            scheduler.pause(1.0)
+            world.close()
+        chaser.close()
+
+    flown(run)
+    assert changes == [("chaser/0", True)] * 2
+    assert len(set(sources)) == 2
+
+
 def test_clocks_of_processes_differ_by_offset_and_drift() -> None:
     def run(scheduler: Scheduler) -> None:
         section = SimulationSection.model_validate(

@@ -22,20 +22,24 @@ _NS = 1_000_000_000
 class RobotActuation:
     """Commands of one chaser that wait for their time, in mission time.
 
-    With thrusters, the duty of each carrier period follows from its pulses; without, a wrench acts
-    until the next one. ``matrix`` (6, n): wrench of each open thruster.
+    With thrusters, each carrier period's pulses become one duty, which the robot holds for a period
+    from when it gets it: a command that comes late is late, and nothing of it is lost. Without, a
+    wrench acts until the next one. ``matrix`` (6, n): wrench of each open thruster.
     """
 
     def __init__(self, body: Body, timing: Timing) -> None:
         self._timing = timing
         self._has_thrusters = body.actuation == "thrusters"
         self.matrix: Array = wrench_matrix(body.thrusters) if self._has_thrusters else np.zeros(0)
-        self._period_ns = _NS // body.modulation.carrier_hz
+        self._period_steps = timing.physics_hz // body.modulation.carrier_hz
+        # As chasers have it: the first period begins when a command can first take effect.
+        self._first_step = timing.latency_steps % self._period_steps
         self._waiting: list[tuple[int, int, ActuatorCommand]] = []
         self._received = 0
         self._pulses: list[ThrusterPulse] = []
         self._isolated: tuple[int, ...] = ()
-        self._sent_period = -1
+        self._sent: tuple[int, int] = (-1, 0)
+        self._until_ns: int | None = None
         self._is_stopped = False
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
@@ -48,6 +52,7 @@ class RobotActuation:
         """Discard all commands; the next output is zero."""
         self._waiting.clear()
         self._pulses.clear()
+        self._until_ns = None
         self._is_stopped = True
 
     def take(self, now_ns: int) -> tuple[Array, Array, Array] | None:
@@ -63,7 +68,7 @@ class RobotActuation:
             self._is_stopped = False
             return np.zeros(3), np.zeros(3), np.zeros(self._thrusters)
         if self._has_thrusters:
-            return self._duty_of(now_ns // self._period_ns)
+            return self._duty_at(now_ns)
         if newest is None:
             return None
         return np.array(newest.force_N), np.array(newest.torque_N_m), np.zeros(0)
@@ -72,17 +77,26 @@ class RobotActuation:
     def _thrusters(self) -> int:
         return self.matrix.shape[1] if self._has_thrusters else 0
 
-    def _duty_of(self, period: int) -> tuple[Array, Array, Array] | None:
-        """Return the output of a carrier period, once."""
-        if period == self._sent_period:
+    def _begin_ns(self, period: int) -> int:
+        return self._timing.time_ns(self._first_step + period * self._period_steps)
+
+    def _duty_at(self, now_ns: int) -> tuple[Array, Array, Array] | None:
+        """Return the output of the present carrier period when its pulses are known, once; and zero
+        when a period has passed without others.
+        """
+        step = (now_ns + 1) * self._timing.physics_hz // _NS
+        period = (step - self._first_step) // self._period_steps
+        begin_ns, end_ns = self._begin_ns(period), self._begin_ns(period + 1)
+        self._pulses = [p for p in self._pulses if p.close_ns > begin_ns]
+        pulses = [p for p in self._pulses if p.open_ns < end_ns]
+        is_over = self._until_ns is not None and now_ns >= self._until_ns
+        if (period, len(pulses)) == self._sent or not (pulses or is_over):
             return None
-        self._sent_period = period
-        begin_ns, end_ns = period * self._period_ns, (period + 1) * self._period_ns
+        self._sent = period, len(pulses)
+        self._until_ns = now_ns + end_ns - begin_ns if pulses else None
         duty = np.zeros(self._thrusters)
-        for pulse in self._pulses:
-            open_ns = min(pulse.close_ns, end_ns) - max(pulse.open_ns, begin_ns)
-            if open_ns > 0 and pulse.thruster < len(duty) and pulse.thruster not in self._isolated:
-                duty[pulse.thruster] += open_ns / self._period_ns
-        self._pulses = [p for p in self._pulses if p.close_ns > end_ns]
+        for pulse in pulses:
+            if pulse.thruster < len(duty) and pulse.thruster not in self._isolated:
+                duty[pulse.thruster] += (pulse.close_ns - pulse.open_ns) / (end_ns - begin_ns)
         wrench = self.matrix @ duty
         return wrench[:3], wrench[3:], duty

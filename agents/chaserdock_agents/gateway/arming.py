@@ -25,9 +25,12 @@ _MOST_REQUESTS = 64
 
 
 class ArmingRequests:
-    """Requests that wait for the gateway's loop."""
+    """Requests that wait for the gateway's loop. ``not_yet``: why robots cannot be armed before the
+    loop runs; ``arm`` is then refused at once, as it must not act later than a person expects.
+    """
 
     def __init__(self) -> None:
+        self.not_yet = "the mission has not begun"
         self._requests: deque[tuple[ArmingAction, str, Answer]] = deque(maxlen=_MOST_REQUESTS)
 
     def submit(self, command: ArmingCommand, reply: Answer) -> None:
@@ -36,6 +39,9 @@ class ArmingRequests:
 
     def add(self, action: ArmingAction, by: str, answer: Answer = lambda reply: None) -> None:
         """Queue a request."""
+        if action == "arm" and self.not_yet:
+            answer(ArmingReply(accepted=False, reason=self.not_yet))
+            return
         self._requests.append((action, by, answer))
 
     def take(self) -> list[tuple[ArmingAction, str, Answer]]:

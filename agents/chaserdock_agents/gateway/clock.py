@@ -50,6 +50,8 @@ class DeviceClock:
         self._base_ns = self._offset_ns = 0
         self._drift = 0.0
         self._late_since_ns: int | None = None
+        # Least deviations in the first and the second half of the time for which messages are late.
+        self._late_ns = [0, 0]
         self.steps = 0
 
     @property
@@ -101,9 +103,17 @@ class DeviceClock:
             # Early: the clock went ahead, unless the estimate is still young.
             span_ns = self._bins[-1][0] - self._bins[0][0]
             return excess_ns < -step_ns and span_ns > self._p.step_after_s * _NS
-        if self._late_since_ns is None:
-            self._late_since_ns = arrived_ns
-        return arrived_ns - self._late_since_ns > self._p.step_after_s * _NS
+        # A clock that stepped deviates evenly. A device or link that falls behind does not.
+        late_ns = 0 if self._late_since_ns is None else arrived_ns - self._late_since_ns
+        if self._late_since_ns is None or late_ns > self._p.step_after_s * _NS:
+            first, second = self._late_ns
+            if self._late_since_ns is not None and abs(second - first) < step_ns / 2:
+                return True
+            self._late_since_ns, self._late_ns = arrived_ns, [excess_ns, excess_ns + step_ns]
+            return False
+        half = int(late_ns > self._p.step_after_s * _NS / 2)
+        self._late_ns[half] = min(self._late_ns[half], excess_ns)
+        return False
 
     def _insert(self, stamp_ns: int, delay_ns: int) -> None:
         bins, bin_ns = self._bins, self._p.bin_s * _NS

@@ -12,6 +12,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 from chaserdock_protocol.scenario.lab import LabCamera, LabDevice, LabPose, LabSection
 
 from .axes import MeasuredPose, body_pose, why_unusable
@@ -161,13 +162,19 @@ class CameraFeed:
         self.clock = DeviceClock(device.latency_s)
         self.watch = DeviceWatch(f"camera of chaser {device.chaser} by {device.address}")
         self.source: CameraSource = open_device("camera", device.address, device.options, host)
+        self._last: ImageArray | None = None
 
     def poll(self) -> Iterator[tuple[ImageArray, int]]:
-        """Yield images with the middle of their exposure by the host's clock, ns. Raises
-        DeviceError if the device is gone.
+        """Yield images with the middle of their exposure by the host's clock, ns; not those equal
+        to the one before: no two exposures have the same noise. Raises DeviceError if the device is
+        gone.
         """
         for frame in self.source.poll():
             self.watch.arrived(frame.arrived_ns)
+            last, self._last = self._last, frame.image
+            if last is not None and np.array_equal(last, frame.image):
+                self.watch.refused["repeats the last image"] += 1
+                continue
             if self.device.stamp == "arrival" or frame.stamp_ns is None:
                 yield frame.image, frame.arrived_ns - round(self.device.latency_s * 1e9)
                 continue

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.flight import flight_scenario
 from chaserdock_protocol.scenario.lab import LabSection
@@ -117,12 +118,17 @@ class Laboratory:
         return tuple(found)
 
     def arm(self) -> None:
-        """Let the robots obey. Raises DeviceError if one refuses."""
-        for obedience in self.obedience.values():
-            obedience.restart()
+        """Let the robots obey, one after the other. Raises DeviceError if one refuses. Only this
+        may run on another thread.
+        """
         if not self._dry_run:
             for robot in self.robots.values():
                 robot.arm()
+
+    def forget_motion(self) -> None:
+        """Judge the robots' obedience from now on."""
+        for obedience in self.obedience.values():
+            obedience.restart()
 
     def send(
         self, chaser: int, actuation: RobotActuation, output: tuple[Array, Array, Array]
@@ -140,6 +146,11 @@ class Laboratory:
         if not self._dry_run:
             command = RobotCommand(self._host.now_ns(), turn(force), turn(torque), duty)
             self.robots[chaser].send(command)
+
+    def command_latch(self, chaser: int, latch: Latch) -> None:
+        """Command the latch of a chaser, if it has one. Raises DeviceError."""
+        if chaser in self.latches and not self._dry_run:
+            self.latches[chaser].command(latch)
 
     def stop(self) -> None:
         """Command zero to all robots."""

@@ -19,6 +19,10 @@ from .axes import MeasuredPose
 
 _LEAST_POSES = 4
 """Fewest poses in a line: at 100 Hz and 15 ticks a second there are six or seven."""
+_LEAST_SPAN_NS = 20_000_000
+"""Shortest time of a line, ns: noise of 0.5 mm at its ends is then a velocity of 35 mm/s; poses
+whose times a clock's estimate has pushed together would give any velocity.
+"""
 _MOST_POSES = 512
 """Poses that are kept: half a second at 1000 Hz; bounds the memory."""
 _LEAST_JUMPS = 5
@@ -130,10 +134,10 @@ class BodyTrack:
             return None
         if all(p.velocity_m_s is not None and p.omega_rad_s is not None for p in fresh):
             return self._by_velocities(fresh, time_ns)
-        if len(fresh) < _LEAST_POSES:
-            older = [p for p in self._poses if p.time_ns <= since_ns]
-            fresh = older[len(fresh) - _LEAST_POSES :] + fresh
-        return _by_line(fresh, time_ns) if len(fresh) >= _LEAST_POSES else None
+        older = [p for p in self._poses if p.time_ns <= since_ns]
+        while older and not _is_line(fresh):
+            fresh.insert(0, older.pop())
+        return _by_line(fresh, time_ns) if _is_line(fresh) else None
 
     def _by_velocities(self, poses: list[MeasuredPose], time_ns: int) -> FittedState:
         """Return the mean of the poses, each moved on by its own velocity and rate."""
@@ -166,6 +170,11 @@ class BodyTrack:
             + rate_noise * ahead_s**2,
             rate_noise,
         )
+
+
+def _is_line(poses: list[MeasuredPose]) -> bool:
+    """Return whether poses, oldest first, give a velocity."""
+    return len(poses) >= _LEAST_POSES and poses[-1].time_ns - poses[0].time_ns >= _LEAST_SPAN_NS
 
 
 def _by_line(poses: list[MeasuredPose], time_ns: int) -> FittedState:

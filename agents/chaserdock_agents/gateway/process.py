@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 
 import cv2
 import numpy as np
@@ -35,21 +36,28 @@ from chaserdock_protocol.scenario import Scenario, ScenarioError
 from chaserdock_protocol.transport import Node
 
 from .actuation import RobotActuation
-from .arming import ArmingRequests, listen_to_keys
+from .arming import Answer, ArmingRequests, listen_to_keys
 from .axes import MeasuredPose
 from .devices import DeviceError, DeviceHost, ImageArray
 from .feeds import PoseFeed
 from .images import image_message
 from .lab import Laboratory
 from .odometry import FittedState
-from .safety import SafetyGate
+from .resume import BegunMission, begun_mission, digest_of, forget_mission, note_mission
+from .safety import RobotSight, SafetyGate
 
+_NS = 1_000_000_000
+"""Nanoseconds of a second."""
 _POLL_S = 0.002
 """Interval, s, at which devices are read and commands sent: the latency that the gateway adds."""
 _LONGEST_SOURCE = 200
 """Characters of a device's address that a message repeats."""
 _POSE_PATIENCE_S = 10.0
 """Wait, s, for the first odometry of all robots: devices were opened long before."""
+_BLIND_NS = 1_000_000_000
+"""Time without a new image of a chaser, ns, after which it is warned of: several images of any
+camera.
+"""
 _SETTLING_NS = 200_000_000
 """Time, ns, whose poses must give the first odometry."""
 
@@ -69,8 +77,13 @@ def main(options: ProcessOptions) -> int:
         node = open_world_node(realtime)
         now_s = node.host.now_s
         host = DeviceHost(lambda: round(now_s() * 1e9))
+        path = options.resume
+        begun = None if path is None else begun_mission(path, scenario, host.now_ns())
         laboratory = Laboratory(scenario, host, options.dry_run)
-        return Gateway(scenario, realtime, node, laboratory).run(options.stop_signal())
+        status = Gateway(scenario, realtime, node, laboratory, begun).run(options.stop_signal())
+        if path is not None:
+            forget_mission(path)
+        return status
     except ChaserdockError as error:
         print_status("gateway", str(error))
         return 2
@@ -82,20 +95,37 @@ def main(options: ProcessOptions) -> int:
 
 
 class Gateway:
-    """Fly one mission on the devices of a laboratory."""
+    """Fly one mission on the devices of a laboratory. ``begun``: take up this one again, which
+    another gateway has begun; robots are disarmed.
+    """
 
     def __init__(
-        self, scenario: Scenario, options: ProcessOptions, node: Node, laboratory: Laboratory
+        self,
+        scenario: Scenario,
+        options: ProcessOptions,
+        node: Node,
+        laboratory: Laboratory,
+        begun: BegunMission | None = None,
     ) -> None:
         assert scenario.lab is not None
         self._scenario, self._node, self._lab = scenario, node, laboratory
         self._timing, self._chasers = scenario.timing, len(scenario.chasers)
         self._gate = SafetyGate(scenario.lab.safety)
         self._requests = ArmingRequests()
+        self._arming: tuple[str, Answer] | None = None
+        self._armed: deque[str] = deque()
+        self._is_disarmed_meanwhile = False
+        self._arm_robots, end_arming = node.host.worker(self._ask_robots)
+        node.on_close(end_arming)
         self._start_ns = 0
+        self._begun, self._resume = begun, options.resume
+        if begun is not None:  # a recorder that is behind holds up no mission that goes on
+            options = dataclasses.replace(options, recorder_expected=False)
         self._used_ns: dict[int, int] = {}
         self._commanded_ns: dict[int, int] = {}
         self._missing: set[int] = set()
+        self._image_ns: dict[int, int] = {}
+        self._blind: set[int] = set()
         self._actuation = {
             f"chaser/{i}": RobotActuation(scenario.chaser, self._timing)
             for i in range(self._chasers)
@@ -116,7 +146,9 @@ class Gateway:
             self._command_latch,
             scenario.controller.command_lifetime_s,
         )
-        self._host = open_mission(scenario, options, node, commands)
+        self._host = open_mission(
+            scenario, options, node, commands, None if begun is None else begun.run_id
+        )
         self._barrier = self._host.barrier
         self._barrier.take_other = self._take_other
 
@@ -131,13 +163,26 @@ class Gateway:
         end_keys = listen_to_keys(self._requests)
         try:
             reason = self._host.wait_for_processes(stop) or self._wait_for_poses(stop)
+            reason = reason or self._wait_for_arming(stop)
             if reason:
                 return self._host.end(0, reason, complete=False)
-            self._start_ns = self._now_ns()
+            self._begin()
             return self._fly(stop)
         finally:
             end_keys()
             self._lab.stop()
+
+    def _begin(self) -> None:
+        """Let the mission's time begin, or go on from its beginning by another gateway."""
+        self._start_ns = self._now_ns() if self._begun is None else self._begun.start_ns
+        self._expect_images()
+        if self._begun is None and self._resume is not None:
+            begun = BegunMission(
+                run_id=self._host.run_id,
+                start_ns=self._start_ns,
+                scenario=digest_of(self._scenario),
+            )
+            note_mission(self._resume, begun)
 
     def _wait_for_poses(self, stop: StopSignal) -> str:
         """Read the devices until each robot has odometry; return why there is none, else
@@ -161,15 +206,38 @@ class Gateway:
             self._barrier.process_until(self._node.host.now_s() + _POLL_S)
         return "stopped before the first tick"
 
+    def _wait_for_arming(self, stop: StopSignal) -> str:
+        """Guard the robots until they are armed; return why they are not, else nothing."""
+        print_status("gateway", "waiting for `chaserdock command arm`")
+        self._requests.not_yet = ""
+        while not stop() and self._gate.state != "killed":
+            self._read()
+            self._guard()
+            if self._gate.is_armed:
+                return ""
+            self._barrier.process_until(self._node.host.now_s() + _POLL_S)
+        return "killed" if self._gate.state == "killed" else "stopped before the first tick"
+
     def _fly(self, stop: StopSignal) -> int:
-        for tick in range(self._scenario.ticks + 1):
+        """Open the ticks of the mission while robots are armed: flight software would take what it
+        commands to disarmed ones for their motion. Time goes on meanwhile.
+        """
+        first = self._mission_ns() * self._timing.rate_hz // _NS + 1 if self._begun else 0
+        for tick in range(min(first, self._scenario.ticks), self._scenario.ticks + 1):
             self._work_until(self._start_ns + self._timing.tick_time_ns(tick))
-            self._publish_odometry(tick)
-            self._publish_docking(tick)
             if tick == self._scenario.ticks:
                 return self._host.end(tick, "completed", complete=True)
+            if stop():
+                return self._host.end(tick, "stopped", complete=False)
+            if not self._gate.is_armed:
+                continue
+            self._publish_odometry(tick)
+            self._publish_docking(tick)
+            self._warn_of_blind_chasers()
             # Cameras run freely: no image belongs to a tick, and no tick waits for one.
             self._barrier.open_tick(tick, images=False)
+            if tick == first > 0:
+                self._barrier.publish_warning("gateway restarted", "the mission goes on")
             if stop() or self._barrier.lost_all_chasers(self._host.options.rejoin_s, stop):
                 reason = "stopped" if stop() else "no chaser is left"
                 return self._host.end(tick, reason, complete=False)
@@ -201,11 +269,11 @@ class Gateway:
 
     def _publish_reference(self, feed: PoseFeed, pose: MeasuredPose) -> None:
         measured_ns = pose.time_ns - self._start_ns
-        if measured_ns < 0:
+        if not self._start_ns or measured_ns < 0:
             return
         body = feed.device.body
         message = BodyReference(
-            tick=measured_ns * self._timing.rate_hz // 1_000_000_000,
+            tick=measured_ns * self._timing.rate_hz // _NS,
             sim_time_ns=measured_ns,
             body=body,
             source=feed.device.address[:_LONGEST_SOURCE],
@@ -220,17 +288,34 @@ class Gateway:
 
     def _publish_image(self, chaser: int, image: ImageArray, time_ns: int) -> None:
         exposed_ns = time_ns - self._start_ns
-        if exposed_ns <= 0 or chaser not in self._barrier.chasers:
+        if not self._gate.is_armed or exposed_ns <= 0 or chaser not in self._barrier.chasers:
             return
         quality = self._scenario.camera.effects.jpeg_quality
         message = image_message(self._timing.rate_hz, quality, chaser, image, exposed_ns)
+        self._image_ns[chaser] = self._mission_ns()
+        self._blind.discard(chaser)
         self._node.publish(topics.IMAGE, message, chaser)
+
+    def _expect_images(self) -> None:
+        self._image_ns = {c.device.chaser: self._mission_ns() for c in self._lab.cameras}
+
+    def _warn_of_blind_chasers(self) -> None:
+        """Publish once for each time that a camera is silent, or repeats an image."""
+        for camera in self._lab.cameras:
+            chaser = camera.device.chaser
+            silent_ns = self._mission_ns() - self._image_ns[chaser]
+            if silent_ns > _BLIND_NS and chaser not in self._blind:
+                self._blind.add(chaser)
+                self._barrier.publish_warning("no new image", f"chaser {chaser}")
 
     def _publish_odometry(self, tick: int) -> None:
         time_ns = self._timing.tick_time_ns(tick)
         host_ns = self._start_ns + time_ns
         for chaser, feed in self._lab.odometry.items():
-            since_ns = self._used_ns.get(chaser, host_ns - 1_000_000_000 // self._timing.rate_hz)
+            # Poses of a pause are no line: bodies come to rest meanwhile.
+            newest_ns = host_ns - _NS // self._timing.rate_hz
+            oldest_ns = 2 * newest_ns - host_ns
+            since_ns = max(oldest_ns, self._used_ns.get(chaser, newest_ns))
             state = feed.track.at(host_ns, since_ns)
             if state is None:
                 if chaser not in self._missing:
@@ -263,10 +348,9 @@ class Gateway:
 
     def _command_latch(self, chaser: int, latch: Latch, step: int) -> None:
         self._commanded_ns[chaser] = self._now_ns()
-        device = self._lab.latches.get(chaser)
-        if device is not None and latch != "keep" and self._gate.is_armed:
+        if latch != "keep" and self._gate.is_armed:
             try:
-                device.command(latch)
+                self._lab.command_latch(chaser, latch)
             except DeviceError as error:
                 self._trip(str(error))
 
@@ -289,31 +373,70 @@ class Gateway:
         ages = {i: (now_ns - at_ns) / 1e9 for i, at_ns in self._commanded_ns.items()}
         sights = self._lab.sights(ages)
         for action, by, answer in self._requests.take():
+            if action == "arm":
+                self._begin_arming(by, answer, sights)
+                continue
             accepted, reason = self._gate.request(action, by, sights)
-            if accepted and action == "arm":
-                accepted, reason = self._arm_robots(reason)
-            elif accepted:
+            if accepted:
+                self._is_disarmed_meanwhile = True
                 self._lab.stop()
-            self._barrier.publish_warning(
-                f"{action} {'accepted' if accepted else 'refused'}", reason
-            )
-            answer(ArmingReply(accepted=accepted, reason=reason))
+            self._answer(action, accepted, reason, answer)
+        if self._end_arming(sights):
+            return  # ages of commands count from now on
         if reason := self._gate.check(sights):
             self._lab.stop()
             self._barrier.publish_warning("disarmed", reason)
 
-    def _arm_robots(self, reason: str) -> tuple[bool, str]:
+    def _answer(self, action: str, accepted: bool, reason: str, answer: Answer) -> None:
+        done = "accepted" if accepted else "refused"
+        self._barrier.publish_warning(f"{action} {done}", reason)
+        answer(ArmingReply(accepted=accepted, reason=reason))
+
+    def _begin_arming(self, by: str, answer: Answer, sights: tuple[RobotSight, ...]) -> None:
+        """Have the robots armed in the background, as they answer after a second, unless something
+        forbids it.
+        """
+        refusal = "robots are being armed" if self._arming else self._gate.refusal(sights)
+        if refusal:
+            self._answer("arm", False, refusal, answer)
+            return
+        self._arming, self._is_disarmed_meanwhile = (by, answer), False
+        self._arm_robots(None)
+
+    def _ask_robots(self, _: None) -> None:
         try:
             self._lab.arm()
+            self._armed.append("")
         except DeviceError as error:
+            self._armed.append(str(error))
+
+    def _end_arming(self, sights: tuple[RobotSight, ...]) -> bool:
+        """Let commands pass once all robots are armed, and return whether they are; stop them if
+        one is not, or if they were disarmed meanwhile.
+        """
+        if self._arming is None or not self._armed:
+            return False
+        (by, answer), self._arming = self._arming, None
+        error = self._armed.popleft()
+        if error:
+            accepted, reason = False, self._gate.trip(error)
+        elif self._is_disarmed_meanwhile:
+            accepted, reason = False, self._gate.reason
+        else:
+            accepted, reason = self._gate.request("arm", by, sights)
+        if accepted:
+            self._lab.forget_motion()
+            self._commanded_ns.clear()
+            self._expect_images()
+        else:
             self._lab.stop()
-            return False, self._gate.trip(str(error))
-        self._commanded_ns.clear()  # ages count from now on
-        return True, reason
+        self._answer("arm", accepted, reason, answer)
+        return accepted
 
     def _trip(self, reason: str) -> None:
         if self._gate.is_armed or reason != self._gate.reason:
             self._gate.trip(reason)
+            self._is_disarmed_meanwhile = True
             self._lab.stop()
             self._barrier.publish_warning("disarmed", reason)
 

@@ -114,16 +114,22 @@ class SafetyGate:
         """Return whether robots may move."""
         return self.state == "armed"
 
+    def refusal(self, robots: tuple[RobotSight, ...]) -> str:
+        """Return why robots may not be armed, empty if they may."""
+        if self.state == "killed":
+            return f"{self.reason}; start the gateway again"
+        return "; ".join(text for robot in robots for text in violations(robot, self._limits))
+
     def request(
         self, action: ArmingAction, by: str, robots: tuple[RobotSight, ...]
     ) -> tuple[bool, str]:
         """Do what a person asks for. Returns whether it is done, and why."""
         who = by or "an operator"
         if self.state == "killed":
-            return action == "kill", f"{self.reason}; start the gateway again"
+            return action == "kill", self.refusal(robots)
         if action == "arm":
-            if found := [text for robot in robots for text in violations(robot, self._limits)]:
-                return False, "; ".join(found)
+            if refusal := self.refusal(robots):
+                return False, refusal
             self.state = "armed"
         else:
             self.state = "killed" if action == "kill" else "disarmed"

@@ -47,12 +47,15 @@ def open_world_node(options: ProcessOptions) -> Node:
 
 @dataclass(frozen=True)
 class MissionHost:
-    """A mission of ``scenario`` that processes can join. ``barrier``: opens its ticks."""
+    """A mission of ``scenario`` that processes can join, as ``run_id``. ``barrier``: opens its
+    ticks.
+    """
 
     scenario: Scenario
     options: ProcessOptions
     node: Node
     barrier: TickBarrier
+    run_id: str
 
     def wait_for_processes(self, stop: StopSignal) -> str:
         """Wait until all expected processes are connected; return why they are not, empty if they
@@ -96,20 +99,25 @@ class MissionHost:
 
 
 def open_mission(
-    scenario: Scenario, options: ProcessOptions, node: Node, commands: CommandIntake
+    scenario: Scenario,
+    options: ProcessOptions,
+    node: Node,
+    commands: CommandIntake,
+    run_id: str | None = None,
 ) -> MissionHost:
     """Serve the queries of a mission and announce it. Call it after all other subscriptions and
-    advertisements of the node (see ``Heartbeat``).
+    advertisements of the node (see ``Heartbeat``). ``run_id``: of a mission that goes on.
     """
     membership = Membership(
         chasers=len(scenario.chasers),
-        run_id=node.host.unique_id(),
+        run_id=run_id or node.host.unique_id(),
         mode=options.mode,
         scenario_json=flight_scenario_json(scenario),
         faults_of=lambda process: faults_of(scenario, process).model_dump_json(),
         instance=node.host.unique_id(),
         source=node.source,
         now_s=node.host.now_s,
+        resumed=run_id is not None,
     )
     realtime = options.mode == "realtime"
     faults = create_fault_layer(
@@ -142,7 +150,7 @@ def open_mission(
         scenario.controller.standby,
     )
     barrier.faults = faults
-    return MissionHost(scenario, options, node, barrier)
+    return MissionHost(scenario, options, node, barrier, membership.run_id)
 
 
 def load_mission_scenario(options: ProcessOptions) -> Scenario:

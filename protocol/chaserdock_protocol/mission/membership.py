@@ -39,8 +39,8 @@ class Membership:
     Thread-safe: called from Zenoh's threads and the main loop. ``instance`` and ``source``: the
     world's own instance and session. ``flying``: set at the first tick; from then on connected
     processes no longer wait for processes that are only joining (see ``connected``).
-    ``scenario_json``: the flight scenario. ``faults_of``: JSON of the faults to inject at a
-    process, by its name.
+    ``resumed``: the mission goes on with a new world. ``scenario_json``: the flight scenario.
+    ``faults_of``: JSON of the faults to inject at a process, by its name.
     """
 
     chasers: int
@@ -52,6 +52,7 @@ class Membership:
     source: str = ""
     now_s: Callable[[], float] = time.monotonic
     flying: bool = False
+    resumed: bool = False
     _alive: set[str] = field(default_factory=set)
     _admitted: dict[tuple[str, str], None] = field(default_factory=dict)
     _asked_s: dict[str, float] = field(default_factory=dict)
@@ -77,7 +78,9 @@ class Membership:
         name, instance = request.process, request.instance
         with self._lock:
             if instance != self._instances.get(name) and (name, instance) not in self._admitted:
-                if name in self._alive:
+                # In a mission that goes on, a process may live before it is known.
+                known = not self.resumed or name in self._instances
+                if name in self._alive and known:
                     text = f"{name} is already running in this mission"
                     return JoinReply(accepted=False, reason=text, source=self.source)
                 if self.now_s() - self._asked_s.get(name, -math.inf) < JOIN_TIMEOUT_S:

@@ -82,6 +82,8 @@ class Node:
         self._last_seq: dict[tuple[str, str], int] = {}
         self._queryables: dict[str, Undo] = {}
         self._close_callbacks: list[Callable[[], None]] = []
+        self.run_id = ""
+        """Mission that the process has joined, empty before."""
         self._foreign = ForeignPublishers()
         self._sessions = ProcessSessions()
         self._newest: Message | None = None

@@ -44,6 +44,10 @@ _MOST_REPLACED = 256
 """Instances that are remembered as replaced: more than any mission restarts processes; bounds the
 memory under forged ones.
 """
+SUCCESSOR_AFTER_S = 2.0
+"""Silence of the world, s, after which a process asks once a second whether another one has taken
+up its mission: two presences are missing.
+"""
 STEADY_PERIOD_S = 1.0
 """Interval of presence in flight, s: a fifth of ``stall.SILENT_S``, after which a process counts as
 silent.
@@ -127,7 +131,7 @@ def run_member(
         mission = join(node, instance, stop, options.patience_s)
         if mission is None:
             return 1
-        node.blocking = mission.mode == "lockstep"
+        node.blocking, node.run_id = mission.mode == "lockstep", mission.run_id
         watch_for_foreign_publishers(node, mission.source)
         # before the start-up work (compilation): reserves the process' name
         node.declare_liveliness()
@@ -222,6 +226,7 @@ class Heartbeat:
         self._node = node
         self._instance = instance
         self._stall_s, self._without_world = stall_s, StallTimer(node.host.now_s)
+        self._ask_at_s = SUCCESSOR_AFTER_S
         self.waiting_for: tuple[str, ...] = ()
         self.hangs: Callable[[], bool] = lambda: False
         """Whether the process' loop has stopped: its presence, published in the background, then
@@ -278,17 +283,41 @@ class Heartbeat:
     def world_heard(self) -> None:
         """Note that the world has sent a message."""
         self._without_world.reset()
+        self._ask_at_s = SUCCESSOR_AFTER_S
 
     def world_is_gone(self) -> bool:
-        """Return, and print, whether the world has been silent for too long. Call it at least twice
-        a second.
+        """Return, and print, whether the world has been silent for too long. In real time another
+        one may take up its mission meanwhile. Call it at least twice a second.
         """
-        gone = self._without_world.update() >= self._stall_s
+        silent_s = self._without_world.update()
+        if silent_s >= self._ask_at_s and not self._node.blocking:
+            self._ask_at_s = silent_s + STEADY_PERIOD_S
+            if self._find_successor():
+                return False
+        gone = silent_s >= self._stall_s
         if gone:
             print_status(
                 self._node.name, f"the world is gone: no presence of it for {self._stall_s:g} s"
             )
         return gone
+
+    def _find_successor(self) -> bool:
+        """Return, and print, whether another world has taken up the mission; it is then this
+        process' world.
+        """
+        node = self._node
+        request = JoinRequest(process=node.name, instance=self._instance)
+        reply = node.query(topics.JOIN_KEY, request, JoinReply, 0.5)
+        if reply is None or not reply.accepted or not node.run_id:
+            return False
+        if reply.run_id != node.run_id or reply.source == node.world_source:
+            return False
+        watch_for_foreign_publishers(node, reply.source)
+        with self._lock:
+            self._listed = {}
+        self.world_heard()
+        print_status(node.name, "the world is back, and the mission goes on")
+        return True
 
     def heard(self) -> dict[str, str]:
         """Return the processes whose presence was received, with their instances."""

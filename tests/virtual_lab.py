@@ -111,9 +111,13 @@ class _Entry:
         return self.driver
 
 
-def install(monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
-    """Let the scheme ``virtual`` open the devices of a laboratory."""
-    kinds = {"camera": _Camera, "pose": _MotionCapture, "robot": _Robot}
+def install(monkeypatch: pytest.MonkeyPatch, lab: Any, latch: Any = None) -> None:
+    """Let the scheme ``virtual`` open the devices of a laboratory, and latches that ``latch()``
+    makes.
+    """
+    kinds: dict[str, Any] = {"camera": _Camera, "pose": _MotionCapture, "robot": _Robot}
+    if latch is not None:
+        kinds["latch"] = lambda lab, host, chaser: latch()
 
     def found(group: str) -> list[_Entry]:
         kind = next(k for k, g in devices.GROUPS.items() if g == group)

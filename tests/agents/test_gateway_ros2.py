@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from chaserdock_agents.gateway import devices
-from chaserdock_agents.gateway.devices import DeviceError, DeviceHost
+from chaserdock_agents.gateway.devices import DeviceError, DeviceHost, LatchReading
 from chaserdock_agents.gateway.drivers import command_stream, ros2_camera, ros2_network, ros2_poses
 from chaserdock_agents.ros2.types import TYPES, type_hash
 from chaserdock_models.camera import Camera
@@ -42,6 +42,7 @@ ODOMETRY, POSE, POSE_COV, PX4 = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "px4_msgs/msg/VehicleOdometry",
 )
+BOOL = "std_msgs/msg/Bool"
 Q = np.array([0.5417, -0.3214, 0.6109, 0.4791]) / np.linalg.norm([0.5417, -0.3214, 0.6109, 0.4791])
 POSITION, LINEAR, ANGULAR = (0.31, -1.7, 2.9), (0.11, -0.22, 0.37), (0.021, 0.043, -0.035)
 STAMP_NS = 1_764_000_123_456_789_012
@@ -797,6 +798,72 @@ def test_px4_that_refuses_or_is_silent_is_named(
     robot.close()
 
 
+# -- latch -----------------------------------------------------------------------------------------
+
+
+def test_latch_states_what_its_topics_say_and_takes_commands(peer: Peer) -> None:
+    """A touch between two polls is not lost; a command is repeated, as its message may be."""
+    name = peer.topic()
+    latch = open_device("latch", f"ros2:{name}", peer.options)
+    latched, contact = (peer.publisher(f"{name}/{part}", BOOL) for part in ("latched", "contact"))
+    assert latch.poll() is None
+    wait_for(lambda: latched.publish(data=False) or latch.poll() is not None)
+    assert latch.poll() == LatchReading(contact=False, armed=False, latched=False)
+
+    def touched() -> bool:
+        contact.publish(data=True)
+        contact.publish(data=False)
+        return latch.poll().contact
+
+    wait_for(touched)
+    wait_for(lambda: not latch.poll().contact)
+
+    read = peer.subscribe(f"{name}/command", BOOL)
+    latch.command("keep")
+    for _ in range(3):
+        latch.poll()
+    time.sleep(0.05)
+    assert read == []
+    for wanted in ("arm", "release"):
+        latch.command(wanted)
+        wait_for(lambda wanted=wanted: latch.poll() and read and read[-1].data == (wanted == "arm"))
+        begun = len(read)
+        latch.command("keep")
+        wait_for(lambda begun=begun: latch.poll() and len(read) > begun + 2)
+        assert {m.data for m in read[begun:]} == {wanted == "arm"}
+        assert latch.poll().armed is (wanted == "arm")
+    wait_for(lambda: latched.publish(data=True) or latch.poll().latched)
+    latched.close()
+    complains(latch, f"nobody publishes {name}/latched any more")
+    latch.close()
+    with pytest.raises(DeviceError, match="cannot send"):
+        latch.command("arm")
+
+
+def test_latch_without_a_docking_sensor_touches_when_it_latches(peer: Peer) -> None:
+    name = peer.topic()
+    options = {**peer.options, "contact": "", "latched": "closed"}
+    latch = open_device("latch", f"ros2:{name}", options)
+    closed = peer.publisher(f"{name}/closed", BOOL)
+    wait_for(lambda: closed.publish(data=True) or latch.poll() is not None)
+    assert latch.poll() == LatchReading(contact=True, armed=False, latched=True)
+    latch.close()
+
+
+def test_latch_of_another_type_is_named(peer: Peer) -> None:
+    name = peer.topic()
+    peer.publisher(f"{name}/latched", POSE)
+
+    def refused() -> bool:
+        try:
+            open_device("latch", f"ros2:{name}", peer.options).close()
+        except DeviceError as error:
+            return f"publishes {name}/latched with type {POSE}" in str(error)
+        return False
+
+    wait_for(refused)
+
+
 def test_devices_of_the_docs_are_valid(peer: Peer) -> None:
     page = (ROOT / "docs" / "devices.md").read_text(encoding="utf-8")
     lab = tomllib.loads(page.split("```toml\n")[1].split("```")[0])["lab"]
@@ -821,6 +888,9 @@ def test_devices_of_the_docs_are_valid(peer: Peer) -> None:
         ("pose", "ros2:/odom", {"twist": "map"}, "in option twist"),
         ("pose", "ros2:/odom", {"connect": ["tcp/127.0.0.1:1"]}, "no router at tcp/127.0.0.1:1"),
         ("camera", "ros2:/image", {"type": POSE}, "in option type"),
+        ("latch", "ros2:latch", {}, "must be an absolute name of ROS 2"),
+        ("latch", "ros2:/latch", {"latched": ""}, "latched and command must name a topic each"),
+        ("latch", "ros2:/latch", {"state": "x"}, "unknown option 'state'; must be one of: connect"),
         ("robot", "px4:/", {}, "needs either option thrusters, or both"),
         ("robot", "px4:/", {"thrusters": [1], **WRENCH}, "needs either option thrusters, or both"),
         ("robot", "px4:/", {"thrusters": [1, 3, 1]}, "names a motor twice: [1, 3, 1]"),

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.flight import flight_scenario
 from chaserdock_protocol.scenario.lab import LabSection
@@ -140,6 +141,11 @@ class Laboratory:
         if not self._dry_run:
             command = RobotCommand(self._host.now_ns(), turn(force), turn(torque), duty)
             self.robots[chaser].send(command)
+
+    def command_latch(self, chaser: int, latch: Latch) -> None:
+        """Command the latch of a chaser, if it has one. Raises DeviceError."""
+        if chaser in self.latches and not self._dry_run:
+            self.latches[chaser].command(latch)
 
     def stop(self) -> None:
         """Command zero to all robots."""

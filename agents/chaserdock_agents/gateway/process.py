@@ -263,10 +263,9 @@ class Gateway:
 
     def _command_latch(self, chaser: int, latch: Latch, step: int) -> None:
         self._commanded_ns[chaser] = self._now_ns()
-        device = self._lab.latches.get(chaser)
-        if device is not None and latch != "keep" and self._gate.is_armed:
+        if latch != "keep" and self._gate.is_armed:
             try:
-                device.command(latch)
+                self._lab.command_latch(chaser, latch)
             except DeviceError as error:
                 self._trip(str(error))
 

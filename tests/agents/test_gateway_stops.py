@@ -18,6 +18,7 @@ from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.transport import Node
 from virtual_lab import SCENARIO, SENT, Fault, arm_when_ready, fly, two_free_flyers
 
+from chaserdock.analysis.summary import summarize
 from chaserdock.simulation.mission import SimulatedFlight
 
 TICK_S, STALE_S = 1 / 15, 0.2
@@ -197,3 +198,17 @@ def test_a_robot_that_leaves_the_volume_stops_all_within_a_tick(
     inside_ns = max(t for t, x in states if x <= limit_m and t < max(stops.at_ns[1]))
     crossed = next(t for t, x in states if x > limit_m)
     assert stops.delay_s(inside_ns) < (crossed - inside_ns) / 1e9 + TICK_S
+
+
+@pytest.mark.slow
+def test_a_reference_that_jumps_is_named_and_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The target is measured by the reference alone."""
+    lab = two_free_flyers(1, (Fault("motion capture jumps", ACT_S, ACT_S + 1.0, chaser=-1),))
+    flight, reason = flown(tmp_path, monkeypatch, lab)
+    assert reason == ""
+    assert "reference jumped: target by 0.54 m" in flight.output
+    (said,) = (x for x in summarize(flight.folder)["not_judged"] if "jumped" in x)
+    assert "target by 0.54 m, 0 deg" in said
+    assert "left out until" in said

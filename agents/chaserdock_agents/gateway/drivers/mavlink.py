@@ -28,8 +28,8 @@ from chaserdock_protocol.errors import require_extra
 from chaserdock_protocol.transport.network import Undo
 
 from ..devices import DeviceError, DeviceHost, PoseSample, RobotCommand
+from ..options import read_options
 from .autopilot import AutopilotRobot
-from .options import read_options
 from .pose_samples import KEPT, is_finite, stated, turned
 from .shares import Maxima, wrench_shares
 from .sharing import Shared

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from chaserdock_agents.ros2.types import TYPES
 
 from ..devices import DeviceError, DeviceHost, RobotCommand
+from ..options import read_options
 from .autopilot import AutopilotRobot
-from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 from .shares import Maxima, wrench_shares
 

@@ -806,6 +806,40 @@ def test_px4_that_refuses_or_is_silent_is_named(
     robot.close()
 
 
+@pytest.mark.parametrize("waits_for", ["the stream", "an acknowledgement"])
+def test_px4_that_is_stopped_while_it_arms_is_not_armed(
+    waits_for: str, peer: Peer, px4: EmulatedPx4, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from chaserdock_agents.gateway.drivers import acknowledgements, px4_robot
+
+    acknowledged = waits_for == "an acknowledgement"
+    monkeypatch.setattr(px4_robot, "_LEAD_S", 0.0 if acknowledged else 30.0)
+    monkeypatch.setattr(acknowledgements, "_REPLY_S", 0.1)
+    px4.results.clear()
+    robot = open_px4(peer, **WRENCH)
+    errors: list[str] = []
+
+    def arm() -> None:
+        try:
+            robot.arm()
+        except DeviceError as error:
+            errors.append(str(error))
+
+    arming = threading.Thread(target=arm)
+    arming.start()
+    wait_for(lambda: px4.read["VehicleCommand" if acknowledged else "OffboardControlMode"])
+    robot.stop()
+    arming.join()
+    assert errors == ["stopped while it was being armed"]
+    wait_for(lambda: (400, 0.0, 21196.0) in px4.commands())
+    assert px4.commands()[-1] == (400, 0.0, 21196.0)
+    assert not [c for c in px4.commands() if c[:2] == (400, 1.0)]
+    px4.results.update({176: 0, 400: 0})
+    monkeypatch.setattr(px4_robot, "_LEAD_S", 0.0)
+    robot.arm()
+    robot.close()
+
+
 # -- latch -----------------------------------------------------------------------------------------
 
 

@@ -16,7 +16,6 @@ import os
 import select
 import socket
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -458,15 +457,14 @@ class MavlinkRobot(AutopilotRobot):
         """Switch the autopilot to its manual mode, and arm it. Raises DeviceError if it refuses, is
         silent, is another, or cannot do what the maxima state.
         """
+        self._stopped.clear()
         if not self._beaten.wait(_GONE_S):
             raise DeviceError(
                 f"no heartbeat of an autopilot with system {self._options.system} within "
                 f"{_GONE_S:g} s"
             )
         mode = manual_mode(*self._kind, self._options)
-        self._was_armed = True
-        self._stream.start()
-        time.sleep(_LEAD_S)
+        self._start_stream(_LEAD_S)
         self._arm_in(mode, "manual mode", "arming")
 
     def _release(self) -> None:

@@ -106,6 +106,19 @@ class SightingCount(Struct, frozen=True, kw_only=True):
     rejected: int
 
 
+class InnovationFigures(Struct, frozen=True, kw_only=True):
+    """Innovations of a chaser's sightings after the settling time: how many were used and rejected,
+    the mean of their normalized square per degree of freedom (1 for white errors as stated), and
+    the share of all above the 95 % band (0.025); None without any.
+    """
+
+    used: int
+    rejected: int
+    mean_per_freedom: float | None
+    rejected_mean_per_freedom: float | None
+    above_share: float | None
+
+
 class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Results of one chaser, measured on ground truth or on a reference; what is measured on poses
     is None without either.
@@ -127,6 +140,7 @@ class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     rendezvous: RendezvousFigures | None = None
     estimated_tracking: EstimatedTracking | None = None
     sightings: SightingCount | None = None
+    innovations: InnovationFigures | None = None
 
 
 class TargetEstimateErrors(PoseEstimateErrors, frozen=True, kw_only=True):

@@ -126,6 +126,9 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
                 focal_sigma_share=5e-4,
             ),
         ),
+        innovations=(
+            m.Innovation(chaser=0, sim_time_ns=400_000_000, squared=5.5, freedoms=6, used=True),
+        ),
     ),
     m.Reference(
         **HEAD,

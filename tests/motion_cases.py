@@ -67,6 +67,23 @@ def measured_motion(tracks: Mapping[str, Track], tick_s: np.ndarray) -> KnownMot
     return KnownMotion({}, {n: table_of(t) for n, t in tracks.items()}, (SYSTEM,), tick_s)
 
 
+def rewritten(
+    source: Path, path: Path, change: Any = lambda record: record.message, **run_data: str
+) -> Path:
+    """A copy of a log, each message as ``change(record)`` has it; None leaves it out."""
+    writer = LogWriter(path)
+    scenario, run = read_scenario(source)
+    writer.describe(scenario, {k: v for k, v in run.items() if k in ("run_id", "mode")} | run_data)
+    for record in read_log(source):
+        message = change(record)
+        if message is not None:
+            writer.write(
+                record.key, m.encoding_of(type(message)), codec.encode(message), record.sent_ns
+            )
+    writer.close()
+    return path
+
+
 def without_truth(
     log: Path, out: Path, bodies: Iterable[str] = (), *, rates: bool = True, flight: bool = False
 ) -> Path:

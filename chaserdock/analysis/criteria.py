@@ -273,7 +273,8 @@ _OF_POSES = (
     "max_estimate_orientation_deg",
 )
 _OF_RATES = ("detumbled", "speed_limit", "arrival")
-"""Criteria on poses of the bodies, and those that need their velocities, too."""
+_AT_THE_END = ("docked", "reached", "detumbled")
+"""Criteria on poses of the bodies, those that need their velocities, too, and those on the end."""
 
 
 def criteria_of(flight: RecordedFlight) -> tuple[Scenario, list[str]]:
@@ -291,10 +292,14 @@ def criteria_of(flight: RecordedFlight) -> tuple[Scenario, list[str]]:
         absent = dict.fromkeys(_OF_POSES, why)
     elif not motion.has_rates():
         absent = dict.fromkeys(_OF_RATES, "the reference does not measure velocities and rates")
+    jumps = motion.reference_jumps()
+    if any(jump.until_s is None for jump in jumps):
+        absent |= dict.fromkeys(_AT_THE_END, "the reference jumped, and did not come back")
     absent = {name: why for name, why in absent.items() if getattr(success, name)}
     skipped += [f"success.{name}: {why}" for name, why in absent.items()]
     unknown = Success(keep_distances=False)
     success = success.model_copy(update={name: getattr(unknown, name) for name in absent})
+    skipped += map(str, jumps)
     skipped += _without_truth(flight)
     return scenario.model_copy(update={"success": success}), skipped
 

@@ -42,6 +42,7 @@ from .plots import (
     save,
     styled,
 )
+from .pose_errors import chi_square_band
 from .summary import estimate_errors, known_estimates, tracking_components, tracking_errors
 from .time_series import OUTCOMES, ImageOutcome, ImageOutcomes, Traces, load_traces
 
@@ -654,11 +655,9 @@ def consistency_text(nees: Array, low: float, high: float) -> str:
     "below it a conservative one.",
 )
 def consistency(flight: RecordedFlight, _: Traces) -> Figure:
-    from scipy.special import gammaincinv  # scipy.stats takes a second to import
-
     component_errors(flight)  # raises MissingData without estimates
     errors = estimate_errors(flight)
-    low, high = 2.0 * gammaincinv(6 / 2, (0.025, 0.975))  # quantiles of the chi-square distribution
+    low, high = map(float, chi_square_band(6))
     figure, (axes,) = new_figure(1)
     d = decimated(len(errors["nees"]))
     axes.semilogy(
@@ -668,6 +667,41 @@ def consistency(flight: RecordedFlight, _: Traces) -> Figure:
     axes.axhline(6.0, color=SERIES[2], linewidth=0.8)
     axes.set_title(consistency_text(errors["nees"], low, high))
     axes.set(ylabel="NEES", xlabel="time / s", xlim=_span_s(errors["time_s"]))
+    return figure
+
+
+@_figure(
+    "Innovations of the sightings",
+    "Squared difference of each sighting from what the estimator expected, normalized by its "
+    "covariance (NIS), per degree of freedom. Crosses: rejected sightings. Shaded: where 95 % lie "
+    "if errors are white and as stated. Errors that persist, as of markers, are stated larger than "
+    "they scatter and lie lower.",
+)
+def innovations(flight: RecordedFlight, _: Traces) -> Figure:
+    if not flight.innovations:
+        raise MissingData("the estimator states no innovations")
+    figure, (axes,) = new_figure(1)
+    for i, history in flight.innovations.items():
+        per_freedom = np.maximum(history.squared / history.freedoms, 1e-3)
+        for used, marker in ((True, "."), (False, "x")):
+            rows = np.flatnonzero(history.used == used)
+            rows = rows[decimated(len(rows))]
+            axes.semilogy(
+                history.time_s[rows],
+                per_freedom[rows],
+                color=colour(i),
+                linestyle="none",
+                marker=marker,
+                markersize=3.0 if used else 5.0,
+                label=f"chaser {i}" if used else None,
+            )
+    freedoms = np.concatenate([h.freedoms for h in flight.innovations.values()]).max()
+    low, high = (float(bound) / freedoms for bound in chi_square_band(freedoms))
+    axes.axhspan(low, high, color=SERIES[2], alpha=0.15, linewidth=0)
+    axes.axhline(1.0, color=SERIES[2], linewidth=0.8)
+    last_s = max(float(history.time_s[-1]) for history in flight.innovations.values())
+    axes.set(ylabel="NIS per degree of freedom", xlabel="time / s", xlim=(0.0, max(last_s, 1e-3)))
+    legend_above(axes)
     return figure
 
 

@@ -167,6 +167,18 @@ class SightingUse:
 
 
 @dataclass
+class InnovationHistory:
+    """Innovations of a chaser's sightings: exposure times (K,) s, squares (K,) normalized by their
+    covariances, degrees of freedom (K,), and whether the estimator used the sighting (K,).
+    """
+
+    time_s: Array
+    squared: Array
+    freedoms: Array
+    used: NDArray[np.bool_]
+
+
+@dataclass
 class LoadHistory:
     """Loads at a port: times (K,) s, and values (K, 6) since the previous tick, in the order of
     ``LOAD_QUANTITIES``.
@@ -248,7 +260,8 @@ class RecordedFlight:
 
     ``motion``: of the bodies, to judge against. ``impulses``: by chaser; ``impulses_are``: true, or
     as commanded. ``ticks``, ``flown_s``: number of ticks, and simulated time of the last one or of
-    the end. ``estimated``: motion of the target as estimated. ``estimated_errors`` (K, 3): time
+    the end. ``innovations``: of the chasers for whose sightings the estimator states them.
+    ``estimated``: motion of the target as estimated. ``estimated_errors`` (K, 3): time
     (s), distance (m) and angle (rad) of a chaser's odometry from its reference pose on the
     estimated target. ``estimate_known`` (K,): the target was tracked or predicted. ``relative``: of
     the chasers whose pose the estimator publishes, while the target is known. ``identified``: None
@@ -275,6 +288,7 @@ class RecordedFlight:
     relative: dict[int, RelativeHistory]
     references: dict[int, ReferenceHistory]
     sightings: dict[int, SightingHistory]
+    innovations: dict[int, InnovationHistory]
     loads: dict[int, LoadHistory]
     identified: IdentificationHistory | None
     safety: dict[int, SafetyHistory]
@@ -400,6 +414,7 @@ class _Collector:
         default_factory=lambda: defaultdict(_ReferenceCollector)
     )
     sightings: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
+    innovations: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
     loads: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(7)))
     identified: Columns = field(default_factory=lambda: Columns(21))
     stack: StackEstimate | None = None
@@ -567,6 +582,9 @@ class _Collector:
             self.use[chaser].used += 1
         for chaser in m.rejected:
             self.use[chaser].rejected += 1
+        for x in m.innovations or ():
+            row = (x.sim_time_ns / 1e9, x.squared, x.freedoms, x.used)
+            self.innovations[x.chaser].add(row)
         known = message.status in ("tracking", "predicting")
         self.known.append(known)
         covariance = np.asarray(message.covariance)
@@ -586,6 +604,11 @@ class _Collector:
 def _sighting_history(columns: Columns) -> SightingHistory:
     t = columns.table()
     return SightingHistory(t[:, 0].copy(), t[:, 1] > 0.0, t[:, 2].astype(np.intp))
+
+
+def _innovation_history(columns: Columns) -> InnovationHistory:
+    t = columns.table()
+    return InnovationHistory(t[:, 0].copy(), t[:, 1].copy(), t[:, 2].copy(), t[:, 3] > 0.0)
 
 
 def _load_history(columns: Columns) -> LoadHistory:
@@ -648,6 +671,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         relative={i: _relative_history(columns) for i, columns in c.relative.items()},
         references={i: collector.finish() for i, collector in c.references.items()},
         sightings={i: _sighting_history(columns) for i, columns in c.sightings.items()},
+        innovations={i: _innovation_history(c.innovations[i]) for i in sorted(c.innovations)},
         loads={i: _load_history(columns) for i, columns in c.loads.items()},
         identified=_identification_history(c),
         plumes=dict(c.plumes),

@@ -6,6 +6,7 @@ and poses of bodies from here.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -26,6 +27,22 @@ _MOST_GAP_S = 0.1
 0.05 m/s^2 of a robot on air bearings the error in the middle is 0.06 mm. Longer: errors of
 interpolation count as errors of the flight; shorter: fewer dropouts are bridged.
 """
+
+
+@dataclass(frozen=True)
+class JumpBounds:
+    """What two reference measurements of a body may differ by, beside their noise, before one of
+    them is of something else: a swapped body, a wrong fit.
+    """
+
+    jump_m: float = 0.05  # as lab.safety.jump_m: vibration and lost markers move a body by less
+    speed_m_s: float = 1.0  # three times the speed that robots on a floor are allowed
+    jump_rad: float = np.radians(20.0)  # the next symmetric fit of markers is 60 degrees and more
+    rate_rad_s: float = np.radians(120.0)  # twice the largest rate of lab.safety
+    sigmas: float = 5.0  # of both measurements: four of their difference
+
+
+_JUMP_BOUNDS = JumpBounds()
 _NO_RATES = (np.nan,) * 3
 _WIDTH = 16
 """Columns of a stored motion: time, position, velocity, attitude, rate, sigma of position and of
@@ -102,6 +119,39 @@ class Track:
             np.hypot((1.0 - w) * one.sigma_rad, w * two.sigma_rad),
         )
 
+    def is_reached_from(self, before: Track) -> NDArray[np.bool_]:
+        """Return whether a body can have got from each pose of ``before`` to the one here."""
+        b, gap_s = _JUMP_BOUNDS, self.time_s - before.time_s
+        moved_m, turned_rad = self.differences(before)
+        noise_m, noise_rad = self.sigma_m + before.sigma_m, self.sigma_rad + before.sigma_rad
+        near = moved_m <= b.jump_m + b.speed_m_s * gap_s + b.sigmas * noise_m
+        return near & (turned_rad <= b.jump_rad + b.rate_rad_s * gap_s + b.sigmas * noise_rad)
+
+    def differences(self, other: Track) -> tuple[Array, Array]:
+        """Return distances (K,) m and angles (K,) rad from the poses of another motion."""
+        moved_m = np.linalg.norm(self.position_m - other.position_m, axis=1)
+        return moved_m, rotations.angle_between(self.q_wxyz, other.q_wxyz)
+
+    def jumps(self) -> list[range]:
+        """Return the rows, in order of time, that no motion from those before explains: from a
+        jump until the body is back where it can have got meanwhile.
+        """
+        n, found = len(self.time_s), list[range]()
+        if n < 2:
+            return found
+        reached = self.rows(slice(1, n)).is_reached_from(self.rows(slice(n - 1)))
+        begins = [int(k) + 1 for k in np.flatnonzero(~reached)]
+        known = begins[0] - 1 if begins else 0
+        for begin, end in itertools.pairwise([*begins, n]):
+            first, last = self.rows(slice(begin, begin + 1)), self.rows(slice(known, known + 1))
+            if first.is_reached_from(last)[0]:
+                known = end - 1
+            elif found and found[-1].stop == begin:
+                found[-1] = range(found[-1].start, end)
+            else:
+                found.append(range(begin, end))
+        return found
+
     def in_order(self) -> Track:
         """Return the motion in order of time, each time once: measurements may come late or
         twice.
@@ -118,6 +168,26 @@ _FIELDS = tuple(Track.__dataclass_fields__)
 def motion_columns() -> Columns:
     """Return an empty table of a motion."""
     return Columns(_WIDTH)
+
+
+@dataclass(frozen=True)
+class ReferenceJump:
+    """Reference measurements of a body that no motion explains, from ``from_s`` to ``until_s``
+    (None: to the last one), and by how much they jumped.
+    """
+
+    body: str
+    from_s: float
+    until_s: float | None
+    distance_m: float
+    angle_rad: float
+
+    def __str__(self) -> str:
+        until = "to the end" if self.until_s is None else f"until {self.until_s:.2f} s"
+        return (
+            f"reference jumped: {self.body} by {self.distance_m:.2f} m, "
+            f"{np.degrees(self.angle_rad):.0f} deg at {self.from_s:.2f} s; left out {until}"
+        )
 
 
 @dataclass
@@ -178,7 +248,26 @@ class KnownMotion(Mapping[str, Track]):
         return len(self._names)
 
     def _measured(self, name: str) -> Track:
-        return Track.of(self._motions[name]).in_order()
+        """Return the reference measurements of a body without those of a jump."""
+        track = Track.of(self._motions[name]).in_order()
+        jumps = track.jumps()
+        if not jumps:
+            return track
+        return track.rows(np.delete(np.arange(len(track.time_s)), np.concatenate(jumps)))
+
+    def reference_jumps(self) -> list[ReferenceJump]:
+        """Return the jumps of all references, none with ground truth."""
+        found: list[ReferenceJump] = []
+        for name in self._motions if self.source == "reference" else ():
+            track = Track.of(self._motions[name]).in_order()
+            for jump in track.jumps():
+                before, first = (track.rows(slice(k, k + 1)) for k in (jump[0] - 1, jump[0]))
+                moved_m, turned_rad = first.differences(before)
+                is_last = jump.stop == len(track.time_s)
+                until_s = None if is_last else float(track.time_s[jump.stop])
+                size = float(moved_m[0]), float(turned_rad[0])
+                found.append(ReferenceJump(name, float(first.time_s[0]), until_s, *size))
+        return sorted(found, key=lambda jump: jump.from_s)
 
     @property
     def chasers(self) -> list[int]:

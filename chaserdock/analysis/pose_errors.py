@@ -51,6 +51,16 @@ def normalized_square(error: Array, covariance: Array) -> Array:
     return np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
+def chi_square_band(freedoms: ArrayLike) -> tuple[Array, Array]:
+    """Return the limits (...) between which 95 % of chi-square variables with ``freedoms`` (...)
+    degrees of freedom are, 2.5 % beyond each.
+    """
+    from scipy.special import gammaincinv  # scipy.stats takes a second to import
+
+    half = np.asarray(freedoms) / 2.0
+    return 2.0 * gammaincinv(half, 0.025), 2.0 * gammaincinv(half, 0.975)
+
+
 def measured_covariance(track: Track) -> Array:
     """Return the covariances (K, 6, 6) of measured poses: position, and attitude in the axes of the
     body.

@@ -158,6 +158,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     relative = any("relative_estimate" in c for c in result["chasers"].values())
     fuel = any(c["propellant_kg"] > 0.0 for c in result["chasers"].values())
     estimated = any("estimated_tracking" in c for c in result["chasers"].values())
+    innovations = any("innovations" in c for c in result["chasers"].values())
     rows = [
         (
             f"chaser {i}",
@@ -167,6 +168,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
             _quantity(c["orientation_mse_rad2"], "rad²"),
             *([_estimated(c)] if estimated else []),
             *([_relative(c)] if relative else []),
+            *([_innovations(c)] if innovations else []),
             *([_docked(c)] if at_distance else []),
             _quantity(c["min_distance_target_m"], "m"),
             _quantity(c["impulse_N_s"], "N s"),
@@ -183,6 +185,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         "orientation MSE, whole run",
         *(["steady RMS as estimated in flight; sightings rejected"] if estimated else []),
         *(["estimated pose relative to the target, RMS"] if relative else []),
+        *(["NIS per degree of freedom; above the 95 % band"] if innovations else []),
         *(["docked since"] if at_distance else []),
         "minimum distance to target",
         "impulse",
@@ -206,6 +209,16 @@ def _relative(c: dict[str, Any]) -> str:
         return _DASH
     position, angle = e["position_rms_m"], e["orientation_rms_rad"]
     return f"{_quantity(position, 'mm', 1e3)}, {_quantity(angle, '°', math.degrees(1.0))}"
+
+
+def _innovations(c: dict[str, Any]) -> str:
+    """Return the innovations of the sightings of a chaser: mean of the used, share above."""
+    found = c.get("innovations")
+    if found is None:
+        return _DASH
+    return (
+        f"{_quantity(found['mean_per_freedom'], '')}; {_quantity(found['above_share'], '%', 1e2)}"
+    )
 
 
 def _estimated(c: dict[str, Any]) -> str:

@@ -39,10 +39,17 @@ from .criteria import (
     rest_failures,
     stack_rest,
 )
-from .flight import RecordedFlight, SafetyHistory, SightingUse, load_flight
+from .flight import (
+    InnovationHistory,
+    RecordedFlight,
+    SafetyHistory,
+    SightingUse,
+    load_flight,
+)
 from .motion import TARGET, Track
 from .pose_errors import (
     Verticals,
+    chi_square_band,
     measured_covariance,
     pose_error,
     pose_nees,
@@ -318,6 +325,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             chasers[str(i)]["capture"] = capture
         if i in flight.shown and (found := rendezvous_of(flight, i)) is not None:
             chasers[str(i)]["rendezvous"] = found
+        if i in flight.innovations:
+            chasers[str(i)]["innovations"] = _innovations(flight.innovations[i], s.settling_s)
         if i in flight.safety:
             chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
 
@@ -431,6 +440,26 @@ def _of_estimates(flight: RecordedFlight, chaser: int) -> dict[str, Any]:
         },
         "sightings": {"used": use.used, "rejected": use.rejected},
     }
+
+
+def _innovations(history: InnovationHistory, from_s: float) -> dict[str, Any]:
+    """Return what the innovations of a chaser's sightings since ``from_s`` show; None for an empty
+    part.
+    """
+    late = history.time_s >= from_s
+    squared, freedoms, used = history.squared[late], history.freedoms[late], history.used[late]
+    _, above = chi_square_band(freedoms)
+    return {
+        "used": int(used.sum()),
+        "rejected": int((~used).sum()),
+        "mean_per_freedom": _share(squared[used].sum(), freedoms[used].sum()),
+        "rejected_mean_per_freedom": _share(squared[~used].sum(), freedoms[~used].sum()),
+        "above_share": _share((squared > above).sum(), len(squared)),
+    }
+
+
+def _share(part: float, whole: float) -> float | None:
+    return float(part / whole) if whole else None
 
 
 def _ended(flight: RecordedFlight) -> str:
@@ -616,11 +645,21 @@ def _chaser_text(i: str, c: dict[str, Any]) -> str:
             f"; estimated relative to it within {relative['position_rms_m'] * 1e3:.2f} mm, "
             f"{math.degrees(relative['orientation_rms_rad']):.3f} deg RMS"
         )
+    line += innovations_text(c.get("innovations"))
     if "capture" in c:
         line += capture_text(c["capture"])
     if "rendezvous" in c:
         line += rendezvous_text(c["rendezvous"])
     return line
+
+
+def innovations_text(found: dict[str, Any] | None) -> str:
+    """Describe the innovations of a chaser's sightings as part of a line."""
+    if found is None or found["above_share"] is None:
+        return ""
+    mean = found["mean_per_freedom"]
+    used = "" if mean is None else f"mean NIS {mean:.2f} per degree of freedom, "
+    return f"; {used}{100.0 * found['above_share']:.1f} % above the 95 % band"
 
 
 def _estimates_text(c: dict[str, Any]) -> str:

@@ -226,7 +226,7 @@ class TopicTable:
         """Add a message."""
         self._rows.add(record)
         for name, rows in self.children.items():
-            for index, item in enumerate(getattr(record.message, name)):
+            for index, item in enumerate(getattr(record.message, name) or ()):
                 rows.add((record, index, item))
 
     def take(self) -> pa.Table:

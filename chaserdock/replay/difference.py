@@ -55,18 +55,27 @@ class TopicDifference(msgspec.Struct):
         )
 
 
+_NOT_STATED = {"TargetEstimate": ("innovations",)}
+"""Fields by type of message that older logs do not state (None): compared only where both sides
+state them."""
+
+
 def field_differences(
     a: Any, b: Any, name: str = ""
 ) -> Iterator[tuple[str, Any, Any, float | None]]:
     """Yield the fields that differ: name (shared by the items of a list), both values, and the
     difference of numbers.
 
-    Transport and wall-clock fields (``seq``, ``wall_...``) are ignored.
+    Transport and wall-clock fields (``seq``, ``wall_...``) and those that one side does not state
+    are ignored.
     """
     if isinstance(a, msgspec.Struct) and type(a) is type(b):
+        younger = _NOT_STATED.get(type(a).__name__, ())
         for field in a.__struct_fields__:
             if field != "seq" and not field.startswith("wall_"):
                 x, y = getattr(a, field), getattr(b, field)
+                if field in younger and (x is None or y is None):
+                    continue
                 if x != y:
                     yield from field_differences(x, y, f"{name}.{field}" if name else field)
     elif isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):

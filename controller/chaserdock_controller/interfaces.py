@@ -23,6 +23,7 @@ from chaserdock_protocol.messages import (
     CommandReply,
     DockingStatus,
     Event,
+    Innovation,
     Latch,
     Level,
     Odometry,
@@ -311,6 +312,7 @@ class TargetEstimation:
     ``at_effect``: the target at ``Observation.effective_ns``, None while its pose is unknown.
     ``body``: the target and the latched chasers as one rigid body. ``stack``: their identified mass
     properties, if identified. ``shape``: errors of the known geometry, once estimated.
+    ``innovations``: of the tick's sightings; None if the estimator states none.
     """
 
     target: TargetState
@@ -320,6 +322,7 @@ class TargetEstimation:
     events: tuple[LogEntry, ...] = ()
     stack: IdentifiedStack | None = None
     shape: EstimatedShape | None = None
+    innovations: tuple[Innovation, ...] | None = None
 
     @property
     def known(self) -> bool:

@@ -450,13 +450,30 @@ class Sighting(Message, frozen=True, kw_only=True):
     wall_estimate_s: float = 0.0
 
 
+class Innovation(Struct, frozen=True, kw_only=True):
+    """How a sighting of chaser ``chaser``, exposed at ``sim_time_ns``, agrees with what the
+    estimator expected: the squared residual, normalized by its covariance.
+
+    ``squared`` of a consistent estimator is a chi-square variable with ``freedoms`` degrees of
+    freedom. ``used``: the sighting passed its gate.
+    """
+
+    chaser: ChaserId
+    sim_time_ns: Count
+    squared: float
+    freedoms: Annotated[int, Meta(ge=1, le=100)]
+    used: bool
+
+
 class TargetEstimate(Message, frozen=True, kw_only=True):
     """Fused odometry of the target at ``sim_time_ns``: position and velocity in WRF, rate in TRF.
 
     ``covariance`` is row-major (12, 12) over (position, velocity, dtheta in TRF, rate in TRF). With
     status ``none``, before the first sighting, the values are meaningless. ``cameras``: estimated
     calibration errors, if estimated. ``relative``: poses of the chasers relative to the target,
-    from an estimator that estimates the chasers, too.
+    from an estimator that estimates the chasers, too. ``innovations``: of the sightings that the
+    tick has processed, but those that start an estimate; None from an estimator that states none,
+    and in older logs.
     """
 
     status: Literal["none", "tracking", "predicting", "lost"]
@@ -469,6 +486,7 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
     rejected: ChaserIds
     cameras: Annotated[tuple[CameraCalibration, ...], Meta(max_length=256)] = ()
     relative: Annotated[tuple[RelativeEstimate, ...], Meta(max_length=256)] = ()
+    innovations: Annotated[tuple[Innovation, ...], Meta(max_length=1024)] | None = None
 
 
 class MassEstimate(Struct, frozen=True, kw_only=True):

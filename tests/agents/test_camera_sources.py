@@ -23,13 +23,9 @@ from chaserdock_agents.gateway.cameras import (
     open_driver,
 )
 from chaserdock_agents.gateway.cameras.files import time_of_name
-from chaserdock_agents.gateway.cameras.image_messages import (
-    BadImageMessage,
-    compressed_pixels,
-    raw_pixels,
-)
 from chaserdock_agents.gateway.cameras.polled import PolledCamera
 from chaserdock_agents.gateway.devices import CameraFrame, DeviceError, DeviceHost
+from chaserdock_agents.gateway.images import BadImageMessage, compressed_pixels, raw_pixels
 from chaserdock_agents.ros2.types import TYPES
 from chaserdock_protocol import codec
 from chaserdock_protocol.messages import Image, encoding_of, schema_of
@@ -144,8 +140,10 @@ def test_files_that_hold_no_images_are_named(tmp_path: Path) -> None:
 
 
 def test_unknown_options_are_listed_with_the_known_ones() -> None:
-    with pytest.raises(ImageSourceError, match="option speed of a camera is unknown; known: width"):
+    with pytest.raises(DeviceError, match="unknown option 'speed'; must be one of: width_px, hei"):
         open_camera("0", {"speed": 1})
+    with pytest.raises(DeviceError, match=r"expected `float \| null`, got `str` in option fps"):
+        open_camera("0", {"fps": "30"})
 
 
 # -- Devices ---------------------------------------------------------------------------------------
@@ -295,7 +293,7 @@ def test_a_source_is_a_camera_of_the_gateway(
     camera.close()
     assert fault.startswith("/dev/video0: has ended")
     assert {(f.stamp_ns, f.arrived_ns) for f in seen} <= {(1_234_000_000, 42)}
-    with pytest.raises(DeviceError, match="unknown option speed; known: width_px"):
+    with pytest.raises(DeviceError, match="unknown option 'speed'; must be one of: width"):
         open_driver("0", {"speed": 1}, DeviceHost(lambda: 42))
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import math
 import os
+import pty
+import select
 import socket
 import sys
 import threading
 import time
+import tty
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -397,6 +400,110 @@ def test_poses_and_robot_share_a_port(lab: Lab) -> None:
     source.close()
 
 
+# -- serial ports ----------------------------------------------------------------------------------
+
+
+class SerialLine:
+    """A pseudo terminal: the vehicle is on one end, ``address`` is the other one."""
+
+    def __init__(self) -> None:
+        self.side, end = pty.openpty()
+        tty.setraw(end)
+        self.path = os.ttyname(end)
+        self.address = f"mavlink:serial://{self.path}:57600"
+        os.close(end)
+
+    def write(self, data: bytes) -> None:
+        os.write(self.side, data)
+
+    def read(self) -> bytes:
+        return os.read(self.side, 4096) if select.select([self.side], [], [], 0.0)[0] else b""
+
+    def hang_up(self) -> None:
+        os.close(self.side)
+
+
+@pytest.fixture
+def line(monkeypatch: pytest.MonkeyPatch) -> SerialLine:
+    use_entry_points(monkeypatch)
+    return SerialLine()
+
+
+def packed(message: Any) -> bytes:
+    dialect: Any = mavutil.mavlink
+    return message.pack(dialect.MAVLink(None, 5, 1))
+
+
+def mocap() -> bytes:
+    dialect: Any = mavutil.mavlink
+    return packed(dialect.MAVLink_att_pos_mocap_message(1, Q, *POSITION))
+
+
+def test_serial_line_carries_poses_and_control_both_ways(line: SerialLine) -> None:
+    """The sides of the line see each other's heartbeats, and the robot arms over it."""
+    source = open_device("pose", line.address, {"message": "ATT_POS_MOCAP"})
+    robot = open_device("robot", line.address, {**PLANAR, "system": 5})
+    sample = poll_one(source, lambda: line.write(mocap()))
+    assert sample.body == "5"
+    np.testing.assert_allclose(sample.position_m, POSITION, atol=1e-6)
+    dialect: Any = mavutil.mavlink
+    line.write(packed(dialect.MAVLink_heartbeat_message(SPACECRAFT, PX4, 0, 0, 4, 3)))
+    reader = dialect.MAVLink(None)
+    reader.robust_parsing = True
+    seen: set[str] = set()
+
+    def vehicle() -> None:
+        for message in reader.parse_buffer(line.read()) or ():
+            seen.add(message.get_type())
+            if message.get_type() == "COMMAND_LONG":
+                line.write(packed(dialect.MAVLink_command_ack_message(message.command, 0)))
+
+    arming = threading.Thread(target=robot.arm)
+    arming.start()
+    while arming.is_alive():
+        vehicle()
+        time.sleep(0.002)
+    robot.send(command(force=(1.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0)))
+    wait_for(lambda: vehicle() or {"HEARTBEAT", "COMMAND_LONG", "MANUAL_CONTROL"} <= seen)
+    robot.close()
+    source.close()
+    line.hang_up()
+
+
+def test_serial_line_that_is_unplugged_is_gone(line: SerialLine) -> None:
+    source = open_device("pose", line.address, {"message": "ATT_POS_MOCAP"})
+    poll_one(source, lambda: line.write(mocap()))
+    line.hang_up()
+    complains(source, f"serial://{line.path}:57600 is gone")
+    source.close()
+
+
+@pytest.mark.parametrize("heard", [b"", b"\x55\xaa\xfd\x00" * 40], ids=["nothing", "noise"])
+def test_mute_serial_device_is_named(line: SerialLine, heard: bytes) -> None:
+    """Noise is what another baud rate looks like."""
+    clock = Clock()
+    source = open_device("pose", line.address, {}, clock)
+    line.write(heard)
+    clock.time_ns += 2_900_000_000
+    assert source.poll() == []
+    clock.time_ns += 200_000_000
+    complains(source, "no MAVLink within 3 s: is the vehicle on, and set to this baud rate?")
+    source.close()
+    line.hang_up()
+
+
+def test_serial_port_in_use_is_named(line: SerialLine) -> None:
+    source = open_device("pose", line.address, {})
+    other = f"mavlink:serial://{line.path}:115200"  # another address: a port of its own
+    with pytest.raises(DeviceError, match="at 115200 baud: another program uses it") as raised:
+        open_device("pose", other, {})
+    assert "\n" not in str(raised.value)
+    source.close()
+    again = open_device("pose", other, {})
+    again.close()
+    line.hang_up()
+
+
 # -- invalid input ---------------------------------------------------------------------------------
 
 
@@ -407,6 +514,15 @@ def test_poses_and_robot_share_a_port(lab: Lab) -> None:
         ("pose", "mavlink:udp://0.0.0.0", {}, "must be udp://HOST:PORT (listens), udpout://"),
         ("pose", "mavlink:udp://127.0.0.1:x", {}, "cannot listen on udp://127.0.0.1:x"),
         ("pose", "mavlink:udp://127.0.0.1:99999", {}, "cannot listen on udp://127.0.0.1:99999"),
+        (
+            "pose",
+            "mavlink:serial:///dev/ttyNONE7:57600",
+            {},
+            "cannot open /dev/ttyNONE7 at 57600 baud: No such file or directory",
+        ),
+        ("pose", "mavlink:serial:///dev/null:57600", {}, "cannot open /dev/null at 57600 baud: "),
+        ("pose", "mavlink:serial:///dev/ttyS0", {}, "tcp://HOST:PORT or serial://PATH:BAUD"),
+        ("pose", "mavlink:serial:///dev/ttyS0:fast", {}, "tcp://HOST:PORT or serial://PATH:BAUD"),
         ("pose", "mavlink:tcp://127.0.0.1:1", {}, "cannot reach tcp://127.0.0.1:1"),
         ("pose", "mavlink:udp://127.0.0.1:1", {"message": "ATTITUDE"}, "in option message"),
         ("pose", "mavlink:udp://127.0.0.1:1", {"sysid": 1}, "unknown option 'sysid'"),

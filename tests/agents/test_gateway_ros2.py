@@ -18,6 +18,7 @@ import pytest
 from chaserdock_agents.gateway import devices
 from chaserdock_agents.gateway.devices import DeviceError, DeviceHost, LatchReading
 from chaserdock_agents.gateway.drivers import command_stream, ros2_camera, ros2_network, ros2_poses
+from chaserdock_agents.gateway.images import BadImageMessage
 from chaserdock_agents.ros2.types import TYPES, type_hash
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.transport.zenoh_network import PlainSession
@@ -245,6 +246,9 @@ def test_every_encoding_becomes_the_same_grey_levels() -> None:
         ("bgra8", opaque, {}),
         ("mono16", wide, {}),
         ("mono16", wide.astype(">u2"), {"is_bigendian": 1}),
+        ("16UC1", wide, {}),
+        ("yuyv", np.stack([GREY, np.full_like(GREY, 128)], axis=2), {}),
+        ("uyvy", np.stack([np.full_like(GREY, 128), GREY], axis=2), {}),
     ]:
         grey = ros2_camera.grey_of_image(image(encoding, rows, **changes))
         np.testing.assert_array_equal(grey, GREY, err_msg=encoding)
@@ -271,16 +275,16 @@ def test_pattern_of_a_sensor_has_its_red_and_blue_where_ros_has_them(
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"encoding": "yuv422"}, "encoding 'yuv422' is not one of: mono8"),
-        ({"height": 13}, "300 bytes in rows of 25 for 20 x 13 pixels of mono8"),
-        ({"width": 26}, "rows of 25 for 26 x 12"),
+        ({"encoding": "32FC1"}, "encoding '32FC1' is unknown; known: mono8"),
+        ({"height": 13}, "300 bytes, 25 a row; 20 x 13 pixels of mono8 have 20 a row"),
+        ({"width": 26}, "25 a row; 26 x 12 pixels of mono8 have 26 a row"),
     ],
 )
 def test_image_that_its_header_does_not_fit_is_refused(changes: Any, said: str) -> None:
     message = image("mono8", GREY)
     for name, value in changes.items():
         setattr(message, name, value)
-    with pytest.raises(ros2_camera.UnreadableMessage, match=said):
+    with pytest.raises(BadImageMessage, match=said):
         ros2_camera.grey_of_image(message)
 
 
@@ -510,7 +514,11 @@ def test_camera_passes_images_on_and_refuses_another_calibration(peer: Peer) -> 
     assert frame.stamp_ns == STAMP_NS
     np.testing.assert_array_equal(frame.image, GREY)
     narrow = vars(image("mono8", GREY[:, :10], 10))
-    complains(camera, "images of 10 x 12 px, the sc", lambda: images.publish(**narrow))
+    complains(
+        camera,
+        "images of 10 x 12; the calibration is for 20 x 12",
+        lambda: images.publish(**narrow),
+    )
     wide = vars(camera_info(width=41))
     complains(camera, "CameraInfo states 41 x 12 px", lambda: infos.publish(**wide))
     camera.close()
@@ -528,7 +536,7 @@ def test_compressed_images_are_decoded(peer: Peer) -> None:
     np.testing.assert_array_equal(poll_until(camera, 1, lambda: publish(png))[0].image, GREY)
     complains(
         camera,
-        "10 images in a row: format 'bgr8; png compressed bgr8' with 3 bytes: no JPEG",
+        "10 images in a row: 3 bytes are not a JPEG or PNG, or damaged",
         lambda: publish(png[:3]),
     )
     camera.close()
@@ -795,6 +803,40 @@ def test_px4_that_refuses_or_is_silent_is_named(
     robot.send(command((3.0, 3.0, 3.0)))
     time.sleep(0.05)
     assert all(not np.any(m.xyz) for m in px4.read["VehicleThrustSetpoint"])
+    robot.close()
+
+
+@pytest.mark.parametrize("waits_for", ["the stream", "an acknowledgement"])
+def test_px4_that_is_stopped_while_it_arms_is_not_armed(
+    waits_for: str, peer: Peer, px4: EmulatedPx4, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from chaserdock_agents.gateway.drivers import acknowledgements, px4_robot
+
+    acknowledged = waits_for == "an acknowledgement"
+    monkeypatch.setattr(px4_robot, "_LEAD_S", 0.0 if acknowledged else 30.0)
+    monkeypatch.setattr(acknowledgements, "_REPLY_S", 0.1)
+    px4.results.clear()
+    robot = open_px4(peer, **WRENCH)
+    errors: list[str] = []
+
+    def arm() -> None:
+        try:
+            robot.arm()
+        except DeviceError as error:
+            errors.append(str(error))
+
+    arming = threading.Thread(target=arm)
+    arming.start()
+    wait_for(lambda: px4.read["VehicleCommand" if acknowledged else "OffboardControlMode"])
+    robot.stop()
+    arming.join()
+    assert errors == ["stopped while it was being armed"]
+    wait_for(lambda: (400, 0.0, 21196.0) in px4.commands())
+    assert px4.commands()[-1] == (400, 0.0, 21196.0)
+    assert not [c for c in px4.commands() if c[:2] == (400, 1.0)]
+    px4.results.update({176: 0, 400: 0})
+    monkeypatch.setattr(px4_robot, "_LEAD_S", 0.0)
+    robot.arm()
     robot.close()
 
 

@@ -18,8 +18,8 @@ from chaserdock_agents.recorder.foxglove_layer import SHOWN, ViewerLayer
 from chaserdock_agents.ros2.conversion import Converter
 from chaserdock_models import rotations
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import ActuatorCommand, BodyReference, ThrusterPulse
-from chaserdock_protocol.recording.log import read_log
+from chaserdock_protocol.messages import ActuatorCommand, BodyReference, Message, ThrusterPulse
+from chaserdock_protocol.recording.log import Record, read_log
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
 from message_samples import SAMPLES
@@ -29,14 +29,17 @@ from motion_cases import (
     SYSTEM,
     cropped,
     measured_motion,
+    rewritten,
     track,
     without_truth,
 )
+from msgspec import structs
 from typer.testing import CliRunner
 
 from chaserdock.analysis import video
 from chaserdock.analysis.actuation import commanded_output
 from chaserdock.analysis.columns import Columns
+from chaserdock.analysis.criteria import criteria_of
 from chaserdock.analysis.figures import component_errors
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.motion import Track
@@ -130,6 +133,98 @@ def test_late_and_doubled_measurements_count_once_and_in_order() -> None:
     np.testing.assert_array_equal(found.time_s, ticks)
     between = (np.square(ticks - 0.005) + np.square(ticks + 0.005)) / 2.0
     np.testing.assert_allclose(found.position_m, np.outer(between, [3.0, -2.0, 1.0]), atol=1e-12)
+
+
+def jumping(moved: Track, rows: slice, by: tuple[float, float, float], turn: float = 0.0) -> Track:
+    """A motion whose measurements are beside the body, and turned, in some rows."""
+    position, q = moved.position_m.copy(), moved.q_wxyz.copy()
+    position[rows] += by
+    q[rows] = rotations.multiply(q[rows], rotations.exp(np.array([0.0, 0.0, turn])))
+    return replace(moved, position_m=position, q_wxyz=q)
+
+
+@pytest.mark.parametrize(
+    ("by", "turn"),
+    [((0.3, -0.2, 0.1), 0.0), ((0.0, 0.0, 0.0), math.pi / 2)],
+    ids=["position", "attitude"],
+)
+def test_measurements_of_a_jump_are_left_out_until_the_body_is_back(by: Any, turn: float) -> None:
+    """Though the jump lasts long enough for the body to have got there meanwhile."""
+    times, ticks = np.arange(0.0, 4.0, 0.01), np.arange(0.05, 3.9, 0.1)
+    true = turning(times)
+    motion = measured_motion({"target": jumping(true, slice(100, 300), by, turn)}, ticks)
+    found = motion["target"]
+    np.testing.assert_array_equal(found.time_s, [t for t in ticks if not 0.99 < t < 3.0])
+    np.testing.assert_allclose(found.position_m, turning(found.time_s).position_m, atol=1e-9)
+    (jump,) = motion.reference_jumps()
+    assert (jump.body, jump.until_s) == ("target", 3.0)
+    assert jump.from_s == 1.0
+    assert abs(jump.distance_m - np.linalg.norm(by)) < 0.01
+    assert abs(jump.angle_rad - turn) < 0.02
+
+
+def test_bodies_that_a_reference_swaps_are_left_out_while_they_are_swapped() -> None:
+    times = np.arange(0.0, 2.0, 0.01)
+    one, other = turning(times), turning(times)
+    other = replace(other, position_m=other.position_m + np.array([0.0, 0.6, 0.0]))
+    swapped = slice(80, 130)
+    moved = [jumping(one, swapped, (0, 0.6, 0)), jumping(other, swapped, (0, -0.6, 0))]
+    motion = measured_motion(dict(zip(("chaser/0", "chaser/1"), moved, strict=True)), times)
+    assert [j.body for j in motion.reference_jumps()] == ["chaser/0", "chaser/1"]
+    for name, true in (("chaser/0", one), ("chaser/1", other)):
+        found = motion[name]
+        assert len(found.time_s) >= 148
+        kept = np.isin(times, found.time_s)
+        np.testing.assert_allclose(found.position_m, true.position_m[kept], atol=1e-9)
+
+
+def test_noise_and_single_outliers_are_no_gap() -> None:
+    """Outliers are left out, and bridged; noise of the stated size is no jump."""
+    times, rng = np.arange(0.0, 2.0, 0.01), np.random.default_rng(3)
+    noisy = replace(turning(times), sigma_m=np.full(200, 0.03))
+    noisy = replace(noisy, position_m=noisy.position_m + 0.03 * rng.standard_normal((200, 3)))
+    assert measured_motion({"target": noisy}, times).reference_jumps() == []
+    spiked = jumping(turning(times), slice(50, 51), (0.0, 0.4, 0.0))
+    motion = measured_motion({"target": spiked}, times)
+    assert [(j.from_s, j.until_s) for j in motion.reference_jumps()] == [(0.5, 0.51)]
+    assert len(motion["target"].time_s) == 200
+    error = motion["target"].position_m - turning(times).position_m
+    assert np.abs(error).max() < 1e-4
+
+
+def test_flight_is_not_judged_by_a_reference_that_jumped(measured: Path, tmp_path: Path) -> None:
+    def moved(record: Record) -> Message:
+        message = record.message
+        if not isinstance(message, BodyReference) or message.body != "chaser/1":
+            return message
+        if message.sim_time_ns < 700_000_000:
+            return message
+        x, y, z = message.position_m
+        return structs.replace(message, position_m=(x, y + 0.5, z))
+
+    before = summarize(measured)
+    after = summarize(rewritten(measured, tmp_path / "mission.mcap", moved))
+    (said,) = (x for x in after["not_judged"] if x.startswith("reference jumped"))
+    assert said.startswith("reference jumped: chaser/1 by 0.50 m, 0 deg at 0.70")
+    assert said.endswith("left out to the end")
+    assert f"not judged: {said}" in text_of(after)
+    own = after["chasers"]["1"]
+    assert own["position_mse_m2"] < 2.0 * before["chasers"]["1"]["position_mse_m2"]
+    assert after["chasers"]["0"] == before["chasers"]["0"]
+
+
+def test_state_at_the_end_is_not_judged_after_a_jump_that_stays(measured: Path) -> None:
+    flight = load_flight(measured)
+    success = flight.scenario.success.model_copy(update={"docked": (1,)})
+    scenario = flight.scenario.model_copy(update={"success": success})
+    assert not [x for x in criteria_of(replace(flight, scenario=scenario))[1] if "docked" in x]
+    times = np.arange(0.0, 1.2, 0.01)
+    tracks = {name: turning(times) for name in BODIES}
+    tracks["chaser/1"] = jumping(turning(times), slice(90, None), (0.0, 0.5, 0.0))
+    jumped = replace(flight, scenario=scenario, motion=measured_motion(tracks, times))
+    judged, skipped = criteria_of(jumped)
+    assert judged.success.docked == ()
+    assert "success.docked: the reference jumped, and did not come back" in skipped
 
 
 def test_bodies_that_are_measured_at_different_times_are_compared_at_the_same_ticks() -> None:

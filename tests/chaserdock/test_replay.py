@@ -26,6 +26,7 @@ from chaserdock_protocol.replay_node import order_by_tick
 from chaserdock_protocol.transport import ReceivedMessage
 from harness import finished
 from message_samples import BY_TYPE
+from motion_cases import rewritten
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.replay.compare import compare, comparison_lines
@@ -45,23 +46,6 @@ REPLAYS = [(GOLDEN, s) for s in STAGES] + [
 ]
 # Another kind of CPU differs in the last bits, and a plan's inputs magnify them; nothing else may.
 TOLERANCE = 1e-4
-
-
-def rewritten(
-    source: Path, path: Path, change: Any = lambda record: record.message, **run_data: str
-) -> Path:
-    """A copy of a log, each message as ``change(record)`` has it; None leaves it out."""
-    writer = LogWriter(path)
-    scenario, run = read_scenario(source)
-    writer.describe(scenario, {k: v for k, v in run.items() if k in ("run_id", "mode")} | run_data)
-    for record in read_log(source):
-        message = change(record)
-        if message is not None:
-            writer.write(
-                record.key, m.encoding_of(type(message)), codec.encode(message), record.sent_ns
-            )
-    writer.close()
-    return path
 
 
 # -- golden logs -----------------------------------------------------------------------------------

@@ -14,12 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_protocol.errors import WriteError
-from chaserdock_protocol.recording.log import logged_scenario
+from chaserdock_protocol.messages import Innovation, Message, TargetEstimate
+from chaserdock_protocol.recording.log import Record, logged_scenario
 from harness import ROOT
-from motion_cases import table_of
+from motion_cases import rewritten, table_of
+from msgspec import structs
 
-from chaserdock.analysis.flight import load_flight
-from chaserdock.analysis.summary import summarize, summary_of
+from chaserdock.analysis.figures import innovations
+from chaserdock.analysis.flight import InnovationHistory, load_flight
+from chaserdock.analysis.plots import MissingData
+from chaserdock.analysis.report import _chasers
+from chaserdock.analysis.summary import summarize, summary_of, text_of
+from chaserdock.analysis.time_series import load_traces
 from chaserdock.launch import launcher
 from chaserdock.launch.progress import ProgressReporter, Show
 from chaserdock.summary import Summary
@@ -34,6 +40,7 @@ IN_SOME_FLIGHTS = {
     "rendezvous",
     "estimated_tracking",
     "sightings",
+    "innovations",
 }
 """Fields of a chaser."""
 
@@ -59,6 +66,72 @@ def test_documented_fields_equal_the_produced_fields() -> None:
     expected = (set(produced) - {"chasers"}) | set(chaser) | IN_SOME_FLIGHTS
     expected |= RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY
     assert names == expected
+
+
+def test_innovations_show_the_mean_of_the_used_and_what_is_beyond_the_band() -> None:
+    """The band ends at 14.45 for six degrees of freedom; nothing of it is judged."""
+    flight = load_flight(GOLDEN)
+    history = InnovationHistory(
+        time_s=np.array([0.1, 0.6, 0.7, 0.8, 0.9]),
+        squared=np.array([90.0, 3.0, 15.0, 60.0, 14.4]),
+        freedoms=np.full(5, 6.0),
+        used=np.array([True, True, True, False, True]),
+    )
+    shown = summary_of(replace(flight, innovations={1: history}))
+    chasers = shown["chasers"]
+    assert "innovations" not in chasers["0"]
+    assert chasers["1"]["innovations"] == {
+        "used": 3,
+        "rejected": 1,
+        "mean_per_freedom": pytest.approx(32.4 / 18.0),
+        "rejected_mean_per_freedom": 10.0,
+        "above_share": 0.5,
+    }
+    before = summary_of(flight)
+    for name in ("failures", "not_judged", "doubts"):
+        assert shown[name] == before[name]
+    assert Summary.from_dict(shown).as_dict() == Summary.from_dict(shown | {}).as_dict()
+    line = next(x for x in text_of(shown).splitlines() if "chaser 1" in x)
+    assert "; mean NIS 1.80 per degree of freedom, 50.0 % above the 95 % band" in line
+    early = summary_of(replace(flight, innovations={1: replace(history, time_s=np.zeros(5))}))
+    assert early["chasers"]["1"]["innovations"]["above_share"] is None
+    assert "NIS" not in text_of(early)
+
+
+def test_innovations_of_a_log_are_collected_by_chaser(tmp_path: Path) -> None:
+    """A log from before them states none."""
+    assert load_flight(GOLDEN).innovations == {}
+
+    def stated(record: Record) -> Message:
+        if not isinstance(record.message, TargetEstimate):
+            return record.message
+        one = Innovation(
+            chaser=1, sim_time_ns=record.message.sim_time_ns, squared=4.5, freedoms=6, used=True
+        )
+        other = structs.replace(one, squared=99.0, used=False)
+        return structs.replace(record.message, innovations=(one, other))
+
+    log = rewritten(GOLDEN, tmp_path / "mission.mcap", stated)
+    (found,) = load_flight(log).innovations.values()
+    assert found.squared.tolist() == [4.5, 99.0] * (len(found.used) // 2)
+    assert found.used.tolist() == [True, False] * (len(found.used) // 2)
+    assert found.freedoms.tolist() == [6.0] * len(found.used)
+
+
+def test_innovations_are_drawn_and_listed_where_they_are_stated() -> None:
+    """By chaser, rejected ones by themselves."""
+    flight, time_s = load_flight(GOLDEN), np.linspace(0.6, 1.1, 8)
+    history = InnovationHistory(time_s, np.full(8, 3.0), np.full(8, 6.0), time_s < 1.0)
+    stated = replace(flight, innovations={0: history})
+    drawn = innovations(stated, load_traces(GOLDEN, flight.scenario)).axes[0]
+    used, rejected, *_ = drawn.lines
+    np.testing.assert_array_equal(np.asarray(used.get_ydata()), np.full(6, 0.5))
+    assert np.size(rejected.get_xdata()) == 2
+    head = "NIS per degree of freedom; above the 95 % band"
+    assert head in _chasers(stated, summary_of(stated))
+    assert head not in _chasers(flight, summary_of(flight))
+    with pytest.raises(MissingData, match="states no innovations"):
+        innovations(flight, load_traces(GOLDEN, flight.scenario))
 
 
 def test_estimate_is_judged_relative_to_each_chaser() -> None:

@@ -668,7 +668,7 @@ def test_published_estimate_is_that_of_the_filter() -> None:
         chaser=0, own=SimpleNamespace(disturbance=pushed), relative=relative, camera=None,
         visible=True,
     )  # fmt: skip
-    estimation: Any = SimpleNamespace(target=target, chasers=(chaser,))
+    estimation: Any = SimpleNamespace(target=target, chasers=(chaser,), innovations=None)
     message = target_message(observed(rng, target.time_ns), estimation)
     np.testing.assert_array_equal(message.relative[0].covariance, relative.covariance.ravel())
     np.testing.assert_array_equal(message.relative[0].force_N, pushed[:3])

@@ -34,6 +34,7 @@ from chaserdock_protocol.scenario import parse_scenario
 from chaserdock_protocol.transport import Node
 from flight_cases import odometry, scenario
 from joint_cases import SyntheticFlight, navigation
+from msgspec import structs
 
 from chaserdock.experiments.in_process import InProcessMission
 from chaserdock.experiments.perception import RenderedImages
@@ -113,6 +114,12 @@ FAILURES: dict[str, dict[str, Any]] = {
     "a motion that is NaN": {"update": chaser_with(disturbance=np.full(6, np.nan))},
     "a motion of another chaser": {"update": chaser_with(chaser=2)},
     "a relative pose of another type": {"update": chaser_with(relative=np.zeros(7))},
+    "innovations of another type": {"update": lambda found: replace(found, innovations=(5.5,))},
+    "an innovation that is infinite": {
+        "update": lambda found: replace(
+            found, innovations=(structs.replace(found.innovations[0], squared=np.inf),)
+        )
+    },
     "an event without level": {
         "update": lambda found: replace(found, events=(EstimatorEvent(0, cast(Any, ""), ""),))
     },

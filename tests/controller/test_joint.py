@@ -50,7 +50,7 @@ from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Odometry, PoseSolution
+from chaserdock_protocol.messages import Innovation, Odometry, PoseSolution
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from flight_cases import scenario
 from joint_cases import PERIOD_S, SyntheticFlight, changed, navigation, odometry_in, parameters
@@ -333,6 +333,55 @@ def test_relative_poses_are_consistent(grade: str, chasers: int) -> None:
         assert estimator.newest.gated <= 0.002 * estimator.newest.accepted + 6
     # Six flights with at least six independent components each: three sigma of the mean.
     assert 6.0 - 3 * np.sqrt(12 / 6) < np.mean(nees) < 6.0 + 3 * np.sqrt(12 / 6)
+
+
+def innovations_of(
+    estimator: JointEstimator, flight: SyntheticFlight, ticks: int, change=lambda i: i
+) -> list[Innovation]:
+    found: list[Innovation] = []
+    for _ in range(ticks):
+        found += estimator.update(change(flight.inputs())).innovations or ()
+        flight.step()
+    return found
+
+
+def test_innovations_of_white_sightings_are_as_large_as_their_covariance_states() -> None:
+    """The mean is chi-square of six degrees of freedom, on either side; with sightings half as
+    noisy as assumed it is not.
+    """
+    means = []
+    for assumed in (1.0, 2.0):
+        errors = navigation("lab")
+        white = SightingNoise(assumed, 0.0, 1.0)
+        p = parameters(SCENARIO, errors, several_markers=white)
+        flight = SyntheticFlight(SCENARIO, errors, 2, 17)
+        estimator = JointEstimator(p, 2)
+        innovations_of(estimator, flight, 30)  # settles
+        found = innovations_of(estimator, flight, 120)
+        assert [x.sim_time_ns for x in found] == sorted(x.sim_time_ns for x in found)
+        assert [(x.chaser, x.freedoms, x.used) for x in found] == [(0, 6, True), (1, 6, True)] * 120
+        means.append(np.mean([x.squared / x.freedoms for x in found]))
+    bound = 4.0 * np.sqrt(2.0 / (6 * 240))
+    assert abs(means[0] - 1.0) < bound
+    assert means[1] < 0.5
+
+
+def test_innovation_of_a_rejected_sighting_is_stated_too() -> None:
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 11)
+    estimator = estimator_for(flight.errors, 2)
+    assert len(innovations_of(estimator, flight, 1)) == 1  # the other one starts the target
+    innovations_of(estimator, flight, 30)
+
+    def displaced(inputs: EstimatorInputs) -> EstimatorInputs:
+        good, bad = inputs.sightings
+        solution = bad.solutions[0]
+        place = vector(np.add(solution.position_m, [0.0, 0.5, 0.0]))
+        wrong = msgspec.structs.replace(solution, position_m=place)
+        return replace(inputs, sightings=(good, msgspec.structs.replace(bad, solutions=(wrong,))))
+
+    good, bad = innovations_of(estimator, flight, 1, displaced)
+    assert (good.chaser, good.used, bad.chaser, bad.used) == (0, True, 1, False)
+    assert good.squared < GATE_CHI_SQUARE < 1e4 < bad.squared
 
 
 def test_disturbances_are_estimated() -> None:

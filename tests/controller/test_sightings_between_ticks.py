@@ -107,6 +107,31 @@ def test_a_doubled_exposure_is_used_once() -> None:
     assert results[0] == results[1]
 
 
+def innovations(late: bool, doubled: bool = False) -> list[tuple[int, int]]:
+    """Fly 30 ticks; return exposure and chaser of all innovations, as published."""
+    p = parameters(SCENARIO, navigation("lab"))
+    flight = SyntheticFlight(SCENARIO, p.navigation, 2, 5, disturbance=0.005)
+    estimator, seen, held, found = JointEstimator(p, 2), [], [], []
+    for k in range(30):
+        given = () if late and k % 3 else (*held, *seen) * (1 + doubled)
+        held = [*held, *seen] if late and k % 3 else []
+        estimate = estimator.update(dataclasses.replace(flight.inputs(), sightings=tuple(given)))
+        assert estimate.innovations is not None
+        assert all(x.used and 0.0 < x.squared < 27.0 for x in estimate.innovations)
+        found += [(x.sim_time_ns, x.chaser) for x in estimate.innovations]
+        seen = flight.step(EXPOSURES_S[k % 2])
+    return found
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_each_exposure_between_ticks_has_one_innovation_however_late_it_is(late: bool) -> None:
+    """All but the first one, which starts the estimate."""
+    found = innovations(late)
+    assert len(set(found)) == len(found)
+    assert len(found) >= (51 if late else 57)
+    assert innovations(late, doubled=True) == found
+
+
 @pytest.mark.parametrize("gap_s", [0.0, 0.4 * PERIOD_S, 1.3 * PERIOD_S])
 def test_parts_of_a_tick_hold_its_impulse_and_its_first_moment(gap_s: float) -> None:
     """The last estimate may be older than what the impulse covers, as after a lost tick: what acted

@@ -18,6 +18,7 @@ from chaserdock_protocol.transport import RawSample
 from harness import DRILL, ROOT, SHORT, simulated_digest, summary
 
 from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summarize
 from chaserdock.simulation import mission
 from chaserdock.simulation.mission import simulate
 from chaserdock.simulation.network import SimulatedNetwork
@@ -54,6 +55,20 @@ def test_digest_equals_that_of_separate_processes_over_zenoh(
     """So do those with faults, a standby and thrusters, in the tests of those."""
     folder = request.getfixturevalue(flown)
     assert simulated_digest(overrides[0], tmp_path, *overrides[1:]) == summary(folder)["digest"]
+
+
+@pytest.mark.slow
+def test_innovations_in_flight_are_as_large_as_their_covariance_states(tmp_path: Path) -> None:
+    """Ranging has white errors: the mean of 570 six-dimensional ones is 1 to four standard
+    errors, on either side. One in 40 is beyond the band, at most twice as many.
+    """
+    changes = ("duration_s=60.0", "settling_s=3.0", "timeline=[]")
+    simulate(ROOT / "scenarios" / "v-bar.toml", tmp_path, changes)
+    (shown,) = (c["innovations"] for c in summarize(tmp_path)["chasers"].values())
+    number = shown["used"] + shown["rejected"]
+    assert number == 570
+    assert abs(shown["mean_per_freedom"] - 1.0) < 4.0 * np.sqrt(2.0 / (6 * number))
+    assert 0.005 < shown["above_share"] < 0.05
 
 
 def test_latency_does_not_change_a_lockstep_flight(tmp_path: Path) -> None:

@@ -63,6 +63,7 @@ def test_there_is_a_sample_of_every_message() -> None:
         m.ExpectedPose,
         m.GeometryEstimate,
         m.GeometryMeasurement,
+        m.Innovation,
         m.MassEstimate,
         m.PoseSolution,
         m.ProbeTouch,

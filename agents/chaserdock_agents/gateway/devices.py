@@ -136,7 +136,9 @@ class Robot(Protocol):
         ...
 
     def stop(self) -> None:
-        """Command zero, and disarm where the robot can be disarmed. Never raises."""
+        """Command zero, and disarm where the robot can be disarmed. Never raises. May come from
+        another thread while ``arm`` waits.
+        """
         ...
 
     def arm(self) -> None:

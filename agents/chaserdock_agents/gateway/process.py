@@ -263,9 +263,17 @@ class Gateway:
             for chaser, image, time_ns in self._lab.read_images():
                 self._publish_image(chaser, image, time_ns)
             for feed, pose in self._lab.read_references():
+                self._name_jump(feed)
                 self._publish_reference(feed, pose)
         except DeviceError as error:
             self._trip(str(error))
+
+    def _name_jump(self, feed: PoseFeed) -> None:
+        """Warn of a reference that has jumped for good: results are not judged by it from then."""
+        jumped_m, feed.track.jumped_m = feed.track.jumped_m, 0.0
+        if jumped_m > 0.0:
+            detail = f"{feed.device.body} by {jumped_m:.2f} m"
+            self._barrier.publish_warning("reference jumped", detail)
 
     def _publish_reference(self, feed: PoseFeed, pose: MeasuredPose) -> None:
         measured_ns = pose.time_ns - self._start_ns

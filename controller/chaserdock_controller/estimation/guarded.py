@@ -12,7 +12,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.codec import MAX_MAGNITUDE, UNIT_QUATERNION_TOLERANCE
 from chaserdock_protocol.failure_watch import FailureWatch, text_of
-from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.messages import Innovation, Odometry
 
 from chaserdock_controller.bodies.body_shape import SHAPE, BodyShape
 from chaserdock_controller.bodies.target_body import TargetBody
@@ -213,9 +213,22 @@ def _check_estimate(found: Any, time_ns: int, chasers: int) -> None:
         if motion.camera is not None:
             _check(f"{name}, camera", motion.camera, CameraError)
             _check_values(f"{name}, focal_share", np.array(motion.camera.focal_share), ())
+    for innovation in found.innovations or ():
+        _check_innovation(innovation, chasers)
     for event in found.events:
         if event.level not in _LEVELS or not isinstance(event.text, str):
             raise ValueError(f"event {event!r} must have a level of {_LEVELS} and a text")
+
+
+def _check_innovation(found: Any, chasers: int) -> None:
+    if not isinstance(found, Innovation):
+        raise TypeError(f"innovations hold a {type(found).__name__}, not an Innovation")
+    _check_numbers("innovations, chaser", [found.chaser], chasers)
+    if not 0.0 <= found.squared <= MAX_MAGNITUDE or found.freedoms < 1:
+        raise ValueError(
+            f"innovations, chaser {found.chaser}: squared must be from 0 to {MAX_MAGNITUDE:g}, "
+            f"freedoms from 1 on: {found.squared!r}, {found.freedoms!r}"
+        )
 
 
 def _check_target(found: Any, time_ns: int, chasers: int) -> None:

@@ -97,6 +97,7 @@ class EstimationStage:
             ),
             body=self.composite.moving,
             events=tuple(events),
+            innovations=found.innovations,
             stack=self._free_target(target) if known else None,
         )
 

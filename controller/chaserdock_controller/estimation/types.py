@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.passive_safety import DisturbedMotion
-from chaserdock_protocol.messages import Level, Odometry, Sighting
+from chaserdock_protocol.messages import Innovation, Level, Odometry, Sighting
 
 from chaserdock_controller.bodies.body_shape import BodyShape
 from chaserdock_controller.bodies.target_body import TargetBody
@@ -109,11 +109,14 @@ class ChaserMotion:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Result of a tick. ``chasers``: those whose motion the estimator estimates, in order."""
+    """Result of a tick. ``chasers``: those whose motion the estimator estimates, in order.
+    ``innovations``: of the tick's sightings; None if the estimator states none.
+    """
 
     target: TargetState
     chasers: tuple[ChaserMotion, ...] = ()
     events: tuple[EstimatorEvent, ...] = ()
+    innovations: tuple[Innovation, ...] | None = None
 
 
 class Estimator(Protocol):

@@ -82,6 +82,7 @@ def target_message(observation: Observation, estimation: TargetEstimation) -> Ta
             for c in estimation.chasers
             if c.own is not None and c.relative is not None
         ),
+        innovations=estimation.innovations,
     )
 
 

@@ -14,6 +14,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from ..devices import GROUPS
+from ..options import read_options
 from .capture import open_address, open_device, open_pipeline
 from .files import open_path
 from .polled import open_driver, open_polled
@@ -47,25 +48,15 @@ def open_camera(
     A device (``0``, ``/dev/video0``), an address (``rtsp://…``), a GStreamer pipeline (``… ! …``),
     a video file, a folder of images, a recording (``.mcap``, folder of a ROS 2 bag), or
     ``SCHEME:REST`` of a driver of the gateway. ``options``: those of `OpeningOptions`, also as a
-    table. Raises ImageSourceError, and DeviceError of a driver.
+    table. Raises ImageSourceError, and DeviceError for other options and of a driver.
     """
-    given = options if isinstance(options, OpeningOptions) else _options(options or {})
+    if not isinstance(options, OpeningOptions):
+        options = read_options(OpeningOptions, options or {})
     scheme, colon, _ = address.partition(":")
     if colon and scheme in {e.name for e in entry_points(group=GROUPS["camera"])}:
-        return open_polled(address, given)
+        return open_polled(address, options)
     opener = next(o for pattern, o in _BUILT_IN if re.fullmatch(pattern, address))
-    return opener(address, given)
-
-
-def _options(values: Mapping[str, Any]) -> OpeningOptions:
-    try:
-        return OpeningOptions(**values)
-    except TypeError:
-        known = OpeningOptions.__dataclass_fields__
-        wrong = sorted(set(values) - set(known))
-        raise ImageSourceError(
-            f"option {', '.join(wrong)} of a camera is unknown; known: {', '.join(known)}"
-        ) from None
+    return opener(address, options)
 
 
 __all__ = [

@@ -10,78 +10,17 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import cv2
-import numpy as np
 from chaserdock_protocol.failure_watch import text_of
-from numpy.typing import NDArray
 
-from ..images import converted_rows
-
-Pixels = NDArray[np.uint8]
-
-
-class BadImageMessage(ValueError):
-    """An image message that cannot be decoded."""
+from ..devices import ImageArray
+from ..images import BadImageMessage, compressed_pixels, raw_pixels
 
 
 class TimedPixels(NamedTuple):
     """An image, grey (h, w) or BGR (h, w, 3), and its stamp: the time of its exposure, ns."""
 
-    pixels: Pixels
+    pixels: ImageArray
     time_ns: int
-
-
-# ROS' name of an encoding: channels, bytes of one, and OpenCV's conversion to BGR; None: as it is.
-_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
-    "mono8": (1, 1, None),
-    "8uc1": (1, 1, None),
-    "mono16": (1, 2, None),
-    "16uc1": (1, 2, None),
-    "bgr8": (3, 1, None),
-    "8uc3": (3, 1, None),
-    "rgb8": (3, 1, cv2.COLOR_RGB2BGR),
-    "bgra8": (4, 1, cv2.COLOR_BGRA2BGR),
-    "rgba8": (4, 1, cv2.COLOR_RGBA2BGR),
-    # OpenCV names a pattern by its second row and column, ROS by its first.
-    "bayer_rggb8": (1, 1, cv2.COLOR_BayerBG2BGR),
-    "bayer_bggr8": (1, 1, cv2.COLOR_BayerRG2BGR),
-    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGR2BGR),
-    "bayer_grbg8": (1, 1, cv2.COLOR_BayerGB2BGR),
-    "yuv422": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
-    "uyvy": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
-    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2BGR_YUY2),
-    "yuyv": (2, 1, cv2.COLOR_YUV2BGR_YUY2),
-}
-
-
-def raw_pixels(
-    data: Any, width: int, height: int, encoding: str, step: int, big_endian: bool = False
-) -> Pixels:
-    """Return the image of raw bytes with ``step`` bytes a row. Raises BadImageMessage."""
-    known = _ENCODINGS.get(encoding.lower())
-    if known is None:
-        raise BadImageMessage(f"encoding {encoding!r} is unknown; known: {', '.join(_ENCODINGS)}")
-    channels, size, conversion = known
-    content, row = np.frombuffer(data, np.uint8), width * channels * size
-    if width < 1 or height < 1 or step < row or content.size < step * (height - 1) + row:
-        raise BadImageMessage(
-            f"{content.size} bytes, {step} a row; {width} x {height} pixels of {encoding} have "
-            f"{row} a row"
-        )
-    padded = np.zeros(step * height, np.uint8)
-    padded[: content.size] = content[: step * height]
-    rows = padded.reshape(height, step)
-    return converted_rows(rows, width, channels, size, conversion, big_endian)
-
-
-def compressed_pixels(data: Any) -> Pixels:
-    """Return the image of a JPEG, PNG or another file that OpenCV reads. Raises BadImageMessage."""
-    content = np.frombuffer(data, np.uint8)
-    pixels: Any = None
-    if content.size:
-        pixels = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise BadImageMessage(f"{content.size} bytes are not a JPEG or PNG, or damaged")
-    return pixels
 
 
 # -- ROS 2 -----------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..devices import CameraFrame, CameraSource, DeviceError, DeviceHost, open_device
+from ..options import read_options
 from .capture import LiveCapture, open_address, open_pipeline
 from .capture import open_device as open_video_device
 from .source import (
@@ -75,12 +76,9 @@ class PolledCamera:
 def open_driver(address: str, options: Mapping[str, Any], host: DeviceHost) -> SourceCamera:
     """Open a device (``0``), a network address or a pipeline as a camera of the gateway.
 
-    ``options``: those of `OpeningOptions`. Raises DeviceError for another option, ImageSourceError.
+    ``options``: those of `OpeningOptions`. Raises DeviceError for others, ImageSourceError.
     """
-    known = OpeningOptions.__dataclass_fields__
-    if wrong := sorted(set(options) - set(known)):
-        raise DeviceError(f"unknown option {', '.join(wrong)}; known: {', '.join(known)}")
-    given = OpeningOptions(**options)
+    given = read_options(OpeningOptions, options)
     source: LiveCapture
     if " ! " in address:
         source = open_pipeline(address, given, host.now_ns)

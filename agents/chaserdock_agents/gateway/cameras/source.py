@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+import msgspec
 import numpy as np
 from chaserdock_protocol.errors import ChaserdockError
 from numpy.typing import NDArray
@@ -51,8 +52,7 @@ class UnreadableImage:
 Captured = CapturedImage | UnreadableImage
 
 
-@dataclass(frozen=True)
-class OpeningOptions:
+class OpeningOptions(msgspec.Struct, frozen=True):
     """How to open a source; a source ignores what it does not have.
 
     ``width_px``, ``height_px``: image size to set on a device. ``fps``: images a second, to set on

@@ -11,10 +11,11 @@ the last value for ever, so that a thruster stays open when the gateway ends.
 
 from __future__ import annotations
 
+import errno
+import os
 import select
 import socket
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -26,8 +27,8 @@ from chaserdock_protocol.errors import require_extra
 from chaserdock_protocol.transport.network import Undo
 
 from ..devices import DeviceError, DeviceHost, PoseSample, RobotCommand
+from ..options import read_options
 from .autopilot import AutopilotRobot
-from .options import read_options
 from .pose_samples import KEPT, is_finite, stated, turned
 from .shares import Maxima, wrench_shares
 from .sharing import Shared
@@ -72,38 +73,88 @@ def _dialect() -> Any:
 # -- link ------------------------------------------------------------------------------------------
 
 
-class _Port:
+def _open_port(address: str) -> _SocketPort | _SerialPort:
+    """Open ``udp://HOST:PORT`` (or ``udpin``: listens), ``udpout``, ``tcp``, or
+    ``serial://PATH:BAUD``. Raises DeviceError.
+    """
+    scheme, found, rest = address.partition("://")
+    host, colon, port = rest.rpartition(":")
+    if found and colon and host:
+        if scheme == "serial" and port.isdecimal() and int(port):
+            return _SerialPort(host, int(port))
+        if scheme in ("udp", "udpin", "udpout", "tcp"):
+            return _SocketPort(address, scheme, host, port)
+    raise DeviceError(
+        f"{address!r} must be udp://HOST:PORT (listens), udpout://HOST:PORT, tcp://HOST:PORT or "
+        "serial://PATH:BAUD"
+    )
+
+
+class _SerialPort:
+    """A serial port, for this program alone. pymavlink's own reads it by pyserial, too, but hides
+    that a port is gone.
+    """
+
+    fixed, must_speak, ended = "the serial line", True, "gone"
+
+    def __init__(self, path: str, baud: int) -> None:
+        require_extra("serial", "mavlink")
+        import serial
+
+        try:
+            self._port = serial.Serial(
+                path, baud, timeout=_WAIT_S, write_timeout=_WAIT_S, exclusive=True
+            )
+        except (OSError, ValueError) as error:
+            number = getattr(error, "errno", None)
+            why = "another program uses it" if number == errno.EAGAIN else str(error)
+            if number not in (None, errno.EAGAIN):
+                why = os.strerror(number)
+            raise DeviceError(f"cannot open {path} at {baud} baud: {why}") from None
+
+    def receive(self) -> tuple[bytes, Any] | None:
+        """Return bytes, None if there are none after ``_WAIT_S``. Raises OSError at the end."""
+        first = self._port.read(1)
+        return (first + self._port.read(self._port.in_waiting), self.fixed) if first else None
+
+    def send(self, data: bytes, receiver: Any) -> None:
+        """Send bytes."""
+        self._port.write(data)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+class _SocketPort:
     """A socket at ``udp://HOST:PORT`` (or ``udpin``: listens), ``udpout`` or ``tcp``."""
 
-    def __init__(self, address: str) -> None:
-        scheme, found, rest = address.partition("://")
-        host, colon, port = rest.rpartition(":")
-        if scheme not in ("udp", "udpin", "udpout", "tcp") or not (found and colon and host):
-            raise DeviceError(
-                f"{address!r} must be udp://HOST:PORT (listens), udpout://HOST:PORT or "
-                "tcp://HOST:PORT"
-            )
+    must_speak, ended = False, "closed by the other side"
+
+    def __init__(self, address: str, scheme: str, host: str, port: str) -> None:
         self._listens, self._streams = scheme in ("udp", "udpin"), scheme == "tcp"
         try:
             if self._streams:
-                self.socket = socket.create_connection((host, int(port)), _CONNECT_S)
-                self.socket.settimeout(_WAIT_S)  # of sending to a side that does not read
+                self._socket = socket.create_connection((host, int(port)), _CONNECT_S)
+                self._socket.settimeout(_WAIT_S)  # of sending to a side that does not read
             else:
-                self.socket = opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                self._socket = opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
                 (opened.bind if self._listens else opened.connect)((host, int(port)))
         except (OSError, ValueError, OverflowError) as error:
             if not self._streams:
-                self.socket.close()
+                self._socket.close()
             what = "listen on" if self._listens else "reach"
             raise DeviceError(f"cannot {what} {address}: {error}") from None
         self.fixed = None if self._listens else (host, int(port))
 
-    def receive(self, wait_s: float) -> tuple[bytes, Any] | None:
-        """Return bytes and their sender, None if there are none. Raises EOFError at the end."""
-        if not select.select([self.socket], [], [], wait_s)[0]:
+    def receive(self) -> tuple[bytes, Any] | None:
+        """Return bytes and their sender, None if there are none after ``_WAIT_S``. Raises EOFError
+        at the end.
+        """
+        if not select.select([self._socket], [], [], _WAIT_S)[0]:
             return None
         try:
-            data, sender = self.socket.recvfrom(_DATAGRAM)
+            data, sender = self._socket.recvfrom(_DATAGRAM)
         except ConnectionRefusedError:  # of an earlier datagram: nobody listens yet
             return None
         if not data and self._streams:
@@ -113,12 +164,16 @@ class _Port:
     def send(self, data: bytes, receiver: Any) -> None:
         """Send bytes; a datagram that nobody takes is lost."""
         if self._listens:
-            self.socket.sendto(data, receiver)
+            self._socket.sendto(data, receiver)
             return
         try:
-            self.socket.sendall(data)
+            self._socket.sendall(data)
         except ConnectionRefusedError:
             return
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
 
 
 class MavlinkLink:
@@ -129,7 +184,8 @@ class MavlinkLink:
     def __init__(self, address: str, now_ns: Callable[[], int]) -> None:
         self._dialect = _dialect()
         self._address, self._now_ns = address, now_ns
-        self._port = _Port(address)
+        self._port = _open_port(address)
+        self._opened_ns = now_ns()
         self._mav = self._dialect.MAVLink(self, *SOURCE)
         self._mav.robust_parsing = True
         self._lock, self._closed = threading.Lock(), threading.Event()
@@ -172,7 +228,13 @@ class MavlinkLink:
     def check(self, system: int) -> None:
         """Raise DeviceError if a system (0: all that were heard) has become silent."""
         if self._ended:
-            raise DeviceError(f"{self._address} is closed by the other side")
+            raise DeviceError(f"{self._address} is {self._port.ended}")
+        silent_s = (self._now_ns() - self._opened_ns) / 1e9
+        if self._port.must_speak and not self._heard_ns and silent_s > _GONE_S:
+            raise DeviceError(
+                f"{self._address}: no MAVLink within {_GONE_S:g} s: is the vehicle on, and set to "
+                "this baud rate?"
+            )
         heard = [t for s, t in self._heard_ns.items() if system in (0, s)]
         if heard and self._now_ns() - max(heard) > _GONE_S * 1e9:
             who = f"system {system}" if system else "everybody"
@@ -182,13 +244,13 @@ class MavlinkLink:
         """Close the port."""
         self._closed.set()
         self._thread.join()
-        self._port.socket.close()
+        self._port.close()
 
     def _run(self) -> None:
         due_ns = self._now_ns()
         while not self._closed.is_set():
             try:
-                received = self._port.receive(_WAIT_S)
+                received = self._port.receive()
             except (EOFError, OSError):
                 self._ended = True
                 return
@@ -325,7 +387,7 @@ class MavlinkPoses:
 
 
 def open_poses(address: str, options: Mapping[str, Any], host: DeviceHost) -> MavlinkPoses:
-    """Open a source of poses: ``mavlink:udp://0.0.0.0:14550``."""
+    """Open poses: ``mavlink:udp://0.0.0.0:14550`` or ``mavlink:serial:///dev/ttyUSB0:57600``."""
     return MavlinkPoses(address, read_options(MavlinkPoseOptions, options), host)
 
 
@@ -395,15 +457,14 @@ class MavlinkRobot(AutopilotRobot):
         """Switch the autopilot to its manual mode, and arm it. Raises DeviceError if it refuses, is
         silent, is another, or cannot do what the maxima state.
         """
+        self._stopped.clear()
         if not self._beaten.wait(_GONE_S):
             raise DeviceError(
                 f"no heartbeat of an autopilot with system {self._options.system} within "
                 f"{_GONE_S:g} s"
             )
         mode = manual_mode(*self._kind, self._options)
-        self._was_armed = True
-        self._stream.start()
-        time.sleep(_LEAD_S)
+        self._start_stream(_LEAD_S)
         self._arm_in(mode, "manual mode", "arming")
 
     def _release(self) -> None:

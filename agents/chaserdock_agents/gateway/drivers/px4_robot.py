@@ -10,7 +10,6 @@ arrival, and a time of another clock may count as too old.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -22,8 +21,8 @@ from numpy.typing import NDArray
 from chaserdock_agents.ros2.types import TYPES
 
 from ..devices import DeviceError, DeviceHost, RobotCommand
+from ..options import read_options
 from .autopilot import AutopilotRobot
-from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 from .shares import Maxima, wrench_shares
 
@@ -120,11 +119,9 @@ class Px4Robot(AutopilotRobot):
         """Switch PX4 to offboard mode, and arm it. Raises DeviceError if it refuses, or does not
         answer.
         """
+        self._stopped.clear()
         self._endpoints.check()
-        if not self._was_armed:
-            self._was_armed = True
-            self._stream.start()
-            time.sleep(_LEAD_S)
+        self._start_stream(0.0 if self._was_armed else _LEAD_S)
         self._arm_in(_OFFBOARD, "PX4, offboard mode", "PX4, arming")
 
     def _release(self) -> None:

@@ -11,13 +11,12 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from chaserdock_models.camera import Camera
 
 from ..devices import CameraFrame, DeviceError, DeviceHost, ImageArray
-from ..images import converted_rows
-from .options import read_options
+from ..images import BadImageMessage, compressed_pixels, raw_pixels, why_other_size
+from ..options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 from .ros2_poses import stamp_of
 
@@ -32,25 +31,6 @@ COEFFICIENT = 1e-4
 UNREADABLE = 10
 """Unreadable images in a row that are a fault of the camera: single ones are damaged on the way."""
 _INFO = "sensor_msgs/msg/CameraInfo"
-# Conversion to grey and channels, by encoding; ROS and OpenCV name Bayer patterns differently.
-_TO_GREY: dict[str, tuple[int | None, int]] = {
-    "mono8": (None, 1),
-    "8UC1": (None, 1),
-    "rgb8": (cv2.COLOR_RGB2GRAY, 3),
-    "bgr8": (cv2.COLOR_BGR2GRAY, 3),
-    "8UC3": (cv2.COLOR_BGR2GRAY, 3),
-    "rgba8": (cv2.COLOR_RGBA2GRAY, 4),
-    "bgra8": (cv2.COLOR_BGRA2GRAY, 4),
-    "bayer_rggb8": (cv2.COLOR_BayerBG2GRAY, 1),
-    "bayer_bggr8": (cv2.COLOR_BayerRG2GRAY, 1),
-    "bayer_gbrg8": (cv2.COLOR_BayerGR2GRAY, 1),
-    "bayer_grbg8": (cv2.COLOR_BayerGB2GRAY, 1),
-}
-_WIDE = ("mono16", "16UC1")
-
-
-class UnreadableMessage(ValueError):
-    """An image message that cannot be decoded."""
 
 
 class RosCameraOptions(RosOptions, frozen=True, kw_only=True):
@@ -65,39 +45,16 @@ class RosCameraOptions(RosOptions, frozen=True, kw_only=True):
 
 
 def grey_of_image(message: Any) -> ImageArray:
-    """Return ``sensor_msgs/msg/Image`` as grey levels (h, w). Raises UnreadableMessage for an
-    encoding that is not known, and for bytes that do not fit it.
-    """
-    height, width, step = message.height, message.width, message.step
-    wide = message.encoding in _WIDE
-    if not wide and message.encoding not in _TO_GREY:
-        raise UnreadableMessage(
-            f"encoding {message.encoding!r} is not one of: {', '.join((*_TO_GREY, *_WIDE))}"
-        )
-    code, channels = (None, 1) if wide else _TO_GREY[message.encoding]
-    size = 2 if wide else 1
-    row = width * channels * size
-    if not (height and width and step >= row and len(message.data) == step * height):
-        raise UnreadableMessage(
-            f"{len(message.data)} bytes in rows of {step} for {width} x {height} pixels of "
-            f"{message.encoding}"
-        )
-    rows = np.asarray(message.data, np.uint8).reshape(height, step)
-    return converted_rows(rows, width, channels, size, code, bool(message.is_bigendian))
+    """Return ``sensor_msgs/msg/Image`` as grey levels (h, w). Raises BadImageMessage."""
+    m = message
+    return raw_pixels(
+        m.data, m.width, m.height, m.encoding, m.step, bool(m.is_bigendian), grey=True
+    )
 
 
 def grey_of_compressed(message: Any) -> ImageArray:
-    """Return ``sensor_msgs/msg/CompressedImage`` as grey levels (h, w). Raises
-    UnreadableMessage.
-    """
-    data = np.asarray(message.data, np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = cv2.imdecode(data, flags) if data.size else None
-    if pixels is None:
-        raise UnreadableMessage(
-            f"format {message.format!r} with {data.size} bytes: no JPEG or PNG image"
-        )
-    return np.asarray(pixels, np.uint8)
+    """Return ``sensor_msgs/msg/CompressedImage`` as grey levels (h, w). Raises BadImageMessage."""
+    return compressed_pixels(message.data, grey=True)
 
 
 def difference_of_calibration(info: Any, camera: Camera) -> str | None:
@@ -169,25 +126,18 @@ class RosCamera:
             message, arrived_ns = self._arrived.popleft()
             try:
                 grey = self._grey(message)
-            except UnreadableMessage as error:
+            except BadImageMessage as error:
                 self._unreadable += 1
                 if self._unreadable >= UNREADABLE:
                     raise DeviceError(f"{self._unreadable} images in a row: {error}") from None
                 continue
             self._unreadable = 0
-            self._check_size(grey)
+            if self._camera is not None and (other := why_other_size(grey, self._camera)):
+                raise DeviceError(other)
             frames.append(CameraFrame(grey, stamp_of(message.header), arrived_ns))
         if not frames:
             self._endpoints.check()
         return frames
-
-    def _check_size(self, grey: ImageArray) -> None:
-        camera, (height, width) = self._camera, grey.shape
-        if camera is not None and (width, height) != (camera.width_px, camera.height_px):
-            raise DeviceError(
-                f"images of {width} x {height} px, the scenario's calibration is of "
-                f"{camera.width_px} x {camera.height_px} px"
-            )
 
     def close(self) -> None:
         """Release the camera."""

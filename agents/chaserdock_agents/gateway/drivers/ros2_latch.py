@@ -16,7 +16,7 @@ from chaserdock_protocol.messages import Latch
 from rosbags.typesys.stores import ros2_jazzy as ros
 
 from ..devices import DeviceError, DeviceHost, LatchReading
-from .options import read_options
+from ..options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 
 BOOL = "std_msgs/msg/Bool"

@@ -16,7 +16,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 
 from ..devices import DeviceError, DeviceHost, PoseSample
-from .options import read_options
+from ..options import read_options
 from .pose_samples import KEPT, is_finite, is_pose, stated, to_body_rotation, turned
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 

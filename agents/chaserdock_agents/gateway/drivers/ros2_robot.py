@@ -16,8 +16,8 @@ from rosbags.typesys.stores import ros2_jazzy as ros
 from chaserdock_agents.ros2.conversion import time_of
 
 from ..devices import DeviceError, DeviceHost, RobotCommand
+from ..options import read_options
 from .command_stream import CommandStream
-from .options import read_options
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 from .shares import wrench_of
 

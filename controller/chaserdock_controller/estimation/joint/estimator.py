@@ -19,7 +19,7 @@ from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Odometry, Sighting
+from chaserdock_protocol.messages import Innovation, Odometry, Sighting
 
 from chaserdock_controller.bodies.body_shape import SHAPE, BodyShape
 from chaserdock_controller.bodies.target_body import TargetBody
@@ -123,13 +123,26 @@ class JointEstimator(Estimator):
             if chaser.outdated is not None:
                 first = min(first, self._insert_odometry(chaser.outdated))
         self._buffer.replay(first, self._process)
+        innovations = self._innovations(inputs.sightings)
         self._buffer.trim(self.parameters.target.buffer_s)
         target = self.estimate_at(inputs.time_ns)
         lost = target.status == "lost"
         if lost and not self._was_lost:
             self._buffer.pending.append(EstimatorEvent(target.time_ns, "info", "lost"))
         self._was_lost = lost
-        return Estimate(target, self._chasers(inputs), tuple(self._buffer.drain_events()))
+        return Estimate(
+            target, self._chasers(inputs), tuple(self._buffer.drain_events()), innovations
+        )
+
+    def _innovations(self, sightings: Sequence[Sighting]) -> tuple[Innovation, ...]:
+        """Return the innovations of sightings that have just been processed."""
+        found: list[Innovation] = []
+        for time_ns, chaser in sorted({(s.sim_time_ns, s.chaser) for s in sightings}):
+            i, _ = self._buffer.find(time_ns)
+            state = self._buffer.records[i].state if i < len(self._buffer.records) else None
+            known = () if state is None else state.innovations
+            found += [x for x in known if (x.sim_time_ns, x.chaser) == (time_ns, chaser)]
+        return tuple(found)
 
     def estimate_at(self, time_ns: int) -> TargetState:
         """Return the target's estimate for ``time_ns`` from the ticks up to then. The state is
@@ -291,13 +304,20 @@ class JointEstimator(Estimator):
             return self._process_part(before, record)
         state, events = before, ()
         seen, rejected = set[int](), set[int]()
+        innovations: tuple[Innovation, ...] = ()
         for part in split_tick(before.time_ns, record):
             state, own = self._process_part(state, part)
             events += own
             seen.update(state.seen)
             rejected.update(state.rejected)
-        seen_in_tick, rejected_in_tick = tuple(sorted(seen)), tuple(sorted(rejected - seen))
-        return msgspec.structs.replace(state, seen=seen_in_tick, rejected=rejected_in_tick), events
+            innovations += state.innovations
+        counted = msgspec.structs.replace(
+            state,
+            seen=tuple(sorted(seen)),
+            rejected=tuple(sorted(rejected - seen)),
+            innovations=innovations,
+        )
+        return counted, events
 
     def _process_part(
         self, before: FilterState | None, record: FilterTick

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Innovation
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -28,9 +29,10 @@ class FilterState(Struct, frozen=True, eq=False):
 
     ``hypotheses``: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is
     unresolved. ``seen``, ``rejected``: chasers whose sightings were accepted and gated out at this
-    time. ``accepted``, ``gated``, ``reinitialisations``: counts since the start. ``collective``:
-    consecutive ticks in which most cameras were rejected. ``overconfident``, ``dropped``: channels
-    of odometry for which this was reported, by chaser and name.
+    time, with ``innovations`` of both. ``accepted``, ``gated``, ``reinitialisations``: counts since
+    the start. ``collective``: consecutive ticks in which most cameras were rejected.
+    ``overconfident``, ``dropped``: channels of odometry for which this was reported, by chaser and
+    name.
     """
 
     time_ns: int
@@ -39,6 +41,7 @@ class FilterState(Struct, frozen=True, eq=False):
     last_accepted_ns: int = 0
     seen: tuple[int, ...] = ()
     rejected: tuple[int, ...] = ()
+    innovations: tuple[Innovation, ...] = ()
     accepted: int = 0
     gated: int = 0
     reinitialisations: int = 0
@@ -154,16 +157,20 @@ def _target_difference(a: JointState, b: JointState) -> Array:
 
 
 def count_measurements(
-    state: FilterState, accepted: Sequence[int], rejected: Sequence[int]
+    state: FilterState,
+    accepted: Sequence[int],
+    rejected: Sequence[int],
+    innovations: tuple[Innovation, ...],
 ) -> FilterState:
-    """Return the state with the chasers whose measurements were accepted or rejected at its
-    time.
+    """Return the state with the chasers whose measurements were accepted or rejected at its time,
+    and the innovations of these.
     """
     return replace(
         state,
         last_accepted_ns=state.time_ns if accepted else state.last_accepted_ns,
         seen=tuple(sorted({*state.seen, *accepted})),
         rejected=tuple(rejected),
+        innovations=innovations,
         accepted=state.accepted + len(accepted),
         gated=state.gated + len(rejected),
     )
@@ -177,6 +184,7 @@ def before_restart(state: FilterState) -> FilterState:
         state,
         seen=(),
         rejected=(),
+        innovations=(),
         accepted=state.accepted - len(state.seen),
         gated=state.gated - len(state.rejected),
         reinitialisations=state.reinitialisations + 1,

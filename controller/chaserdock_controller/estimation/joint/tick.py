@@ -93,14 +93,16 @@ def process_tick(
     seen = {i: s for i, s in record.sightings.items() if s.solutions and hypotheses[0].alive[i]}
     results = [update(h, record.odometry, seen, mounting, p) for h in hypotheses]
     updated = tuple(r[0] for r in results)
-    now = replace(old, time_ns=record.time_ns, hypotheses=updated, seen=(), rejected=())
+    now = replace(
+        old, time_ns=record.time_ns, hypotheses=updated, seen=(), rejected=(), innovations=()
+    )
     if seen and not now.hypotheses[0].target_known:
         now = _start(now, seen, unknown_rates(p.target), mounting, p, "initialised", events)
     elif seen and all_lost(now, lost_limits(now.hypotheses[0], p.target)):
         now = _reacquire(now, seen, mounting, p, events)
     elif seen:
         report = max(results, key=lambda r: r[0].log_likelihood)[1]
-        now = count_measurements(now, report.accepted, report.rejected)
+        now = count_measurements(now, report.accepted, report.rejected, report.innovations)
         now = _check_cameras(now, old.hypotheses[0], report, seen, mounting, p, events)
     if p.floor is not None:
         level = tuple(keep_on_floor(h, p.floor) for h in now.hypotheses)
@@ -246,7 +248,8 @@ def _start(
 
     started = tuple(r[0] for r in results)
     now = replace(now, hypotheses=started, ambiguous_since_ns=now.time_ns, collective=0)
-    return count_measurements(now, (first, *report.accepted), report.rejected)
+    accepted = (first, *report.accepted)
+    return count_measurements(now, accepted, report.rejected, report.innovations)
 
 
 def _reacquire(

@@ -28,7 +28,8 @@ from typing import NamedTuple
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
+from chaserdock_protocol.codec import MAX_MAGNITUDE
+from chaserdock_protocol.messages import Innovation, Odometry, PoseSolution, Sighting
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
@@ -73,15 +74,18 @@ from .state import (
 
 _POSE = (CHANNELS.index("position"), CHANNELS.index("attitude"))
 _RATES = (CHANNELS.index("velocity"), CHANNELS.index("rate"))
+_POSE_FREEDOMS = 6
+"""Degrees of freedom of a sighting: position and attitude."""
 _SIGHTING, _ODOMETRY = frozenset({SIGHTING_CHANNEL}), frozenset(range(1, len(CHANNELS)))
 
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """Chasers whose sightings were accepted and rejected."""
+    """Chasers whose sightings were accepted and rejected, and the innovations of both."""
 
     accepted: tuple[int, ...] = ()
     rejected: tuple[int, ...] = ()
+    innovations: tuple[Innovation, ...] = ()
 
 
 class _Channel(NamedTuple):
@@ -92,13 +96,15 @@ class _Channel(NamedTuple):
 
 class _Gates(NamedTuple):
     """Result of the gates of one chaser: numbers of the channels to use, counts of rejections,
-    normalized innovations, and the log likelihood.
+    normalized innovations of odometry, the log likelihood, and the normalized innovation squared of
+    the sighting (0 without one).
     """
 
     fits: dict[int, bool]
     rejections: list[int]
     nis: list[float]
     log_likelihood: float
+    sighting: float
 
 
 def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParameters) -> JointState:
@@ -335,6 +341,7 @@ def update(
     """Update the state at its time with the odometry and the sightings of the chasers."""
     accepted: list[int] = []
     rejected: list[int] = []
+    innovations: list[Innovation] = []
     state = with_view_units(state, sightings, p)
     running, measured = RunningUpdate(state), state.measured_ns.copy()
     # If most cameras disagree with the estimate, the target has moved.
@@ -344,17 +351,35 @@ def update(
         if not state.alive[i]:
             continue
         sighting = sightings.get(i) if state.target_known else None
-        fits = _update_chaser(running, i, odometry.get(i), sighting, new_views, mounting, p)
+        gates = _update_chaser(running, i, odometry.get(i), sighting, new_views, mounting, p)
+        fits = {} if gates is None else gates.fits
         if _is_supported(fits, bool(running.rejections[i, SIGHTING_CHANNEL])):
             measured[i] = state.time_ns
-        if sighting is not None and sighting.solutions:
-            (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
+        if gates is not None and sighting is not None and sighting.solutions:
+            used = fits[SIGHTING_CHANNEL]
+            (accepted if used else rejected).append(i)
+            innovations += _innovation(sighting, gates.sighting, used)
     markers = state.markers.copy()
     for i in accepted:
         markers[i] = len(sightings[i].marker_ids)
-    report = UpdateReport(tuple(accepted), tuple(rejected))
+    report = UpdateReport(tuple(accepted), tuple(rejected), tuple(innovations))
     finished = running.finished(state.updates + bool(accepted), markers)
     return replace(finished, measured_ns=measured), report
+
+
+def _innovation(sighting: Sighting, squared: float, used: bool) -> list[Innovation]:
+    """Return the innovation of a sighting, nothing if it is not finite."""
+    if not math.isfinite(squared):
+        return []
+    return [
+        Innovation(
+            chaser=sighting.chaser,
+            sim_time_ns=sighting.sim_time_ns,
+            squared=min(squared, MAX_MAGNITUDE),
+            freedoms=_POSE_FREEDOMS,
+            used=used,
+        )
+    ]
 
 
 def _is_supported(fits: Mapping[int, bool], contradicted: bool) -> bool:
@@ -378,8 +403,9 @@ def _update_chaser(
     new_views: bool,
     mounting: CameraMounting,
     p: JointParameters,
-) -> dict[int, bool]:
-    """Update by the measurements of one chaser. Returns which channels were used.
+) -> _Gates | None:
+    """Update by the measurements of one chaser. Returns which channels were used; None without a
+    measurement.
 
     ``new_views``: follow errors of views that jump.
     """
@@ -389,7 +415,7 @@ def _update_chaser(
     )
     solution = _likeliest(running, i, sighting, mounting, p)
     if odometry is None and solution is None:
-        return {}
+        return None
 
     view = _view_units(running.state, i, markers, p)
     z = measurement(chasers, i, odometry, solution, markers, mounting, p, view)
@@ -421,7 +447,7 @@ def _update_chaser(
             gates.fits.get(SIGHTING_CHANNEL, False) and running.state.updates < p.iterated_updates
         )
         running.correct(z, used, p.iterations if nonlinear else 1)
-    return gates.fits
+    return gates
 
 
 def _follow(
@@ -444,7 +470,7 @@ def _follow(
     diagonal += change
     wider = _gate(running, i, channels, running.values(z), p)
     if all(fit for k, fit in wider.fits.items() if k in judged):
-        return wider._replace(nis=gates.nis)
+        return wider._replace(nis=gates.nis, sighting=gates.sighting)
     diagonal[:] = before
     running.values(z)
     return gates
@@ -489,6 +515,7 @@ def _gate(
         running.nis[i].tolist(),
         running.log_likelihood,
     )
+    sighting = 0.0
     fits: dict[int, bool] = {}
     for number, _, gate in channels:
         value = values[number]
@@ -496,9 +523,10 @@ def _gate(
         if number == SIGHTING_CHANNEL:
             # Bound the penalty: a gross outlier counts as much as one at the gate.
             likelihood -= 0.5 * (min(value, gate) + math.log(values[-1]))
+            sighting = value
         else:
             nis[number - 1] += (min(10.0 * gate, value) - nis[number - 1]) / p.overconfident_ticks
-    return _Gates(fits, rejections, nis, likelihood)
+    return _Gates(fits, rejections, nis, likelihood, sighting)
 
 
 def _likeliest(
@@ -529,8 +557,8 @@ def _channels(
 ) -> tuple[_Channel, ...]:
     channels, row = [], 0
     if has_sighting:
-        channels.append(_Channel(SIGHTING_CHANNEL, range(6), gate_sighting))
-        row = 6
+        channels.append(_Channel(SIGHTING_CHANNEL, range(_POSE_FREEDOMS), gate_sighting))
+        row = _POSE_FREEDOMS
     if has_odometry:
         for k in range(1, len(CHANNELS)):
             channels.append(_Channel(k, range(row, row + 3), gate_odometry))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read the options of a device, with one line for those that are invalid."""
+"""Read the options of a device or a source of images, with one line for those that are invalid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from ..devices import DeviceError
+from .devices import DeviceError
 
 _Options = TypeVar("_Options", bound=msgspec.Struct)
 

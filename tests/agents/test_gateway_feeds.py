@@ -111,10 +111,9 @@ class Frames:
 def test_an_image_was_exposed_by_the_stamp_or_the_latency_before_its_arrival(
     monkeypatch: pytest.MonkeyPatch, stamp: str, states: bool
 ) -> None:
-    pixels = np.zeros((4, 6), np.uint8)
     frames = [
-        CameraFrame(pixels, stamp_ns if states else None, arrived_ns)
-        for _, arrived_ns, stamp_ns in measured()
+        CameraFrame(np.full((4, 6), k, np.uint8), stamp_ns if states else None, arrived_ns)
+        for k, (_, arrived_ns, stamp_ns) in enumerate(measured())
     ]
     values = {"address": "x:y", "chaser": 0, "latency_s": LATENCY_S, "stamp": stamp}
     monkeypatch.setattr(feeds, "open_device", lambda *_: Frames(frames))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from chaserdock_agents.gateway import own_camera
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import ArmingCommand, ArmingReply, Kill
+from chaserdock_protocol.messages import ArmingCommand, ArmingReply
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.transport import Node
 from virtual_lab import (
@@ -249,31 +249,6 @@ def test_disarming_wins_over_arming(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not flight.crashes
     assert "arm refused: disarmed by two" in flight.output
     assert SENT == []
-
-
-def kill_by_topic(options: ProcessOptions) -> int:
-    assert arm_when_ready(options) == 0
-    node = Node("operator", "operator", options.link)
-    try:
-        node.advertise(topics.KILL)
-        node.host.sleep(2.0)
-        node.publish(topics.KILL, Kill(by="a button"))
-        node.host.sleep(0.5)
-    finally:
-        node.close()
-    return 0
-
-
-@pytest.mark.slow
-def test_the_topic_kills_within_a_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flight, lab = flown(tmp_path, monkeypatch, seconds=8.0, operator=kill_by_topic)
-    assert not flight.crashes
-    assert "kill accepted: killed by a button" in flight.output
-    assert lab.begun_ns is not None
-    newest_ns = max(at_ns for at_ns, _ in SENT)
-    assert (newest_ns - lab.begun_ns) / 1e9 < 2.3
-    for actuators in lab.actuators.values():
-        assert np.abs(actuators.output).max() < 1e-9
 
 
 @pytest.mark.slow

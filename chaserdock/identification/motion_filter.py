@@ -193,6 +193,10 @@ class _State:
     covariance: Array
 
 
+_Motion = tuple[Array, Array, Array, Array]
+"""Position, velocity, attitude and rate."""
+
+
 class MotionFilter:
     """Linearizes about ``parameters`` of a robot of ``mass_kg``."""
 
@@ -203,11 +207,13 @@ class MotionFilter:
         self._tensor = parameters.tensor
         self._inverse = np.linalg.inv(self._tensor)
         self._turns = np.diag(actuation.axes[3:])
+        # Torque about the centre of mass by a force at the origin of CRF.
+        self._across = -self._turns @ rotations.skew(parameters.centre_m)
         n = 12 + actuation.gains
         self._gains = slice(12, n)
         self._centre, self._inertia = slice(n, n + 3), slice(n + 3, n + 9)
-        self._force, self._torque = slice(n + 9, n + 12), slice(n + 12, n + 15)
-        self._delay, self._bias = n + 15, slice(n + 16, n + 19)
+        self._push = slice(n + 9, n + 15)
+        self._delay, self._bias = slice(n + 15, n + 16), slice(n + 16, n + 19)
 
     def run(self, motion: MeasuredMotion, commanded: Commanded, start: Array, prior: Array) -> Pass:
         """Filter a run. ``start`` (P,): mean of the parameters' error, ``prior`` (P,): its standard
@@ -247,30 +253,45 @@ class MotionFilter:
         return _State(z[:3] + arm, z[3:6] + moved, q, w, mean, covariance)
 
     def _predicted(self, s: _State, commanded: Commanded, k: int, dt: float) -> _State:
-        p, g = self._p, self._p.gains
-        columns = self._actuation.columns
-        axes = self._actuation.axes
-        by_gain, by_gain_moment = columns @ commanded.impulses[k], columns @ commanded.moments[k]
-        late = g @ (columns @ commanded.impulses_by_delay[k])
-        late_moment = g @ (columns @ commanded.moments_by_delay[k])
-        impulse, moment = g @ by_gain + axes * p.push * dt, g @ by_gain_moment
-        across = -self._turns @ rotations.skew(p.centre_m)  # torque about the centre by a force
-        torque = impulse[3:] + across @ impulse[:3]
+        """Return the state after interval ``k`` of length ``dt``."""
+        f = self._transition(s, commanded, k, dt)
+        covariance, moved_by = s.covariance.copy(), f @ s.covariance
+        covariance[:12], covariance[:, :12] = moved_by, moved_by.T
+        covariance[:12, :12] = moved_by @ f.T
+        covariance[range(12), range(12)] += self._noise.wander * dt
+        if self._noise.scatter_share:
+            scattered = (self._actuation.scattered @ commanded.impulses[k]).T
+            b = self._noise.scatter_share * self._effects(self._middle(s.q, s.w, dt), scattered, dt)
+            covariance[:12, :12] += b @ b.T
 
-        x, v, q, w_end = s.x, s.v, s.q, s.w
-        parts = len(commanded.impulses_of_parts[k])
-        for of_part, moment_of_part in zip(
-            commanded.impulses_of_parts[k], commanded.moments_of_parts[k], strict=True
-        ):
-            given = g @ (columns @ of_part) + axes * p.push * (dt / parts)
-            x, v, q, w_end = self._moved(
-                x, v, q, w_end, given, g @ (columns @ moment_of_part), dt / parts
-            )
-        turn = self._inverse @ torque
+        g, columns = self._p.gains, self._actuation.columns
+        push = self._actuation.axes * self._p.push
+        motion = s.x, s.v, s.q, s.w
+        parts, moments = commanded.impulses_of_parts[k], commanded.moments_of_parts[k]
+        for of_part, moment in zip(parts, moments, strict=True):
+            part_s = dt / len(parts)
+            given = g @ (columns @ of_part) + push * part_s
+            motion = self._moved(motion, given, g @ (columns @ moment), part_s)
+        x, v, q, w = motion
+        moved = f[:, 12:] @ s.mean
+        return _State(
+            x + moved[_X],
+            v + moved[_V],
+            rotations.multiply(q, rotations.exp(moved[_Q])),
+            w + moved[_W],
+            s.mean,
+            covariance,
+        )
+
+    def _transition(self, s: _State, commanded: Commanded, k: int, dt: float) -> Array:
+        """Return the derivative (12, size) of the motion after an interval by the error state."""
+        p, g, columns = self._p, self._p.gains, self._actuation.columns
+        by_gain, moment_by_gain = columns @ commanded.impulses[k], columns @ commanded.moments[k]
+        impulse = g @ by_gain + self._actuation.axes * p.push * dt
+        moment = g @ moment_by_gain
+        turn = self._inverse @ (impulse[3:] + self._across @ impulse[:3])
         w = s.w + turn / 2.0
-        middle = rotations.exp((s.w + turn / 4.0) * (dt / 2.0))
-        half = rotations.to_matrix(rotations.multiply(s.q, middle))
-        alpha = self._inverse @ rotations.cross(self._tensor @ w, w)
+        half = self._middle(s.q, s.w + turn / 4.0, dt)
 
         f = np.zeros((12, len(s.covariance)))
         free = self._inverse @ (rotations.skew(self._tensor @ w) - rotations.skew(w) @ self._tensor)
@@ -280,70 +301,53 @@ class MotionFilter:
         f[_Q, _W] = dt * (np.eye(3) + dt / 2.0 * (free - rotations.skew(w)))
         f[_W, _W] = np.eye(3) + dt * free + dt**2 / 2.0 * free @ free
         turned = -half @ rotations.skew(impulse[:3]) / self._mass_kg
-        f[_V, _Q] = turned
-        f[_V, _W] = dt / 2.0 * turned
+        f[_V, _Q], f[_V, _W] = turned, dt / 2.0 * turned
         f[_X, _Q] = dt / 2.0 * turned - half @ rotations.skew(moment[:3]) / self._mass_kg
 
-        def push(where: slice | int, force: Array, torque: Array, moments: Array | None) -> None:
-            """Add what columns (3, c) of force and torque impulses, and (6, c) moments, do."""
-            dv = half @ force / self._mass_kg
-            dw = self._inverse @ (torque + across @ force)
-            f[_V, where] += dv
-            f[_W, where] += dw
-            f[_X, where] += dt / 2.0 * dv
-            f[_Q, where] += dt / 2.0 * dw
-            if moments is not None:
-                f[_X, where] += half @ moments[:3] / self._mass_kg
-                f[_Q, where] += self._inverse @ (moments[3:] + across @ moments[:3])
+        late = (g @ (columns @ commanded.impulses_by_delay[k]))[:, None]
+        late_moment = (g @ (columns @ commanded.moments_by_delay[k]))[:, None]
+        f[:, self._gains] = self._effects(half, by_gain.T, dt, moment_by_gain.T)
+        f[:, self._delay] = self._effects(half, late, dt, late_moment)
+        f[:, self._push] = self._effects(half, np.diag(self._actuation.axes) * dt, dt)
+        self._add_body(f, w, turn, impulse, moment, dt)
+        return f
 
-        push(self._gains, by_gain.T[:3], by_gain.T[3:], by_gain_moment.T)
-        push(self._delay, late[:3], late[3:], late_moment)
-        push(self._force, np.diag(axes[:3]) * dt, np.zeros((3, 3)), None)
-        push(self._torque, np.zeros((3, 3)), np.diag(axes[3:]) * dt, None)
-        f[_W, self._centre] += self._inverse @ self._turns @ rotations.skew(impulse[:3])
-        f[_Q, self._centre] += (
-            self._inverse
-            @ self._turns
-            @ (dt / 2.0 * rotations.skew(impulse[:3]) + rotations.skew(moment[:3]))
-        )
-        by_turn = np.stack([-self._inverse @ (e @ turn) for e in _BASIS], axis=1)
-        by_rate = np.stack(
-            [-self._inverse @ (e @ alpha + rotations.cross(w, e @ w)) for e in _BASIS], axis=1
-        )
-        f[_W, self._inertia] += by_turn + dt * by_rate
-        f[_Q, self._inertia] += dt / 2.0 * (by_turn + dt * by_rate)
+    def _middle(self, q: Array, w: Array, dt: float) -> Array:
+        """Return the attitude (3, 3) in the middle of an interval."""
+        return rotations.to_matrix(rotations.multiply(q, rotations.exp(w * (dt / 2.0))))
 
-        moved = f[:, 12:] @ s.mean
-        covariance = s.covariance.copy()
-        top = f @ s.covariance
-        covariance[:12] = top
-        covariance[:, :12] = top.T
-        covariance[:12, :12] = top @ f.T
-        covariance[range(12), range(12)] += self._noise.wander * dt
-        if self._noise.scatter_share:
-            scattered = (self._actuation.scattered @ commanded.impulses[k]).T
-            b = np.zeros((12, scattered.shape[1]))
-            b[_V] = half @ scattered[:3] / self._mass_kg
-            b[_W] = self._inverse @ (scattered[3:] + across @ scattered[:3])
-            b[_X], b[_Q] = dt / 2.0 * b[_V], dt / 2.0 * b[_W]
-            covariance[:12, :12] += self._noise.scatter_share**2 * b @ b.T
-        return _State(
-            x + moved[_X],
-            v + moved[_V],
-            rotations.multiply(q, rotations.exp(moved[_Q])),
-            w_end + moved[_W],
-            s.mean,
-            covariance,
-        )
+    def _effects(
+        self, half: Array, wrenches: Array, dt: float, moments: Array | None = None
+    ) -> Array:
+        """Return the change of the motion (12, c) by impulses (6, c) with these first moments."""
+        out = np.zeros((12, wrenches.shape[1]))
+        out[_V] = half @ wrenches[:3] / self._mass_kg
+        out[_W] = self._inverse @ (wrenches[3:] + self._across @ wrenches[:3])
+        out[_X], out[_Q] = dt / 2.0 * out[_V], dt / 2.0 * out[_W]
+        if moments is not None:
+            out[_X] += half @ moments[:3] / self._mass_kg
+            out[_Q] += self._inverse @ (moments[3:] + self._across @ moments[:3])
+        return out
 
-    def _moved(
-        self, x: Array, v: Array, q: Array, w: Array, impulse: Array, moment: Array, dt: float
-    ) -> tuple[Array, Array, Array, Array]:
+    def _add_body(
+        self, f: Array, w: Array, turn: Array, impulse: Array, moment: Array, dt: float
+    ) -> None:
+        """Add the derivatives by centre of mass and inertia."""
+        by_arm = self._inverse @ self._turns
+        f[_W, self._centre] = by_arm @ rotations.skew(impulse[:3])
+        f[_Q, self._centre] = by_arm @ rotations.skew(dt / 2.0 * impulse[:3] + moment[:3])
+        alpha = self._inverse @ rotations.cross(self._tensor @ w, w)
+        changes = [e @ (turn + dt * alpha) + dt * rotations.cross(w, e @ w) for e in _BASIS]
+        f[_W, self._inertia] = -self._inverse @ np.stack(changes, axis=1)
+        f[_Q, self._inertia] = dt / 2.0 * f[_W, self._inertia]
+
+    def _moved(self, motion: _Motion, impulse: Array, moment: Array, dt: float) -> _Motion:
         """Return the motion after ``dt`` under an impulse (6,) at the origin of CRF with a first
         moment (6,). Half of the torque's impulse acts at the beginning and half at the end.
         """
-        torque = self._turns @ (impulse[3:] - rotations.cross(self._p.centre_m, impulse[:3]))
-        early = self._turns @ (moment[3:] - rotations.cross(self._p.centre_m, moment[:3]))
+        x, v, q, w = motion
+        torque = impulse[3:] + self._across @ impulse[:3]
+        early = moment[3:] + self._across @ moment[:3]
         turn = self._inverse @ torque
         mean = w + turn / 2.0
         middle = rotations.multiply(q, rotations.exp((w + turn / 4.0) * (dt / 2.0)))

@@ -176,10 +176,9 @@ class _Fit:
 
     def converged(self) -> tuple[Parameters, Pass, Noise]:
         """Return the likeliest parameters, the last pass, and the noise."""
-        parameters = self._with_best_delay()
-        parameters, found = self._iterated(parameters)
-        if self._actuation.scattered.any():
-            self._noise = self._with_best_scatter(parameters)
+        parameters, found = self._iterated(self._with_best_delay())
+        while (likelier := self._with_best_scatter(parameters)) != self._noise.scatter_share:
+            self._noise = replace(self._noise, scatter_share=likelier)
             parameters, found = self._iterated(parameters)
         return parameters, found, self._noise
 
@@ -187,9 +186,14 @@ class _Fit:
         tries = [replace(self._nominal, delay_s=delay) for delay in _FIT.delays_s]
         return max(tries, key=lambda p: self._run(p, self._noise).log_likelihood)
 
-    def _with_best_scatter(self, parameters: Parameters) -> Noise:
-        tries = [replace(self._noise, scatter_share=share) for share in _FIT.scatter_shares]
-        return max(tries, key=lambda noise: self._run(parameters, noise).log_likelihood)
+    def _with_best_scatter(self, parameters: Parameters) -> float:
+        """Return the likeliest scatter, not below the present one: noise that it explains now is
+        not the odometry's any more.
+        """
+        tries = [share for share in _FIT.scatter_shares if share >= self._noise.scatter_share]
+        noises = [replace(self._noise, scatter_share=share) for share in tries]
+        likelihoods = [self._run(parameters, noise).log_likelihood for noise in noises]
+        return tries[int(np.argmax(likelihoods))]
 
     def _iterated(self, parameters: Parameters) -> tuple[Parameters, Pass]:
         for _ in range(_FIT.passes):

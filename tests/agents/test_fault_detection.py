@@ -68,7 +68,8 @@ class Case:
             thrusts_max(self.body.thrusters),
         )
         self.least = self.full * [t.min_on_s for t in self.body.thrusters]
-        self.watch = ThrusterFaultDetector(self.matrix, self.full, self.least, 13 + len(self.full))
+        min_on_s = np.array([t.min_on_s for t in self.body.thrusters])
+        self.watch = ThrusterFaultDetector(self.matrix, min_on_s, 13 + len(self.full))
         self.rng = np.random.default_rng(seed)
         self.state = start(seed)
         self.state[3:6] *= 0.05
@@ -94,7 +95,11 @@ class Case:
         )
 
     def step(
-        self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None
+        self,
+        asked_N_s: Array,
+        given_N_s: Array,
+        suspects: Flags | None = None,
+        known_N: Array | None = None,
     ) -> ThrusterFault | None:
         wrench = self.matrix @ (given_N_s * self.thrust) / TICK_S
         wrench[:3] += self.force_N
@@ -116,6 +121,7 @@ class Case:
             TICK_S,
             everyone if suspects is None else suspects,
             mismatch,
+            self.full if known_N is None else known_N,
         )
 
     def pulses(self, in_minima: dict[int, float]) -> Array:
@@ -175,6 +181,29 @@ def test_a_lost_thruster_is_found_after_some_pulses(
     assert verdict is not None
     assert (verdict.thruster, verdict.kind) == (thruster, kind)
     assert verdict.factor == pytest.approx(left, abs=0.15)
+
+
+@pytest.mark.parametrize("body", ["tetra12", "slider"])
+@pytest.mark.parametrize("thruster", [0, 5, 11])
+@pytest.mark.parametrize("left", [0.35, 0.6])
+def test_a_weak_thruster_that_dies_is_found(body: str, thruster: int, left: float) -> None:
+    noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=4e-4)
+    case = Case(body, 7 + thruster, noise, odometry_noise=True)
+    known, verdicts = np.ones(len(case.full)), list[ThrusterFault]()
+    remains = np.ones(len(case.full))
+    for tick in range(500):
+        remains[thruster] = 1.0 if tick < 30 else left if tick < 300 else 0.0
+        asked = case.random()
+        verdict = case.step(asked * known, asked * remains, known_N=case.full * known)
+        if verdict is not None:
+            known[thruster] *= verdict.factor
+            case.watch.reset()
+            verdicts.append(verdict)
+            assert (verdict.kind == "weak") == (tick < 300)
+            if verdict.kind != "weak":
+                break
+    assert {v.thruster for v in verdicts} == {thruster}
+    assert [v.kind for v in verdicts] == ["weak", "stuck_off"]
 
 
 @pytest.mark.parametrize("seed", range(4))

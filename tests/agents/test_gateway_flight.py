@@ -31,6 +31,7 @@ from virtual_lab import (
 import chaserdock
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
+from chaserdock.identification.fit import identify
 from chaserdock.launch.twin import twin_of
 from chaserdock.simulation.mission import SimulatedFlight
 from chaserdock.simulation.network import SimulatedHost
@@ -91,6 +92,27 @@ def test_robots_dock_by_probe_and_port_alone(
     assert lab.clearance_m > 0.02
     judged = summary_of(load_flight(flight.folder / "mission.mcap"))
     assert judged["success"] is True
+
+
+@pytest.mark.slow(2)
+def test_a_flight_identifies_its_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By forces that are given as commanded, with motion capture of other noise than stated."""
+    scenario = tmp_path / "lab.toml"
+    scenario.write_text(SCENARIO)
+    lab = two_free_flyers(4)
+    lab.mass_kg, lab.inertia = 33.0, np.array([0.19, 0.15, 0.28])
+    flight = fly(scenario, tmp_path / "run", lab, monkeypatch)
+    true = {"mass": 33.0, "Ixx": 0.19, "Iyy": 0.15, "Izz": 0.28}
+    for chaser in (0, 1):
+        found = identify(flight.folder / "mission.mcap", chaser)
+        values = {q.name: q for q in found.quantities}
+        for name, value in true.items():
+            assert values[name].known
+            assert values[name].value == pytest.approx(value, rel=0.03)
+        assert values["mass"].value == pytest.approx(33.0, rel=1e-3)
+        # Its thrust follows a command with a time constant of 20 ms, which is no pure delay.
+        assert values["delay"].value == pytest.approx(0.02, abs=0.004)
+        assert found.robot.free_s < 40.0 - 0.4  # it was armed after the start
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import planar_cases
 import pytest
@@ -21,8 +22,10 @@ from chaserdock_controller.ingest.latency_compensation import (
     CommandHistory,
     predict_state,
 )
+from chaserdock_models.rigid_body import propagate
 from chaserdock_models.thruster_model import Valves
 from chaserdock_models.wrench_set import wrench_matrix
+from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.faults import faults_of
@@ -299,6 +302,54 @@ def test_stuck_thruster_is_isolated_within_half_a_second(thruster: int) -> None:
     assert record.position_error_m[late, 0].max() < 0.05
     assert record.rms(16.0)[0] < 0.01
     assert math.degrees(record.rms(16.0)[1]) < 2.0
+
+
+def test_a_weak_thruster_that_dies_later_is_isolated() -> None:
+    """Closed loop of pulses and motion, random commands: weak from 1 s on, dead from 9 s on."""
+    s, rng = mission(), np.random.default_rng(3)
+    pilot, valves = ThrusterController(s, 0), Valves(s.chaser.thrusters)
+    matrix, state = wrench_matrix(s.chaser.thrusters), np.eye(13)[6]
+    reports: list[tuple[float, str]] = []
+    isolated: tuple[int, ...] = ()
+    tick = 0
+    while not isolated and tick < 400:
+        now_ns, next_ns = (s.timing.tick_time_ns(tick + k) for k in (0, 1))
+        if tick == 15:
+            valves.fail(4, "weak", now_ns, 0.5)
+        if tick == 135:
+            valves.fail(4, "stuck_off", now_ns)
+        x, v, q, omega = np.split(state, [3, 6, 10])
+        pilot.observe(
+            odometry(
+                tick=tick,
+                time_ns=now_ns,
+                position_m=vector(x),
+                velocity_m_s=vector(v),
+                q_wxyz=vector(q),
+                omega_rad_s=vector(omega),
+            )
+        )
+        reports += [
+            (now_ns / 1e9, what) for _, what, _ in pilot.drain_events() if "limits" not in what
+        ]
+        asked = rng.uniform(-0.3, 0.3, 6) * box(s)
+        command = msgspec.structs.replace(
+            wrench(s, tick), force_N=vector(asked[:3]), torque_N_m=vector(asked[3:])
+        )
+        pilot.apply_command(command)
+        done = pilot.add_pulses(passed_on(command))
+        for p in done.pulses:
+            valves.pulse(p.thruster, p.open_ns, p.close_ns)
+        valves.set_shut(done.isolated, done.effective_time_ns)
+        edges_ns = np.linspace(now_ns, next_ns, 5)
+        for impulse, step_s in zip(valves.impulses(edges_ns), np.diff(edges_ns) / 1e9, strict=True):
+            state = propagate(state, matrix @ impulse / step_s, s.chaser, float(step_s))
+        valves.forget_before(now_ns)
+        isolated, tick = done.isolated, tick + 1
+    failures = [(what, time_s) for time_s, what in reports if what != "thrusters changed"]
+    assert [what for what, _ in failures] == ["thruster 4 weak", "thruster 4 stuck off"]
+    assert 9.0 < failures[1][1] < 11.0
+    assert isolated == (4,)
 
 
 def test_commanded_thrusts_replace_the_allocation_except_of_isolated_thrusters() -> None:

@@ -89,7 +89,8 @@ class ThrusterController:
                 self._monitor.reset()
             else:
                 suspects = self._suspects(before.sim_time_ns)
-                fault = self._monitor.detect(before, odometry, given_N_s, suspects)
+                known_N = self.health.available_N()
+                fault = self._monitor.detect(before, odometry, given_N_s, suspects, known_N)
                 if fault is not None:
                     self._add_fault(fault, now_ns, "detected")
         if now_ns - self._pruned_ns > _HISTORY_NS:

@@ -6,7 +6,8 @@ stuck on (constant full thrust: the residual is the part that was not commanded)
 off (the residual is the negative of a share of what was commanded). A hypothesis is accepted if the
 residuals are much more likely under it than without a fault (likelihood ratio), are consistent with
 it (chi-square), and neither another thruster nor a loss of whole commands, which no thruster gave,
-explains them nearly as well.
+explains them nearly as well. A weak thruster stays a suspect: what it is known to give counts as
+commanded.
 
 Mass properties and thrusts that differ from the model cause residuals too, the same ones at every
 tick. All likelihoods are those after integration over these constant differences with their prior,
@@ -76,7 +77,7 @@ SUFFICIENT_INFORMATION = 2.0 / _TEST.loss_sigma**2
 
 @dataclass(frozen=True)
 class ThrusterFault:
-    """A detected fault; ``factor``: remaining share of the thrust (1 for stuck on)."""
+    """A detected fault; ``factor``: remaining share of the full thrust (1 for stuck on)."""
 
     thruster: int
     kind: FailureKind
@@ -124,26 +125,25 @@ class _Evidence:
 class ThrusterFaultDetector:
     """Test the residuals of the last ticks for a fault.
 
-    ``matrix`` (6, n): see ``wrench_matrix``. ``differences``: number of constant differences
-    between plant and model. ``fired`` (n,): suspects with a pulse in the last update.
+    ``matrix`` (6, n): see ``wrench_matrix``. ``min_on_s`` (n,): shortest pulses. ``differences``:
+    number of constant differences between plant and model. ``fired`` (n,): suspects with a pulse
+    in the last update.
     """
 
-    def __init__(
-        self, matrix: Array, full_N: Array, min_pulse_N_s: Array, differences: int
-    ) -> None:
-        self._matrix, self._full_N, self._min_pulse_N_s = matrix, full_N, min_pulse_N_s
-        self._on_evidence = _Evidence(len(full_N), differences)
+    def __init__(self, matrix: Array, min_on_s: Array, differences: int) -> None:
+        self._matrix, self._min_on_s = matrix, min_on_s
+        self._on_evidence = _Evidence(len(min_on_s), differences)
         # One more hypothesis after those of the thrusters: whole commands are lost.
-        self._off_evidence = _Evidence(len(full_N) + 1, differences)
+        self._off_evidence = _Evidence(len(min_on_s) + 1, differences)
         self._on: deque[Array] = deque(maxlen=max(_TEST.on_windows))
         self._off: list[deque[Array]] = []
-        self.fired: Flags = np.zeros(len(full_N), dtype=np.bool_)
+        self.fired: Flags = np.zeros(len(min_on_s), dtype=np.bool_)
         self.reset()
 
     def reset(self) -> None:
         """Discard the residuals, as a change explains them."""
         self._on.clear()
-        self._off = [deque(maxlen=MAX_TICKS) for _ in self._full_N]
+        self._off = [deque(maxlen=MAX_TICKS) for _ in self._min_on_s]
 
     def update(
         self,
@@ -153,19 +153,21 @@ class ThrusterFaultDetector:
         time_s: float,
         suspects: Flags,
         mismatch: Array,
+        known_N: Array,
     ) -> ThrusterFault | None:
         """Add the residual of one tick; return a fault if one is detected.
 
         ``residual`` (6,): observed minus expected impulse; ``noise`` (6, 6): its covariance;
         ``commanded_N_s`` (n,): expected impulse of every thruster in ``time_s``; ``suspects`` (n,):
-        thrusters that may have failed; ``mismatch`` (6, differences): see ``mismatch_signatures``.
+        thrusters that may have failed; ``mismatch`` (6, differences): see ``mismatch_signatures``;
+        ``known_N`` (n,): thrust of each when open. The fault's factor is a share of that.
         """
         whiten = np.linalg.inv(np.linalg.cholesky(noise))
         white, columns = whiten @ residual, whiten @ self._matrix
         constant = whiten @ mismatch
-        extra = self._full_N * time_s - commanded_N_s
+        extra = known_N * time_s - commanded_N_s
         self._on.append(self._on_evidence.of_tick(white, columns * extra, constant))
-        fired = suspects & (commanded_N_s > 0.5 * self._min_pulse_N_s)
+        fired = suspects & (commanded_N_s > 0.5 * known_N * self._min_on_s)
         self.fired = fired
         signatures = -columns * commanded_N_s
         signatures = np.column_stack([signatures, signatures.sum(axis=1)])

@@ -5,6 +5,9 @@ find out.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
 from chaserdock_protocol.scenario import FlightScenario
@@ -32,11 +35,10 @@ class FaultMonitor:
     def __init__(self, scenario: FlightScenario, allocator: Allocator) -> None:
         body = scenario.chaser
         self._body, self._matrix = body, allocator.matrix
-        full_N = thrusts_max(body.thrusters)
-        min_pulse_N_s = full_N * [t.min_on_s for t in body.thrusters]
-        self._detector = ThrusterFaultDetector(
-            self._matrix, full_N, min_pulse_N_s, 13 + len(full_N)
-        )
+        self._full_N = thrusts_max(body.thrusters)
+        min_on_s = np.array([t.min_on_s for t in body.thrusters])
+        min_pulse_N_s = self._full_N * min_on_s
+        self._detector = ThrusterFaultDetector(self._matrix, min_on_s, 13 + len(min_on_s))
         self._mismatch = PlantMismatch()
         self._noise = noise_of(scenario.navigation.errors())
         variance = quiescent_variance(self._noise, body)
@@ -67,11 +69,17 @@ class FaultMonitor:
         self._self_test.reset()
 
     def detect(
-        self, before: Odometry, after: Odometry, given_N_s: Array, suspects: Flags
+        self,
+        before: Odometry,
+        after: Odometry,
+        given_N_s: Array,
+        suspects: Flags,
+        known_N: Array,
     ) -> ThrusterFault | None:
         """Return the failure that the motion between two odometries proves, if any.
 
-        ``given_N_s`` (n,): impulses of healthy thrusters; ``suspects`` (n,): those that may fail.
+        ``given_N_s`` (n,): impulses of thrusters as far as they are known to work; ``suspects``
+        (n,): those that may fail; ``known_N`` (n,): known thrust of each when open.
         """
         if self._free_since_ns is None or before.sim_time_ns < self._free_since_ns:
             self.reset()
@@ -82,10 +90,16 @@ class FaultMonitor:
         mismatch = mismatch_signatures(
             self._mismatch, self._body, self._matrix, given_N_s, before, after
         )
-        fault = self._detector.update(residual, noise, given_N_s, time_s, suspects, mismatch)
+        fault = self._detector.update(
+            residual, noise, given_N_s, time_s, suspects, mismatch, known_N
+        )
         if fault is None:
             self._self_test.add_pulses(self._detector.fired, after.sim_time_ns)
-        return fault
+            return None
+        if fault.kind != "weak":
+            return fault
+        share = float(known_N[fault.thruster] / self._full_N[fault.thruster])
+        return replace(fault, factor=share * fault.factor)
 
     def test_pulses(
         self,

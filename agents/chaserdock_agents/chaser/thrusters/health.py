@@ -57,9 +57,11 @@ class ThrusterHealth:
     def suspects(self, shut: Iterable[int]) -> list[bool]:
         """Return for every thruster whether a failure of it can be detected.
 
-        Not if it is ``shut``, known to have failed, or trusted by command.
+        Not if it is ``shut``, known to be stuck, or trusted by command. One that is weak may fail
+        for good.
         """
-        excluded = {*self._failed, *shut, *self._trusted}
+        stuck = {j for j, fault in self._failed.items() if fault.kind != "weak"}
+        excluded = {*stuck, *shut, *self._trusted}
         return [thruster not in excluded for thruster in range(len(self._full_N))]
 
     def states(self) -> tuple[ThrusterState, ...]:

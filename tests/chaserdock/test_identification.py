@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot is identified from its recorded motion, with honest standard deviations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import ActuatorCommand, DrawnBody
+from chaserdock_protocol.scenario import Scenario, load_scenario
+from flight_cases import scenario
+from general_position import flown, matrix
+from harness import ROOT, finished
+from mcap_writers import copy_log
+from scipy.stats import chi2
+
+from chaserdock.identification.fit import Identification, identify, identify_robot
+from chaserdock.identification.motion_filter import (
+    INERTIA_ROWS,
+    MotionFilter,
+    Noise,
+    Parameters,
+    actuation_of,
+    commanded_over,
+)
+from chaserdock.identification.recorded import (
+    IdentificationError,
+    MeasuredMotion,
+    RecordedRobot,
+    Wrenches,
+)
+from chaserdock.identification.report import identification_lines
+from chaserdock.logs.reader import open_log
+from chaserdock.simulation.flight import fly_case
+
+GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
+TICK_S, TICK_NS, START_NS = 0.1, 100_000_000, 1_000_000_000
+CENTRE = np.array([0.011, -0.008, 0.006])
+INERTIA = np.array([[0.36, 0.02, -0.015], [0.02, 0.29, 0.01], [-0.015, 0.01, 0.41]])
+PUSH = np.array([0.004, -0.006, 0.003, 4e-4, -3e-4, 5e-4])
+SIGMAS = np.repeat([3e-4, 5e-4, 5e-4, 4e-4], 3)
+
+
+def robot_scenario(**chaser: Any) -> Scenario:
+    values = {"mass_kg": 20.0, "inertia_kg_m2": [0.33, 0.33, 0.33], "torque_max_N_m": 0.1}
+    return scenario(chaser=values | chaser, time={"rate_hz": 10, "image_hz": 10})
+
+
+def command(tick: int, wrench: Array, early_ns: int) -> ActuatorCommand:
+    return ActuatorCommand(
+        seq=tick,
+        chaser=0,
+        source="command",
+        effective_time_ns=START_NS + tick * TICK_NS - early_ns,
+        force_N=vector(wrench[:3]),
+        torque_N_m=vector(wrench[3:]),
+    )
+
+
+def motion_of(wrenches: Array, mass_kg: float, noise: Array, seed: int) -> MeasuredMotion:
+    """Return the measured motion (K + 1) of a body, by definition, under wrenches (K, 6) at the
+    origin of CRF that each act for a tick."""
+    rng = np.random.default_rng(seed)
+    x = np.zeros(18)
+    x[6:15], x[15:] = matrix([0.8, 0.3, -0.4, 0.2]).ravel(), (0.04, -0.05, 0.03)
+    rows = []
+    for k in range(len(wrenches) + 1):
+        r, w = x[6:15].reshape(3, 3), x[15:]
+        q = rotations.from_matrix(r)
+        e = noise * rng.standard_normal(12)
+        turned = rotations.multiply(q, rotations.exp(e[6:9]))
+        place, velocity = x[:3] - r @ CENTRE, x[3:6] - r @ np.cross(w, CENTRE)
+        rows.append([*(place + e[:3]), *(velocity + e[3:6]), *turned, *(w + e[9:])])
+        if k < len(wrenches):
+            total = wrenches[k] + PUSH
+            total[3:] -= np.cross(CENTRE, total[:3])
+            before = np.concatenate([x[:6], q, w])
+            x = flown(before, mass_kg, INERTIA, total, TICK_S)
+    covariance = np.diag(np.maximum(noise, 1e-7) ** 2)
+    time_ns = START_NS + np.arange(len(rows)) * TICK_NS
+    return MeasuredMotion(time_ns, np.array(rows), covariance, np.ones(len(wrenches), dtype=bool))
+
+
+def free_flyer(
+    seed: int, ticks: int, noise: Array, late_ns: int = 0, axes: Any = 1.0
+) -> RecordedRobot:
+    """Return a robot of 24 kg, in general position, whose forces along ``axes`` (6,) are as
+    commanded, and later by ``late_ns``."""
+    rng = np.random.default_rng(100 + seed)
+    held = np.repeat(rng.uniform(-1.0, 1.0, (ticks // 4 + 1, 6)), 4, axis=0)[:ticks]
+    wrenches = held * [1.5, 1.5, 1.5, 0.03, 0.03, 0.03] * np.asarray(axes)
+    commands = [command(k, w, late_ns) for k, w in enumerate(wrenches)]
+    own = robot_scenario()
+    motion = motion_of(wrenches, 24.0, noise, seed)
+    return RecordedRobot(own, 0, motion, Wrenches(own, commands, simulated=True))
+
+
+TRUE = {
+    "mass": 24.0,
+    "delay": 0.0,
+    **dict(zip(("centre x", "centre y", "centre z"), CENTRE.tolist(), strict=True)),
+    **{f"I{'xyz'[i]}{'xyz'[j]}": float(INERTIA[i, j]) for i, j in INERTIA_ROWS},
+    **dict(zip(("force x", "force y", "force z"), PUSH[:3].tolist(), strict=True)),
+    **dict(zip(("torque x", "torque y", "torque z"), PUSH[3:].tolist(), strict=True)),
+}
+
+
+def test_two_passes_without_noise_find_what_differs() -> None:
+    """So every derivative of the motion is right: after the second, third order is left."""
+    robot = free_flyer(0, 40, np.zeros(12))
+    true = np.array([20.0 / 24.0, *CENTRE, *(INERTIA[e] for e in INERTIA_ROWS), *PUSH, *[0.0] * 4])
+    true[4:16] *= 20.0 / 24.0  # the filter counts in units of the stated mass
+    scale = np.array([1.0, *[0.01] * 3, *[0.3] * 6, *[0.3] * 3, *[0.03] * 3, 0.1, *[1e-9] * 3])
+    off = 0.02 * np.random.default_rng(5).choice([-1.0, 1.0], 20)
+    own = Parameters.of(true + off * scale)
+    for _ in range(2):
+        commanded = commanded_over(robot.actuators, robot.motion.time_ns, own.delay_s)
+        noise = Noise(np.eye(12) * 1e-10, np.zeros(12), 0.0)
+        run = MotionFilter(actuation_of(robot.scenario.chaser), 20.0, own, noise).run
+        found = run(robot.motion, commanded, np.zeros(20), scale)
+        own = Parameters.of(own.vector + found.change)
+    assert np.all(np.abs(own.vector - true) < 5e-4 * scale + 1e-9)
+
+
+@pytest.fixture(scope="module")
+def found() -> Identification:
+    return identify_robot(free_flyer(1, 60, SIGMAS))
+
+
+def test_a_free_flyer_is_identified(found: Identification) -> None:
+    assert all(q.known for q in found.quantities)
+    for q in found.quantities:
+        assert abs(q.value - TRUE[q.name]) < 4.0 * q.sigma, q
+    assert found.named("mass")[0].sigma < 0.3
+    assert found.noise_ratio == pytest.approx([1.0] * 4, abs=0.15)
+    assert not found.disturbed
+
+
+@pytest.mark.slow(1)
+def test_standard_deviations_are_those_of_the_errors() -> None:
+    """Over 12 seeds, two-sided: chi-square of all values together with their covariance."""
+    total = freedoms = 0.0
+    for seed in range(12):
+        found = identify_robot(free_flyer(seed, 200, SIGMAS))
+        order = ["mass", *list(TRUE)[2:], "delay"]
+        by_name = {q.name: q for q in found.quantities}
+        error = np.array([by_name[name].value - TRUE[name] for name in order])
+        covariance = np.delete(np.delete(found.covariance, 1, axis=0), 1, axis=1)
+        total += float(error @ np.linalg.solve(covariance, error))
+        freedoms += len(order)
+    assert 0.001 < chi2.cdf(total, freedoms) < 0.999, total / freedoms
+
+
+def test_its_lines_can_be_pasted(found: Identification, tmp_path: Path) -> None:
+    pasted = load_pasted(found, "single", tmp_path)
+    values = {q.name: q.value for q in found.quantities}
+    assert pasted.chaser.mass_kg == pytest.approx(values["mass"], rel=1e-5)
+    assert pasted.chaser.inertia == pytest.approx([values[f"I{a}{a}"] for a in "xyz"], rel=1e-5)
+    true = pasted.truth.values_of(0)
+    assert true is not None
+    assert true.centre_of_mass_m == pytest.approx(CENTRE, abs=0.02)
+    assert true.inertia_kg_m2 is not None
+    assert true.inertia_kg_m2[3] == pytest.approx(values["Ixy"], rel=1e-5)
+
+
+def load_pasted(found: Identification, base: str, folder: Path) -> Scenario:
+    lines = identification_lines(found)
+    text = "\n".join([f'extends = "{base}"', 'name = "pasted"', *lines[lines.index("") :]])
+    (folder / "pasted.toml").write_text(text, encoding="utf-8")
+    return load_scenario(folder / "pasted.toml")
+
+
+def test_a_late_robot_is_late() -> None:
+    delay = identify_robot(free_flyer(2, 60, SIGMAS, late_ns=60_000_000)).named("delay")[0]
+    assert abs(delay.value - 0.06) < 4.0 * delay.sigma < 0.02
+
+
+def test_what_was_not_excited_is_not_stated() -> None:
+    """Torque only: moments and products of inertia are found, no mass."""
+    found = identify_robot(free_flyer(3, 60, SIGMAS, axes=[0, 0, 0, 1, 1, 1]))
+    assert [q.name for q in found.quantities if not q.known] == ["mass"]
+    for q in found.named("I"):
+        assert abs(q.value - TRUE[q.name]) < 4.0 * q.sigma < 0.04, q
+    lines = identification_lines(found)
+    assert "not observable in this run: mass" in lines
+    assert not any(line.startswith(("mass", "mass_kg")) for line in lines)
+
+
+def test_a_weighed_robot_shows_its_force() -> None:
+    found = identify_robot(free_flyer(4, 60, SIGMAS), mass_kg=20.0)
+    share = found.named("force and torque")[0]
+    assert abs(share.value - 20.0 / 24.0) < 4.0 * share.sigma < 0.05
+    assert not found.named("mass")
+
+
+@pytest.mark.parametrize(
+    ("lacking", "chaser", "said"),
+    [
+        ("", 2, r"no chaser 2; its 2 are 0 to 1"),
+        ("chaser/0/actuators", 0, r"chaser 0: no thrust was commanded"),
+        ("world/chaser/0/odometry", 0, r"chaser 0: no odometry; the log must hold"),
+        ("", 0, r"chaser 0: 1\.2 s in which only its actuators moved it; at least 10 s"),
+    ],
+)
+def test_a_run_that_does_not_serve_is_refused(
+    lacking: str, chaser: int, said: str, tmp_path: Path
+) -> None:
+    log = copy_log(
+        GOLDEN, tmp_path / "log.mcap", keep=lambda key, _: not key.endswith(lacking or "-")
+    )
+    with pytest.raises(IdentificationError, match=said):
+        identify(log, chaser)
+
+
+def test_the_command_says_what_is_wrong() -> None:
+    refused = finished("calibrate", str(GOLDEN), "--robot", "5")
+    assert refused[0] == 2
+    assert refused[1].count("\n") == 1
+    assert "no chaser 5" in refused[1]
+    assert finished("calibrate", str(GOLDEN), "--mass", "20") == (
+        2,
+        "chaserdock: --mass: only with --robot\n",
+    )
+    assert finished("calibrate", str(GOLDEN)) == (
+        2,
+        "chaserdock: --out: needed for a camera's calibration\n",
+    )
+
+
+def flight_errors(log: Path, scenario: Scenario) -> tuple[Array, Array, Identification]:
+    """Return the errors of all that a flight of a weighed chaser tells, their covariance, and what
+    it tells."""
+    opened = open_log(log)
+    drawn = next(iter(opened.messages(topics.TRUTH_DRAWN))).bodies
+    true: DrawnBody = next(b for b in drawn if b.body == "chaser/0")
+    found = identify(log, 0, true.mass_kg)
+    assert all(q.known for q in found.quantities)
+    turns = np.reshape(true.thrust_turn_rad, (-1, 3))
+    thrusts = {
+        f"thruster {k}": t.thrust_N
+        * (1.0 + true.thrust_share[k])
+        * float(np.dot(rotations.rotate(rotations.exp(turns[k]), t.direction), t.direction))
+        for k, t in enumerate(scenario.chaser.thrusters)
+    }
+    inertia = np.reshape(true.inertia_kg_m2, (3, 3))
+    values = thrusts | {"delay": scenario.truth.mismatch("chaser").delay_s}
+    for name, vector3 in (
+        ("centre", true.centre_of_mass_m),
+        ("force", true.force_N),
+        ("torque", true.torque_N_m),
+    ):
+        values |= {f"{name} {axis}": v for axis, v in zip("xyz", vector3, strict=True)}
+    values |= {f"I{'xyz'[i]}{'xyz'[j]}": float(inertia[i, j]) for i, j in INERTIA_ROWS}
+    order = [
+        *thrusts,
+        *(q.name for q in found.named("centre")),
+        *(q.name for q in found.named("I")),
+        *(q.name for q in found.named("force") + found.named("torque")),
+        "delay",
+    ]
+    by_name = {q.name: q for q in found.quantities}
+    scale = np.array(
+        [scenario.chaser.thrusters[0].thrust_N] * len(thrusts) + [1.0] * (len(order) - len(thrusts))
+    )
+    error = np.array([by_name[name].value - values[name] for name in order]) / scale
+    count = len(thrusts)
+    planar = scenario.chaser.is_planar
+    kept = [*range(1, 3 + count), *([] if planar else [3 + count])]
+    kept += [6 + count] if planar else list(range(4 + count, 10 + count))
+    kept += [10 + count, 11 + count, 15 + count] if planar else list(range(10 + count, 16 + count))
+    kept.append(16 + count)
+    return error, found.covariance[np.ix_(kept, kept)], found
+
+
+FLIGHTS = {
+    "single-thrusters": {
+        "duration_s": 60.0,
+        "truth": {"preset": "mismatch", "chaser": {"inertia_turn_deg": 5.0, "delay_s": 0.008}},
+        "timeline": [{"at_s": 12.0, "command": "calibrate", "chasers": [0]}],
+    },
+    "planar-tracking": {},
+}
+
+
+@pytest.mark.slow(5)
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_flights_tell_the_robot_within_the_standard_deviations(name: str, tmp_path: Path) -> None:
+    """Five seeds with bodies, thrusters and odometry of their own: each value within four standard
+    deviations, and chi-square of all together within a two-sided band of 1 in 500."""
+    total = freedoms = 0.0
+    for seed in range(1, 6):
+        folder = tmp_path / str(seed)
+        case = {"extends": name, "name": f"identified-{seed}", "seed": seed, **FLIGHTS[name]}
+        fly_case(case, seed, folder)
+        scenario = open_log(folder / "run").scenario
+        error, covariance, found = flight_errors(folder / "run", scenario)
+        assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(covariance)))
+        total += float(error @ np.linalg.solve(covariance, error))
+        freedoms += len(error)
+        load_pasted(found, name, tmp_path)
+    print(f"{name}: chi-square {total:.1f} of {freedoms:.0f}")
+    assert 0.001 < chi2.cdf(total, freedoms) < 0.999, total / freedoms

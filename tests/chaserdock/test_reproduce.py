@@ -663,6 +663,13 @@ def test_earlier_cells_stand_marked_where_a_row_is_not_flown() -> None:
     assert read_earlier(text).cells["Table: position", "T=10", CODE].endswith(MARK)
 
 
+def test_lower_bound_needs_the_nominal_start() -> None:
+    results = complete(plan(False))
+    assert "m^2 from the nominal start" in " ".join(page_of(plan(False), results).split())
+    del results["alone/baseline"]
+    assert "Lower bound" not in page_of(plan(False), results)
+
+
 def test_complete_rows_replace_earlier_cells() -> None:
     text = page_of(plan(False), complete(plan(False)), earlier=read_earlier(EARLIER))
     assert "[20" not in text

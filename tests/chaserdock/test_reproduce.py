@@ -658,8 +658,16 @@ def test_earlier_cells_stand_marked_where_a_row_is_not_flown() -> None:
     assert f"| 4 (2 to 7) larger {MARK} | 0.013 smaller |" in text
     assert f"| +10.0 % yes; +9.0 % no {MARK} | x 2 no; x 2 no {MARK} | +0.0 %; +0.0 % |" in text
     assert f"| {CODE} | 1 of 1 | 0 of 1 |" in text
+    assert "the headline and the counts of this table include such cells" in " ".join(text.split())
     assert "NOT COMPLETE: 5 of " in text
     assert read_earlier(text).cells["Table: position", "T=10", CODE].endswith(MARK)
+
+
+def test_lower_bound_needs_the_nominal_start() -> None:
+    results = complete(plan(False))
+    assert "m^2 from the nominal start" in " ".join(page_of(plan(False), results).split())
+    del results["alone/baseline"]
+    assert "Lower bound" not in page_of(plan(False), results)
 
 
 def test_complete_rows_replace_earlier_cells() -> None:

@@ -257,7 +257,7 @@ def _start(results: Summaries, earlier: EarlierPage) -> PageSection:
         f"{ATTITUDE_BOUND_RAD:g} rad, of its velocities within {100 * RATE_BOUND:.0f} %.",
         earlier.fill("Start", Table(header, tuple(rows))),
     ]
-    if floors:
+    if names[0] in results:
         least = min(value for _, value in floors)
         best = min(ROWS, key=lambda row: row.position_mse_m2)
         compared = "below" if best.position_mse_m2 < floors[0][1] else "above"

@@ -61,7 +61,7 @@ def result_section(
         "Multiple Satellites with an Uncooperative Target (IFAC 2023). This page is the output of "
         f"`{command}`; the section Flights says what was flown when and at which commit. A cell "
         "with date and commit in brackets is that of an earlier page, as its row was not flown "
-        "again since.",
+        "again since; the headline and the counts of this table include such cells.",
         f'Three chains fly the nine rows of its table, with images. "{WRITTEN}": the paper\'s '
         "perception (EPnP), its moving average of all estimates and its solver OpEn, in its "
         f"settings. \"{CODE}\": the same with OpenCV's iterative PnP, which the authors' public "

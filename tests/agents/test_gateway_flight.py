@@ -193,7 +193,7 @@ def test_a_fault_stops_all_robots_with_a_named_reason(
     assert FAULTS[kind] in reason
     assert lab.begun_ns is not None
     stopped_ns = max(at_ns for at_ns, _ in SENT)
-    longest_s = 3.0 if kind == "robot does not obey" else 0.2 + 2 / 15
+    longest_s = 3.0 if kind == "robot does not obey" else 0.5 + 2 / 15  # stale_s, and two ticks
     assert (stopped_ns - lab.begun_ns) / 1e9 < 6.0 + longest_s
 
 

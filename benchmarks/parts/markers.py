@@ -12,6 +12,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -22,8 +23,9 @@ from chaserdock_agents.chaser.perception import (
     PerceptionResult,
     make_perception,
 )
-from chaserdock_agents.chaser.perception.corners import SETTINGS
+from chaserdock_agents.chaser.perception.corners import SETTINGS, mean_side_px
 from chaserdock_agents.chaser.perception.detect import dictionary_of
+from chaserdock_agents.chaser.perception.pnp import MarkerTable
 from chaserdock_agents.chaser.sighting import decode_image, look
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -493,6 +495,46 @@ def small(count: int) -> Figures:
     return out
 
 
+def corner_errors(count: int) -> Figures:
+    """Return errors of fitted corners beside the stated ones, by the narrowest cell of a marker:
+    root mean square, per coordinate; mean and median square of whitened errors (1 and 0.45).
+    """
+    out: Figures = {}
+    for target in ("servicer", "paper"):
+        views = Views(target, 960, 540)
+        perception, table = views.perception(), MarkerTable.of(views.model)
+        found: list[tuple[float, Array, Array, Array]] = []
+        for view in views.random_views(count, 0.4, 4.5, 5):
+            truth = views.camera.project_ideal(
+                rotations.rotate(view.q, table.corners) + view.position
+            )
+            rows = np.flatnonzero(np.isin(table.ids, perception.estimate(view.image).marker_ids))
+            refined = perception.refined(view.image, truth[rows], rows)
+            for k in np.flatnonzero(refined.good).tolist():
+                white = refined.errors.whitening[k]
+                off = (refined.corners_px[k] - truth[rows[k]]).ravel()
+                area_px = float(cv2.contourArea(truth[rows[k]].astype(np.float32)))
+                cell_px = (
+                    area_px / mean_side_px(truth[rows[k : k + 1]])[0] / perception.reader.cells
+                )
+                found.append((cell_px, off, white @ off, np.linalg.inv(white.T @ white)))
+        for low_px, high_px in pairwise((1.0, 2.0, 3.0, 5.0, 10.0, 100.0)):
+            part = [f for f in found if low_px <= f[0] < high_px]
+            if not part:
+                continue
+            squares = np.square([white for _, _, white, _ in part])
+            stated = np.trace(np.array([c for *_, c in part]), axis1=1, axis2=2) / 8.0
+            at = f"corners_{target}_cells_of_{low_px:g}_to_{high_px:g}_px_"
+            out |= {
+                f"{at}markers": len(part),
+                f"{at}rms_px": float(np.sqrt(np.mean(np.square([off for _, off, *_ in part])))),
+                f"{at}stated_median_px": float(np.sqrt(np.median(stated))),
+                f"{at}whitened_square_mean": float(np.mean(squares)),
+                f"{at}whitened_square_median": float(np.median(squares)),
+            }
+    return out
+
+
 COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "rendering": (rendering, 200, 20),
     "speed": (speed, 200, 30),
@@ -502,6 +544,7 @@ COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "accuracy": (accuracy, 10_000, 60),
     "far": (far, 80, 4),
     "small": (small, 200, 10),
+    "corners": (corner_errors, 200, 4),
     "bearing": (bearing, 80, 8),
 }
 """Number of views of each part, and number with ``--quick``."""
